@@ -1,0 +1,1 @@
+"""The ``remaster`` command: one file per verb."""

@@ -1,0 +1,202 @@
+"""Frozen records that pass between collection, storage and estimation. SI units throughout."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+Split = Literal['optimization', 'validation']
+
+
+@dataclass(frozen=True)
+class JointSolution:
+    """One joint solution of a Cartesian pose.
+
+    Attributes
+    ----------
+    q
+        Joint positions, base to tip, rad, shape (k,).
+    position_error_m, rotation_error_rad
+        What forward kinematics leaves against the wanted pose.
+    """
+
+    q: FloatArray
+    position_error_m: float
+    rotation_error_rad: float
+
+
+@dataclass(frozen=True)
+class MarkerReading:
+    """One marker position measured by one sensor, in the sensor's own frame N.
+
+    Attributes
+    ----------
+    stamp_s
+        Time of capture, s.
+    position
+        Marker position in N, m, shape (3,).
+    """
+
+    stamp_s: float
+    position: FloatArray
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One row of ``observations.csv``: where the robot says it is, where a sensor saw a marker.
+
+    Attributes
+    ----------
+    q, from_q
+        Reported joint positions, and those it came from (None where unknown), rad, (k,).
+    position, std
+        Mean marker position in N over the dwell, and the samples' standard deviation
+        (None for a single shot), m, (3,).
+    samples
+        How many samples the mean has; None where unknown.
+    """
+
+    observation: int
+    pose: int
+    configuration: int
+    split: Split
+    stamp_s: float
+    sensor: str
+    marker: str
+    q: FloatArray
+    position: FloatArray
+    from_q: FloatArray | None = None
+    std: FloatArray | None = None
+    samples: int | None = None
+    temperature_c: float | None = None
+
+
+@dataclass(frozen=True)
+class BasePrior:
+    """A sensor's registration known beforehand: T_R_N, the sensor frame N in the robot base R.
+
+    Attributes
+    ----------
+    translation_m
+        Sensor origin in R, m, (3,).
+    rotation_xyzw
+        Unit quaternion of R_R_N, (4,).
+    std_m, std_rad
+        Standard deviation per axis.
+    """
+
+    translation_m: FloatArray
+    rotation_xyzw: FloatArray
+    std_m: float
+    std_rad: float
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """The observations of a session as columns; row i of every array is one observation.
+
+    Attributes
+    ----------
+    observation, pose, configuration
+        Integers as in the file, (n,).
+    is_validation
+        True where ``split`` is ``validation``, (n,).
+    stamp_s
+        Time of the measurement, s, (n,).
+    sensor, marker
+        Index into the session's ``sensors`` / ``markers`` (in their order), (n,).
+    q, from_q
+        Joint positions, rad, (n, k); ``from_q`` is NaN where unknown.
+    position, std
+        Marker in the sensor's own frame N and its dwell std, m, (n, 3); ``std`` NaN if unknown.
+    samples
+        Samples in the mean, (n,); -1 where unknown.
+    temperature_c
+        Degrees Celsius, (n,); NaN where unknown.
+    effort
+        Measured joint torques, N m, (n, k), NaN where unknown; None if the file has no column.
+    """
+
+    observation: IntArray
+    pose: IntArray
+    configuration: IntArray
+    is_validation: BoolArray
+    stamp_s: FloatArray
+    sensor: IntArray
+    marker: IntArray
+    q: FloatArray
+    from_q: FloatArray
+    position: FloatArray
+    std: FloatArray
+    samples: IntArray
+    temperature_c: FloatArray
+    effort: FloatArray | None = None
+
+    def __len__(self) -> int:
+        """Return the number of observations."""
+        return len(self.observation)
+
+    def select(self, rows: BoolArray | IntArray) -> Measurements:
+        """Return the given rows (a mask or indices), in that order."""
+        return Measurements(
+            **{name: None if value is None else value[rows] for name, value in vars(self).items()}
+        )
+
+
+@dataclass(frozen=True)
+class Session:
+    """A session: the robot, the markers and sensors, and what was measured.
+
+    Attributes
+    ----------
+    urdf
+        Text of the nominal robot's URDF.
+    markers
+        Nominal marker positions in the tool frame T, m, name -> (3,).
+    marker_std_m
+        How well the nominal marker positions are known, per axis, m.
+    sensors
+        Sensor name -> the marker it follows while collecting.
+    base_prior
+        Sensor name -> registration known beforehand.
+    exit_status
+        ``complete``, ``stopped``, ``aborted`` or '' where the file does not say.
+    extra
+        Keys of session.yaml this version does not know, kept as they are.
+    """
+
+    urdf: str
+    base_link: str
+    tip_link: str
+    markers: Mapping[str, FloatArray]
+    sensors: Mapping[str, str]
+    measurements: Measurements
+    marker_std_m: float = 0.5e-3
+    settle_s: float = 3.0
+    base_prior: Mapping[str, BasePrior] = field(default_factory=dict)
+    exit_status: str = ''
+    notes: str = ''
+    created: str = ''
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Sensor names in index order."""
+        return tuple(self.sensors)
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Marker names in index order."""
+        return tuple(self.markers)
+
+    def select(self, rows: BoolArray | IntArray) -> Session:
+        """Return this session with only the given rows."""
+        return replace(self, measurements=self.measurements.select(rows))

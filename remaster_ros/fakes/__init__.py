@@ -1,0 +1,1 @@
+"""Fake devices that speak the real wire formats, behind one hidden World."""

@@ -1,0 +1,1 @@
+"""Session folders, rosbag2 (MCAP), result files, reports and figures; no ROS graph."""

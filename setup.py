@@ -1,0 +1,95 @@
+"""Package of remaster_ros: ament_python at the root, and a plain pip package too."""
+
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = 'remaster_ros'
+
+# What `ros2 run remaster_ros <executable>` finds. pip puts console scripts into bin/ and never into
+# lib/<package>/, so thin wrapper scripts are installed as data files; only `remaster` goes on PATH.
+EXECUTABLES = sorted(glob('scripts/*'))
+
+JAZZY = [
+    'ros-jazzy-' + name
+    for name in (
+        'rclpy',
+        'rmw-fastrtps-cpp',
+        'builtin-interfaces',
+        'std-msgs',
+        'geometry-msgs',
+        'sensor-msgs',
+        'std-srvs',
+        'trajectory-msgs',
+        'diagnostic-msgs',
+        'rosgraph-msgs',
+    )
+]
+
+
+def config_files() -> list[tuple[str, list[str]]]:
+    """Return the data_files entries for config/, keeping its folders."""
+    folders = ['config', *(str(p) for p in Path('config').iterdir() if p.is_dir())]
+    return [
+        (f'share/{NAME}/{folder}', [p for p in glob(f'{folder}/*') if Path(p).is_file()])
+        for folder in folders
+    ]
+
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='Remaster a robot arm in place: joint zero-offsets with honest uncertainty',
+    author='remaster_ros maintainers',
+    maintainer='remaster_ros maintainers',
+    maintainer_email='maintainers@remaster-ros.example',
+    python_requires='>=3.11',
+    # config/ stays at the top level, where ROS users look for it, and is package data as well:
+    # without ROS there is no share/ folder to read defaults from.
+    packages=[*find_packages(include=[NAME, f'{NAME}.*']), f'{NAME}.config'],
+    package_dir={f'{NAME}.config': 'config'},
+    package_data={
+        f'{NAME}.config': ['*.yaml', 'robots/*', 'cells/*'],
+        f'{NAME}.storage': ['*.jinja'],
+    },
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/launch', glob('launch/*.py')),
+        (f'lib/{NAME}', EXECUTABLES),
+        *config_files(),
+    ],
+    install_requires=[
+        'setuptools',
+        'numpy>=1.26',
+        'scipy>=1.11',
+        'pyyaml>=6',
+        'EAIK>=1.2',
+        'msgspec>=0.18',
+        'rich>=13',
+        'jinja2>=3.1',
+        'matplotlib>=3.8',
+        'plotly>=5.20',
+        'mcap>=1.2',
+        'rosbags>=0.10',
+    ],
+    extras_require={
+        'jazzy': JAZZY,
+        'natnetclient': ['NatNetClient==0.8.3'],
+        'test': [
+            'pytest>=8',
+            'pytest-timeout',
+            'hypothesis',
+            'NatNetClient==0.8.3',
+            'natnet==0.3.0',
+            'CESAPI==1.1.3',
+            'mcap-ros2-support>=0.5',
+            'arviz-stats',
+            'pin>=3',
+        ],
+        'check': ['ruff', 'mypy', 'types-PyYAML', 'import-linter'],
+    },
+    zip_safe=False,
+    entry_points={'console_scripts': ['remaster = remaster_ros.cli.main:main']},
+)
