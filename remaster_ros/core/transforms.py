@@ -1,0 +1,107 @@
+"""Rigid transforms SE(3) on arrays: any number of leading dimensions, which broadcast.
+
+``T_a_b`` maps coordinates of frame b to frame a: ``p_a = apply(T_a_b, p_b)``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from .types import FloatArray
+
+
+def transform(rotation: ArrayLike, translation: ArrayLike) -> FloatArray:
+    """Assemble homogeneous transforms.
+
+    Parameters
+    ----------
+    rotation
+        Rotation matrices, (..., 3, 3).
+    translation
+        Translations, m, (..., 3).
+
+    Returns
+    -------
+    ndarray
+        (..., 4, 4).
+    """
+    rotation = np.asarray(rotation, dtype=float)
+    translation = np.asarray(translation, dtype=float)
+    batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    T = np.zeros((*batch, 4, 4))
+    T[..., :3, :3] = rotation
+    T[..., :3, 3] = translation
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def inverse(T: ArrayLike) -> FloatArray:
+    """Invert rigid transforms (..., 4, 4): T_a_b becomes T_b_a."""
+    T = np.asarray(T, dtype=float)
+    rotation = np.swapaxes(T[..., :3, :3], -1, -2)
+    return transform(rotation, -(rotation @ T[..., :3, 3:])[..., 0])
+
+
+def apply(T: ArrayLike, points: ArrayLike) -> FloatArray:
+    """Map points (..., 3) from frame b to frame a by T_a_b (..., 4, 4)."""
+    T = np.asarray(T, dtype=float)
+    points = np.asarray(points, dtype=float)
+    return (T[..., :3, :3] @ points[..., None])[..., 0] + T[..., :3, 3]
+
+
+def rotation_vector_to_matrix(rotation_vector: ArrayLike) -> FloatArray:
+    """Turn rotation vectors (axis times angle, rad), (..., 3), into matrices (..., 3, 3)."""
+    vectors = np.asarray(rotation_vector, dtype=float)
+    matrices = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+    return matrices.reshape(*vectors.shape[:-1], 3, 3)
+
+
+def matrix_to_rotation_vector(rotation: ArrayLike) -> FloatArray:
+    """Turn rotation matrices (..., 3, 3) into rotation vectors (..., 3) of angle 0 to pi, rad."""
+    matrices = np.asarray(rotation, dtype=float)
+    vectors = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_rotvec()
+    return vectors.reshape(*matrices.shape[:-2], 3)
+
+
+def quaternion_xyzw(rotation: ArrayLike) -> FloatArray:
+    """Turn rotation matrices (..., 3, 3) into unit quaternions x, y, z, w (..., 4) with w >= 0."""
+    matrices = np.asarray(rotation, dtype=float)
+    quaternions = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat()
+    # q and -q are the same rotation; one sign makes files and messages comparable.
+    quaternions *= np.where(quaternions[:, 3:] < 0.0, -1.0, 1.0)
+    return quaternions.reshape(*matrices.shape[:-2], 4)
+
+
+def matrix_from_quaternion_xyzw(quaternion: ArrayLike) -> FloatArray:
+    """Turn quaternions x, y, z, w (..., 4) of any length but zero into matrices (..., 3, 3)."""
+    quaternions = np.asarray(quaternion, dtype=float)
+    matrices = Rotation.from_quat(quaternions.reshape(-1, 4)).as_matrix()
+    return matrices.reshape(*quaternions.shape[:-1], 3, 3)
+
+
+def matrix_from_rpy(rpy: ArrayLike) -> FloatArray:
+    """Turn roll, pitch, yaw (..., 3) in rad, URDF's Rz(yaw) Ry(pitch) Rx(roll), into matrices."""
+    angles = np.asarray(rpy, dtype=float)
+    matrices = Rotation.from_euler('xyz', angles.reshape(-1, 3)).as_matrix()
+    return matrices.reshape(*angles.shape[:-1], 3, 3)
+
+
+def rotation_angle(rotation: ArrayLike) -> FloatArray:
+    """Return the angle of rotation matrices (..., 3, 3), rad, (...): exact near zero too.
+
+    From the antisymmetric part (sine) and the trace (cosine): the arc cosine alone would lose
+    angles below 1e-8 rad.
+    """
+    R = np.asarray(rotation, dtype=float)
+    sine_axis = np.stack(
+        (
+            R[..., 2, 1] - R[..., 1, 2],
+            R[..., 0, 2] - R[..., 2, 0],
+            R[..., 1, 0] - R[..., 0, 1],
+        ),
+        axis=-1,
+    )
+    cosine = np.trace(R, axis1=-2, axis2=-1) - 1.0
+    return np.arctan2(np.linalg.norm(sine_axis, axis=-1), cosine)

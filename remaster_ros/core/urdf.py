@@ -1,0 +1,219 @@
+"""A strict reader of URDF text: the links, joints, limits and masses, nothing else.
+
+Meshes, materials and the like are passed over. What does not fit is refused with one line that
+names the joint or link; nothing is guessed.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from .errors import InputError
+from .transforms import matrix_from_rpy, transform
+from .types import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfLink:
+    """One link: its mass (kg; 0 without ``<inertial>``) and centre of mass (m, link frame)."""
+
+    name: str
+    mass: float
+    center_of_mass: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfJoint:
+    """One joint as written.
+
+    Attributes
+    ----------
+    kind
+        ``type`` of the URDF: revolute, continuous, fixed, prismatic, floating, planar.
+    origin
+        T_parent_joint, (4, 4).
+    axis
+        Unit vector in the joint frame, (3,).
+    lower, upper, velocity
+        Limits as written, rad and rad/s; None where absent.
+    mimic
+        True where the joint follows another one.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: FloatArray
+    axis: FloatArray
+    lower: float | None
+    upper: float | None
+    velocity: float | None
+    mimic: bool
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfModel:
+    """A robot as a tree: ``parent_joint`` maps each link but the root to its joint."""
+
+    name: str
+    root: str
+    links: Mapping[str, UrdfLink]
+    parent_joint: Mapping[str, UrdfJoint]
+
+    def leaves(self) -> list[str]:
+        """Return the links that carry nothing, in file order."""
+        parents = {joint.parent for joint in self.parent_joint.values()}
+        return [name for name in self.links if name not in parents]
+
+
+def parse_urdf(text: str) -> UrdfModel:
+    """Read URDF text.
+
+    Raises
+    ------
+    InputError
+        Malformed XML, a DOCTYPE or entity declaration, a joint to a missing link, two links or
+        joints of one name, a link with two parents, a loop, or a number that is none.
+    """
+    # The keyword is case-sensitive in XML, so text without it cannot declare an entity.
+    if '<!DOCTYPE' in text or '<!ENTITY' in text:
+        raise InputError('URDF: it declares a DOCTYPE or entities; remove the declaration')
+    try:
+        robot = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise InputError(f'URDF: not well-formed XML ({error})') from None
+    if robot.tag != 'robot':
+        raise InputError(f'URDF: the outermost element is <{robot.tag}>, not <robot>')
+
+    links: dict[str, UrdfLink] = {}
+    for element in robot.findall('link'):
+        link = _link(element)
+        if link.name in links:
+            raise InputError(f"URDF: two links are named '{link.name}'")
+        links[link.name] = link
+
+    parent_joint: dict[str, UrdfJoint] = {}
+    names: set[str] = set()
+    for element in robot.findall('joint'):
+        joint = _joint(element)
+        for end in (joint.parent, joint.child):
+            if end not in links:
+                raise InputError(
+                    f"URDF: joint '{joint.name}' names link '{end}', which is missing"
+                )
+        if joint.name in names:
+            raise InputError(f"URDF: two joints are named '{joint.name}'")
+        if joint.child in parent_joint:
+            other = parent_joint[joint.child].name
+            raise InputError(
+                f"URDF: link '{joint.child}' hangs on two joints, '{other}' and '{joint.name}'"
+            )
+        names.add(joint.name)
+        parent_joint[joint.child] = joint
+
+    roots = [name for name in links if name not in parent_joint]
+    if len(roots) != 1:
+        found = ', '.join(roots) if roots else 'none, the links form a loop'
+        raise InputError(f'URDF: a robot is a tree with one root link; found {found}')
+    for name in links:
+        _path_to_root(name, links[roots[0]].name, parent_joint)
+    return UrdfModel(robot.get('name', ''), roots[0], links, parent_joint)
+
+
+def _path_to_root(link: str, root: str, parent_joint: Mapping[str, UrdfJoint]) -> None:
+    """Refuse a link whose ancestors form a loop apart from the root."""
+    here, seen = link, {link}
+    while here != root:
+        here = parent_joint[here].parent
+        if here in seen:
+            raise InputError(f"URDF: link '{link}' is part of a loop; a robot is a tree")
+        seen.add(here)
+
+
+def _link(element: ElementTree.Element) -> UrdfLink:
+    name = _attribute(element, 'name', 'a link')
+    where = f"link '{name}'"
+    inertial = element.find('inertial')
+    if inertial is None:
+        return UrdfLink(name, 0.0, np.zeros(3))
+    mass_element = inertial.find('mass')
+    if mass_element is None:
+        raise InputError(f'URDF: {where} has <inertial> without <mass>')
+    mass = _number(_attribute(mass_element, 'value', where), f'the mass of {where}')
+    if mass < 0.0:
+        raise InputError(f'URDF: the mass of {where} is {mass} kg; it cannot be negative')
+    return UrdfLink(name, mass, _origin(inertial, where)[:3, 3])
+
+
+def _joint(element: ElementTree.Element) -> UrdfJoint:
+    name = _attribute(element, 'name', 'a joint')
+    where = f"joint '{name}'"
+    ends = {}
+    for end in ('parent', 'child'):
+        child = element.find(end)
+        if child is None:
+            raise InputError(f'URDF: {where} has no <{end}>')
+        ends[end] = _attribute(child, 'link', f'<{end}> of {where}')
+    axis_element = element.find('axis')
+    axis = np.array([1.0, 0.0, 0.0])
+    if axis_element is not None:
+        axis = _triple(_attribute(axis_element, 'xyz', where), f'the axis of {where}')
+    length = np.linalg.norm(axis)
+    if length == 0.0:
+        raise InputError(f'URDF: the axis of {where} has length zero')
+    limit = element.find('limit')
+    limits: dict[str, float | None] = {}
+    for key in ('lower', 'upper', 'velocity'):
+        written = None if limit is None else limit.get(key)
+        limits[key] = None if written is None else _number(written, f'{key} of {where}')
+    return UrdfJoint(
+        name=name,
+        kind=_attribute(element, 'type', where),
+        parent=ends['parent'],
+        child=ends['child'],
+        origin=_origin(element, where),
+        axis=axis / length,
+        lower=limits['lower'],
+        upper=limits['upper'],
+        velocity=limits['velocity'],
+        mimic=element.find('mimic') is not None,
+    )
+
+
+def _origin(element: ElementTree.Element, where: str) -> FloatArray:
+    origin = element.find('origin')
+    if origin is None:
+        return np.eye(4)
+    xyz = _triple(origin.get('xyz', '0 0 0'), f'the origin xyz of {where}')
+    rpy = _triple(origin.get('rpy', '0 0 0'), f'the origin rpy of {where}')
+    return transform(matrix_from_rpy(rpy), xyz)
+
+
+def _attribute(element: ElementTree.Element, key: str, where: str) -> str:
+    value = element.get(key, '')
+    if not value:
+        raise InputError(f"URDF: {where} has no attribute '{key}'")
+    return value
+
+
+def _triple(text: str, what: str) -> FloatArray:
+    words = text.split()
+    if len(words) != 3:
+        raise InputError(f"URDF: {what} is '{text}'; three numbers are needed")
+    return np.array([_number(word, what) for word in words])
+
+
+def _number(text: str, what: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        hint = ' (run xacro on the file first)' if '$' in text else ''
+        raise InputError(f"URDF: {what} is '{text}', not a number{hint}") from None
+    if not np.isfinite(value):
+        raise InputError(f"URDF: {what} is '{text}', not a finite number")
+    return value
