@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,8 +55,6 @@ def test_the_folder_is_readable_after_every_observation(session, tmp_path):
 
 
 def test_both_writers_write_the_same_bytes(session, tmp_path):
-    from dataclasses import replace
-
     session = replace(session, measurements=replace(session.measurements, effort=None))
     write_session(tmp_path / 'a', session)
     with SessionWriter(tmp_path / 'b', session) as writer:
@@ -77,16 +76,17 @@ def test_the_exit_status_is_what_close_says(session, tmp_path):
 
 
 def test_an_exception_leaves_an_aborted_session(session, tmp_path):
-    with pytest.raises(RuntimeError, match='cable'):
+    def collect():
         with SessionWriter(tmp_path / 's', session) as writer:
             writer.append(next(observations(session)))
             raise RuntimeError('cable')
+
+    with pytest.raises(RuntimeError, match='cable'):
+        collect()
     assert read_session(tmp_path / 's').exit_status == 'aborted'
 
 
 def test_a_wrong_observation_is_refused_and_not_written(session, tmp_path):
-    from dataclasses import replace
-
     first, second, *_ = observations(session)
     with SessionWriter(tmp_path / 's', session) as writer:
         writer.append(first)
