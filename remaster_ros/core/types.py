@@ -144,6 +144,26 @@ class Measurements:
         """Return the number of observations."""
         return len(self.observation)
 
+    @classmethod
+    def empty(cls, joints: int) -> Measurements:
+        """Return no observations of an arm with that many joints."""
+        integers, numbers = np.zeros(0, np.int64), np.zeros(0)
+        return cls(
+            observation=integers,
+            pose=integers,
+            configuration=integers,
+            is_validation=np.zeros(0, bool),
+            stamp_s=numbers,
+            sensor=integers,
+            marker=integers,
+            q=np.zeros((0, joints)),
+            from_q=np.zeros((0, joints)),
+            position=np.zeros((0, 3)),
+            std=np.zeros((0, 3)),
+            samples=integers,
+            temperature_c=numbers,
+        )
+
     def select(self, rows: BoolArray | IntArray) -> Measurements:
         """Return the given rows (a mask or indices), in that order."""
         return Measurements(

@@ -1,0 +1,111 @@
+"""A fake arm behind ros2_control: joint_trajectory_controller and joint_state_broadcaster.
+
+It does what the real controller of Jazzy does with a trajectory: permutes by joint name, drops with
+a log line what it cannot follow, does not clamp to limits, and holds when the trajectory is empty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.core.types import FloatArray
+from remaster_ros.fakes.world import World
+
+
+@dataclass(frozen=True)
+class TrajectoryPoint:
+    """A point as it comes in a trajectory_msgs/JointTrajectory; seconds, rad, rad/s."""
+
+    time_from_start_s: float
+    positions: Sequence[float]
+    velocities: Sequence[float] = ()
+
+
+class FakeArm:
+    """Follows trajectories in the hidden World and reports joint states.
+
+    Parameters
+    ----------
+    world
+        The hidden World; this is the only fake that moves it.
+    rng
+        Source of repeatability errors, encoder noise and of the order of the reported joints.
+    """
+
+    def __init__(self, world: World, rng: np.random.Generator) -> None:
+        self.world = world
+        self.names = world.chain.joint_names
+        self._rng = rng
+        # joint_state_broadcaster reports in an order of its own; everyone must permute by name.
+        self._order = rng.permutation(len(self.names))
+
+    def command(
+        self, names: Sequence[str], points: Sequence[TrajectoryPoint], start_s: float = 0.0
+    ) -> str | None:
+        """Take a trajectory.
+
+        Parameters
+        ----------
+        names, points
+            As in the message.
+        start_s
+            The header's stamp, s; 0 means now.
+
+        Returns
+        -------
+        str or None
+            Why the trajectory was dropped, for the log; None when it is followed.
+        """
+        now = self.world.now()
+        if not points:
+            self._hold(now)
+            return None
+        reason = self._refuse(names, points, start_s, now)
+        if reason is not None:
+            return reason
+        columns = [list(names).index(name) for name in self.names]
+        begin = max(start_s, now)
+        for earlier, point in zip([0.0, *(p.time_from_start_s for p in points)], points):
+            end = np.asarray(point.positions, float)[columns]
+            end = end + self._rng.normal(0.0, self.world.truth.repeatability_rad, len(end))
+            duration = max(point.time_from_start_s - earlier, 1e-3)
+            self.world.begin_motion(begin + earlier, end, duration)
+        return None
+
+    def _hold(self, now: float) -> None:
+        """Stop where the arm is, in the time that braking takes."""
+        q, velocity = self.world.reported(now)
+        braking_s = 0.15
+        self.world.begin_motion(now, q + 0.5 * braking_s * velocity, braking_s)
+
+    def _refuse(
+        self, names: Sequence[str], points: Sequence[TrajectoryPoint], start_s: float, now: float
+    ) -> str | None:
+        unknown = sorted(set(names) - set(self.names))
+        missing = sorted(set(self.names) - set(names))
+        if unknown or missing or len(names) != len(self.names):
+            return f'incoming joints do not match: unknown {unknown}, missing {missing}'
+        times = [point.time_from_start_s for point in points]
+        if any(later <= earlier for earlier, later in zip(times, times[1:])):
+            return 'time_from_start does not increase'
+        for point in points:
+            if len(point.positions) != len(self.names):
+                return f'{len(point.positions)} positions for {len(self.names)} joints'
+            if not np.all(np.isfinite(point.positions)):
+                return 'a position is not finite'
+        if np.any(np.asarray(points[-1].velocities, float) != 0.0):
+            return 'velocity of the last point is not zero'
+        if start_s > 0.0 and start_s + times[-1] <= now:
+            return 'the trajectory ends in the past'
+        return None
+
+    def joint_state(self) -> tuple[float, list[str], FloatArray, FloatArray]:
+        """Report now: time (s), names, positions (rad), velocities (rad/s), in its own order."""
+        now = self.world.now()
+        q, velocity = self.world.reported(now)
+        q = q + self._rng.normal(0.0, self.world.truth.encoder_rad, len(q))
+        order = self._order
+        return now, [self.names[i] for i in order], q[order], velocity[order]

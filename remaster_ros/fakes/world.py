@@ -1,0 +1,315 @@
+"""The hidden World behind all fakes: the true arm, the true sensors, world time.
+
+The fakes run as separate processes. They share one World through a folder that no estimating code
+ever sees: ``world.yaml`` holds the truth and the clock, ``motion.jsonl`` the segments that the fake
+robot has begun, a line each. The arm's motion is a closed form of its segments (see `motion`), so
+every process computes the same joint positions at the same world time. A killed fake reads the
+folder again and goes on.
+
+World time runs `rate` times as fast as the wall clock: a 3 s settle is 3 s of world time. All
+processes of one machine read the same monotonic clock.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import yaml
+
+from remaster_ros.core import transforms
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.collision import LinkCapsules, line_of_sight
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.types import FloatArray
+from remaster_ros.fakes.motion import Motion
+
+START_S = 100.0
+"""World time at the beginning, s; ROS reads a time of 0 as "no time yet"."""
+
+
+class WorldView(Protocol):
+    """What a fake sensor may ask the World."""
+
+    def now(self) -> float:
+        """World time, s."""
+
+    def sleep(self, seconds: float) -> None:
+        """Wait that much world time."""
+
+    def marker_in_sensor(self, sensor: str, t: float) -> FloatArray:
+        """True position of the sensor's marker in the sensor's frame at time t, m, (3,)."""
+
+    def is_moving(self, t: float) -> bool:
+        """Whether any joint moves at time t."""
+
+    def joint_speed(self, t: float) -> float:
+        """Largest joint speed at time t, rad/s."""
+
+    def line_of_sight(self, sensor: str, t: float) -> bool:
+        """Whether the sensor sees its marker at time t."""
+
+
+@dataclass(frozen=True)
+class SensorTruth:
+    """A sensor as it really stands.
+
+    Attributes
+    ----------
+    T_R_N
+        Sensor frame N in the robot base R, (4, 4).
+    marker
+        True marker position in the tool frame T, m, (3,).
+    acceptance_rad
+        Largest angle between the tool's z axis and the line to the sensor at which the marker
+        is seen, rad (a retroreflector takes about 30 degrees, a sphere more).
+    """
+
+    T_R_N: FloatArray
+    marker: FloatArray
+    acceptance_rad: float
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Everything an estimate is to find, and the seed it came from.
+
+    Attributes
+    ----------
+    joint_offsets
+        True joint angle minus reported one, rad, (k,).
+    sensors
+        Sensor name -> `SensorTruth`.
+    repeatability_rad
+        Standard deviation with which a joint comes back to a commanded position, rad.
+    encoder_rad
+        Standard deviation of the noise of a reported joint position, rad.
+    """
+
+    seed: int
+    joint_offsets: FloatArray
+    sensors: dict[str, SensorTruth]
+    repeatability_rad: float = 2e-5
+    encoder_rad: float = 2e-6
+
+    @classmethod
+    def draw(
+        cls,
+        seed: int,
+        joints: int,
+        markers: dict[str, FloatArray],
+        marker_std_m: float,
+        placements: dict[str, dict[str, Any]],
+        offset_std_rad: float = np.deg2rad(0.3),
+    ) -> Truth:
+        """Draw a truth.
+
+        Parameters
+        ----------
+        seed
+            Of the generator; the same seed gives the same truth.
+        joints
+            Number of joints k.
+        markers
+            Sensor name -> nominal position of its marker in T, m.
+        marker_std_m
+            Standard deviation of a true marker about its nominal position, per axis, m.
+        placements
+            Sensor name -> `position_m`, `look_at_m` (in R), `acceptance_deg`.
+        offset_std_rad
+            Standard deviation of a zero-offset, rad.
+        """
+        rng = np.random.default_rng([seed, 1])
+        sensors = {}
+        for name, place in placements.items():
+            position = np.asarray(place['position_m'], float) + rng.normal(0, 0.03, 3)
+            T_R_N = transforms.transform(
+                _looking(position, np.asarray(place['look_at_m'], float), rng), position
+            )
+            marker = np.asarray(markers[name], float) + rng.normal(0, marker_std_m, 3)
+            sensors[name] = SensorTruth(T_R_N, marker, np.deg2rad(place['acceptance_deg']))
+        return cls(seed, rng.normal(0, offset_std_rad, joints), sensors)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists and numbers for YAML."""
+        return {
+            'seed': self.seed,
+            'joint_offsets_rad': self.joint_offsets.tolist(),
+            'repeatability_rad': self.repeatability_rad,
+            'encoder_rad': self.encoder_rad,
+            'sensors': {
+                name: {
+                    'T_R_N': s.T_R_N.tolist(),
+                    'marker_m': s.marker.tolist(),
+                    'acceptance_rad': float(s.acceptance_rad),
+                }
+                for name, s in self.sensors.items()
+            },
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Truth:
+        """Undo `to_dict`."""
+        sensors = {
+            name: SensorTruth(np.array(s['T_R_N']), np.array(s['marker_m']), s['acceptance_rad'])
+            for name, s in data['sensors'].items()
+        }
+        return cls(
+            data['seed'],
+            np.array(data['joint_offsets_rad']),
+            sensors,
+            data['repeatability_rad'],
+            data['encoder_rad'],
+        )
+
+
+def _looking(position: FloatArray, target: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Rotation whose z axis points from `position` to `target`, rolled at random."""
+    z = (target - position) / np.linalg.norm(target - position)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    aimed = np.column_stack([x, np.cross(z, x), z])
+    roll = transforms.rotation_vector_to_matrix(np.array([0.0, 0.0, rng.uniform(-0.2, 0.2)]))
+    return aimed @ roll
+
+
+class World:
+    """The true arm in front of the true sensors.
+
+    Make one with `create` (the demo) or `open` (a fake); see the module's text.
+    """
+
+    def __init__(self, folder: Path, data: dict[str, Any]) -> None:
+        self.folder = folder
+        self.truth = Truth.from_dict(data['truth'])
+        self.rate = float(data['rate'])
+        self._started = float(data['started_monotonic_s'])
+        self.chain = SerialChain.from_urdf(data['urdf'], data['base_link'], data['tip_link'])
+        self._capsules = LinkCapsules.from_chain(self.chain, data['link_radius_m'])
+        self.start_q = np.array(data['start_q_rad'], float)
+        self._motion = Motion(START_S, self.start_q)
+        self._lines = None
+        self._torn = ''
+
+    @classmethod
+    def create(
+        cls,
+        folder: Path,
+        truth: Truth,
+        *,
+        urdf: str,
+        base_link: str | None,
+        tip_link: str | None,
+        rate: float,
+        start_q: FloatArray,
+        link_radius_m: float,
+    ) -> World:
+        """Write a new World into `folder`; its time begins now."""
+        data = {
+            'truth': truth.to_dict(),
+            'rate': float(rate),
+            'started_monotonic_s': time.monotonic(),
+            'urdf': urdf,
+            'base_link': base_link,
+            'tip_link': tip_link,
+            'start_q_rad': np.asarray(start_q, float).tolist(),
+            'link_radius_m': float(link_radius_m),
+        }
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / 'motion.jsonl').write_text('')
+        (folder / 'world.yaml').write_text(yaml.safe_dump(data, sort_keys=False))
+        return cls(folder, data)
+
+    @classmethod
+    def open(cls, folder: Path) -> World:
+        """Open the World that another process wrote.
+
+        Raises
+        ------
+        InputError
+            If there is none.
+        """
+        try:
+            text = (folder / 'world.yaml').read_text()
+        except OSError as error:
+            raise InputError(
+                f'{folder}: no fake world here ({error.strerror}); `remaster demo` makes one'
+            ) from error
+        return cls(folder, yaml.safe_load(text))
+
+    # Time
+
+    def now(self) -> float:
+        """World time, s."""
+        return START_S + (time.monotonic() - self._started) * self.rate
+
+    def sleep(self, seconds: float) -> None:
+        """Wait that much world time."""
+        if seconds > 0:
+            time.sleep(seconds / self.rate)
+
+    # Motion
+
+    def begin_motion(self, start_s: float, end: FloatArray, duration: float) -> None:
+        """Send the arm to `end` (reported joint positions, rad); every process learns of it."""
+        line = json.dumps({'start_s': start_s, 'end_rad': list(end), 'duration_s': duration})
+        with (self.folder / 'motion.jsonl').open('a') as file:
+            file.write(line + '\n')
+        self._learn()
+
+    def _learn(self) -> None:
+        """Read the segments that have been added to the file since the last look."""
+        if self._lines is None:
+            self._lines = (self.folder / 'motion.jsonl').open()
+        while line := self._lines.readline():
+            self._torn += line
+            if self._torn.endswith('\n'):
+                segment, self._torn = json.loads(self._torn), ''
+                self._motion.command(
+                    segment['start_s'], np.array(segment['end_rad']), segment['duration_s']
+                )
+
+    def reported(self, t: float) -> tuple[FloatArray, FloatArray]:
+        """Joint positions (rad) and velocities (rad/s) as the encoders have them, each (k,)."""
+        self._learn()
+        return self._motion.at(t)
+
+    def joint_speed(self, t: float) -> float:
+        """Largest joint speed at time t, rad/s."""
+        return float(np.max(np.abs(self.reported(t)[1])))
+
+    def is_moving(self, t: float) -> bool:
+        """Whether any joint moves faster than 0.1 mrad/s at time t."""
+        return self.joint_speed(t) > 1e-4
+
+    # What sensors see
+
+    def marker_in_sensor(self, sensor: str, t: float) -> FloatArray:
+        """True position of the sensor's marker in the sensor's frame at time t, m, (3,)."""
+        truth = self._sensor(sensor)
+        q = self.reported(t)[0]
+        marker_R = self.chain.positions(q, truth.marker, self.truth.joint_offsets)
+        return transforms.apply(transforms.inverse(truth.T_R_N), marker_R)
+
+    def line_of_sight(self, sensor: str, t: float) -> bool:
+        """Whether the sensor sees its marker at time t: turned to it, and no link between."""
+        truth = self._sensor(sensor)
+        q = self.reported(t)[0] + self.truth.joint_offsets
+        T_R_T = self.chain.forward(q)
+        marker_R = transforms.apply(T_R_T, truth.marker)
+        line = truth.T_R_N[:3, 3] - marker_R
+        cosine = T_R_T[:3, 2] @ line / np.linalg.norm(line)
+        if cosine < np.cos(truth.acceptance_rad):
+            return False
+        return bool(line_of_sight(self._capsules, self.chain, q, marker_R, truth.T_R_N[:3, 3]))
+
+    def _sensor(self, name: str) -> SensorTruth:
+        try:
+            return self.truth.sensors[name]
+        except KeyError:
+            known = ', '.join(self.truth.sensors)
+            raise InputError(f'the fake world has no sensor {name!r}; it has {known}') from None

@@ -1,0 +1,115 @@
+"""Pairing: only what was captured after settling, while the arm stood, is ever an observation."""
+
+import numpy as np
+import pytest
+
+from remaster_ros.core.pairing import PairedReading, Pairing, Rejection, SensorRules
+from remaster_ros.core.types import MarkerReading
+
+STREAM = SensorRules('mocap', 'sir', dwell_s=0.5, min_samples=5, max_std_m=5e-4, timeout_s=2.0)
+SHOT = SensorRules('tracker', 'smr', single_shot=True, timeout_s=10.0)
+Q = np.array([0.1, 0.2, 0.3])
+
+
+def run(pairing, *, until=1.0, offset=0.0, q=Q, skip_stream=False, start=10.0):
+    """Feed joint states at 50 Hz and stream readings at 100 Hz until `until` s after settling."""
+    events = [(start + t, 'q') for t in np.arange(-0.1, until, 0.02)]
+    if not skip_stream:
+        events += [(start + t, 'p') for t in np.arange(-0.1, until, 0.01)]
+    for stamp, kind in sorted(events):
+        if kind == 'q':
+            pairing.add_joint_state(stamp, q + offset * (stamp > start + 0.2))
+        else:
+            position = np.array([stamp, 0.0, 0.0]) * 1e-6
+            pairing.add_reading('mocap', MarkerReading(stamp, position))
+    return pairing
+
+
+def test_the_mean_has_exactly_the_samples_of_the_dwell():
+    pairing = run(Pairing(10.0, Q, (STREAM,)))
+    reading = pairing.decided['mocap']
+    assert isinstance(reading, PairedReading)
+    # 10.00 < stamp <= 10.50: nothing from before settling, nothing from after the dwell.
+    expected = np.arange(10.01, 10.505, 0.01) * 1e-6
+    assert reading.samples == len(expected)
+    assert reading.position[0] == pytest.approx(expected.mean(), rel=1e-12)
+    assert reading.std[0] == pytest.approx(expected.std(ddof=1), rel=1e-6)
+    assert reading.stamp_s == 10.5
+    np.testing.assert_allclose(reading.q, Q)
+
+
+def test_it_is_not_decided_before_something_later_than_the_dwell_has_come():
+    assert not run(Pairing(10.0, Q, (STREAM,)), until=0.5).decided
+    assert run(Pairing(10.0, Q, (STREAM,)), until=0.56).complete
+
+
+def test_the_order_of_arrival_does_not_matter():
+    """All readings first, all joint states later: a replay's worst case."""
+    mixed, sorted_by_kind = run(Pairing(10.0, Q, (STREAM,))), Pairing(10.0, Q, (STREAM,))
+    for t in np.arange(-0.1, 1.0, 0.01):
+        stamp = 10.0 + t
+        reading = MarkerReading(stamp, np.array([stamp, 0.0, 0.0]) * 1e-6)
+        sorted_by_kind.add_reading('mocap', reading)
+    for t in np.arange(-0.1, 1.0, 0.02):
+        sorted_by_kind.add_joint_state(10.0 + t, Q)
+    one, other = mixed.decided['mocap'], sorted_by_kind.decided['mocap']
+    np.testing.assert_array_equal(one.position, other.position)
+    assert (one.samples, one.stamp_s) == (other.samples, other.stamp_s)
+
+
+def test_an_arm_that_moves_during_the_dwell_is_rejected():
+    rejection = run(Pairing(10.0, Q, (STREAM,)), offset=1e-3).decided['mocap']
+    assert isinstance(rejection, Rejection)
+    assert rejection.reason == 'moving'
+
+
+def test_too_few_samples_are_rejected():
+    pairing = Pairing(10.0, Q, (STREAM,))
+    for stamp in (10.1, 10.2, 10.3, 10.6):
+        pairing.add_reading('mocap', MarkerReading(stamp, np.zeros(3)))
+    run(pairing, skip_stream=True)
+    assert pairing.decided['mocap'].reason == 'too_few'
+    assert '3 usable samples' in pairing.decided['mocap'].detail
+
+
+def test_an_unsteady_marker_is_rejected():
+    pairing = Pairing(10.0, Q, (STREAM,))
+    for i, stamp in enumerate(np.arange(10.01, 10.7, 0.01)):
+        pairing.add_reading('mocap', MarkerReading(stamp, np.array([0, 0, 2e-3 * (i % 2)])))
+    run(pairing, skip_stream=True)
+    assert pairing.decided['mocap'].reason == 'unsteady'
+
+
+def test_silence_is_stale_after_the_timeout_and_not_before():
+    pairing = run(Pairing(10.0, Q, (STREAM,)), skip_stream=True)
+    pairing.give_up(12.4)
+    assert not pairing.decided
+    pairing.give_up(12.6)
+    assert pairing.decided['mocap'].reason == 'stale'
+    assert '0 samples' in pairing.decided['mocap'].detail
+
+
+def test_a_single_shot_waits_for_the_joint_state_that_vouches_for_it():
+    pairing = Pairing(10.0, Q, (SHOT,))
+    pairing.add_joint_state(10.5, Q)
+    pairing.add_reading('tracker', MarkerReading(9.0, np.ones(3)))  # before settling: ignored
+    pairing.add_reading('tracker', MarkerReading(11.0, np.full(3, 2.0)))
+    assert not pairing.complete
+    pairing.add_joint_state(11.02, Q)
+    reading = pairing.decided['tracker']
+    np.testing.assert_array_equal(reading.position, [2.0, 2.0, 2.0])
+    assert (reading.samples, reading.std, reading.stamp_s) == (1, None, 11.0)
+
+
+def test_two_sensors_are_decided_on_apart():
+    pairing = run(Pairing(10.0, Q, (STREAM, SHOT)))
+    assert set(pairing.decided) == {'mocap'}
+    pairing.fail('tracker', 'beam broken')
+    assert pairing.complete
+    assert pairing.decided['tracker'] == Rejection('tracker', 'device', 'beam broken')
+
+
+def test_a_device_error_does_not_undo_an_accepted_reading():
+    pairing = run(Pairing(10.0, Q, (STREAM,)))
+    pairing.fail('mocap', 'too late')
+    assert isinstance(pairing.decided['mocap'], PairedReading)
