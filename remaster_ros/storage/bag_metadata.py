@@ -1,0 +1,90 @@
+"""metadata.yaml of a rosbag2 bag, version 9 as ROS 2 Jazzy writes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from .safe_yaml import dump_yaml
+
+METADATA_FILE = 'metadata.yaml'
+
+# rosbag2 writes an empty bag's start, and QoS "for ever", as these.
+_NEVER_NS = 2**63 - 1
+_FOREVER = {'sec': 9223372036, 'nsec': 854775807}
+
+
+@dataclass
+class TopicMetadata:
+    """A topic as metadata.yaml lists it; ``count`` is the number of its messages so far."""
+
+    topic: str
+    msgtype: str
+    type_hash: str
+    latched: bool
+    count: int = 0
+
+
+def metadata_text(
+    file_name: str, topics: list[TopicMetadata], first_ns: int | None, last_ns: int
+) -> str:
+    """Return metadata.yaml for a bag of one MCAP file; `first_ns` is None where it is empty."""
+    start = {'nanoseconds_since_epoch': _NEVER_NS if first_ns is None else first_ns}
+    duration = {'nanoseconds': 0 if first_ns is None else last_ns - first_ns}
+    count = sum(topic.count for topic in topics)
+    information: dict[str, Any] = {
+        'version': 9,
+        'storage_identifier': 'mcap',
+        'duration': duration,
+        'starting_time': start,
+        'message_count': count,
+        'topics_with_message_count': [
+            {
+                'topic_metadata': {
+                    'name': topic.topic,
+                    'type': topic.msgtype,
+                    'serialization_format': 'cdr',
+                    'offered_qos_profiles': _qos(topic.latched),
+                    'type_description_hash': topic.type_hash,
+                },
+                'message_count': topic.count,
+            }
+            for topic in topics
+        ],
+        'compression_format': '',
+        'compression_mode': '',
+        'relative_file_paths': [file_name],
+        'files': [
+            {
+                'path': file_name,
+                'starting_time': dict(start),
+                'duration': dict(duration),
+                'message_count': count,
+            }
+        ],
+        'custom_data': None,
+        'ros_distro': 'jazzy',
+    }
+    return dump_yaml({'rosbag2_bagfile_information': information})
+
+
+def qos_text(latched: bool) -> str:
+    """Return a topic's offered QoS as the MCAP channel keeps it."""
+    return dump_yaml(_qos(latched))
+
+
+def _qos(latched: bool) -> list[dict[str, Any]]:
+    return [
+        {
+            'history': 'keep_last',
+            'depth': 1 if latched else 10,
+            'reliability': 'reliable',
+            'durability': 'transient_local' if latched else 'volatile',
+            # Copies: YAML would write a shared object as an alias.
+            'deadline': dict(_FOREVER),
+            'lifespan': dict(_FOREVER),
+            'liveliness': 'automatic',
+            'liveliness_lease_duration': dict(_FOREVER),
+            'avoid_ros_namespace_conventions': False,
+        }
+    ]
