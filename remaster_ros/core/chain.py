@@ -11,10 +11,9 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from .errors import InputError
-from .transforms import apply
+from .transforms import apply, inverse, rotation_vector_to_matrix
 from .types import BoolArray, FloatArray
 from .urdf import UrdfJoint, UrdfModel, parse_urdf
 
@@ -200,9 +199,8 @@ class SerialChain:
         sine, cosine = self._sine_cosine(q, joint_offsets)
         points = np.asarray(points, dtype=float)
         x, y, z = (points[..., i] for i in range(3))
-        rotations, translations = self._aligned
         for i in range(len(self), -1, -1):
-            R, t = rotations[i], translations[i]
+            R, t = self.T_fixed_z[i, :3, :3], self.T_fixed_z[i, :3, 3]
             x, y, z = (
                 R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0],
                 R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1],
@@ -228,7 +226,7 @@ class SerialChain:
         frames = self.frames(q, joint_offsets)
         tip = frames[..., -1, :, :] @ self.T_fixed[-1]
         arms = apply(tip, points)[..., None, :] - frames[..., :3, 3]
-        return np.swapaxes(np.cross(self._axes_in_base(frames), arms), -1, -2)
+        return np.swapaxes(np.cross(self.axes_in_base(frames), arms), -1, -2)
 
     def gravity_torque(
         self,
@@ -263,10 +261,10 @@ class SerialChain:
         carried_mass = np.cumsum(self.masses[::-1])[::-1]
         arms = carried_moment - carried_mass[:, None] * frames[..., :3, 3]
         torque = np.cross(arms, np.asarray(gravity, dtype=float))
-        return np.sum(self._axes_in_base(frames) * torque, axis=-1)
+        return np.sum(self.axes_in_base(frames) * torque, axis=-1)
 
-    def _axes_in_base(self, frames: FloatArray) -> FloatArray:
-        """Return the joint axes in R, (..., k, 3)."""
+    def axes_in_base(self, frames: FloatArray) -> FloatArray:
+        """Return the joint axes in R, (..., k, 3), of frames (..., k, 4, 4)."""
         return (frames[..., :3, :3] @ self.axes[:, :, None])[..., 0]
 
     def _sine_cosine(
@@ -297,29 +295,19 @@ class SerialChain:
         return self._cross @ self._cross
 
     @cached_property
-    def _aligned(self) -> tuple[FloatArray, FloatArray]:
-        """The fixed rotations and translations, redrawn so that every joint turns about Z."""
-        to_axis = [np.eye(3)]
-        for axis in self.axes:
+    def T_fixed_z(self) -> FloatArray:
+        """`T_fixed` of the same arm with every joint frame turned so that its axis is Z."""
+        turns = np.broadcast_to(np.eye(4), (len(self) + 2, 4, 4)).copy()
+        for turn, axis in zip(turns[1:-1], self.axes, strict=True):
             # The shortest turn from Z to the axis; which one does not matter.
             tilt = np.cross((0.0, 0.0, 1.0), axis)
             sine = np.linalg.norm(tilt)
             if sine < 1e-12:
-                flip = np.diag([1.0, np.sign(axis[2]), np.sign(axis[2])])
-                to_axis.append(flip)
+                turn[:3, :3] = np.diag([1.0, np.sign(axis[2]), np.sign(axis[2])])
             else:
-                angle = np.arctan2(sine, axis[2])
-                to_axis.append(Rotation.from_rotvec(tilt / sine * angle).as_matrix())
-        from_axis = [R.T for R in to_axis]
-        after = [*to_axis[1:], np.eye(3)]
-        rotations = [
-            before @ fixed[:3, :3] @ behind
-            for before, fixed, behind in zip(from_axis, self.T_fixed, after, strict=True)
-        ]
-        translations = [
-            before @ fixed[:3, 3] for before, fixed in zip(from_axis, self.T_fixed, strict=True)
-        ]
-        return np.array(rotations), np.array(translations)
+                rotation_vector = tilt / sine * np.arctan2(sine, axis[2])
+                turn[:3, :3] = rotation_vector_to_matrix(rotation_vector)
+        return inverse(turns[:-1]) @ self.T_fixed @ turns[1:]
 
 
 def _joints_between(model: UrdfModel, base_link: str, tip_link: str) -> list[UrdfJoint]:
