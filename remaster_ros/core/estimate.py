@@ -1,0 +1,241 @@
+"""From a session to the posterior's mode: gauge fixed, gross errors named, no sampling yet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .chain import SerialChain
+from .errors import InputError, InsufficientDataError
+from .gauge import Gauge, find_gauge
+from .laplace import Mode, find_mode
+from .model import Model, Rows
+from .outliers import Judgement, find_outliers
+from .posterior import Posterior, Prior, base_prior, marker_prior
+from .start import robust_start
+from .types import BoolArray, FloatArray, IntArray, Measurements, Session
+
+# Fewer rows of a sensor leave nothing to estimate its noise from.
+FEWEST_ROWS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What a session gives to fit, reduced to the sensors and markers that occur in it.
+
+    Attributes
+    ----------
+    session
+        As it was given.
+    chain
+        The nominal robot.
+    sensor_names, marker_names
+        Those with at least one row.
+    measurements
+        All rows in file order, ``sensor`` and ``marker`` being indices into these names.
+    markers
+        Nominal positions, m, (markers, 3).
+    fitted
+        Indices of the optimization rows.
+    """
+
+    session: Session
+    chain: SerialChain
+    sensor_names: tuple[str, ...]
+    marker_names: tuple[str, ...]
+    measurements: Measurements
+    markers: FloatArray
+    fitted: IntArray
+
+    @classmethod
+    def of(cls, session: Session) -> Problem:
+        """Reduce and check a session.
+
+        Raises
+        ------
+        InputError
+            A robot that does not fit the session.
+        InsufficientDataError
+            Too few observations, of one sensor or of all.
+        """
+        chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+        given = session.measurements
+        if given.q.shape[1:] != (len(chain),):
+            raise InputError(
+                f'the session has {given.q.shape[-1]} joints, '
+                f'the URDF from {session.base_link} to {session.tip_link} has {len(chain)}'
+            )
+        if len(chain) < 2:
+            raise InsufficientDataError(
+                'the robot has one joint: its zero-offset cannot be told from the registration'
+            )
+        fitted = np.flatnonzero(~given.is_validation)
+        if len(fitted) == 0:
+            raise InsufficientDataError(
+                'the session has no optimization rows; record poses to fit, not only to validate'
+            )
+        sensors, sensor = np.unique(given.sensor, return_inverse=True)
+        markers, marker = np.unique(given.marker, return_inverse=True)
+        sensor_names = tuple(session.sensor_names[index] for index in sensors)
+        marker_names = tuple(session.marker_names[index] for index in markers)
+        for index, name in enumerate(sensor_names):
+            count = int(np.sum(sensor[fitted] == index))
+            if count < FEWEST_ROWS:
+                raise InsufficientDataError(
+                    f"sensor '{name}' has {count} optimization rows; at least {FEWEST_ROWS} are "
+                    'needed to register it and to know its noise'
+                )
+        return cls(
+            session,
+            chain,
+            sensor_names,
+            marker_names,
+            replace(given, sensor=sensor.astype(np.int64), marker=marker.astype(np.int64)),
+            np.array([session.markers[name] for name in marker_names], dtype=float),
+            fitted,
+        )
+
+    def marker_priors(self, model: Model) -> tuple[Prior, ...]:
+        """Return the priors on the markers."""
+        return tuple(
+            marker_prior(model, index, nominal, self.session.marker_std_m)
+            for index, nominal in enumerate(self.markers)
+        )
+
+    def base_priors(self, model: Model) -> tuple[Prior, ...]:
+        """Return the priors on the registrations that the session knows beforehand."""
+        return tuple(
+            base_prior(model, index, self.session.base_prior[name])
+            for index, name in enumerate(self.sensor_names)
+            if name in self.session.base_prior
+        )
+
+    def empty_model(self) -> Model:
+        """Return a model with registrations still unknown."""
+        count = len(self.sensor_names)
+        return Model(
+            self.chain,
+            self.sensor_names,
+            self.marker_names,
+            np.tile(np.eye(4), (count, 1, 1)),
+            np.zeros((count, 3)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The mode with offsets and, for comparison, with offsets held at zero.
+
+    Attributes
+    ----------
+    problem, model
+        What was fitted.
+    gauge
+        What the data cannot see.
+    mode, before
+        With offsets, and with all of them at zero (registrations and markers fitted).
+    left_out
+        (row of the measurements, reason) of the gross errors.
+    kept
+        Indices of the optimization rows that were fitted.
+    """
+
+    problem: Problem
+    model: Model
+    gauge: Gauge
+    mode: Mode
+    before: Mode
+    left_out: tuple[tuple[int, str], ...]
+    kept: IntArray
+
+    @property
+    def posterior(self) -> Posterior:
+        """The posterior that `mode` is the mode of."""
+        return self.mode.linearisation.posterior
+
+
+def estimate(problem: Problem) -> Estimate:
+    """Find the mode.
+
+    Raises
+    ------
+    InsufficientDataError
+        Where the data do not determine the parameters, or disagree with the model altogether.
+    """
+    measurements = problem.measurements
+    empty = problem.empty_model()
+    model, z = robust_start(
+        empty,
+        measurements,
+        problem.fitted,
+        problem.markers,
+        problem.session.marker_std_m,
+        problem.marker_priors(empty),
+    )
+    priors = problem.marker_priors(model) + problem.base_priors(model)
+    rows = Rows.of(measurements, problem.fitted, model.reference)
+    gauge = find_gauge(model, model.natural(z), rows, priors)
+    free = np.setdiff1d(np.arange(model.size), gauge.held)
+    z[gauge.held] = 0.0
+
+    def kept_rows(keep: BoolArray) -> Rows:
+        return Rows.of(measurements, np.sort(rows.source[keep]), model.reference)
+
+    def refit(keep: BoolArray) -> FloatArray:
+        mode = find_mode(Posterior.of(model, kept_rows(keep), priors, free, z))
+        return rows.target - model.predict(mode.z, rows)
+
+    judgement = find_outliers(rows, refit, rows.target - model.predict(z, rows))
+    kept = kept_rows(~judgement.gross)
+    _require_information(kept, free, model)
+    mode = find_mode(Posterior.of(model, kept, priors, free, z))
+    return Estimate(
+        problem,
+        model,
+        gauge,
+        mode,
+        hold_offsets(mode, np.zeros(model.joints)),
+        _left_out(rows, judgement),
+        np.sort(kept.source),
+    )
+
+
+def hold_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
+    """Return the mode of the same posterior with the joint offsets held at given values.
+
+    Parameters
+    ----------
+    mode
+        Of the fit with free offsets.
+    joint_offsets
+        rad, (k,).
+    """
+    posterior = mode.linearisation.posterior
+    joints = posterior.model.joints
+    natural = posterior.model.natural(mode.z)
+    natural[:joints] = joint_offsets
+    held = replace(
+        posterior,
+        free=posterior.free[posterior.free >= joints],
+        reference=posterior.model.pinned(natural),
+    )
+    return find_mode(held)
+
+
+def _require_information(rows: Rows, free: IntArray, model: Model) -> None:
+    needed = int(np.sum(free < model.joints + 6 * len(model.sensor_names))) + 3
+    if 3 * len(rows) < needed:
+        raise InsufficientDataError(
+            f'{len(rows)} observations of 3 coordinates for {len(free)} unknowns; '
+            f'measure at least {-(-needed // 3)}, better ten times as many'
+        )
+
+
+def _left_out(rows: Rows, judgement: Judgement) -> tuple[tuple[int, str], ...]:
+    found = [
+        (int(source), why)
+        for source, why, gross in zip(rows.source, judgement.why, judgement.gross, strict=True)
+        if gross
+    ]
+    return tuple(sorted(found))

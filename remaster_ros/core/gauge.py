@@ -1,0 +1,313 @@
+"""Which combinations of parameters the data cannot see, in words, and what fixes each of them.
+
+The null space of the data's Jacobian (priors left out) over every parameter group, found
+numerically for the data at hand. A direction that a proper prior resolves is left to the prior;
+any other is fixed by holding one joint at zero, and said so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .errors import InsufficientDataError
+from .model import Model, Rows
+from .posterior import RESOLUTION_M, Prior, prior_rows
+from .types import FloatArray, IntArray
+
+# Singular values (of unit columns, relative to the largest) that are rounding errors.
+ROUNDING = 1e-9
+# An angle known no better than this counts as unknown: neither the data's nor a prior's linear
+# picture holds over such a range.
+UNKNOWN_ANGLE = np.radians(5.0)
+# Entries of a direction below this share of its largest are rounding errors.
+NEGLIGIBLE = 1e-5
+
+
+@dataclass(frozen=True)
+class GaugeDirection:
+    """A combination of parameters that can change without any change in the data.
+
+    Attributes
+    ----------
+    combination
+        How far each parameter moves, rad and m, the largest entry 1. Registrations are
+        corrections of the robot's points on their way to the sensor, along the axes of R and
+        about its origin (see `model`).
+    why
+        The same in words.
+    fixed_by
+        What decides where on the direction the result lies.
+    """
+
+    combination: Mapping[str, float]
+    why: str
+    fixed_by: str
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """All of the directions, and what follows for the joints.
+
+    Attributes
+    ----------
+    directions
+        One per dimension of the null space.
+    held
+        Indices of the joints held at zero, (h,).
+    why
+        For each joint what the data cannot tell it from; '' where they can, k strings.
+    """
+
+    directions: tuple[GaugeDirection, ...]
+    held: IntArray
+    why: tuple[str, ...]
+
+
+def find_gauge(
+    model: Model,
+    x: FloatArray,
+    rows: Rows,
+    priors: Sequence[Prior],
+    *,
+    fitted: IntArray | None = None,
+) -> Gauge:
+    """Find the null space at a solution, name it, and fix what no prior does.
+
+    Parameters
+    ----------
+    model, rows, priors
+        What is fitted, to which rows, and what is known beforehand.
+    x
+        Natural parameters, (size,).
+    fitted
+        Indices of the parameters that are fitted at all; None for all of them.
+
+    Raises
+    ------
+    InsufficientDataError
+        Where a registration or a marker itself cannot be told: holding a joint does not help.
+    """
+    fitted = np.arange(model.size) if fitted is None else fitted
+    scale, null, pivots = _null_space(model, x, rows, fitted)
+    _, by_x = prior_rows(model, priors, x, natural=True)
+    held = _unresolved(by_x @ null, pivots, model)
+
+    directions, why = [], [''] * model.joints
+    for column, pivot in enumerate(pivots):
+        combination = _about_origin(model, null[:, column], scale)
+        words = _in_words(model, combination)
+        if pivot in held:
+            fixed_by = f'{model.names[pivot]} = 0'
+        else:
+            fixed_by = _resolving_priors(priors, x, null[:, column], model)
+        entries = {
+            name: round(float(value), 9)
+            for name, value in zip(model.names, combination, strict=True)
+            if value != 0.0
+        }
+        directions.append(GaugeDirection(entries, words, fixed_by))
+        for joint in np.flatnonzero(combination[: model.joints]):
+            text = f'the data cannot see it: {words}; fixed by {fixed_by}'
+            why[joint] = f'{why[joint]}; {text}' if why[joint] else text
+    return Gauge(tuple(directions), np.array(sorted(held), dtype=np.int64), tuple(why))
+
+
+def _null_space(
+    model: Model, x: FloatArray, rows: Rows, fitted: IntArray
+) -> tuple[FloatArray, FloatArray, list[int]]:
+    """Return the scale of each parameter, a basis of the null space, (size, d), and its pivots."""
+    derivative = model.natural_jacobian(x, rows)
+    errors = rows.target - model.predict(model.pinned(x), rows)
+    for _, span in rows.spans:
+        spread = np.sqrt(np.mean(errors[span] ** 2)) + RESOLUTION_M
+        derivative[span] /= spread
+    flat = derivative.reshape(-1, model.size)[:, fitted]
+    norm = np.linalg.norm(flat, axis=0)
+    norm = np.where(norm > ROUNDING * norm.max(), norm, norm.max())
+    triangle: FloatArray = np.asarray(np.linalg.qr(flat / norm, mode='r'))
+    _, singular, vectors = np.linalg.svd(triangle, full_matrices=True)
+    singular = np.append(singular, np.zeros(len(vectors) - len(singular)))
+    unseen = singular < ROUNDING * singular[0]
+
+    scale = np.ones(model.size)
+    scale[fitted] = norm
+    basis = np.zeros((model.size, int(unseen.sum())))
+    basis[fitted] = (vectors[unseen] / norm).T
+    basis, pivots = _reduce(basis, scale, _kinds(model))
+    for direction, pivot in _nearly_null(triangle, fitted, norm, pivots, model):
+        basis = np.column_stack((basis, direction))
+        pivots.append(pivot)
+    return scale, basis, pivots
+
+
+def _nearly_null(
+    triangle: FloatArray, fitted: IntArray, norm: FloatArray, pivots: list[int], model: Model
+) -> list[tuple[FloatArray, int]]:
+    """Return the directions along which an angle is seen, but no better than `UNKNOWN_ANGLE`.
+
+    With the pivots of the null space held the rest has a covariance; its column of the worst
+    angle is how everything moves with that angle. Then that one is held too.
+    """
+    found = []
+    active = ~np.isin(fitted, pivots)
+    angles = np.array([_is_angle(model, index) for index in fitted])
+    while np.any(active & angles):
+        root = np.linalg.inv(np.linalg.qr(triangle[:, active], mode='r'))
+        covariance = (root @ root.T) / np.outer(norm[active], norm[active])
+        std = np.where(angles[active], np.sqrt(np.diag(covariance)), 0.0)
+        worst = int(np.argmax(std))
+        if std[worst] < UNKNOWN_ANGLE:
+            break
+        direction = np.zeros(model.size)
+        direction[fitted[active]] = covariance[worst] / covariance[worst, worst]
+        pivot = int(fitted[active][worst])
+        found.append((direction, pivot))
+        active[np.flatnonzero(active)[worst]] = False
+    return found
+
+
+def _is_angle(model: Model, index: int) -> bool:
+    return index < model.joints or model.names[index].rsplit('.', 1)[-1].startswith('r')
+
+
+def _kinds(model: Model) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the indices of joints, markers and registrations: the order pivots are sought in."""
+    end = model.joints + 6 * len(model.sensor_names)
+    return (
+        np.arange(model.joints),
+        np.arange(end, model.size),
+        np.arange(model.joints, end),
+    )
+
+
+def _reduce(
+    null: FloatArray, scale: FloatArray, kinds: tuple[IntArray, ...]
+) -> tuple[FloatArray, list[int]]:
+    """Bring the basis to reduced echelon form: one pivot each, 1 there and 0 in the others.
+
+    This is what makes directions nameable: any rotation of the basis spans the same space.
+    """
+    work = null * scale[:, None]
+    pivots: list[int] = []
+    for column in range(work.shape[1]):
+        for kind in kinds:
+            part = np.abs(work[kind][:, column:])
+            if part.max() > NEGLIGIBLE * np.abs(work[:, column:]).max():
+                break
+        row, offset = divmod(int(np.argmax(part)), part.shape[1])
+        pivot = int(kind[row])
+        pivots.append(pivot)
+        work[:, [column, column + offset]] = work[:, [column + offset, column]]
+        work[:, column] /= work[pivot, column]
+        for other in range(work.shape[1]):
+            if other != column:
+                work[:, other] -= work[pivot, other] * work[:, column]
+    null = work / scale[:, None]
+    for column, pivot in enumerate(pivots):
+        null[:, column] /= null[pivot, column]
+    order = np.argsort(pivots)
+    return null[:, order], [pivots[index] for index in order]
+
+
+def _unresolved(by_direction: FloatArray, pivots: list[int], model: Model) -> set[int]:
+    """Return the pivots that no prior resolves; all of them must be joints, to be held."""
+    held: set[int] = set()
+    while True:
+        active = [column for column, pivot in enumerate(pivots) if pivot not in held]
+        if not active:
+            return held
+        W = by_direction[:, active]
+        # A trace of information keeps the inverse finite where there is none.
+        covariance = np.linalg.inv(W.T @ W + 1e-12 * np.eye(len(active)))
+        std = np.sqrt(np.diag(covariance))
+        limit = [UNKNOWN_ANGLE if _is_angle(model, pivots[c]) else 1e3 for c in active]
+        joints = [i for i, c in enumerate(active) if pivots[c] < model.joints]
+        loose = [i for i in range(len(active)) if std[i] > limit[i]]
+        if not loose:
+            return held
+        joints = [i for i in loose if i in joints]
+        if not joints:
+            names = ', '.join(model.names[pivots[active[i]]] for i in loose)
+            raise InsufficientDataError(
+                f'the observations do not determine {names}; '
+                'measure poses that are spread further and turn the tool'
+            )
+        held.add(pivots[active[max(joints, key=lambda i: std[i])]])
+
+
+def _about_origin(model: Model, direction: FloatArray, scale: FloatArray) -> FloatArray:
+    """Turn corrections about the centroids into ones about the origin of R; scale, drop dust."""
+    size = np.abs(direction * scale)
+    moved = np.where(size > NEGLIGIBLE * size.max(), direction, 0.0)
+    for sensor, centroid in enumerate(model.centroid):
+        part = moved[model.registration(sensor)]
+        part[:3] -= np.cross(part[3:], centroid)
+    moved[np.abs(moved) < NEGLIGIBLE * np.abs(moved).max()] = 0.0
+    # The pivot has the value 1 already; it stays positive where it is as large as any other.
+    largest = np.abs(moved).max()
+    if largest > 1.0 + 1e-6:
+        moved /= moved[np.argmax(np.abs(moved))]
+    return moved
+
+
+def _in_words(model: Model, direction: FloatArray) -> str:
+    joints = np.flatnonzero(direction[: model.joints])
+    sensors = [
+        index
+        for index in range(len(model.sensor_names))
+        if np.any(direction[model.registration(index)])
+    ]
+    markers = [
+        index for index in range(len(model.marker_names)) if np.any(direction[model.marker(index)])
+    ]
+    if len(joints) == 1:
+        joint, amount = model.names[joints[0]], direction[joints[0]]
+        if not sensors and not markers:
+            return f'{joint} moves no marker; a marker off its axis would show it'
+        if joints[0] == 0 and not markers:
+            return (
+                f'{joint} offset = a rotation of the '
+                f'{_listed([model.sensor_names[s] for s in sensors])} registration'
+                f'{"s" if len(sensors) > 1 else ""} about the base axis; '
+                'a known base frame (base_prior) would tell them apart'
+            )
+        if joints[0] == model.joints - 1 and not sensors:
+            moved = [
+                f'marker {model.marker_names[m]} moved tangentially, '
+                f'{_per_degree(direction[model.marker(m)] / amount)} mm per degree'
+                for m in markers
+            ]
+            return f'{joint} offset = {_listed(moved)}; a measured marker would tell them apart'
+    moved = [
+        f'{name} ({value:+.3g})'
+        for name, value in zip(model.names, direction, strict=True)
+        if value != 0.0
+    ]
+    return f'{_listed(moved)} together change no observation'
+
+
+def _per_degree(shift: FloatArray) -> str:
+    return f'{np.radians(1.0) * np.linalg.norm(shift) * 1e3:.3f}'
+
+
+def _listed(parts: Sequence[str]) -> str:
+    if len(parts) < 2:
+        return ''.join(parts)
+    return f'{", ".join(parts[:-1])} and {parts[-1]}'
+
+
+def _resolving_priors(
+    priors: Sequence[Prior], x: FloatArray, direction: FloatArray, model: Model
+) -> str:
+    """Name the priors that hold a direction: those that change along it."""
+    pull = [
+        float(np.linalg.norm(prior_rows(model, [prior], x, natural=True)[1] @ direction))
+        for prior in priors
+    ]
+    names = [
+        prior.description for prior, p in zip(priors, pull, strict=True) if p > 1e-3 * max(pull)
+    ]
+    return _listed(names)

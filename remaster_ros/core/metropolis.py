@@ -1,0 +1,199 @@
+"""Metropolis–Hastings on any log density: independent proposals in one batch, or a random walk.
+
+Both work in logarithms, run several chains at once and repeat the state on rejection. They know
+nothing of robots; the densities come from `posterior` and `paper_mode`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from scipy.special import gammaln
+
+from .types import FloatArray
+
+LogDensity = Callable[[FloatArray], FloatArray]
+
+
+class Chains(NamedTuple):
+    """What a sampler returns.
+
+    Attributes
+    ----------
+    draws
+        (chains, draws, d).
+    acceptance_rate
+        Share of proposals taken, over all chains.
+    trace
+        A thinned record from the very start, warm-up and all, (chains, records, d).
+    """
+
+    draws: FloatArray
+    acceptance_rate: float
+    trace: FloatArray
+
+
+class Proposal(Protocol):
+    """A density that can be sampled and evaluated: the independence sampler proposes from it."""
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Return points (count, d) and their log density (count,), normalised or not."""
+        ...
+
+    def log_density(self, points: FloatArray) -> FloatArray:
+        """Return the same log density of points (n, d), (n,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class StudentT:
+    """A multivariate Student t distribution.
+
+    Attributes
+    ----------
+    mean
+        (d,).
+    factor
+        Lower Cholesky factor of the scale matrix, (d, d).
+    freedom
+        Degrees of freedom; small means heavy tails.
+    """
+
+    mean: FloatArray
+    factor: FloatArray
+    freedom: float
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Return points (count, d) and their log density (count,)."""
+        normal = rng.standard_normal((count, len(self.mean)))
+        mixing = rng.chisquare(self.freedom, count) / self.freedom
+        points = self.mean + (normal @ self.factor.T) / np.sqrt(mixing)[:, None]
+        return points, self.log_density(points)
+
+    def log_density(self, points: FloatArray) -> FloatArray:
+        """Return the normalised log density of points (..., d), (...)."""
+        whitened = np.linalg.solve(self.factor, (points - self.mean)[..., None])[..., 0]
+        log_root = float(np.sum(np.log(np.diag(self.factor))))
+        return log_student_t(np.sum(whitened**2, axis=-1), len(self.mean), self.freedom) - log_root
+
+
+def log_student_t(square: FloatArray, d: int, freedom: float) -> FloatArray:
+    """Return the log density of a standard t in d dimensions at squared distances (...)."""
+    constant = (
+        gammaln(0.5 * (freedom + d)) - gammaln(0.5 * freedom) - 0.5 * d * np.log(freedom * np.pi)
+    )
+    return constant - 0.5 * (freedom + d) * np.log1p(square / freedom)
+
+
+def independence_sampler(
+    log_density: LogDensity,
+    proposal: Proposal,
+    *,
+    chains: int,
+    draws: int,
+    warm_up: int,
+    rng: np.random.Generator,
+    start: FloatArray,
+    progress: Callable[[float], None] | None = None,
+) -> Chains:
+    """Sample exactly with proposals that do not depend on the state.
+
+    All proposals are evaluated in batches beforehand; the chains then walk over their importance
+    weights (Hastings 1970; Tierney 1994): take y from x with probability min(1, w(y) / w(x)).
+
+    Parameters
+    ----------
+    log_density
+        Points (n, d) to log density (n,), up to a constant; -inf where there is none.
+    proposal
+        Heavier in the tails than the target.
+    chains, draws, warm_up
+        Draws kept per chain, after ``warm_up`` that are not.
+    rng
+        Source of all randomness.
+    start
+        First states of the chains, dispersed, (chains, d).
+    progress
+        Called with the share done.
+    """
+    length = warm_up + draws
+    points, log_proposal = proposal.sample(chains * length, rng)
+    log_target = np.empty(chains * length)
+    blocks = np.array_split(np.arange(chains * length), max(1, chains * length // 500))
+    for done, block in enumerate(blocks, start=1):
+        log_target[block] = log_density(points[block])
+        if progress is not None:
+            progress(done / len(blocks))
+    points = points.reshape(chains, length, -1)
+    log_weight = (log_target - log_proposal).reshape(chains, length)
+    log_uniform = np.log(rng.random((chains, length)))
+
+    index = np.empty((chains, length), dtype=np.int64)
+    accepted = np.zeros((chains, length), dtype=bool)
+    everyone = np.arange(chains)
+    current = np.full(chains, -1)
+    current_weight = log_density(start) - proposal.log_density(start)
+    for step in range(length):
+        weight = log_weight[:, step]
+        take = log_uniform[:, step] < weight - current_weight
+        current = np.where(take, step, current)
+        current_weight = np.where(take, weight, current_weight)
+        accepted[:, step] = take
+        index[:, step] = current
+    path = np.where((index >= 0)[..., None], points[everyone[:, None], index], start[:, None])
+    return Chains(path[:, warm_up:], float(accepted[:, warm_up:].mean()), path)
+
+
+def random_walk_sampler(
+    log_density: LogDensity,
+    step: Callable[[np.random.Generator], FloatArray],
+    *,
+    start: FloatArray,
+    steps: int,
+    burn_in: int,
+    rng: np.random.Generator,
+    thin: int = 1,
+    trace_every: int = 100,
+    progress: Callable[[float], None] | None = None,
+) -> Chains:
+    """Sample with Metropolis' random walk (Metropolis et al. 1953), all chains side by side.
+
+    Parameters
+    ----------
+    log_density
+        Points (chains, d) to log density (chains,), up to a constant; -inf where there is none.
+    step
+        Draws the proposed moves of all chains, (chains, d), from a symmetric distribution.
+    start
+        First states, (chains, d).
+    steps, burn_in
+        Steps of every chain in all, and how many of them are not kept.
+    rng
+        Source of all randomness.
+    thin
+        Every how many steps a draw is kept.
+    trace_every
+        Every how many steps a state is recorded in the trace, from the start.
+    progress
+        Called with the share done.
+    """
+    state, log_state = start.copy(), log_density(start)
+    kept, trace = [], [state]
+    taken = 0
+    for count in range(1, steps + 1):
+        candidate = state + step(rng)
+        log_candidate = log_density(candidate)
+        take = np.log(rng.random(len(state))) < log_candidate - log_state
+        taken += int(take.sum())
+        state = np.where(take[:, None], candidate, state)
+        log_state = np.where(take, log_candidate, log_state)
+        if count > burn_in and (count - burn_in) % thin == 0:
+            kept.append(state)
+        if count % trace_every == 0:
+            trace.append(state)
+            if progress is not None:
+                progress(count / steps)
+    return Chains(np.stack(kept, axis=1), taken / (steps * len(start)), np.stack(trace, axis=1))

@@ -1,0 +1,355 @@
+"""Chain, registrations and markers together: where each sensor should see each marker.
+
+The model of one observation (eq. 8 of Van Wyk et al., with the marker's position as a parameter)::
+
+    p_N = inverse(T_R_N) f(q + joint_offsets, marker)
+
+Parameters are one flat vector x, base units m and rad, in the order joint offsets (k),
+registration of each sensor (6), position of each marker (3). A registration is a correction C
+applied to the robot's points on their way to the sensor, along and about the axes of the base R::
+
+    inverse(T_R_N) = inverse(T_R_N of the reference) C,    C(p) = c + exp(r) (p - c) + t
+
+with t = (x, y, z) and r = (rx, ry, rz), about the centroid c of that sensor's data, which keeps t
+and r nearly uncorrelated. Everything is computed in the reference's base coordinates: distances
+there equal distances in N.
+
+*Pinned coordinates.* Turning joint 1 is the same as turning the registrations about its axis, and
+turning joint k the same as turning the markers about its axis: no data can tell them apart. The
+samplers use coordinates in which this is exact at any size: C' = C Rot_1(offset of joint 1) and
+marker' = Rot_k(offset of joint k) marker. Predictions depend on C', marker' and the inner joints;
+the outer two joints move nothing but the priors. `pinned` and `natural` convert.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from .chain import SerialChain
+from .transforms import (
+    apply,
+    inverse,
+    matrix_to_rotation_vector,
+    rotation_vector_to_matrix,
+    transform,
+)
+from .types import FloatArray, IntArray, Measurements
+
+REGISTRATION_AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
+
+
+def predict_in_sensor(
+    chain: SerialChain,
+    measurements: Measurements,
+    joint_offsets: FloatArray,
+    T_R_N: FloatArray,
+    markers: FloatArray,
+) -> FloatArray:
+    """Return where the sensors should see the markers.
+
+    Parameters
+    ----------
+    chain
+        The nominal robot, k joints.
+    measurements
+        The observations to predict, n rows.
+    joint_offsets
+        Zero-offsets, rad, (k,).
+    T_R_N
+        Registration of each sensor, (sensors, 4, 4).
+    markers
+        Position of each marker in the tool frame, m, (markers, 3).
+
+    Returns
+    -------
+    ndarray
+        Marker positions in the frame N of the row's sensor, m, (n, 3).
+    """
+    points = chain.positions(measurements.q, markers[measurements.marker], joint_offsets)
+    return apply(inverse(T_R_N)[measurements.sensor], points)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """The parameters' layout and the prediction with its derivative.
+
+    Attributes
+    ----------
+    chain
+        The nominal robot, k joints.
+    sensor_names, marker_names
+        In the order of the indices in `Measurements`.
+    reference
+        The registration T_R_N at (t, r) = 0 of each sensor, (sensors, 4, 4).
+    centroid
+        Point in R about which each sensor's correction turns, m, (sensors, 3).
+    """
+
+    chain: SerialChain
+    sensor_names: tuple[str, ...]
+    marker_names: tuple[str, ...]
+    reference: FloatArray
+    centroid: FloatArray
+
+    @property
+    def joints(self) -> int:
+        """Number of joints k."""
+        return len(self.chain)
+
+    @property
+    def size(self) -> int:
+        """Length of the parameter vector."""
+        return self.joints + 6 * len(self.sensor_names) + 3 * len(self.marker_names)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, in order."""
+        names = list(self.chain.joint_names)
+        for sensor in self.sensor_names:
+            names += [f'registration.{sensor}.{axis}' for axis in REGISTRATION_AXES]
+        for marker in self.marker_names:
+            names += [f'marker.{marker}.{axis}' for axis in 'xyz']
+        return tuple(names)
+
+    def registration(self, sensor: int) -> slice:
+        """Return where the correction of a sensor lies in the vector."""
+        start = self.joints + 6 * sensor
+        return slice(start, start + 6)
+
+    def marker(self, marker: int) -> slice:
+        """Return where the position of a marker lies in the vector."""
+        start = self.joints + 6 * len(self.sensor_names) + 3 * marker
+        return slice(start, start + 3)
+
+    def vector(self, joint_offsets: FloatArray, markers: FloatArray) -> FloatArray:
+        """Assemble the vector of these offsets and markers at the reference registrations."""
+        corrections = np.zeros(6 * len(self.sensor_names))
+        return np.concatenate((joint_offsets, corrections, np.ravel(markers)))
+
+    def offsets(self, x: FloatArray) -> FloatArray:
+        """Return the joint offsets, rad, (..., k)."""
+        return x[..., : self.joints]
+
+    def markers(self, x: FloatArray) -> FloatArray:
+        """Return the marker positions in T, m, (..., markers, 3)."""
+        start = self.joints + 6 * len(self.sensor_names)
+        return x[..., start:].reshape(*x.shape[:-1], len(self.marker_names), 3)
+
+    def corrections(self, x: FloatArray) -> FloatArray:
+        """Return the corrections C as transforms, (..., sensors, 4, 4)."""
+        end = self.joints + 6 * len(self.sensor_names)
+        parts = x[..., self.joints : end].reshape(*x.shape[:-1], len(self.sensor_names), 6)
+        turn = rotation_vector_to_matrix(parts[..., 3:])
+        shift = self.centroid + parts[..., :3] - (turn @ self.centroid[..., None])[..., 0]
+        return transform(turn, shift)
+
+    def T_R_N(self, x: FloatArray) -> FloatArray:
+        """Return the registrations, (..., sensors, 4, 4), of natural parameters (..., size)."""
+        return inverse(self.corrections(x)) @ self.reference
+
+    def with_corrections(self, x: FloatArray, corrections: FloatArray) -> FloatArray:
+        """Return x with its registrations replaced by transforms C (..., sensors, 4, 4)."""
+        shift = apply(corrections, self.centroid) - self.centroid
+        turn = matrix_to_rotation_vector(corrections[..., :3, :3])
+        parts = np.concatenate((shift, turn), axis=-1)
+        result = x.copy()
+        end = self.joints + 6 * len(self.sensor_names)
+        result[..., self.joints : end] = parts.reshape(*x.shape[:-1], -1)
+        return result
+
+    def pinned(self, x: FloatArray) -> FloatArray:
+        """Convert natural to pinned coordinates, (..., size)."""
+        return self._turned(x, 1.0)
+
+    def natural(self, z: FloatArray) -> FloatArray:
+        """Convert pinned to natural coordinates, (..., size)."""
+        return self._turned(z, -1.0)
+
+    def _turned(self, x: FloatArray, sign: float) -> FloatArray:
+        """Turn registrations with joint 1 and markers with joint k."""
+        base = _rotation_about(*self.base_axis, sign * x[..., 0])
+        result = self.with_corrections(x, self.corrections(x) @ base[..., None, :, :])
+        tool = _rotation_about(*self.tool_axis, sign * x[..., self.joints - 1])
+        markers = apply(tool[..., None, :, :], self.markers(x))
+        start = self.joints + 6 * len(self.sensor_names)
+        result[..., start:] = markers.reshape(*x.shape[:-1], -1)
+        return result
+
+    @cached_property
+    def base_axis(self) -> tuple[FloatArray, FloatArray]:
+        """Axis of joint 1 in R: a point on it, m, (3,), and its unit direction, (3,)."""
+        first = self.chain.T_fixed[0]
+        return first[:3, 3], first[:3, :3] @ self.chain.axes[0]
+
+    @cached_property
+    def tool_axis(self) -> tuple[FloatArray, FloatArray]:
+        """Axis of joint k in T: a point on it, m, (3,), and its unit direction, (3,)."""
+        last = inverse(self.chain.T_fixed[-1])
+        return last[:3, 3], last[:3, :3] @ self.chain.axes[-1]
+
+    def predict(self, z: FloatArray, rows: Rows) -> FloatArray:
+        """Return the predicted markers in the references' base coordinates.
+
+        Parameters
+        ----------
+        z
+            Pinned parameters, (..., size).
+        rows
+            n observations, those of one sensor next to each other.
+
+        Returns
+        -------
+        ndarray
+            m, (..., n, 3).
+        """
+        offsets = self._inner_offsets(z)
+        points = self.chain.positions(
+            rows.q, self.markers(z)[..., rows.marker, :], offsets[..., None, :]
+        )
+        corrections = self.corrections(z)
+        for sensor, span in rows.spans:
+            turn = corrections[..., sensor, :3, :3]
+            shift = corrections[..., sensor, None, :3, 3]
+            points[..., span, :] = points[..., span, :] @ np.swapaxes(turn, -1, -2) + shift
+        return points
+
+    def jacobian(self, z: FloatArray, rows: Rows) -> FloatArray:
+        """Return the derivative of `predict` by the pinned parameters, (n, 3, size).
+
+        The columns of the outer two joints are zero.
+        """
+        derivative = self._derivative(self._inner_offsets(z), z, rows)
+        derivative[..., [0, self.joints - 1]] = 0.0
+        return derivative
+
+    def natural_jacobian(self, x: FloatArray, rows: Rows) -> FloatArray:
+        """Return the derivative of the prediction by the natural parameters, (n, 3, size)."""
+        return self._derivative(self.offsets(x), x, rows)
+
+    def _inner_offsets(self, z: FloatArray) -> FloatArray:
+        offsets = self.offsets(z).copy()
+        offsets[..., [0, self.joints - 1]] = 0.0
+        return offsets
+
+    def _derivative(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> FloatArray:
+        markers = self.markers(x)[rows.marker]
+        derivative = np.zeros((len(rows.q), 3, self.size))
+        tool = self.chain.forward(rows.q, offsets)
+        points = apply(tool, markers)
+        by_joints = self.chain.position_jacobian(rows.q, markers, offsets)
+        correction = self.corrections(x)
+        for sensor, span in rows.spans:
+            turn = correction[sensor, :3, :3]
+            derivative[span, :, : self.joints] = turn @ by_joints[span]
+            start = self.registration(sensor).start
+            derivative[span, :, start : start + 3] = np.eye(3)
+            vector = x[self.registration(sensor)][3:]
+            # d(exp(r) v) = (J_l(r) dr) × exp(r) v: the arm after the turn, the left Jacobian of r.
+            arms = (points[span] - self.centroid[sensor]) @ turn.T
+            derivative[span, :, start + 3 : start + 6] = -_cross_matrix(arms) @ _left_jacobian(
+                vector
+            )
+            by_marker = turn @ tool[span, :3, :3]
+            for marker in range(len(self.marker_names)):
+                seen = rows.marker[span] == marker
+                derivative[span, :, self.marker(marker)] = by_marker * seen[:, None, None]
+        return derivative
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Observations as the estimators want them: sorted by sensor, then by pose.
+
+    Attributes
+    ----------
+    source
+        Index of each row in the `Measurements` it came from, (n,).
+    q
+        rad, (n, k).
+    marker
+        Marker index, (n,).
+    target
+        Measured positions in the base coordinates of the reference registrations, m, (n, 3).
+    spans
+        (sensor index, slice of its rows) of every sensor present.
+    group_start, group_size, group_sensor
+        The rows of one sensor at one pose share an error: where each group starts, how many rows
+        and which sensor it has, (groups,).
+    """
+
+    source: IntArray
+    q: FloatArray
+    marker: IntArray
+    target: FloatArray
+    spans: tuple[tuple[int, slice], ...]
+    group_start: IntArray
+    group_size: IntArray
+    group_sensor: IntArray
+
+    @classmethod
+    def of(cls, measurements: Measurements, rows: IntArray, reference: FloatArray) -> Rows:
+        """Sort the given rows of the measurements; `reference` is T_R_N, (sensors, 4, 4)."""
+        order = np.lexsort((rows, measurements.pose[rows], measurements.sensor[rows]))
+        source = rows[order]
+        sensor, pose = measurements.sensor[source], measurements.pose[source]
+        change = np.flatnonzero((np.diff(sensor) != 0) | (np.diff(pose) != 0)) + 1
+        group_start = np.concatenate(([0], change)).astype(np.int64)
+        edges = np.searchsorted(sensor, np.arange(len(reference) + 1))
+        return cls(
+            source=source,
+            q=measurements.q[source],
+            marker=measurements.marker[source],
+            target=apply(reference[sensor], measurements.position[source]),
+            spans=tuple(
+                (index, slice(int(edges[index]), int(edges[index + 1])))
+                for index in range(len(reference))
+                if edges[index] < edges[index + 1]
+            ),
+            group_start=group_start,
+            group_size=np.diff(np.append(group_start, len(source))),
+            group_sensor=sensor[group_start],
+        )
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.source)
+
+    def group_sum(self, values: FloatArray, axis: int) -> FloatArray:
+        """Sum over the rows of each group; `axis` (the rows) becomes the groups."""
+        return np.add.reduceat(values, self.group_start, axis=axis)
+
+    @property
+    def group_of_row(self) -> IntArray:
+        """Index of each row's group, (n,)."""
+        return np.repeat(np.arange(len(self.group_start)), self.group_size)
+
+
+def used_indices(column: IntArray, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names that occur in a column of indices."""
+    return tuple(name for index, name in enumerate(names) if np.any(column == index))
+
+
+def _rotation_about(point: FloatArray, axis: FloatArray, angle: FloatArray) -> FloatArray:
+    """Return the transform that turns by an angle (...) about an axis, (..., 4, 4)."""
+    turn = rotation_vector_to_matrix(np.asarray(angle)[..., None] * axis)
+    return transform(turn, point - turn @ point)
+
+
+def _cross_matrix(vectors: FloatArray) -> FloatArray:
+    """Return the matrices K with K w = v × w, (..., 3, 3)."""
+    return np.swapaxes(np.cross(vectors[..., None, :], np.eye(3)), -1, -2)
+
+
+def _left_jacobian(vector: FloatArray) -> FloatArray:
+    """Return what turns a change of a rotation vector into a small rotation on its left."""
+    angle = float(np.linalg.norm(vector))
+    K = _cross_matrix(vector)
+    if angle < 1e-4:
+        return np.eye(3) + K / 2.0 + K @ K / 6.0
+    first = (1.0 - np.cos(angle)) / angle**2
+    second = (angle - np.sin(angle)) / angle**3
+    return np.eye(3) + first * K + second * K @ K

@@ -1,0 +1,166 @@
+"""Gross errors: which rows no noise of the size of the others' can explain.
+
+A row is judged against what the other rows of its pose say (the pose-common error), a whole pose
+against the other poses, with robust standard deviations. The limit of `LIMIT` standard deviations
+in three dimensions calls one good Gaussian row in 10 million gross. The standard deviations are
+the larger of what the median and what the 80 % quantile of the errors say, so that errors with
+more than Gaussian tails, which real robots have, are not eaten.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi
+
+from .errors import InsufficientDataError
+from .model import Rows
+from .posterior import RESOLUTION_M
+from .types import BoolArray, FloatArray
+
+LIMIT = 6.0
+# More than this share is no accident: the model or the session is wrong.
+LARGEST_SHARE = 0.1
+_QUANTILES = (0.5, 0.8)
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What `judge` found, row by row in the order of `Rows`.
+
+    Attributes
+    ----------
+    gross
+        True where the row is to be left out, (n,).
+    why
+        The reason with its numbers; '' where kept, n strings.
+    """
+
+    gross: BoolArray
+    why: tuple[str, ...]
+
+
+def find_outliers(
+    rows: Rows, refit: Callable[[BoolArray], FloatArray], errors: FloatArray
+) -> Judgement:
+    """Leave gross rows out and fit again until the same rows stay out.
+
+    Parameters
+    ----------
+    rows
+        All rows, good and bad.
+    refit
+        Fits the rows that are True, (n,), and returns the errors of all, m, (n, 3).
+    errors
+        Errors of a first, robust fit, m, (n, 3).
+
+    Raises
+    ------
+    InsufficientDataError
+        When more than a tenth of a sensor's rows would have to go.
+    """
+    gross = np.zeros(len(rows), dtype=bool)
+    judgement = judge(rows, errors, gross)
+    for _ in range(20):
+        _guard(rows, judgement.gross)
+        if np.array_equal(judgement.gross, gross):
+            break
+        gross = judgement.gross
+        judgement = judge(rows, refit(~gross), gross)
+    return judgement
+
+
+def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
+    """Judge every row by the rows not yet called gross.
+
+    In each pose at most one row is called gross that was not before: a bad row makes its
+    neighbours look bad too, as long as it is among them.
+    """
+    group = rows.group_of_row
+    sensor = rows.group_sensor[group]
+    good = ~gross
+    count = rows.group_sum(good.astype(float), axis=0)
+    total = rows.group_sum(errors * good[:, None], axis=0)
+    sigma, pose_sigma = robust_noise(rows, errors, good)
+
+    # What the other good rows of the pose say of the error it shares.
+    others = count[group] - good
+    mean = (total[group] - errors * good[:, None]) / np.maximum(others, 1.0)[:, None]
+    variance, common = sigma[sensor] ** 2, pose_sigma[sensor] ** 2
+    share = others * common / (variance + others * common)
+    spread = np.sqrt(variance + common * (1.0 - share))
+    deviation = np.linalg.norm(errors - share[:, None] * mean, axis=1)
+    sigmas = deviation / spread
+
+    new = sigmas > LIMIT
+    worst = np.zeros(len(count))
+    np.maximum.at(worst, group, np.where(gross, 0.0, sigmas))
+    gross_now = new & (gross | (sigmas == worst[group]))
+    why = [
+        f'residual {_mm(d)} mm, {s:.0f} sigma' if g else ''
+        for d, s, g in zip(deviation, sigmas, gross_now, strict=True)
+    ]
+
+    # A pose whose rows agree with each other, and with no other pose.
+    pose_mean = total / np.maximum(count, 1.0)[:, None]
+    pose_spread = np.sqrt(
+        pose_sigma[rows.group_sensor] ** 2 + sigma[rows.group_sensor] ** 2 / np.maximum(count, 1.0)
+    )
+    pose_sigmas = np.linalg.norm(pose_mean, axis=1) / pose_spread
+    for index in np.flatnonzero((pose_sigmas > LIMIT) & (count > 1)):
+        start = rows.group_start[index]
+        for row in range(start, start + rows.group_size[index]):
+            gross_now[row] = True
+            why[row] = (
+                f'residual {_mm(float(np.linalg.norm(errors[row])))} mm: '
+                f'the whole pose is off by {pose_sigmas[index]:.0f} sigma'
+            )
+    return Judgement(gross_now, tuple(why))
+
+
+def robust_noise(rows: Rows, errors: FloatArray, good: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Estimate sigma and pose_sigma of each sensor, m, (sensors,) each, unmoved by a few outliers.
+
+    Where poses have one row each all of the error counts as sigma.
+    """
+    group = rows.group_of_row
+    count = rows.group_sum(good.astype(float), axis=0)
+    mean = rows.group_sum(errors * good[:, None], axis=0) / np.maximum(count, 1.0)[:, None]
+    # Deviations from the mean of n rows are smaller than sigma by (n - 1) / n in variance.
+    inflation = np.sqrt(count / np.maximum(count - 1.0, 1.0))[group]
+    deviation = np.linalg.norm(errors - mean[group], axis=1) * inflation
+    sensors = len(rows.spans)
+    sigma, pose_sigma = np.zeros(sensors), np.zeros(sensors)
+    for index, span in rows.spans:
+        paired = good[span] & (count[group[span]] > 1)
+        poses = (rows.group_sensor == index) & (count > 0)
+        pose_total = _robust_scale(np.linalg.norm(mean[poses], axis=1))
+        if not paired.any():
+            sigma[index] = pose_total
+            continue
+        sigma[index] = _robust_scale(deviation[span][paired])
+        own = sigma[index] ** 2 * np.mean(1.0 / count[poses])
+        pose_sigma[index] = np.sqrt(max(pose_total**2 - own, 0.0))
+    return sigma, pose_sigma
+
+
+def _robust_scale(lengths: FloatArray) -> float:
+    """Return the standard deviation per axis of three-dimensional errors of these lengths."""
+    expected = chi.ppf(_QUANTILES, 3)
+    return float(np.max(np.quantile(lengths, _QUANTILES) / expected)) + RESOLUTION_M
+
+
+def _guard(rows: Rows, gross: BoolArray) -> None:
+    for _, span in rows.spans:
+        out, of = int(gross[span].sum()), span.stop - span.start
+        if out > max(1.0, LARGEST_SHARE * of):
+            raise InsufficientDataError(
+                f'{out} of {of} observations of a sensor are beyond {LIMIT:g} sigma: the model '
+                'does not describe them; check units, joint order, markers and the URDF'
+            )
+
+
+def _mm(length: float) -> str:
+    return f'{length * 1e3:.1f}'

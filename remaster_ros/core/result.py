@@ -1,0 +1,357 @@
+"""What a fit gives: the posterior's summary, and everything that follows from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from . import convergence
+from .accuracy import (
+    THEORETICAL_CONFIGURATIONS,
+    THEORETICAL_DRAWS,
+    Predictive,
+    accuracy_of,
+)
+from .chain import SerialChain
+from .estimate import Problem
+from .gauge import Gauge, GaugeDirection
+from .model import Model, Rows, predict_in_sensor
+from .transforms import matrix_to_rotation_vector
+from .types import BoolArray, FloatArray, IntArray, Session
+
+# The usual limit of R-hat, and effective draws enough for two digits of a 95 % interval.
+R_HAT_LIMIT = 1.01
+ESS_LIMIT = 400.0
+# Of an angle that nothing is known of: uniform over the turn.
+UNKNOWN_STD = np.pi / np.sqrt(3.0)
+
+
+@dataclass(frozen=True)
+class NoiseEstimate:
+    """The noise of one sensor per axis, m: posterior means, and the std of ``sigma_m``.
+
+    ``pose_sigma_m`` is None where no pose has two rows: ``sigma_m`` then holds both parts.
+    """
+
+    sigma_m: float
+    std_m: float
+    pose_sigma_m: float | None
+    pose_sigma_std_m: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class SamplerInfo:
+    """How the draws were made and whether they can be believed.
+
+    Attributes
+    ----------
+    name
+        Which sampler, in words.
+    chains, draws
+        Number of chains, and of draws kept of each.
+    acceptance_rate
+        Share of proposals taken.
+    r_hat, ess_bulk, ess_tail
+        Per parameter of `FitResult.parameter_names`, (p,).
+    seconds
+        By the clock passed in; NaN without one.
+    converged
+        Every R-hat at most 1.01 and every effective sample size at least 400.
+    message
+        The verdict in words.
+    """
+
+    name: str
+    chains: int
+    draws: int
+    acceptance_rate: float
+    r_hat: FloatArray
+    ess_bulk: FloatArray
+    ess_tail: FloatArray
+    seconds: float
+    converged: bool
+    message: str
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """The posterior of a session and what follows from it; k joints, p sampled parameters.
+
+    Attributes
+    ----------
+    session, chain
+        What was fitted, on which nominal robot.
+    joint_names
+        k names.
+    parameter_names
+        p names: joints, ``registration.<sensor>.x`` … ``rz`` (corrections about the centroid of
+        the sensor's data to a registration near the result, see `model`), ``marker.<name>.x``,
+        ``noise.<sensor>.sigma`` and ``.pose_sigma``. What is held fixed is not among them.
+    draws
+        (chains, draws, p); rad and m.
+    trace
+        The chains from their first state, thinned where long, (chains, records, p).
+    joint_offset_draws
+        rad, (chains, draws, k); zeros where a joint is held by the gauge.
+    joint_offsets, joint_offsets_std, joint_offsets_interval95
+        Posterior mean and std, rad, (k,), and 95 % interval, rad, (k, 2). A joint that neither
+        data nor prior tell has mean 0, the std of a uniform turn, and the whole turn.
+    identifiable
+        False where the data alone cannot tell a joint's offset, (k,).
+    why
+        What they cannot tell it from; '' where they can, k strings.
+    gauge
+        Every combination of parameters that the data cannot see.
+    T_R_N, T_R_N_std_m, T_R_N_std_rad
+        Registration of each sensor, (4, 4), with std of its translation and of its rotation
+        along and about the axes of R, (3,) each.
+    marker_positions, marker_std_m
+        Markers in T, m, (3,) each.
+    noise
+        By sensor.
+    T_R_N_before, marker_positions_before
+        The same fit with all offsets held at zero.
+    residuals_before, residuals_after
+        Measured minus modelled position in N for every row of the session, m, (n, 3).
+    accuracy
+        The three metrics as fit.json has them.
+    left_out
+        (observation, reason) of every gross error.
+    """
+
+    session: Session
+    chain: SerialChain
+    joint_names: tuple[str, ...]
+    parameter_names: tuple[str, ...]
+    draws: FloatArray
+    trace: FloatArray
+    joint_offset_draws: FloatArray
+    joint_offsets: FloatArray
+    joint_offsets_std: FloatArray
+    joint_offsets_interval95: FloatArray
+    identifiable: BoolArray
+    why: tuple[str, ...]
+    gauge: tuple[GaugeDirection, ...]
+    T_R_N: Mapping[str, FloatArray]
+    T_R_N_std_m: Mapping[str, FloatArray]
+    T_R_N_std_rad: Mapping[str, FloatArray]
+    marker_positions: Mapping[str, FloatArray]
+    marker_std_m: Mapping[str, FloatArray]
+    noise: Mapping[str, NoiseEstimate]
+    sampler: SamplerInfo
+    T_R_N_before: Mapping[str, FloatArray]
+    marker_positions_before: Mapping[str, FloatArray]
+    residuals_before: FloatArray
+    residuals_after: FloatArray
+    accuracy: Mapping[str, Any]
+    left_out: tuple[tuple[int, str], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """What a sampler hands over to `build_result`.
+
+    Attributes
+    ----------
+    model
+        Whose parameters were sampled.
+    z
+        Pinned parameters, (chains, draws, size).
+    sigma, pose_sigma
+        Noise of each sensor, m, (chains, draws, sensors).
+    trace, draws
+        What moved, in the order of ``names`` and in readable units, (chains, ..., p).
+    names
+        p names.
+    separable
+        Sensor indices with a pose_sigma of their own.
+    name, acceptance_rate
+        Of the sampler.
+    gauge
+        What the data cannot see.
+    unfixed
+        True for joints that neither the data nor a prior tell, (k,).
+    z_before
+        Pinned parameters of the fit with offsets at zero, (size,).
+    left_out
+        (row of the measurements, reason) of the gross errors.
+    """
+
+    model: Model
+    z: FloatArray
+    sigma: FloatArray
+    pose_sigma: FloatArray
+    trace: FloatArray
+    draws: FloatArray
+    names: tuple[str, ...]
+    separable: tuple[int, ...]
+    name: str
+    acceptance_rate: float
+    gauge: Gauge
+    unfixed: BoolArray
+    z_before: FloatArray
+    left_out: tuple[tuple[int, str], ...]
+
+
+def build_result(
+    problem: Problem, sampled: Sampled, seconds: float, rng: np.random.Generator
+) -> FitResult:
+    """Summarise the draws; ``seconds`` is how long they took, ``rng`` for section V-C."""
+    model, measurements = sampled.model, problem.measurements
+    joints = model.joints
+    flat = sampled.z.reshape(-1, model.size)
+    z_after = flat.mean(axis=0)
+    x_after, x_before = model.natural(z_after), model.natural(sampled.z_before)
+    predicted_before = predicted_rows(problem, model, x_before)
+    predicted_after = predicted_rows(problem, model, x_after)
+
+    offset_draws = sampled.z[..., :joints]
+    pooled = flat[:, :joints]
+    mean, std = pooled.mean(axis=0), pooled.std(axis=0, ddof=1)
+    interval = np.quantile(pooled, (0.025, 0.975), axis=0).T
+    mean = np.where(sampled.unfixed, 0.0, mean)
+    std = np.where(sampled.unfixed, UNKNOWN_STD, std)
+    interval = np.where(sampled.unfixed[:, None], (-np.pi, np.pi), interval)
+
+    T_R_N = model.T_R_N(x_after)
+    x_draws = model.natural(flat)
+    T_draws = model.T_R_N(x_draws)
+    turns = matrix_to_rotation_vector(T_draws[..., :3, :3] @ np.swapaxes(T_R_N[:, :3, :3], -1, -2))
+    sensors, markers = problem.sensor_names, problem.marker_names
+    marker_draws = model.markers(x_draws)
+    left_rows = np.array([row for row, _ in sampled.left_out], dtype=np.int64)
+    return FitResult(
+        session=problem.session,
+        chain=problem.chain,
+        joint_names=problem.chain.joint_names,
+        parameter_names=sampled.names,
+        draws=sampled.draws,
+        trace=sampled.trace,
+        joint_offset_draws=offset_draws,
+        joint_offsets=mean,
+        joint_offsets_std=std,
+        joint_offsets_interval95=interval,
+        identifiable=np.array([not why for why in sampled.gauge.why]),
+        why=sampled.gauge.why,
+        gauge=sampled.gauge.directions,
+        T_R_N=dict(zip(sensors, T_R_N, strict=True)),
+        T_R_N_std_m=dict(zip(sensors, T_draws[..., :3, 3].std(axis=0, ddof=1), strict=True)),
+        T_R_N_std_rad=dict(zip(sensors, turns.std(axis=0, ddof=1), strict=True)),
+        marker_positions=dict(zip(markers, model.markers(x_after), strict=True)),
+        marker_std_m=dict(zip(markers, marker_draws.std(axis=0, ddof=1), strict=True)),
+        noise=_noise(sampled, sensors),
+        sampler=_sampler_info(sampled, seconds),
+        T_R_N_before=dict(zip(sensors, model.T_R_N(x_before), strict=True)),
+        marker_positions_before=dict(zip(markers, model.markers(x_before), strict=True)),
+        residuals_before=measurements.position - predicted_before,
+        residuals_after=measurements.position - predicted_after,
+        accuracy=_accuracy(
+            problem, sampled, z_after, predicted_before, predicted_after, left_rows, rng
+        ),
+        left_out=tuple((int(measurements.observation[row]), why) for row, why in sampled.left_out),
+    )
+
+
+def predicted_rows(problem: Problem, model: Model, x: FloatArray) -> FloatArray:
+    """Return where the sensors should see the markers of all rows by natural parameters x."""
+    return predict_in_sensor(
+        problem.chain,
+        problem.measurements,
+        model.offsets(x),
+        model.T_R_N(x),
+        model.markers(x),
+    )
+
+
+def _noise(sampled: Sampled, sensors: tuple[str, ...]) -> dict[str, NoiseEstimate]:
+    noise = {}
+    for index, name in enumerate(sensors):
+        sigma, pose = sampled.sigma[..., index], sampled.pose_sigma[..., index]
+        known = index in sampled.separable
+        noise[name] = NoiseEstimate(
+            sigma_m=float(sigma.mean()),
+            std_m=float(sigma.std(ddof=1)),
+            pose_sigma_m=float(pose.mean()) if known else None,
+            pose_sigma_std_m=float(pose.std(ddof=1)) if known else None,
+        )
+    return noise
+
+
+def _sampler_info(sampled: Sampled, seconds: float) -> SamplerInfo:
+    r_hat = convergence.r_hat(sampled.draws)
+    bulk, tail = convergence.ess_bulk(sampled.draws), convergence.ess_tail(sampled.draws)
+    worst, least = float(np.max(r_hat)), float(np.min(np.minimum(bulk, tail)))
+    converged = worst <= R_HAT_LIMIT and least >= ESS_LIMIT
+    figures = (
+        f'R-hat up to {worst:.3f} ({sampled.names[int(np.argmax(r_hat))]}), '
+        f'at least {least:.0f} effective draws'
+    )
+    return SamplerInfo(
+        name=sampled.name,
+        chains=sampled.draws.shape[0],
+        draws=sampled.draws.shape[1],
+        acceptance_rate=sampled.acceptance_rate,
+        r_hat=r_hat,
+        ess_bulk=bulk,
+        ess_tail=tail,
+        seconds=seconds,
+        converged=converged,
+        message=f'converged: {figures}' if converged else f'NOT converged: {figures}',
+    )
+
+
+def _accuracy(
+    problem: Problem,
+    sampled: Sampled,
+    z_after: FloatArray,
+    predicted_before: FloatArray,
+    predicted_after: FloatArray,
+    left_rows: IntArray,
+    rng: np.random.Generator,
+) -> dict[str, Any]:
+    """Compute the metrics on the fitted rows and on all of the validation rows."""
+    validation = np.flatnonzero(problem.measurements.is_validation)
+    result = {}
+    for name, chosen in (
+        ('optimization', np.setdiff1d(problem.fitted, left_rows)),
+        ('validation', validation),
+    ):
+        result[name] = accuracy_of(
+            problem.measurements.select(chosen),
+            predicted_before[chosen],
+            predicted_after[chosen],
+            _predictive(problem, sampled, z_after, chosen, rng),
+            rng,
+        )
+    return result
+
+
+def _predictive(
+    problem: Problem,
+    sampled: Sampled,
+    z_after: FloatArray,
+    chosen: IntArray,
+    rng: np.random.Generator,
+) -> Predictive | None:
+    if len(chosen) == 0:
+        return None
+    if len(chosen) > THEORETICAL_CONFIGURATIONS:
+        chosen = rng.choice(chosen, THEORETICAL_CONFIGURATIONS, replace=False)
+    model = sampled.model
+    rows = Rows.of(problem.measurements, chosen, model.reference)
+    flat = sampled.z.reshape(-1, model.size)
+    draws = rng.choice(len(flat), min(THEORETICAL_DRAWS, len(flat)), replace=False)
+    sensors = sampled.sigma.shape[-1]
+    sensor_of_row = rows.group_sensor[rows.group_of_row]
+    return Predictive(
+        predict=lambda z: model.predict(z, rows),
+        before=sampled.z_before,
+        after=z_after,
+        draws=flat[draws],
+        sigma=sampled.sigma.reshape(-1, sensors)[draws][:, sensor_of_row],
+        pose_sigma=sampled.pose_sigma.reshape(-1, sensors)[draws][:, sensor_of_row],
+        group=rows.group_of_row,
+    )

@@ -1,0 +1,212 @@
+"""A first solution that a few gross outliers and badly known markers cannot spoil.
+
+Closed-form starts (registration by points; registration and markers together as one linear
+problem), each refined by damped Gauss–Newton steps on a Cauchy cost; the best of them wins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .errors import InsufficientDataError
+from .model import Model, Rows
+from .posterior import RESOLUTION_M, TIGHTEST_PRIOR, Prior, prior_rows
+from .registration import register_points
+from .transforms import apply
+from .types import FloatArray, IntArray, Measurements
+
+# Median length of a standard normal vector in three dimensions.
+MEDIAN_CHI3 = 1.5382
+# Errors beyond this many robust standard deviations lose their weight in the start.
+CAUCHY_WIDTH = 2.5
+# What the linear start expects of a robot out of the box, against which it weighs the nominal
+# marker positions.
+UNCALIBRATED_ERROR_M = 5e-3
+
+
+def robust_start(
+    model: Model,
+    measurements: Measurements,
+    rows: IntArray,
+    nominal_markers: FloatArray,
+    marker_std_m: float,
+    priors: Sequence[Prior],
+) -> tuple[Model, FloatArray]:
+    """Find a solution near the mode.
+
+    Parameters
+    ----------
+    model
+        Only its chain and names matter here.
+    measurements, rows
+        The observations, and which of them to fit.
+    nominal_markers, marker_std_m
+        Markers in the tool frame, m, (markers, 3), and how well they are known.
+    priors
+        Priors on the markers.
+
+    Returns
+    -------
+    model
+        With its reference registrations at the solution.
+    z
+        Pinned parameters there, the outer joints at 0, (size,).
+
+    Raises
+    ------
+    InsufficientDataError
+        When the points of a sensor do not fix a registration.
+    """
+    chain = model.chain
+    tool = chain.forward(measurements.q[rows])
+    sensor, marker = measurements.sensor[rows], measurements.marker[rows]
+    measured = measurements.position[rows]
+    candidates = []
+    for markers in (
+        nominal_markers,
+        _linear_markers(tool, sensor, marker, measured, nominal_markers, marker_std_m),
+    ):
+        points = apply(tool, markers[marker])
+        reference = np.array(
+            [
+                register(points[sensor == index], measured[sensor == index], name)
+                for index, name in enumerate(model.sensor_names)
+            ]
+        )
+        start = referenced(model, measurements, rows, reference)
+        sorted_rows = Rows.of(measurements, rows, reference)
+        z = start.vector(np.zeros(len(chain)), markers)
+        z, cost = _refined(start, sorted_rows, priors, z)
+        candidates.append((cost, start, z))
+    _, start, z = min(candidates, key=lambda candidate: candidate[0])
+    moved = referenced(model, measurements, rows, start.T_R_N(z))
+    return moved, moved.vector(start.offsets(z), start.markers(z))
+
+
+def register(points_R: FloatArray, points_N: FloatArray, sensor: str) -> FloatArray:
+    """Return T_R_N of one sensor from pairs of points; errors name the sensor."""
+    try:
+        return register_points(points_R, points_N)[0]
+    except InsufficientDataError as error:
+        raise InsufficientDataError(f"sensor '{sensor}': {error}") from error
+
+
+def referenced(
+    model: Model, measurements: Measurements, rows: IntArray, reference: FloatArray
+) -> Model:
+    """Return the model with these registrations as reference, centred on each sensor's data."""
+    centroid = []
+    for index, T_R_N in enumerate(reference):
+        mine = rows[measurements.sensor[rows] == index]
+        centroid.append(apply(T_R_N, np.median(measurements.position[mine], axis=0)))
+    return Model(
+        model.chain, model.sensor_names, model.marker_names, reference, np.array(centroid)
+    )
+
+
+def _linear_markers(
+    tool: FloatArray,
+    sensor: IntArray,
+    marker: IntArray,
+    measured: FloatArray,
+    nominal: FloatArray,
+    marker_std_m: float,
+) -> FloatArray:
+    """Estimate marker positions without any registration.
+
+    With any 3×3 matrix G in the place of the sensor's rotation, tool · marker = G p + t is linear
+    in marker, G and t together: one least-squares problem, no start needed. Rows that disagree
+    lose their weight in a few repetitions.
+    """
+    sensors, markers = int(sensor.max()) + 1, len(nominal)
+    design = np.zeros((len(measured), 3, 12 * sensors + 3 * markers))
+    rotations = tool[:, :3, :3]
+    for index in range(sensors):
+        mine = sensor == index
+        centred = measured[mine] - measured[mine].mean(axis=0)
+        for axis in range(3):
+            start = 12 * index + 3 * axis
+            design[mine, axis, start : start + 3] = -centred
+            design[mine, axis, 12 * index + 9 + axis] = -1.0
+    for index in range(markers):
+        start = 12 * sensors + 3 * index
+        mine = marker == index
+        design[mine, :, start : start + 3] = rotations[mine]
+    # Unknown marker = nominal + shift, the shift known to be small.
+    target = -apply(tool, nominal[marker])
+    weight: FloatArray = np.ones(len(measured), dtype=np.float64)
+    pull = np.zeros((3 * markers, design.shape[2]))
+    pull[:, 12 * sensors :] = np.eye(3 * markers) * (
+        UNCALIBRATED_ERROR_M / max(marker_std_m, TIGHTEST_PRIOR)
+    )
+    shift = np.zeros(3 * markers)
+    for _ in range(6):
+        root = np.sqrt(weight)[:, None]
+        matrix = np.concatenate(((design * root[:, :, None]).reshape(-1, design.shape[2]), pull))
+        right = np.concatenate(((target * root).ravel(), np.zeros(3 * markers)))
+        solution = np.linalg.lstsq(matrix, right, rcond=None)[0]
+        shift = solution[12 * sensors :]
+        length = np.linalg.norm(design @ solution - target, axis=1)
+        scale = CAUCHY_WIDTH * (np.median(length) / MEDIAN_CHI3 + RESOLUTION_M)
+        weight = np.asarray(1.0 / (1.0 + (length / scale) ** 2))
+    return nominal + shift.reshape(-1, 3)
+
+
+def _refined(
+    model: Model, rows: Rows, priors: Sequence[Prior], z: FloatArray
+) -> tuple[FloatArray, float]:
+    """Minimise the Cauchy cost by damped Gauss–Newton; return the solution and its spread.
+
+    The outer joints stay at 0: in pinned coordinates the data do not depend on them.
+    """
+    free = np.setdiff1d(np.arange(model.size), (0, model.joints - 1))
+    damping = 1e-6
+    errors = rows.target - model.predict(z, rows)
+    spread = _spread(errors, rows)
+    for _ in range(60):
+        scale = np.repeat(spread, [span.stop - span.start for _, span in rows.spans])
+        weight = 1.0 / (1.0 + _squares(errors) / (CAUCHY_WIDTH * scale) ** 2) / scale**2
+        derivative = model.jacobian(z, rows)[:, :, free]
+        residual, by_z = prior_rows(model, priors, z)
+        weighted = (derivative * weight[:, None, None]).reshape(-1, len(free))
+        H = weighted.T @ derivative.reshape(-1, len(free)) + by_z[:, free].T @ by_z[:, free]
+        g = weighted.T @ errors.ravel() - by_z[:, free].T @ residual
+        diagonal = np.diag(H) + 1e-9 * np.max(np.diag(H))
+        cost = _cost(errors, scale, residual)
+        improved = False
+        for _ in range(12):
+            trial = z.copy()
+            step = np.linalg.solve(H + damping * np.diag(diagonal), g)
+            trial[free] += step
+            trial_errors = rows.target - model.predict(trial, rows)
+            if _cost(trial_errors, scale, prior_rows(model, priors, trial)[0]) < cost:
+                improved = True
+                break
+            damping *= 10.0
+        if not improved:
+            break
+        z, errors, damping = trial, trial_errors, max(damping / 10.0, 1e-12)
+        before, spread = spread, _spread(errors, rows)
+        settled = np.all(np.abs(spread - before) < 1e-3 * before)
+        if settled and np.sqrt(step @ H @ step) < 1e-2 * np.sqrt(len(step)):
+            break
+    sizes = [span.stop - span.start for _, span in rows.spans]
+    return z, float(np.dot(sizes, np.log(spread)))
+
+
+def _squares(errors: FloatArray) -> FloatArray:
+    return np.einsum('ni,ni->n', errors, errors)
+
+
+def _spread(errors: FloatArray, rows: Rows) -> FloatArray:
+    """Return the robust standard deviation per axis of each sensor's errors, m, (sensors,)."""
+    length = np.sqrt(_squares(errors))
+    return np.array([np.median(length[s]) / MEDIAN_CHI3 + RESOLUTION_M for _, s in rows.spans])
+
+
+def _cost(errors: FloatArray, scale: FloatArray, prior_residual: FloatArray) -> float:
+    width = CAUCHY_WIDTH**2
+    data = 0.5 * width * np.sum(np.log1p(_squares(errors) / (width * scale**2)))
+    return float(data + 0.5 * prior_residual @ prior_residual)
