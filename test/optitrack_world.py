@@ -1,0 +1,73 @@
+"""A world with one marker for the tests of OptiTrack: no arm; and ports that are free."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+RATE = 10.0
+SENSOR = 'mocap'
+
+
+class MarkerWorld:
+    """A marker that circles in the sensor's frame, hidden while `visible` is False."""
+
+    def __init__(self) -> None:
+        self.visible = True
+        self._started = time.monotonic()
+
+    def now(self) -> float:
+        return 100.0 + (time.monotonic() - self._started) * RATE
+
+    def sleep(self, seconds: float) -> None:
+        time.sleep(max(seconds, 0.0) / RATE)
+
+    def marker_in_sensor(self, sensor: str, t: float) -> np.ndarray:
+        assert sensor == SENSOR
+        return np.array([0.3 * np.cos(t), 0.3 * np.sin(t), 2.0])
+
+    def line_of_sight(self, sensor: str, t: float) -> bool:
+        return self.visible
+
+    def is_moving(self, t: float) -> bool:
+        return True
+
+    def joint_speed(self, t: float) -> float:
+        return 1.0
+
+
+class SteppedWorld(MarkerWorld):
+    """The same, with a time that the test sets."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.time = 100.0
+
+    def now(self) -> float:
+        return self.time
+
+
+def free_port() -> int:
+    """Return a UDP port that nothing uses."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(('127.0.0.1', 0))
+        return probe.getsockname()[1]
+
+
+def eventually(condition: Callable[[], object], within_s: float = 20.0) -> bool:
+    """Wait until something holds; tests say what, never how fast."""
+    deadline = time.monotonic() + within_s
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def open_descriptors() -> int:
+    """Count this process's open files and sockets."""
+    return len(list(Path('/proc/self/fd').iterdir()))
