@@ -38,6 +38,7 @@ CLOCK_HZ = 10_000_000
 _MARKER_SIZE_M = 0.0127
 _RESIDUAL_M = 2e-4
 _FIRST_STRAY_ID = 50_001
+_FLAGS_BEFORE_3 = OCCLUDED | MEASURED | MODEL_FILLED
 _HIDDEN = (
     OCCLUDED | HAS_MODEL,
     OCCLUDED | MODEL_FILLED | HAS_MODEL,
@@ -111,6 +112,9 @@ class OptiTrackScene:
         self._start_s = world.now()
         self._offsets = np.array([(0.0, 0.0, 0.0), *behaviour.companions])
         self._strays = np.reshape(np.array(behaviour.strays, dtype=float), (-1, 3))
+        members = range(1, len(self._offsets) + 1)
+        stray_labels = range(_FIRST_STRAY_ID, _FIRST_STRAY_ID + len(self._strays))
+        self._labels = (*(behaviour.body_id << 16 | m for m in members), *stray_labels)
         across, along = behaviour.noise_across_m, behaviour.noise_along_m
         self._noise = np.array([across, across, along])
         self._occlusion = (self._start_s, self._start_s)
@@ -149,43 +153,41 @@ class OptiTrackScene:
         version
             Bitstream of the server: NatNet 2 has fewer flags and no residual.
         """
-        behaviour = self._behaviour
+        behaviour, size = self._behaviour, len(self._offsets)
         t = self._world.now()
         tracked = self._world.line_of_sight(self._sensor, t)
         hidden_params = self._hidden(t, tracked)
-        truth = self._world.marker_in_sensor(self._sensor, t) + self._offsets
-        noise = self._rng.standard_normal((len(truth) + len(self._strays), 3)) * self._noise
-        seen = truth + noise[: len(truth)]
-        params = [MEASURED | HAS_MODEL] * len(seen)
+        points = self._rng.standard_normal((len(self._labels), 3))
+        points *= self._noise
+        points[size:] += self._strays
+        seen = points[:size]
+        truth = self._offsets + self._world.marker_in_sensor(self._sensor, t)
+        seen += truth
+        params = [MEASURED | HAS_MODEL] * size + [MEASURED | UNLABELED] * len(self._strays)
         if hidden_params is not None:
-            hidden = slice(None) if not tracked else slice(0, 1)
+            hidden = 1 if tracked else size
             guessed = bool(hidden_params & MODEL_FILLED)
-            seen[hidden] = (truth + self._guess_error if guessed else self._last_seen)[hidden]
-            params[hidden] = [hidden_params] * len(seen[hidden])
+            seen[:hidden] = (truth + self._guess_error if guessed else self._last_seen)[:hidden]
+            params[:hidden] = [hidden_params] * hidden
         self._last_seen = seen
 
-        positions = _tuples(seen)
-        strays = _tuples(self._strays + noise[len(truth) :])
-        known_flags = 0x07 if version < (3, 0) else 0xFFFF
-        residual = None if version < (3, 0) else _RESIDUAL_M
-        labels = [behaviour.body_id << 16 | member for member in range(1, len(seen) + 1)]
-        stray_labels = range(_FIRST_STRAY_ID, _FIRST_STRAY_ID + len(strays))
+        old = version < (3, 0)
+        if old:
+            params = [flags & _FLAGS_BEFORE_3 for flags in params]
+        residual = None if old else _RESIDUAL_M
+        positions = _tuples(points)
+        tool, strays = positions[:size], positions[size:]
         labeled = tuple(
-            LabeledMarker(label, position, _MARKER_SIZE_M, flags & known_flags, residual)
-            for label, position, flags in zip(
-                (*labels, *stray_labels),
-                (*positions, *strays),
-                (*params, *[MEASURED | UNLABELED] * len(strays)),
-                strict=True,
-            )
+            LabeledMarker(label, position, _MARKER_SIZE_M, flags, residual)
+            for label, position, flags in zip(self._labels, positions, params, strict=True)
         )
         body = RigidBody(
             behaviour.body_id,
-            tuple(seen.mean(axis=0).tolist()),  # type: ignore[arg-type]
+            tuple((seen.sum(axis=0) / size).tolist()),  # type: ignore[arg-type]
             (0.0, 0.0, 0.0, 1.0),
             _RESIDUAL_M,
             TRACKING_VALID if tracked else 0,
-            tuple(BodyMarker(p, i + 1, _MARKER_SIZE_M) for i, p in enumerate(positions)),
+            tuple(BodyMarker(p, i, _MARKER_SIZE_M) for i, p in enumerate(tool, 1)) if old else (),
         )
         ticks = self.ticks(t)
         return Frame(
@@ -194,8 +196,8 @@ class OptiTrackScene:
             labeled_markers=labeled,
             rigid_bodies=(body,),
             marker_sets=(
-                MarkerSet(behaviour.rigid_body, positions),
-                MarkerSet('all', positions),
+                MarkerSet(behaviour.rigid_body, tool),
+                MarkerSet('all', tool),
             ),
             other_markers=strays,
             mid_exposure=ticks if behaviour.mid_exposure_clock else 0,
@@ -231,4 +233,4 @@ class OptiTrackScene:
 
 def _tuples(points: FloatArray) -> tuple[Vec3, ...]:
     """Turn an array of points, (n, 3), into plain tuples."""
-    return tuple((x, y, z) for x, y, z in points.tolist())
+    return tuple(map(tuple, points.tolist()))
