@@ -1,11 +1,20 @@
-"""A small two-joint session for the storage tests."""
+"""A small two-joint session, and a fit, for the storage tests."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.fit import fit_session
+from remaster_ros.core.result import FitResult
+from remaster_ros.core.simulation import SimulatedSensor, simulate_session
 from remaster_ros.core.types import BasePrior, Measurements, Session
+
+ROOT = Path(__file__).parents[3]
+HOSTILE_NAME = 'tracker<script>&$x_{$'
 
 URDF = """<?xml version="1.0"?>
 <robot name="two_joints">
@@ -82,3 +91,34 @@ def session() -> Session:
         created='2024-05-01T12:00:00Z',
         extra={'cell': {'operator': 'no', 'humidity': 0.4}, 'robot': {'serial': '0123'}},
     )
+
+
+@pytest.fixture(scope='session')
+def fit_result() -> FitResult:
+    """A fit of the LWR 4+ with two sensors, gross errors, and a name that is no harmless text."""
+    urdf = (ROOT / 'config' / 'robots' / 'lwr4plus.urdf').read_text(encoding='utf-8')
+    chain = SerialChain.from_urdf(urdf, 'base_link', 'tool')
+    seed = 11
+    print('seed', seed)
+    rng = np.random.default_rng(seed)
+    low, high = np.maximum(chain.lower, -2.5), np.minimum(chain.upper, 2.5)
+
+    def poses(count):
+        return [rng.uniform(low, high, (4, len(chain))) for _ in range(count)]
+
+    T_R_N = np.eye(4)
+    T_R_N[:3, 3] = 2.0, 0.3, 1.0
+    session, _ = simulate_session(
+        chain,
+        urdf,
+        rng,
+        poses=poses(24),
+        validation_poses=poses(12),
+        sensors={
+            'mocap': SimulatedSensor('sir', T_R_N, sigma_m=0.2e-3),
+            HOSTILE_NAME: SimulatedSensor('smr', T_R_N),
+        },
+        markers={'sir': np.array([0.1, 0.0, 0.02]), 'smr': np.array([-0.1, 0.0, 0.02])},
+        outlier_share=0.02,
+    )
+    return fit_session(session, rng=rng, draws=500)

@@ -1,0 +1,167 @@
+"""Three ready ways to use the offsets: re-master, an offset layer, or a corrected URDF.
+
+The true joint angle is the reported one plus the offset. Each way corrects all of it, so only one
+may be in use at a time.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ..core.chain import SerialChain
+from ..core.transforms import matrix_from_rpy, rotation_vector_to_matrix
+from ..core.types import FloatArray
+from .files import make_folder, write_atomically
+from .results import urdf_sha256
+from .safe_yaml import dump_yaml
+
+if TYPE_CHECKING:
+    from ..core.result import FitResult
+
+REMASTER_FILE = 'remaster.txt'
+LAYER_FILE = 'offset_layer.yaml'
+URDF_FILE = 'robot_calibrated.urdf'
+
+_PROLOG = re.compile(r'(?:\s*(?:<\?.*?\?>|<!--.*?-->))*\s*', re.DOTALL)
+_LIMITS = {
+    'limit': {'lower', 'upper'},
+    'safety_controller': {'soft_lower_limit', 'soft_upper_limit'},
+}
+
+
+def write_apply(result: FitResult, folder: str | os.PathLike[str]) -> list[Path]:
+    """Write the three files into a folder (``apply`` next to fit.json); return their paths.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to.
+    """
+    folder = Path(folder)
+    make_folder(folder)
+    texts = {
+        REMASTER_FILE: remaster_text(result),
+        LAYER_FILE: layer_text(result),
+        URDF_FILE: calibrated_urdf(result.session.urdf, result.chain, result.joint_offsets),
+    }
+    for name, text in texts.items():
+        write_atomically(folder / name, text)
+    return [folder / name for name in texts]
+
+
+def remaster_text(result: FitResult) -> str:
+    """Return the instructions for re-mastering on the robot's own pad."""
+    rows, notes = [], []
+    for i, joint in enumerate(result.joint_names):
+        offset, std = np.degrees((result.joint_offsets[i], result.joint_offsets_std[i]))
+        row = f'  {joint:<20} {offset:>+12.4f} {std:>10.4f} {0.0 - offset:>+16.4f}'
+        if not result.identifiable[i]:
+            row += '   *'
+            notes.append(f'* {joint}: {result.why[i]}')
+        rows.append(row)
+    return '\n'.join(
+        [
+            f'Joint zero-offsets of robot {result.chain.name!r}',
+            f'(URDF with SHA-256 {urdf_sha256(result.session)})',
+            '',
+            'The true joint angle is the reported one plus the offset. Use ONE of three ways,',
+            'never two at once:',
+            '',
+            '1. Re-master on the pad: drive each joint to the angle in the last column, as the',
+            "   robot reports it now, and set that place as the joint's new zero.",
+            f'2. An offset layer between planner and controller: {LAYER_FILE}.',
+            f'3. A corrected robot model for planner and controller: {URDF_FILE}.',
+            '',
+            f'  {"joint":<20} {"offset, deg":>12} {"std, deg":>10} {"drive to, deg":>16}',
+            *rows,
+            *(('', *notes) if notes else ()),
+            '',
+            'Afterwards measure a few poses again and run "remaster accuracy": it shows whether',
+            'the offsets are in use.',
+            '',
+        ]
+    )  # fmt: skip
+
+
+def layer_text(result: FitResult) -> str:
+    """Return the offsets as a ROS 2 parameter file for an offset layer."""
+    head = (
+        '# Joint zero-offsets, rad. A layer between planner and controller:\n'
+        '#   command to the controller = planned angle - offset\n'
+        '#   angle to the planner      = reported angle + offset\n'
+        "# Shift the joint limits as well: the controller's limits apply to its own angles.\n"
+    )  # fmt: skip
+    return head + dump_yaml(
+        {
+            '/**': {
+                'ros__parameters': {
+                    'robot': result.chain.name,
+                    'urdf_sha256': urdf_sha256(result.session),
+                    'joint_names': list(result.joint_names),
+                    'joint_offsets': [float(offset) for offset in result.joint_offsets],
+                    'joint_offsets_std': [float(std) for std in result.joint_offsets_std],
+                    'identifiable': [bool(yes) for yes in result.identifiable],
+                }
+            }
+        }
+    )
+
+
+def calibrated_urdf(urdf: str, chain: SerialChain, joint_offsets: FloatArray) -> str:
+    """Return the URDF whose kinematics at reported angles is that of the true ones.
+
+    Each joint's origin is turned by its offset about its axis, and its limits are shifted the
+    other way, so that they still stop the arm in the same places.
+
+    Parameters
+    ----------
+    urdf
+        The nominal robot, as `chain` was read from.
+    chain
+        Its joints.
+    joint_offsets
+        rad, (k,).
+    """
+    parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
+    root = ElementTree.fromstring(urdf, parser)
+    joints = {joint.get('name'): joint for joint in root.iter('joint')}
+    for name, axis, offset in zip(chain.joint_names, chain.axes, joint_offsets, strict=True):
+        joint = joints[name]
+        origin = joint.find('origin')
+        if origin is None:
+            origin = ElementTree.Element('origin', xyz='0 0 0', rpy='0 0 0')
+            joint.insert(0, origin)
+        rpy = [float(angle) for angle in origin.get('rpy', '0 0 0').split()]
+        turned = matrix_from_rpy(rpy) @ rotation_vector_to_matrix(offset * axis)
+        origin.set('rpy', ' '.join(repr(angle) for angle in _rpy(turned)))
+        for tag, keys in _LIMITS.items():
+            for element in joint.findall(tag):
+                for key in keys.intersection(element.keys()):
+                    element.set(key, repr(float(element.attrib[key]) - float(offset)))
+    note = ElementTree.Comment(' joint origins and limits hold the calibrated zero-offsets ')
+    note.tail = '\n  '
+    root.insert(0, note)
+    # What stands before the root (who made the model, under which licence) is no part of the tree.
+    prolog = _PROLOG.match(urdf)
+    head = prolog.group() if prolog else ''
+    return head + ElementTree.tostring(root, encoding='unicode') + '\n'
+
+
+def _rpy(rotation: FloatArray) -> tuple[float, float, float]:
+    """Return roll, pitch, yaw of R = Rz(yaw) Ry(pitch) Rx(roll), exact at pitch ±90° too.
+
+    The roll is taken after undoing the yaw, so that where the two act alike, an error in one is
+    made good by the other.
+    """
+    R = rotation
+    yaw = np.arctan2(R[1, 0], R[0, 0])
+    s, c = np.sin(yaw), np.cos(yaw)
+    pitch = np.arctan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
+    roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return float(roll), float(pitch), float(yaw)

@@ -1,0 +1,234 @@
+"""report.html: one self-contained page that says what the fit found and whether to believe it."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import importlib.resources
+import json
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from .files import make_folder, write_atomically
+from .results import fit_to_dict
+
+if TYPE_CHECKING:
+    from ..core.result import FitResult
+    from .scene import Scene
+
+REPORT_FILE = 'report.html'
+# Less than this is no gain a user would notice.
+NOTICEABLE_GAIN = 1.1
+
+
+class Verdict(NamedTuple):
+    """The result in plain words.
+
+    Attributes
+    ----------
+    mood
+        ``good``, ``caution`` or ``bad``.
+    headline
+        One sentence.
+    points
+        What else must be known before the offsets are used.
+    """
+
+    mood: str
+    headline: str
+    points: list[str]
+
+
+def write_report(result: FitResult, folder: str | os.PathLike[str], figures: bool = True) -> Path:
+    """Write report.html, and the figures as SVG files under ``figures``; return its path.
+
+    Parameters
+    ----------
+    result
+        The fit.
+    folder
+        Where to; made if missing.
+    figures
+        False leaves the figures out: tables only, made in an instant.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to.
+    """
+    folder = Path(folder)
+    make_folder(folder)
+    drawings: dict[str, str] = {}
+    if figures:
+        # Matplotlib takes a second to import: only where something is drawn.
+        from .figures import draw_figures
+
+        drawings = draw_figures(result)
+        make_folder(folder / 'figures')
+        for name, text in drawings.items():
+            write_atomically(folder / 'figures' / f'{name}.svg', text)
+    write_atomically(folder / REPORT_FILE, report_html(result, drawings))
+    return folder / REPORT_FILE
+
+
+def report_html(result: FitResult, drawings: dict[str, str]) -> str:
+    """Return the page; with drawings (of `draw_figures`) it also has the 3-D view."""
+    template = importlib.resources.files(__package__).joinpath('report.html.jinja')
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {'fixed': _fixed, 'signed': _signed}
+    scene: Scene | None = None
+    if drawings:
+        from .scene import draw_scene
+
+        scene = draw_scene(result)
+    return environment.from_string(template.read_text(encoding='utf-8')).render(
+        fit=fit_to_dict(result),
+        verdict=verdict(result),
+        accuracy=_accuracy_rows(result),
+        markers=_marker_rows(result),
+        notes=result.session.notes,
+        drawings={name: Markup(_inline(name, text)) for name, text in drawings.items()},
+        scene=scene,
+        scene_json=_json({'data': scene.data, 'layout': scene.layout}) if scene else '',
+        plotly=_plotly() if scene else '',
+    )
+
+
+def verdict(result: FitResult) -> Verdict:
+    """Judge a fit in words: what was gained, whether the chains agree, what stays unknown."""
+    validated = result.accuracy['validation'] is not None
+    split = 'validation' if validated else 'optimization'
+    metrics = result.accuracy[split]['post_registration']
+    before, after = metrics['before']['mean_mm'], metrics['after']['mean_mm']
+    gain = before / max(after, 1e-9)
+    where = 'on poses it never fitted' if validated else 'on the fitted poses'
+    change = f'{before:.3f} mm to {after:.3f} mm {where}'
+    if gain >= NOTICEABLE_GAIN:
+        mood = 'good'
+        times = f'{gain:.1f} times' if gain < 10 else f'{gain:.0f} times'
+        headline = f'The mean position error falls from {change}: {times} smaller.'
+    elif gain > 1 / NOTICEABLE_GAIN:
+        mood = 'caution'
+        headline = (
+            f'The zero-offsets hardly matter here: the mean position error goes from {change}. '
+            'Other errors dominate; "remaster discover" looks for them.'
+        )
+    else:
+        mood = 'bad'
+        headline = f'The offsets make it worse: the mean position error goes from {change}.'
+
+    points = []
+    if not validated:
+        mood = 'caution' if mood == 'good' else mood
+        points.append(
+            'There are no validation poses, so the gain is not proven: measure some and fit again.'
+        )
+    sampler = result.sampler
+    if sampler.converged:
+        points.append(f'The chains agree with each other ({sampler.message}).')
+    else:
+        mood = 'bad'
+        points.append(
+            f'The chains have not converged ({sampler.message}): do not trust the uncertainties; '
+            'fit again with more draws.'
+        )
+    unknown = [
+        joint
+        for joint, known in zip(result.joint_names, result.identifiable, strict=True)
+        if not known
+    ]
+    count = len(result.joint_names)
+    if unknown:
+        points.append(
+            f'{count - len(unknown)} of {count} zero-offsets are measured. The data cannot tell '
+            f'{" and ".join(unknown)} from something else; the table says from what.'
+        )
+    else:
+        points.append(f'All {count} zero-offsets are measured.')
+    if result.left_out:
+        plural = 's are' if len(result.left_out) > 1 else ' is'
+        points.append(
+            f'{len(result.left_out)} observation{plural} left out as gross errors; '
+            'they are listed below.'
+        )
+    return Verdict(mood, headline, points)
+
+
+def _accuracy_rows(result: FitResult) -> list[dict[str, Any]]:
+    """Return one row per split and metric, and the reason where there is no number."""
+    titles = {
+        'post_registration': 'Position, sensor registered (eq.\u00a018)',
+        'relative': 'Distances between solutions of a pose (eq.\u00a017)',
+        'theoretical': 'What the posterior predicts (section V-C)',
+    }
+    rows = []
+    for split in ('validation', 'optimization'):
+        metrics = result.accuracy[split]
+        if metrics is None:
+            continue
+        for metric, title in titles.items():
+            sides = metrics[metric]
+            rows.append(
+                {
+                    'split': split,
+                    'title': title,
+                    'cells': [sides.get(side) for side in ('before', 'after')],
+                    'offsets_only': sides.get('after_offsets_only'),
+                    'why': sides.get('why', ''),
+                }
+            )
+    return rows
+
+
+def _marker_rows(result: FitResult) -> list[dict[str, Any]]:
+    return [
+        {
+            'name': name,
+            'position_mm': (1e3 * position).tolist(),
+            'std_mm': (1e3 * result.marker_std_m[name]).tolist(),
+            'moved_mm': 1e3 * float(np.linalg.norm(position - result.session.markers[name])),
+        }
+        for name, position in result.marker_positions.items()
+    ]
+
+
+def _inline(name: str, svg: str) -> str:
+    """Make a figure part of the page: its colours, its font, its width, identifiers of its own."""
+    from .figures import GRID, INK, PAPER
+
+    svg = svg[svg.index('<svg') :]
+    for color, ours in ((INK, 'var(--ink)'), (GRID, 'var(--line)'), (PAPER, 'none')):
+        svg = svg.replace(color, ours)
+    svg = re.sub(r"'DejaVu Sans'(, [^;\"]*)?", 'var(--font)', svg)
+    svg = re.sub(r'(<svg [^>]*?) width="[^"]*"', r'\1', svg, count=1)
+    svg = re.sub(r'(<svg [^>]*?) height="[^"]*"', r'\1', svg, count=1)
+    svg = re.sub(r'\bid="([^"]+)"', rf'id="{name}-\1"', svg)
+    return re.sub(r'(url\(#|href="#)', rf'\1{name}-', svg)
+
+
+def _plotly() -> str:
+    """Return plotly.js, compressed and in base64: a third of its size in the page."""
+    script = importlib.resources.files('plotly').joinpath('package_data', 'plotly.min.js')
+    return base64.b64encode(gzip.compress(script.read_bytes(), 9, mtime=0)).decode()
+
+
+def _json(content: Any) -> Markup:
+    """Return JSON that no script element can be left with."""
+    text = json.dumps(content, separators=(',', ':'), allow_nan=False)
+    return Markup(text.replace('<', '\\u003c'))
+
+
+def _fixed(number: float | None, digits: int) -> str:
+    return '–' if number is None else f'{number:.{digits}f}'.replace('-', '−')
+
+
+def _signed(number: float, digits: int) -> str:
+    return f'{number:+.{digits}f}'.replace('-', '−')
