@@ -7,8 +7,9 @@ from setuptools import find_packages, setup
 
 NAME = 'remaster_ros'
 
-# What `ros2 run remaster_ros <executable>` finds. pip puts console scripts into bin/ and never into
-# lib/<package>/, so thin wrapper scripts are installed as data files; only `remaster` goes on PATH.
+# What `ros2 run remaster_ros <executable>` finds. pip puts console scripts into bin/ and never
+# into lib/<package>/, so thin wrapper scripts are installed as data files; only `remaster` goes
+# on PATH.
 EXECUTABLES = sorted(glob('scripts/*'))
 
 JAZZY = [

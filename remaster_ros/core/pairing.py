@@ -31,7 +31,7 @@ class SensorRules:
     max_std_m
         A larger standard deviation on any axis over the dwell is no still marker, m (streams).
     timeout_s
-        How long after the dwell (stream) or after settling (single shot) a reading may stay out, s.
+        How long after the dwell (stream) or settling (single shot) a reading may stay out, s.
     """
 
     sensor: str

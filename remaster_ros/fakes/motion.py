@@ -1,13 +1,14 @@
 """How the fake arm moves: a second-order servo behind a trajectory, solved in closed form.
 
-The reported joint positions x follow a reference r by x'' + 2 ζ ω x' + ω² x = ω² r. Each
-segment's reference is a quintic that ends at rest, held afterwards, so x lags while moving,
-overshoots a little and settles. The solution is a polynomial plus a decaying oscillation: exact at
-any time, without integration, and therefore the same in every process that knows the segments.
+The reported joint positions x follow a reference r by x'' + 2 ζ ω x' + ω² x = ω² r. Each piece
+of the reference is a polynomial, so x lags while moving, overshoots a little and settles. The
+solution is a polynomial plus a decaying oscillation: exact at any time, without integration, and
+therefore the same in every process that knows the trajectories.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,19 +21,35 @@ DAMPING = 0.7
 """ζ of the servo; below 1 the arm overshoots."""
 
 
-def quintic(start: FloatArray, velocity: FloatArray, end: FloatArray, duration: float) -> FloatArray:
-    """Coefficients, lowest power first, (6, k), of the quintic that ends at rest at `end`.
+@dataclass(frozen=True)
+class Waypoint:
+    """A point of a trajectory: time from its start (s), position (rad) and velocity (rad/s).
 
-    It starts at `start` (rad) with `velocity` (rad/s) and zero acceleration, and takes
-    `duration` s.
+    Without a velocity the controller interpolates linearly towards it, as the real one does.
     """
-    T = duration
-    gap = end - start - velocity * T
-    # Solve r(T) = end, r'(T) = r''(T) = 0 for the three highest coefficients.
-    c3 = (10 * gap + 4 * velocity * T) / T**3
-    c4 = (-15 * gap - 7 * velocity * T) / T**4
-    c5 = (6 * gap + 3 * velocity * T) / T**5
-    return np.array([start, velocity, np.zeros_like(start), c3, c4, c5])
+
+    time_s: float
+    q: FloatArray
+    velocity: FloatArray | None = None
+
+
+def spline(
+    start: FloatArray,
+    start_velocity: FloatArray,
+    end: FloatArray,
+    end_velocity: FloatArray | None,
+    duration: float,
+) -> FloatArray:
+    """Coefficients, lowest power first, (n, k), of the piece between two waypoints.
+
+    Cubic (Hermite) where the end has a velocity, else linear.
+    """
+    T, gap = duration, end - start
+    if end_velocity is None:
+        return np.array([start, gap / T])
+    c2 = (3 * gap / T - 2 * start_velocity - end_velocity) / T
+    c3 = (start_velocity + end_velocity - 2 * gap / T) / T**2
+    return np.array([start, start_velocity, c2, c3])
 
 
 def _steady_response(reference: FloatArray) -> FloatArray:
@@ -88,7 +105,7 @@ class _Response:
 
 
 class Motion:
-    """The arm's reported joint positions over time, as commanded segments make them.
+    """The arm's reported joint positions over time, as commanded trajectories make them.
 
     Parameters
     ----------
@@ -102,22 +119,28 @@ class Motion:
         q = np.asarray(q, float)
         self._responses = [_Response.of(start_s, q[None], q, np.zeros_like(q))]
 
-    def command(self, start_s: float, end: FloatArray, duration: float) -> None:
-        """From `start_s` on go to `end` (rad, (k,)) in `duration` s; replaces what is under way.
+    def follow(self, start_s: float, waypoints: Sequence[Waypoint]) -> None:
+        """From `start_s` on follow a trajectory; replaces what is under way.
 
-        Two pieces of response are kept for a segment: while the reference moves, and after.
+        The last waypoint is held. One piece of response is kept for each piece of the reference.
         """
-        # A later command replaces what of the former has not happened yet.
+        # A later trajectory replaces what of the former has not happened yet.
         self._responses = [r for r in self._responses if r.start_s <= start_s] or [
             self._responses[0]
         ]
         x, v = self.at(start_s)
-        end = np.asarray(end, float)
-        moving = _Response.of(start_s, quintic(x, v, end, duration), x, v)
-        arrived = moving.at(start_s + duration)
-        self._responses += [moving, _Response.of(start_s + duration, end[None], *arrived)]
+        reference, velocity, begin = x, v, start_s
+        for waypoint in waypoints:
+            end = start_s + waypoint.time_s
+            piece = spline(reference, velocity, waypoint.q, waypoint.velocity, end - begin)
+            response = _Response.of(begin, piece, x, v)
+            self._responses.append(response)
+            x, v = response.at(end)
+            reference, begin = waypoint.q, end
+            velocity = np.zeros_like(x) if waypoint.velocity is None else waypoint.velocity
+        self._responses.append(_Response.of(begin, reference[None], x, v))
         # Nobody asks for times long gone; bounded memory over hours of collection.
-        del self._responses[:-8]
+        del self._responses[:-16]
 
     def at(self, t: float) -> tuple[FloatArray, FloatArray]:
         """Joint positions (rad) and velocities (rad/s) at world time t, each (k,)."""

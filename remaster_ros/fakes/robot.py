@@ -1,17 +1,20 @@
 """A fake arm behind ros2_control: joint_trajectory_controller and joint_state_broadcaster.
 
-It does what the real controller of Jazzy does with a trajectory: permutes by joint name, drops with
-a log line what it cannot follow, does not clamp to limits, and holds when the trajectory is empty.
+It does what the real controller of Jazzy does with a trajectory: permutes by joint name, drops
+with a log line what it cannot follow, does not clamp to limits, and holds when the trajectory is
+empty.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from remaster_ros.core.types import FloatArray
+from remaster_ros.fakes.motion import Waypoint
 from remaster_ros.fakes.world import World
 
 
@@ -67,19 +70,22 @@ class FakeArm:
         if reason is not None:
             return reason
         columns = [list(names).index(name) for name in self.names]
-        begin = max(start_s, now)
-        for earlier, point in zip([0.0, *(p.time_from_start_s for p in points)], points):
-            end = np.asarray(point.positions, float)[columns]
-            end = end + self._rng.normal(0.0, self.world.truth.repeatability_rad, len(end))
-            duration = max(point.time_from_start_s - earlier, 1e-3)
-            self.world.begin_motion(begin + earlier, end, duration)
+        # The arm does not come back to quite the same place twice.
+        stray = self._rng.normal(0.0, self.world.truth.repeatability_rad, len(columns))
+        waypoints = []
+        for point in points:
+            q = np.asarray(point.positions, float)[columns] + stray
+            velocity = np.asarray(point.velocities, float)[columns] if point.velocities else None
+            waypoints.append(Waypoint(point.time_from_start_s, q, velocity))
+        self.world.begin_motion(max(start_s, now), waypoints)
         return None
 
     def _hold(self, now: float) -> None:
         """Stop where the arm is, in the time that braking takes."""
         q, velocity = self.world.reported(now)
         braking_s = 0.15
-        self.world.begin_motion(now, q + 0.5 * braking_s * velocity, braking_s)
+        end = q + 0.5 * braking_s * velocity
+        self.world.begin_motion(now, [Waypoint(braking_s, end, np.zeros_like(end))])
 
     def _refuse(
         self, names: Sequence[str], points: Sequence[TrajectoryPoint], start_s: float, now: float
@@ -88,14 +94,16 @@ class FakeArm:
         missing = sorted(set(self.names) - set(names))
         if unknown or missing or len(names) != len(self.names):
             return f'incoming joints do not match: unknown {unknown}, missing {missing}'
-        times = [point.time_from_start_s for point in points]
-        if any(later <= earlier for earlier, later in zip(times, times[1:])):
+        times = [0.0, *(point.time_from_start_s for point in points)]
+        if any(later <= earlier for earlier, later in pairwise(times)):
             return 'time_from_start does not increase'
         for point in points:
             if len(point.positions) != len(self.names):
                 return f'{len(point.positions)} positions for {len(self.names)} joints'
-            if not np.all(np.isfinite(point.positions)):
-                return 'a position is not finite'
+            if len(point.velocities) not in (0, len(self.names)):
+                return f'{len(point.velocities)} velocities for {len(self.names)} joints'
+            if not np.all(np.isfinite([*point.positions, *point.velocities])):
+                return 'a position or velocity is not finite'
         if np.any(np.asarray(points[-1].velocities, float) != 0.0):
             return 'velocity of the last point is not zero'
         if start_s > 0.0 and start_s + times[-1] <= now:

@@ -1,10 +1,10 @@
 """The hidden World behind all fakes: the true arm, the true sensors, world time.
 
-The fakes run as separate processes. They share one World through a folder that no estimating code
-ever sees: ``world.yaml`` holds the truth and the clock, ``motion.jsonl`` the segments that the fake
-robot has begun, a line each. The arm's motion is a closed form of its segments (see `motion`), so
-every process computes the same joint positions at the same world time. A killed fake reads the
-folder again and goes on.
+The fakes run as separate processes. They share one World through a folder that no estimating
+code ever sees: ``world.yaml`` holds the truth and the clock, ``motion.jsonl`` the trajectories
+that the fake robot has begun, a line each. The arm's motion is a closed form of these (see
+`motion`), so every process computes the same joint positions at the same world time. A killed fake
+reads the folder again and goes on.
 
 World time runs `rate` times as fast as the wall clock: a 3 s settle is 3 s of world time. All
 processes of one machine read the same monotonic clock.
@@ -13,20 +13,22 @@ processes of one machine read the same monotonic clock.
 from __future__ import annotations
 
 import json
+import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TextIO
 
 import numpy as np
 import yaml
 
 from remaster_ros.core import transforms
 from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.collision import LinkCapsules, line_of_sight
+from remaster_ros.core.collision import ArmCapsules
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.types import FloatArray
-from remaster_ros.fakes.motion import Motion
+from remaster_ros.fakes.motion import Motion, Waypoint
 
 START_S = 100.0
 """World time at the beginning, s; ROS reads a time of 0 as "no time yet"."""
@@ -189,11 +191,14 @@ class World:
         self.rate = float(data['rate'])
         self._started = float(data['started_monotonic_s'])
         self.chain = SerialChain.from_urdf(data['urdf'], data['base_link'], data['tip_link'])
-        self._capsules = LinkCapsules.from_chain(self.chain, data['link_radius_m'])
+        self._capsules = ArmCapsules(self.chain, data['link_radius_m'])
         self.start_q = np.array(data['start_q_rad'], float)
         self._motion = Motion(START_S, self.start_q)
-        self._lines = None
+        self._lines: TextIO | None = None
         self._torn = ''
+        self._position = 0
+        # A fake asks from its network thread and from its streaming thread.
+        self._lock = threading.Lock()
 
     @classmethod
     def create(
@@ -241,6 +246,15 @@ class World:
             ) from error
         return cls(folder, yaml.safe_load(text))
 
+    def close(self) -> None:
+        """Close the file of motions; the World can be asked again, which opens it again."""
+        with self._lock:
+            if self._lines is not None:
+                # What has been read stays learned: go on behind it.
+                self._position = self._lines.tell()
+                self._lines.close()
+                self._lines = None
+
     # Time
 
     def now(self) -> float:
@@ -254,29 +268,36 @@ class World:
 
     # Motion
 
-    def begin_motion(self, start_s: float, end: FloatArray, duration: float) -> None:
-        """Send the arm to `end` (reported joint positions, rad); every process learns of it."""
-        line = json.dumps({'start_s': start_s, 'end_rad': list(end), 'duration_s': duration})
+    def begin_motion(self, start_s: float, waypoints: Sequence[Waypoint]) -> None:
+        """Send the arm along waypoints (reported joint positions); every process learns of it."""
+        points = [
+            [p.time_s, p.q.tolist(), None if p.velocity is None else p.velocity.tolist()]
+            for p in waypoints
+        ]
+        line = json.dumps({'start_s': start_s, 'points': points})
         with (self.folder / 'motion.jsonl').open('a') as file:
             file.write(line + '\n')
-        self._learn()
 
     def _learn(self) -> None:
-        """Read the segments that have been added to the file since the last look."""
+        """Read the trajectories that have been added to the file since the last look."""
         if self._lines is None:
             self._lines = (self.folder / 'motion.jsonl').open()
+            self._lines.seek(self._position)
         while line := self._lines.readline():
             self._torn += line
             if self._torn.endswith('\n'):
-                segment, self._torn = json.loads(self._torn), ''
-                self._motion.command(
-                    segment['start_s'], np.array(segment['end_rad']), segment['duration_s']
-                )
+                trajectory, self._torn = json.loads(self._torn), ''
+                waypoints = [
+                    Waypoint(time_s, np.array(q), None if v is None else np.array(v))
+                    for time_s, q, v in trajectory['points']
+                ]
+                self._motion.follow(trajectory['start_s'], waypoints)
 
     def reported(self, t: float) -> tuple[FloatArray, FloatArray]:
         """Joint positions (rad) and velocities (rad/s) as the encoders have them, each (k,)."""
-        self._learn()
-        return self._motion.at(t)
+        with self._lock:
+            self._learn()
+            return self._motion.at(t)
 
     def joint_speed(self, t: float) -> float:
         """Largest joint speed at time t, rad/s."""
@@ -305,7 +326,7 @@ class World:
         cosine = T_R_T[:3, 2] @ line / np.linalg.norm(line)
         if cosine < np.cos(truth.acceptance_rad):
             return False
-        return bool(line_of_sight(self._capsules, self.chain, q, marker_R, truth.T_R_N[:3, 3]))
+        return not bool(self._capsules.hides(q, truth.marker, truth.T_R_N[:3, 3]))
 
     def _sensor(self, name: str) -> SensorTruth:
         try:

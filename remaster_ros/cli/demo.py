@@ -1,0 +1,70 @@
+"""The whole pipeline on fake hardware: real nodes, real DDS, real sockets."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import sys
+from pathlib import Path
+from typing import NoReturn
+
+from remaster_ros.core.errors import InputError
+
+WITHOUT_ROS = (
+    "needs ROS 2 Jazzy: source /opt/ros/jazzy/setup.bash, or pip install '.[jazzy]' for the wheels"
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``remaster demo``."""
+    parser.add_argument('--out', metavar='DIR', help='new folder (default: remaster_demo_N)')
+    parser.add_argument(
+        '--full', action='store_true', help="the paper's size: 60 candidate poses each"
+    )
+    parser.add_argument(
+        '--rate', type=float, default=10.0, help='world time over wall time (1 to 20; default 10)'
+    )
+
+
+def run(args: argparse.Namespace) -> NoReturn:
+    """Become the demo's process."""
+    out = Path(args.out) if args.out else free_folder()
+    run_node(
+        'demo',
+        {
+            'out': str(out),
+            'seed': args.seed,
+            'full': args.full,
+            'rate': args.rate,
+            'figures': not args.no_figures,
+            'quiet': args.quiet,
+        },
+    )
+
+
+def free_folder() -> Path:
+    """Return the first of remaster_demo_1, remaster_demo_2, … that does not exist."""
+    number = 1
+    while Path(f'remaster_demo_{number}').exists():
+        number += 1
+    return Path(f'remaster_demo_{number}')
+
+
+def run_node(name: str, parameters: dict[str, object]) -> NoReturn:
+    """Replace this process by the node `name` with these parameters; does not return.
+
+    Raises
+    ------
+    InputError
+        If there is no ROS on this machine; says what to install.
+    """
+    if importlib.util.find_spec('rclpy') is None:
+        raise InputError(f'remaster {name} {WITHOUT_ROS}')
+    command = [sys.executable, '-m', f'remaster_ros.nodes.{name}', '--ros-args']
+    for key, value in parameters.items():
+        # JSON is YAML; text in double quotes stays text whatever it looks like.
+        command += ['-p', f'{key}:={json.dumps(value)}']
+    sys.stdout.flush()
+    os.execv(sys.executable, command)

@@ -1,0 +1,77 @@
+"""Fit the zero-offsets of a session: fit.json, figures and report.html."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+from remaster_ros.cli.console import progress_bar, say
+from remaster_ros.core.fit import FitResult, fit_session
+from remaster_ros.storage.results import prepare_folder, save_fit
+from remaster_ros.storage.session import read_session
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``remaster fit``."""
+    parser.add_argument('session', metavar='SESSION', type=Path, help='session folder')
+    parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='output folder')
+    parser.add_argument(
+        '--sampler',
+        choices=('fast', 'paper'),
+        default='fast',
+        help="'fast' (default), or 'paper': the source paper's own chain, with its faults",
+    )
+    parser.add_argument('--chains', type=int, default=4, help='number of chains (default 4)')
+    parser.add_argument('--draws', type=int, help='draws per chain (default: the sampler says)')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fit, write, and say in a few lines what came out."""
+    session = read_session(args.session)
+    # An hour's chain must not end at a folder that cannot be written.
+    prepare_folder(args.out)
+    with progress_bar(args.quiet) as progress:
+        result = fit_session(
+            session,
+            rng=np.random.default_rng(args.seed),
+            sampler=args.sampler,
+            chains=args.chains,
+            draws=args.draws,
+            progress=progress,
+            clock=time.perf_counter,
+        )
+        progress('writing', 0.0)
+        report = save_fit(result, args.out, figures=not args.no_figures)
+    say(args.quiet, summary(result))
+    say(args.quiet, f'written: {report}')
+    return 0
+
+
+def summary(result: FitResult) -> str:
+    """Return offsets, errors and verdict in a few lines."""
+    lines = []
+    for joint, mean, std, seen in zip(
+        result.joint_names,
+        np.rad2deg(result.joint_offsets),
+        np.rad2deg(result.joint_offsets_std),
+        result.identifiable,
+    ):
+        value = f'{mean:+9.4f} ± {std:.4f} deg' if seen else '   not identifiable'
+        lines.append(f'{joint:12s} {value}')
+    for split, metrics in result.accuracy.items():
+        if metrics is None:
+            lines.append(f'{split}: no such rows')
+            continue
+        for metric in ('relative', 'post_registration'):
+            sides = metrics[metric]
+            if sides['before'] and sides['after']:
+                before, after = sides['before']['mean_mm'], sides['after']['mean_mm']
+                lines.append(f'{split}, {metric}: {before:.3f} mm before, {after:.3f} mm after')
+    lines.append(result.sampler.message)
+    if result.left_out:
+        rows = ', '.join(str(observation) for observation, _ in result.left_out)
+        lines.append(f'left out as gross errors: observation {rows}')
+    return '\n'.join(lines)

@@ -1,0 +1,290 @@
+"""The main job on fake hardware: start every node, collect, fit, and print what was found.
+
+Real nodes in processes of their own, real DDS, real sockets; the fakes share a hidden World, and
+its truth is opened only at the very end, to be compared with the estimate.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from std_srvs.srv import Trigger
+
+from remaster_ros.core.errors import DeviceError, InputError, RemasterError
+from remaster_ros.fakes.setup import make_world
+from remaster_ros.nodes.demo_summary import ConfigurationTimes, print_offsets, print_times
+from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.processes import NodeProcesses
+from remaster_ros.nodes.running import report
+from remaster_ros.nodes.status import Event, listen
+from remaster_ros.storage.cell import config_path, read_cell
+from remaster_ros.storage.results import read_fit
+
+FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
+NODES = (
+    'pose_planner',
+    'robot_bridge',
+    'optitrack_markers',
+    'laser_tracker_markers',
+    'recorder',
+    'optimizer',
+)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the demo."""
+
+    out: str = parameter('', 'folder of everything the demo writes; must be new or empty')
+    seed: int = parameter(0, 'seed of the hidden World and of all randomness', low=0)
+    full: bool = parameter(False, "the paper's size: 60 candidate poses each")
+    rate: float = parameter(
+        10.0, 'how many times as fast as the wall clock world time runs', low=1.0, high=20.0
+    )
+    figures: bool = parameter(True, 'write figures and the report')
+    quiet: bool = parameter(False, 'print nothing but errors')
+
+
+class Conductor(Node):
+    """Calls the services and follows the status of the nodes."""
+
+    def __init__(self) -> None:
+        super().__init__('demo')
+        self.p = declare(self, Parameters)
+        self.summaries: dict[str, dict[str, str]] = {}
+        self.times = ConfigurationTimes()
+        self.planned = ''
+        listen(self, self._on_event, self._on_summary)
+        self._clients_by_name: dict[str, Any] = {}
+
+    def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
+        self.summaries[node] = {'message': message, **values}
+
+    def _on_event(self, event: Event) -> None:
+        if event.event == 'planned':
+            self.planned = event.message
+        self.times.add(event)
+
+    def call(self, service: str) -> Any:
+        """Begin a call of a std_srvs/Trigger service; returns the future."""
+        if service not in self._clients_by_name:
+            self._clients_by_name[service] = self.create_client(Trigger, service)
+        client = self._clients_by_name[service]
+        return client.call_async(Trigger.Request()) if client.service_is_ready() else None
+
+
+class Demo:
+    """One run of the demo.
+
+    Parameters
+    ----------
+    node
+        The conductor.
+    stopping
+        Filled by a signal; looked at between all steps.
+    """
+
+    def __init__(self, node: Conductor, stopping: list[int]) -> None:
+        self.node, self.p, self._stopping = node, node.p, stopping
+        self.console = Console(quiet=self.p.quiet)
+        self.out = new_folder(Path(self.p.out))
+        self.session, self.fit = self.out / 'session', self.out / 'fit'
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(node)
+        self.hidden = Path(tempfile.mkdtemp(prefix='remaster_world_'))
+        (self.out / 'log').mkdir()
+        self.processes = NodeProcesses(
+            self.out / 'log', {'PYTHONUNBUFFERED': '1', **_domain_environment()}
+        )
+
+    # Running
+
+    def run(self) -> None:
+        """Collect, fit, print."""
+        cell = read_cell('demo')
+        world = make_world(self.hidden, cell, self.p.seed, self.p.rate)
+        self.console.print(f'hidden world drawn with seed {self.p.seed}; starting the nodes')
+        self._start()
+        self._wait(self._ready, 60.0, 'the nodes to come up')
+        self._trigger('/remaster/collect')
+        self._collect()
+        self.console.print('fitting')
+        self._trigger('/remaster/fit', timeout_s=300.0)
+        result = read_fit(self.fit / 'fit.json')
+        self.processes.stop()
+        print_times(self.console, self.node.times, self.p.rate)
+        print_offsets(self.console, result, world.truth)
+        self.console.print(f'session: {self.session}')
+        name = 'report.html' if self.p.figures else 'fit.json'
+        self.console.print(f'report: {self.fit / name}')
+
+    def _start(self) -> None:
+        common = config_path('fake.yaml')
+        command_port, data_port = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM)
+        tracker_port = free_port(socket.SOCK_STREAM)
+        ports = {'command_port': command_port, 'data_port': data_port}
+        size = 60 if self.p.full else 14
+        own: dict[str, dict[str, Any]] = {
+            **{name: {'world': str(self.hidden)} for name in FAKES},
+            'pose_planner': {
+                'seed': self.p.seed,
+                'optimization_candidates': size,
+                'validation_candidates': size,
+            },
+            'recorder': {'session': str(self.session)},
+            'optimizer': {
+                'session': str(self.session),
+                'out': str(self.fit),
+                'seed': self.p.seed,
+                'figures': self.p.figures,
+            },
+            'optitrack_markers': dict(ports),
+            'laser_tracker_markers': {'port': tracker_port},
+        }
+        own['fake_optitrack'].update(ports)
+        own['fake_laser_tracker']['port'] = tracker_port
+        for name in (*FAKES, *NODES):
+            self.processes.start(name, common, own.get(name, {}))
+
+    def _spin(self) -> None:
+        self._executor.spin_once(timeout_sec=0.1)
+        if self._stopping:
+            raise KeyboardInterrupt
+        self.processes.check()
+
+    def _wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            if time.monotonic() > deadline:
+                states = {name: s['message'] for name, s in self.node.summaries.items()}
+                raise DeviceError(f'waited {timeout_s:g} s in vain for {what}; {states}')
+            self._spin()
+
+    def _ready(self) -> bool:
+        waiting = [name for name in NODES if name not in self.node.summaries]
+        tracker = self.node.summaries.get('laser_tracker_markers', {}).get('state')
+        frames = self.node.summaries.get('optitrack_markers', {}).get('frames', '0')
+        return not waiting and tracker == 'ready' and frames != '0'
+
+    def _trigger(self, service: str, timeout_s: float = 30.0) -> None:
+        future = None
+
+        def done() -> bool:
+            nonlocal future
+            if future is None:
+                future = self.node.call(service)
+            return future is not None and future.done()
+
+        self._wait(done, timeout_s, f'an answer of {service}')
+        response = future.result()  # type: ignore[union-attr]
+        if not response.success:
+            raise DeviceError(f'{service}: {response.message}')
+
+    def _collect(self) -> None:
+        columns = (
+            TextColumn('{task.description}'),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+        )
+        with Progress(*columns, console=self.console, transient=False) as progress:
+            task = progress.add_task('registering the sensors', total=None)
+
+            def complete() -> bool:
+                planner = self.node.summaries.get('pose_planner', {})
+                if planner.get('phase') == 'collection' and planner.get('configurations') != '0':
+                    progress.update(
+                        task,
+                        description='visiting configurations',
+                        total=int(planner.get('configurations', 0)),
+                        completed=int(planner.get('configurations_done', 0)),
+                    )
+                if planner.get('state') == 'failed':
+                    raise DeviceError(f'the planner gave up: {planner["message"]}')
+                closed = self.node.summaries.get('recorder', {}).get('exit_status')
+                return planner.get('state') == 'complete' and closed == 'complete'
+
+            self._wait(complete, 3600.0, 'the collection to complete')
+        self.console.print(self.node.planned)
+
+    def close(self) -> None:
+        """End every process and remove the hidden World."""
+        self.processes.stop()
+        shutil.rmtree(self.hidden, ignore_errors=True)
+
+
+def new_folder(path: Path) -> Path:
+    """Make a new folder, or use an empty one.
+
+    Raises
+    ------
+    InputError
+        If it holds something or cannot be written.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        if any(path.iterdir()):
+            raise InputError(f'{path} is not empty; give --out a new folder')
+        (path / 'log').mkdir()
+        (path / 'log').rmdir()
+    except OSError as error:
+        raise InputError(
+            f'{path}: cannot write there ({error.strerror}); give another --out'
+        ) from None
+    return path
+
+
+def free_port(kind: int) -> int:
+    """Return a port on loopback that nobody uses now."""
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(('127.0.0.1', 0))
+        return int(probe.getsockname()[1])
+
+
+def _domain_environment() -> dict[str, str]:
+    """Keep the demo's DDS traffic on this machine and apart from other runs."""
+    return {name: os.environ[name] for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE')}
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the demo; returns its exit status."""
+    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    stopping: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda signum, frame: stopping.append(signum))
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    demo = None
+    try:
+        demo = Demo(Conductor(), stopping)
+        demo.run()
+        return 0
+    except KeyboardInterrupt:
+        print('stopped; what was recorded so far can be read', file=sys.stderr)
+        return 130
+    except RemasterError as error:
+        return report(error)
+    finally:
+        if demo is not None:
+            demo.close()
+        rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

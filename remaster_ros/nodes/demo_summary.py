@@ -1,0 +1,100 @@
+"""What the demo prints at its end: the time of a configuration, the offsets, the gain."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from remaster_ros.fakes.world import Truth
+from remaster_ros.nodes.status import Event
+
+
+class ConfigurationTimes:
+    """Where the time of each configuration went, from the nodes' events.
+
+    Motion, settle and measuring are world time as the nodes' stamps have it. Software is wall
+    time: from the bridge's word that the arm has settled to its next command, less the measuring.
+    """
+
+    def __init__(self) -> None:
+        self._open: dict[tuple[str, str], dict[str, float]] = {}
+        self._last: dict[str, float] | None = None
+        self._registration: set[str] = set()
+        self.rows: list[dict[str, float]] = []
+
+    def add(self, event: Event) -> None:
+        """Take an event of the planner, the bridge or the recorder."""
+        values = event.values
+        if event.event == 'pose' and values['split'] == 'registration':
+            self._registration.add(values['stamp'])
+        key = (values.get('stamp', ''), values.get('solution', ''))
+        if event.event == 'commanded':
+            if self._last is not None:
+                self._last['until_command'] = float(values['since_settled_wall_s'])
+            # A registration pose is followed by planning, which is no configuration's time.
+            self._last = None if key[0] in self._registration else self._open.setdefault(key, {})
+        elif event.event == 'settled' and key in self._open:
+            self._open[key].update(
+                motion=float(values['motion_s']), settle=float(values['settle_s'])
+            )
+        elif event.event == 'configuration' and 'measuring_s' in values and key in self._open:
+            self._open[key]['measuring'] = float(values['measuring_s'])
+            self.rows.append(self._open[key])
+
+    def columns(self, rate: float) -> dict[str, np.ndarray]:
+        """Return motion, settle, measuring (world s) and software (wall s) of complete rows."""
+        needed = ('motion', 'settle', 'measuring', 'until_command')
+        rows = [row for row in self.rows if all(name in row for name in needed)]
+        table = {name: np.array([row[name] for row in rows]) for name in needed}
+        software = table.pop('until_command') - table['measuring'] / rate
+        return {**table, 'software': software}
+
+
+def print_times(console: Console, times: ConfigurationTimes, rate: float) -> None:
+    """Print the table of times per configuration."""
+    columns = times.columns(rate)
+    table = Table(title=f'time per configuration, s ({len(columns["motion"])} configurations)')
+    for heading in ('', 'median', '95 %', 'largest'):
+        table.add_column(heading, justify='left' if not heading else 'right')
+    for name, values in columns.items():
+        if len(values):
+            unit = 'wall' if name == 'software' else 'world time'
+            figures = (np.median(values), np.quantile(values, 0.95), values.max())
+            table.add_row(f'{name} ({unit})', *(f'{figure:.3f}' for figure in figures))
+    console.print(table)
+
+
+def print_offsets(console: Console, fit: dict[str, Any], truth: Truth) -> None:
+    """Print offsets against the truth, which is opened only here, and the error on validation."""
+    table = Table(title='joint zero-offsets, degrees')
+    for heading in ('joint', 'estimate', 'std', 'hidden truth', 'off by, std'):
+        table.add_column(heading, justify='left' if heading == 'joint' else 'right')
+    for row, true in zip(fit['joint_offsets'], np.rad2deg(truth.joint_offsets)):
+        if row['identifiable']:
+            off = (row['mean_deg'] - true) / row['std_deg']
+            cells = [
+                f'{row["mean_deg"]:.4f}',
+                f'{row["std_deg"]:.4f}',
+                f'{true:.4f}',
+                f'{off:+.1f}',
+            ]
+        else:
+            cells = ['not identifiable', f'{row["std_deg"]:.2f}', f'{true:.4f}', '']
+        table.add_row(row['joint'], *cells)
+    console.print(table)
+    for row in fit['joint_offsets']:
+        if not row['identifiable']:
+            console.print(f'{row["joint"]}: {row["why"]}')
+    accuracy = Table(title='error on validation poses, which were never fitted, mm (mean)')
+    for heading in ('metric', 'before', 'after'):
+        accuracy.add_column(heading, justify='left' if heading == 'metric' else 'right')
+    for metric in ('relative', 'post_registration'):
+        sides = (fit['accuracy']['validation'] or {}).get(metric) or {}
+        cells = [
+            f'{sides[s]["mean_mm"]:.3f}' if sides.get(s) else '-' for s in ('before', 'after')
+        ]
+        accuracy.add_row(metric.replace('_', '-'), *cells)
+    console.print(accuracy)

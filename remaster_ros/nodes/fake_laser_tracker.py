@@ -1,0 +1,59 @@
+"""ROS shell of the fake laser tracker; it speaks emScon, and nothing else, to the product."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.fakes.laser_tracker import FakeLaserTracker
+from remaster_ros.fakes.laser_tracker_settings import TrackerBehaviour
+from remaster_ros.fakes.setup import open_world
+from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.running import RemasterNode, run
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the fake laser tracker."""
+
+    world: str = parameter('', 'folder of the hidden World; empty for the default one')
+    sensor: str = parameter('tracker', "the tracker's name in the World")
+    host: str = parameter('127.0.0.1', 'address to serve on')
+    port: int = parameter(700, 'TCP port', low=1, high=65535)
+    warm_up_s: float = parameter(
+        5.0, 'from switching on to ready, world time', unit='s', low=0.0, high=1e5
+    )
+
+
+class FakeLaserTrackerNode(RemasterNode):
+    """Serve until told to stop."""
+
+    def __init__(self) -> None:
+        super().__init__('fake_laser_tracker')
+        p = declare(self, Parameters)
+        self.world = world = open_world(p.world)
+        self.tracker = FakeLaserTracker(
+            world,
+            p.sensor,
+            np.random.default_rng([world.truth.seed, 4]),
+            host=p.host,
+            port=p.port,
+            behaviour=TrackerBehaviour(warm_up_s=p.warm_up_s),
+        )
+        self.tracker.start()
+
+    def close(self) -> None:
+        """Close the sockets."""
+        self.tracker.close()
+        self.world.close()
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run(FakeLaserTrackerNode, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

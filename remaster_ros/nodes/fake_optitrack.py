@@ -1,0 +1,70 @@
+"""ROS shell of the fake OptiTrack server; it speaks NatNet, and nothing else, to the product."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.fakes.optitrack import FakeOptiTrackServer
+from remaster_ros.fakes.optitrack_scene import OptiTrackBehaviour
+from remaster_ros.fakes.setup import open_world
+from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.running import RemasterNode, run
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the fake OptiTrack server."""
+
+    world: str = parameter('', 'folder of the hidden World; empty for the default one')
+    sensor: str = parameter('mocap', "the bar's name in the World")
+    version: str = parameter('3.1', 'NatNet bitstream', choices=('2.10', '3.1', '4.1'))
+    transport: str = parameter('multicast', 'how frames go out', choices=('multicast', 'unicast'))
+    rate: float = parameter(
+        30.0, 'frames per second of world time', unit='Hz', low=1.0, high=1000.0
+    )
+    host: str = parameter('127.0.0.1', 'address to serve on')
+    command_port: int = parameter(1510, 'port of the command channel', low=1, high=65535)
+    data_port: int = parameter(1511, 'port of multicast data', low=1, high=65535)
+    occlusions_per_s: float = parameter(
+        0.02, 'how often the marker is hidden, world time', unit='1/s', low=0.0, high=10.0
+    )
+
+
+class FakeOptiTrackNode(RemasterNode):
+    """Serve until told to stop."""
+
+    def __init__(self) -> None:
+        super().__init__('fake_optitrack')
+        p = declare(self, Parameters)
+        self.world = world = open_world(p.world)
+        major, minor = (int(part) for part in p.version.split('.'))
+        self.server = FakeOptiTrackServer(
+            world,
+            p.sensor,
+            np.random.default_rng([world.truth.seed, 3]),
+            version=(major, minor),
+            transport='unicast' if p.transport == 'unicast' else 'multicast',
+            rate_hz=p.rate,
+            host=p.host,
+            command_port=p.command_port,
+            data_port=p.data_port,
+            behaviour=OptiTrackBehaviour(occlusions_per_s=p.occlusions_per_s),
+        )
+        self.server.start()
+
+    def close(self) -> None:
+        """Close the sockets."""
+        self.server.stop()
+        self.world.close()
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run(FakeOptiTrackNode, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

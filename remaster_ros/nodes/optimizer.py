@@ -1,0 +1,106 @@
+"""Fit the session on request; publish the offsets, latched, with their standard deviations."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from remaster_ros.core.errors import RemasterError
+from remaster_ros.core.fit import FitResult, fit_session
+from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.status import LATCHED, Status
+from remaster_ros.storage.results import prepare_folder, save_fit
+from remaster_ros.storage.session import read_session
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the optimizer."""
+
+    session: str = parameter('session', 'folder of the session to fit')
+    out: str = parameter('fit', 'folder for fit.json, figures and report')
+    sampler: str = parameter('fast', 'which sampler', choices=('fast', 'paper'))
+    chains: int = parameter(4, 'number of chains', low=2, high=64)
+    seed: int = parameter(0, 'seed of the sampler', low=0)
+    figures: bool = parameter(True, 'write figures and the report')
+
+
+class Optimizer(RemasterNode):
+    """See the module's text."""
+
+    def __init__(self) -> None:
+        super().__init__('optimizer')
+        self.p = declare(self, Parameters)
+        self._state = 'waiting'
+        self._busy = threading.Lock()
+        self._means = self.create_publisher(JointState, '/remaster/joint_offsets', LATCHED)
+        self._stds = self.create_publisher(JointState, '/remaster/joint_offsets_std', LATCHED)
+        # A group of its own: status and clock go on while a fit takes its seconds.
+        self.create_service(
+            Trigger, '/remaster/fit', self._on_fit, callback_group=MutuallyExclusiveCallbackGroup()
+        )
+        self.status = Status(self, self._summary)
+
+    def _on_fit(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+        if not self._busy.acquire(blocking=False):
+            response.message = 'a fit is under way'
+            return response
+        try:
+            result, report = self._fit()
+            self._publish(result)
+            response.success, response.message = True, str(report)
+            self._state = 'fitted'
+        except RemasterError as error:
+            response.message = self._state = str(error)
+        finally:
+            self._busy.release()
+        return response
+
+    def _fit(self) -> tuple[FitResult, Path]:
+        out = Path(self.p.out)
+        session = read_session(self.p.session)
+        prepare_folder(out)
+        result = fit_session(
+            session,
+            rng=np.random.default_rng(self.p.seed),
+            sampler='paper' if self.p.sampler == 'paper' else 'fast',
+            chains=self.p.chains,
+            progress=self._progress,
+            clock=time.perf_counter,
+        )
+        return result, save_fit(result, out, figures=self.p.figures)
+
+    def _progress(self, stage: str, share: float) -> None:
+        self._state = f'{stage} {100 * share:.0f} %'
+
+    def _publish(self, result: FitResult) -> None:
+        stamp = self.get_clock().now().to_msg()
+        for publisher, values in (
+            (self._means, result.joint_offsets),
+            (self._stds, result.joint_offsets_std),
+        ):
+            message = JointState(name=list(result.joint_names), position=values.tolist())
+            message.header.stamp = stamp
+            publisher.publish(message)
+
+    def _summary(self) -> tuple[str, str, dict[str, Any]]:
+        return 'ok', self._state, {'session': self.p.session, 'out': self.p.out}
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run(Optimizer, args, threads=2)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

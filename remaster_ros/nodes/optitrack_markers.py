@@ -1,0 +1,141 @@
+"""Publish the calibration marker that an OptiTrack bar measures.
+
+Occluded, model-filled and otherwise unmeasured frames never become a point; they are counted with
+their reason in /remaster/status, which also says what is wrong when nothing comes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from geometry_msgs.msg import PointStamped
+
+from remaster_ros.core.clock_mapping import ClockMapping
+from remaster_ros.core.errors import DeviceError, InputError
+from remaster_ros.drivers.natnet import NatNetClient
+from remaster_ros.drivers.natnet_diagnosis import NatNetSettings
+from remaster_ros.drivers.natnet_follower import MarkerFollower
+from remaster_ros.drivers.natnet_gate import MarkerChoice, MarkerSample
+from remaster_ros.drivers.natnetclient_backend import NatNetClientBackend
+from remaster_ros.nodes.messages import stamp_of
+from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.status import RELIABLE, Status
+from remaster_ros.storage.cell import read_cell
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the OptiTrack node."""
+
+    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
+    sensor: str = parameter('mocap', "the bar's name among the cell's sensors")
+    client: str = parameter(
+        'builtin', 'which NatNet client to use', choices=('builtin', 'natnetclient')
+    )
+    server_address: str = parameter('192.168.0.10', 'the computer that runs Motive')
+    local_address: str = parameter(
+        '', "this computer's network card towards it; empty lets the routing decide"
+    )
+    transport: str = parameter('multicast', 'as set in Motive', choices=('multicast', 'unicast'))
+    multicast_group: str = parameter('239.255.42.99', 'as set in Motive')
+    command_port: int = parameter(1510, 'as set in Motive', low=1, high=65535)
+    data_port: int = parameter(1511, 'as set in Motive', low=1, high=65535)
+    bitstream: str = parameter('', "NatNet version to ask for; empty takes the server's own")
+    rigid_body: str = parameter('', 'name of the rigid body in Motive; empty for the only one')
+    member: int = parameter(
+        1, 'number of the marker in that body; 0 for a lone marker without a body', low=0, high=999
+    )
+    start_timeout_s: float = parameter(
+        20.0, 'how long to wait for the first reading, wall time', unit='s', low=0.1, high=3600.0
+    )
+
+
+class OptiTrackMarkers(RemasterNode):
+    """See the module's text."""
+
+    def __init__(self) -> None:
+        super().__init__('optitrack_markers')
+        self.p = declare(self, Parameters)
+        cell = read_cell(self.p.cell)
+        if self.p.sensor not in cell.sensors:
+            raise InputError(
+                f'optitrack_markers: parameter sensor is {self.p.sensor!r}; '
+                f'the cell has {", ".join(cell.sensors)}'
+            )
+        simulated = self.get_parameter('use_sim_time').value
+        self._clock_mapping = ClockMapping(simulated=bool(simulated))
+        self._publisher = self.create_publisher(
+            PointStamped, cell.sensors[self.p.sensor].topic, RELIABLE
+        )
+        self.published = 0
+        self.client = self._make_client()
+        self.client.start()
+        self.status = Status(self, self._summary)
+        self._started_s = time.monotonic()
+        self._timer = self.create_timer(0.5, self._check_start, clock=self.status.steady)
+
+    def _make_client(self) -> MarkerFollower:
+        lone = self.p.member == 0
+        marker = MarkerChoice(
+            rigid_body=self.p.rigid_body, member=max(self.p.member, 1), lone_marker=lone
+        )
+        settings = NatNetSettings(
+            server=self.p.server_address,
+            local_interface=self.p.local_address,
+            transport='unicast' if self.p.transport == 'unicast' else 'multicast',
+            multicast_group=self.p.multicast_group,
+            command_port=self.p.command_port,
+            data_port=self.p.data_port,
+            bitstream=self.p.bitstream,
+            marker=marker,
+        )
+        client = NatNetClientBackend if self.p.client == 'natnetclient' else NatNetClient
+        return client(settings, self._publish, clock=self.now_s)
+
+    def _check_start(self) -> None:
+        """End the process with the diagnosis if nothing ever came."""
+        if self.published:
+            self._timer.cancel()
+        elif time.monotonic() - self._started_s > self.p.start_timeout_s:
+            message = self.client.diagnosis().message or 'no reading of the marker'
+            self.failure = DeviceError(f'OptiTrack: {message}')
+
+    def _publish(self, sample: MarkerSample) -> None:
+        """Publish a reading with its time of capture; called in the client's thread."""
+        message = PointStamped()
+        captured = self._clock_mapping.capture_time(
+            sample.timestamp_s, sample.age_s, sample.received_s
+        )
+        message.header.stamp = stamp_of(captured)
+        message.header.frame_id = self.p.sensor
+        message.point.x, message.point.y, message.point.z = map(float, sample.position)
+        self._publisher.publish(message)
+        self.published += 1
+
+    def _summary(self) -> tuple[str, str, dict[str, Any]]:
+        status = self.client.status()
+        diagnosis = self.client.diagnosis()
+        values = {
+            'frames': status.frames,
+            'published': self.published,
+            'lost': status.lost,
+            **{f'dropped_{reason}': count for reason, count in status.dropped.items()},
+        }
+        return ('ok' if not diagnosis.message else 'error'), diagnosis.message or 'ok', values
+
+    def close(self) -> None:
+        """Say goodbye to the server."""
+        self.client.stop()
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run(OptiTrackMarkers, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -1,0 +1,130 @@
+"""A node's parameters: one frozen dataclass, each field with unit, range and description.
+
+A value of the wrong type, outside its range, or a name that the node does not know is refused at
+start with one line.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+from remaster_ros.core.errors import InputError
+
+T = TypeVar('T')
+
+# Declared by rclpy itself, or by every node.
+_ALWAYS = ('use_sim_time', 'start_type_description_service')
+
+
+def parameter(
+    default: Any,
+    description: str,
+    *,
+    unit: str = '',
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """Return a dataclass field that describes a node parameter.
+
+    Parameters
+    ----------
+    default
+        Its value where the user gives none; its type is the parameter's type.
+    description, unit
+        For the user; shown by ``ros2 param describe``.
+    low, high
+        Smallest and largest allowed value, both included.
+    choices
+        The allowed words of a text parameter.
+    """
+    metadata = {
+        'description': description,
+        'unit': unit,
+        'low': low,
+        'high': high,
+        'choices': choices,
+    }
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def declare(node: Node, kind: type[T]) -> T:
+    """Declare the fields of `kind` on `node` and return their values.
+
+    Raises
+    ------
+    InputError
+        Naming the node, the parameter and what it may be.
+    """
+    overrides: Mapping[str, Any] = node._parameter_overrides
+    fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    for name in overrides:
+        if name not in fields and name not in _ALWAYS and not name.startswith('qos_overrides.'):
+            known = ', '.join(sorted(fields))
+            raise InputError(
+                f'{node.get_name()}: unknown parameter {name!r}; the parameters are {known}'
+            )
+    values = {}
+    for name, field in fields.items():
+        value = overrides[name].value if name in overrides else field.default
+        values[name] = check(node.get_name(), field, value)
+        node.declare_parameter(name, field.default, _descriptor(field), ignore_override=True)
+        node.set_parameters([_as_parameter(name, values[name])])
+    return kind(**values)
+
+
+def check(node_name: str, field: dataclasses.Field[Any], value: Any) -> Any:
+    """Return `value` as the field's type; refuse what does not fit with one line."""
+    where = f'{node_name}: parameter {field.name}'
+    wanted = type(field.default)
+    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not wanted:
+        raise InputError(f'{where} is {value!r}; it must be of type {wanted.__name__}')
+    low, high = field.metadata['low'], field.metadata['high']
+    too_low = low is not None and not value >= low
+    too_high = high is not None and not value <= high
+    if too_low or too_high:
+        unit = f' {field.metadata["unit"]}' if field.metadata['unit'] else ''
+        limits = f'{"-inf" if low is None else low} to {"inf" if high is None else high}'
+        raise InputError(f'{where} is {value}; it must lie in {limits}{unit}')
+    choices = field.metadata['choices']
+    if choices and value not in choices:
+        raise InputError(f'{where} is {value!r}; it must be one of {", ".join(choices)}')
+    return value
+
+
+def _as_parameter(name: str, value: Any) -> Any:
+    from rclpy.parameter import Parameter
+
+    return Parameter(name, value=value)
+
+
+def _descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
+    meta = field.metadata
+    unit = f' [{meta["unit"]}]' if meta['unit'] else ''
+    descriptor = ParameterDescriptor(
+        description=meta['description'] + unit,
+        additional_constraints='one of ' + ', '.join(meta['choices']) if meta['choices'] else '',
+    )
+    low, high = meta['low'], meta['high']
+    if low is not None or high is not None:
+        if isinstance(field.default, float):
+            bounds = FloatingPointRange(
+                from_value=-1e300 if low is None else float(low),
+                to_value=1e300 if high is None else float(high),
+            )
+            descriptor.floating_point_range = [bounds]
+        elif isinstance(field.default, int):
+            limits = IntegerRange(
+                from_value=-(2**62) if low is None else int(low),
+                to_value=2**62 if high is None else int(high),
+                step=1,
+            )
+            descriptor.integer_range = [limits]
+    return descriptor

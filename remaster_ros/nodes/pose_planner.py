@@ -1,0 +1,311 @@
+"""Plan poses in front of the sensors; publish them one by one, each with all its joint solutions.
+
+``/remaster/collect`` starts or resumes; ``/remaster/pause`` and ``/remaster/stop`` hold the arm.
+Without a registration of every sensor the first poses serve the three-point registration.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, TransformStamped
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from remaster_ros.core import transforms
+from remaster_ros.core.collision import ArmCapsules
+from remaster_ros.core.errors import InputError, InsufficientDataError, RemasterError
+from remaster_ros.core.inverse import InverseKinematics
+from remaster_ros.core.planning import LineOfSight, Plan, candidate_poses, plan_poses
+from remaster_ros.core.tour import REGISTRATION, Stop, Tour, registration_tour
+from remaster_ros.core.types import FloatArray
+from remaster_ros.nodes.messages import JointOrder, duration_of, stamp_key, transform_array
+from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.status import LATCHED, RELIABLE, Event, Status, listen
+from remaster_ros.storage.cell import read_cell
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the planner."""
+
+    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
+    optimization_candidates: int = parameter(
+        60, 'candidate poses that the offsets are fitted on', low=1, high=10000
+    )
+    validation_candidates: int = parameter(
+        60, 'candidate poses that the gain is proved on', low=0, high=10000
+    )
+    registration_candidates: int = parameter(
+        12, 'candidate poses for the three-point registration', low=3, high=1000
+    )
+    seed: int = parameter(0, 'seed of the Latin hypercube', low=0)
+    limit_margin_deg: float = parameter(
+        1.0, 'distance kept from the joint limits', unit='deg', low=0.0, high=45.0
+    )
+
+
+class PosePlanner(RemasterNode):
+    """See the module's text."""
+
+    def __init__(self) -> None:
+        super().__init__('pose_planner')
+        self.p = declare(self, Parameters)
+        self.cell = read_cell(self.p.cell)
+        self.chain = self.cell.chain()
+        self._order = JointOrder(self.chain.joint_names)
+        self._rng = np.random.default_rng(self.p.seed)
+        self._q: FloatArray | None = None
+        self.T_R_N: dict[str, FloatArray] = {}
+        self.state, self.phase, self._why = 'idle', REGISTRATION, ''
+        self._registered = False
+        self._matched_wall: float | None = None
+        self._inverse = InverseKinematics(self.chain, self.cell.held(self.chain))
+        self._arm = ArmCapsules(self.chain, self.cell.link_radius_m)
+        self._tour: Tour | None = None
+        self._stamp = ''
+        self._open: set[int] = set()
+        self.outcomes: Counter[str] = Counter()
+        self.dropped: dict[str, int] = {}
+        self._poses = self.create_publisher(PoseStamped, '/remaster/target_pose', RELIABLE)
+        self._solutions = self.create_publisher(
+            JointTrajectory, '/remaster/joint_solutions', RELIABLE
+        )
+        self._joint_states: Subscription | None = self._listen_to_the_arm()
+        self.create_subscription(JointState, '/remaster/settled', self._on_settled, RELIABLE)
+        self.create_subscription(
+            TransformStamped, '/remaster/registration', self._on_registration, LATCHED
+        )
+        for name in ('collect', 'pause', 'stop'):
+            self.create_service(Trigger, f'/remaster/{name}', getattr(self, f'_on_{name}'))
+        self.status = Status(self, self._summary)
+        listen(self, self._on_event)
+        self.create_timer(0.05, self._step, clock=self.status.steady)
+
+    # Services
+
+    def _on_collect(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+        if self._q is None:
+            response.message = 'no joint_states yet: is the robot running?'
+            return response
+        if self.state in ('complete', 'failed'):
+            response.message = f'the collection is {self.state}: {self._why or "start anew"}'
+            return response
+        if self.state != 'running' and self._joint_states is None:
+            # The arm may have been stopped, or moved by hand, since it last settled.
+            self._joint_states = self._listen_to_the_arm()
+        self._set_state('running')
+        response.success = True
+        response.message = 'collecting'
+        return response
+
+    def _on_pause(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+        response.success = self.state in ('running', 'paused')
+        response.message = 'paused' if response.success else f'not running, but {self.state}'
+        if response.success:
+            self._set_state('paused')
+        return response
+
+    def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+        self._set_state('stopped')
+        self._solutions.publish(JointTrajectory(joint_names=list(self.chain.joint_names)))
+        self._open = set()
+        response.success, response.message = True, 'stopped'
+        return response
+
+    def _set_state(self, state: str, why: str = '') -> None:
+        self.state, self._why = state, why
+        self.status.publish()
+
+    # What comes in
+
+    def _listen_to_the_arm(self) -> Subscription:
+        return self.create_subscription(
+            JointState, '/joint_states', self._on_joint_state, RELIABLE
+        )
+
+    def _on_joint_state(self, message: JointState) -> None:
+        """Learn where the arm is before the first pose; after that /remaster/settled says it."""
+        self._on_settled(message)
+        if self._q is not None and self._joint_states is not None:
+            self.destroy_subscription(self._joint_states)
+            self._joint_states = None
+
+    def _on_settled(self, message: JointState) -> None:
+        try:
+            self._q = self._order.positions(message)
+        except InputError as error:
+            self._why = str(error)
+
+    def _on_registration(self, message: TransformStamped) -> None:
+        self.T_R_N[message.child_frame_id] = transform_array(message)
+
+    def _on_event(self, event: Event) -> None:
+        final = (event.node, event.event) in (
+            ('recorder', 'configuration'),
+            ('robot_bridge', 'failed'),
+        )
+        if not final or event.values.get('stamp') != self._stamp:
+            return
+        solution = int(event.values['solution'])
+        if solution in self._open:
+            self._open.remove(solution)
+            self._registered = event.values.get('registered') == 'yes'
+            if self.phase != REGISTRATION:
+                self.outcomes[event.values.get('result', 'failed')] += 1
+            self._step()
+
+    # The tour
+
+    def _step(self) -> None:
+        """Publish the next pose once every solution of the last one has its outcome."""
+        if self.state != 'running' or self._open or self._q is None or not self._heard():
+            return
+        try:
+            stop = self._next_stop(self._q)
+        except RemasterError as error:
+            self._set_state('failed', str(error))
+            self.get_logger().error(str(error))
+            return
+        if stop is not None:
+            self._publish(stop)
+
+    def _heard(self) -> bool:
+        """Whether bridge and recorder are there for the next pose; DDS takes its time to match."""
+        if self._solutions.get_subscription_count() >= 2:
+            if self._matched_wall is None:
+                self._matched_wall = time.monotonic()
+            # The other side of a match comes a little later than ours.
+            if time.monotonic() - self._matched_wall > 0.5:
+                self._why = ''
+                return True
+        else:
+            self._matched_wall = None
+            self._why = 'waiting for robot_bridge and recorder'
+        return False
+
+    def _next_stop(self, q: FloatArray) -> Stop | None:
+        if self.phase == REGISTRATION:
+            return self._next_registration(q)
+        if self._tour is None:
+            self._tour = self._plan_collection()
+        stop = self._tour.next(q)
+        if stop is None:
+            self._set_state('complete')
+        return stop
+
+    def _next_registration(self, q: FloatArray) -> Stop | None:
+        """Visit poses until the recorder has registered every sensor."""
+        missing = [name for name in self.cell.sensors if name not in self.T_R_N]
+        if not missing:
+            self._tour, self.phase, self._why = None, 'collection', ''
+            return self._next_stop(q)
+        if self._registered:
+            # The recorder said so; its transforms are on their way.
+            return None
+        if self._tour is None:
+            aim = np.array(self.cell.sensors[self.cell.aim_at].rough_position_m)
+            rough = {n: np.array(s.rough_position_m) for n, s in self.cell.sensors.items()}
+            plan = self._plan(self.p.registration_candidates, aim, rough)
+            markers = [np.array(self.cell.markers[s.marker]) for s in self.cell.sensors.values()]
+            self._tour = registration_tour(self.chain, plan, markers)
+        stop = self._tour.next(q)
+        if stop is None:
+            raise InsufficientDataError(
+                f'no registration of {", ".join(missing)} after {self._tour.visited} poses; '
+                'the recorder counts why readings were rejected'
+            )
+        return stop
+
+    def _plan(self, count: int, aim: FloatArray, sensors_R: dict[str, FloatArray]) -> Plan:
+        """Plan poses that face `aim` and that every sensor sees; positions in R, m, (3,)."""
+        sights = [
+            LineOfSight(
+                name,
+                sensors_R[name],
+                np.array(self.cell.markers[sensor.marker]),
+                np.deg2rad(sensor.max_angle_deg),
+            )
+            for name, sensor in self.cell.sensors.items()
+        ]
+        candidates = candidate_poses(count, self.cell.poses.ranges(), aim, self._rng)
+        margin = np.deg2rad(self.p.limit_margin_deg)
+        return plan_poses(self._inverse, self._arm, candidates, sights, margin)
+
+    def _plan_collection(self) -> Tour:
+        sensors = {name: T[:3, 3] for name, T in self.T_R_N.items()}
+        aim = sensors[self.cell.aim_at]
+        plans = {'optimization': self._plan(self.p.optimization_candidates, aim, sensors)}
+        if self.p.validation_candidates:
+            plans['validation'] = self._plan(self.p.validation_candidates, aim, sensors)
+        tour = Tour(self.chain, plans)
+        if not plans['optimization'].poses:
+            raise InsufficientDataError(f'{tour.describe()}: no pose is left to fit on')
+        self.dropped = dict(tour.dropped)
+        self.status.event('planned', tour.describe())
+        return tour
+
+    def _publish(self, stop: Stop) -> None:
+        stamp = self.get_clock().now().to_msg()
+        self._stamp = stamp_key(stamp)
+        self._open = set(range(len(stop.solutions)))
+        # The event goes first: the recorder must know the pose before the arm gets there.
+        self.status.event(
+            'pose',
+            f'pose {stop.pose} ({stop.split}): {len(stop.solutions)} solutions',
+            stamp=self._stamp,
+            pose=stop.pose,
+            split=stop.split,
+            solutions=len(stop.solutions),
+        )
+        pose = PoseStamped()
+        pose.header.stamp, pose.header.frame_id = stamp, self.chain.base_link
+        position, orientation = pose.pose.position, pose.pose.orientation
+        position.x, position.y, position.z = map(float, stop.T_R_T[:3, 3])
+        quaternion = transforms.quaternion_xyzw(stop.T_R_T[:3, :3])
+        orientation.x, orientation.y, orientation.z, orientation.w = map(float, quaternion)
+        self._poses.publish(pose)
+        message = JointTrajectory(joint_names=list(self.chain.joint_names))
+        message.header = pose.header
+        message.points = [
+            JointTrajectoryPoint(positions=q.tolist(), time_from_start=duration_of(i + 1.0))
+            for i, q in enumerate(stop.solutions)
+        ]
+        self._solutions.publish(message)
+
+    def _summary(self) -> tuple[str, str, dict[str, Any]]:
+        tour = self._tour
+        values = {
+            'state': self.state,
+            'phase': self.phase,
+            'poses_done': tour.visited if tour else 0,
+            'poses': sum(tour.poses.values()) if tour else 0,
+            'configurations_done': sum(self.outcomes.values()),
+            'configurations': sum(tour.configurations.values()) if tour else 0,
+            **{f'outcome_{name}': count for name, count in sorted(self.outcomes.items())},
+            **{f'dropped_{name}': count for name, count in sorted(self.dropped.items())},
+        }
+        level = 'error' if self.state == 'failed' else 'warn' if self._why else 'ok'
+        return level, self._why or self.state, values
+
+    def close(self) -> None:
+        """Tell the bridge to stop: nobody plans any more."""
+        if self.state == 'running':
+            self._set_state('stopped')
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run(PosePlanner, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -1,0 +1,84 @@
+"""Start nodes as processes of their own, watch them, and end them all in time."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from remaster_ros.core.errors import DeviceError
+
+_PR_SET_PDEATHSIG = 1
+
+
+def _die_with_parent() -> None:
+    """Ask Linux for SIGTERM when the parent dies, so that even a killed demo leaves nothing."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+class NodeProcesses:
+    """The node processes of a run.
+
+    Parameters
+    ----------
+    log_folder
+        Each process writes its output to ``<name>.log`` there.
+    environment
+        Variables added to the processes' environment.
+    """
+
+    def __init__(self, log_folder: Path, environment: Mapping[str, str]) -> None:
+        self._log_folder = log_folder
+        self._environment = {**os.environ, **environment}
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(self, name: str, parameters_file: Path, parameters: Mapping[str, Any]) -> None:
+        """Start node `name` with a parameter file and values that override it."""
+        command = [sys.executable, '-m', f'remaster_ros.nodes.{name}', '--ros-args']
+        command += ['--params-file', str(parameters_file)]
+        for key, value in parameters.items():
+            # With the node's name: a bare one gives way to what the file says of that node.
+            # JSON is YAML; text in double quotes stays text whatever it looks like.
+            command += ['-p', f'{name}:{key}:={json.dumps(value)}']
+        with (self._log_folder / f'{name}.log').open('wb') as log:
+            self._running[name] = subprocess.Popen(
+                command,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                env=self._environment,
+                start_new_session=True,  # Ctrl-C on the terminal reaches us alone; we end them.
+                preexec_fn=_die_with_parent,
+            )
+
+    def check(self) -> None:
+        """Raise DeviceError with the last line of its log if a process has ended by itself."""
+        for name, process in self._running.items():
+            if process.poll() is not None:
+                lines = (self._log_folder / f'{name}.log').read_text(errors='replace').split('\n')
+                last = next((line for line in reversed(lines) if line.strip()), 'it said nothing')
+                raise DeviceError(f'{name} ended with status {process.returncode}: {last.strip()}')
+
+    def stop(self, grace_s: float = 3.5) -> list[str]:
+        """End every process within about `grace_s` seconds; return those that were killed."""
+        for process in self._running.values():
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        deadline = time.monotonic() + grace_s
+        killed = []
+        for name, process in self._running.items():
+            try:
+                process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+                killed.append(name)
+        self._running.clear()
+        return killed

@@ -1,0 +1,392 @@
+"""Pair settled joints with marker readings; write the session and the bag; register the sensors.
+
+What becomes of each configuration is said as an event on /remaster/status, after its observations
+are on disk; the bridge moves on only then.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PointStamped
+from rclpy.task import Future
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.pairing import PairedReading, Pairing, SensorRules
+from remaster_ros.core.types import FloatArray, MarkerReading, Measurements, Observation, Session
+from remaster_ros.nodes.bagging import BagRecorder
+from remaster_ros.nodes.messages import JointOrder, seconds, stamp_key
+from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.registering import Registrar
+from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.status import TOPIC as STATUS
+from remaster_ros.nodes.status import Event, Status, receiver
+from remaster_ros.storage.cell import Cell, read_cell
+from remaster_ros.storage.session import SessionWriter
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the recorder."""
+
+    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
+    session: str = parameter('session', 'folder of the new session; must not exist or be empty')
+    bag: bool = parameter(True, 'record a rosbag2 (MCAP) of the raw topics into session/bag')
+    call_measure: bool = parameter(
+        True, 'call the measure service of single-shot sensors; false when a bag is replayed'
+    )
+    dwell_s: float = parameter(0.5, 'how long a stream is averaged', unit='s', low=0.01, high=60.0)
+    min_samples: int = parameter(5, 'fewest samples in the dwell', low=1)
+    max_std_m: float = parameter(
+        0.5e-3, 'largest standard deviation over the dwell', unit='m', low=1e-6, high=0.1
+    )
+    motion_tolerance: float = parameter(
+        5e-4, 'largest joint movement during a reading', unit='rad', low=1e-7, high=0.01
+    )
+    stream_timeout_s: float = parameter(
+        3.0, 'how long after the dwell a stream may stay out', unit='s', low=0.1, high=600.0
+    )
+    shot_timeout_s: float = parameter(
+        60.0, 'how long after settling a single shot may stay out', unit='s', low=0.1, high=3600.0
+    )
+    settle_s: float = parameter(
+        3.0, 'settle time of the bridge, noted in the session', unit='s', low=0.1, high=60.0
+    )
+
+
+@dataclass(frozen=True)
+class _Pose:
+    """What the planner announced."""
+
+    pose: int
+    split: str
+
+
+@dataclass
+class _Taking:
+    """A reading under way: of a configuration, or (`future`) asked for by /remaster/register."""
+
+    pairing: Pairing
+    stamp: str
+    solution: int
+    pose: _Pose
+    settled_wall: float
+    future: Future | None = None
+
+
+def sensor_rules(cell: Cell, p: Parameters) -> tuple[SensorRules, ...]:
+    """Return how each sensor of the cell is read."""
+    return tuple(
+        SensorRules(
+            sensor=name,
+            marker=sensor.marker,
+            single_shot=sensor.single_shot,
+            dwell_s=p.dwell_s,
+            min_samples=p.min_samples,
+            max_std_m=p.max_std_m,
+            timeout_s=p.shot_timeout_s if sensor.single_shot else p.stream_timeout_s,
+        )
+        for name, sensor in cell.sensors.items()
+    )
+
+
+class Recorder(RemasterNode):
+    """See the module's text."""
+
+    def __init__(self) -> None:
+        super().__init__('recorder')
+        self.p = declare(self, Parameters)
+        self.cell = read_cell(self.p.cell)
+        self.chain = self.cell.chain()
+        self.rules = sensor_rules(self.cell, self.p)
+        self._order = JointOrder(self.chain.joint_names)
+        folder = Path(self.p.session)
+        header = Session(
+            urdf=self.cell.urdf_text,
+            base_link=self.chain.base_link,
+            tip_link=self.chain.tip_link,
+            markers={name: np.array(position) for name, position in self.cell.markers.items()},
+            sensors={name: sensor.marker for name, sensor in self.cell.sensors.items()},
+            measurements=Measurements.empty(len(self.chain)),
+            marker_std_m=self.cell.marker_std_m,
+            settle_s=self.p.settle_s,
+            created=datetime.now(UTC).isoformat(timespec='seconds'),
+        )
+        self.writer = SessionWriter(folder, header)
+        self.counts: Counter[str] = Counter()
+        self._trouble = ''
+        self._poses: dict[str, _Pose] = {}
+        self._solutions: JointTrajectory | None = None
+        self._taking: _Taking | None = None
+        self._q: FloatArray | None = None
+        self._now = 0.0
+        self._from_q: FloatArray | None = None
+        self._configuration = 0
+        self._observation = 0
+        self._closed = ''
+        self.registrar = Registrar(self, self.cell, self.chain)
+        self._bag = BagRecorder(self, folder / 'bag' if self.p.bag else None)
+        self._subscribe()
+        self.create_service(Trigger, '/remaster/register', self._on_register)
+        self.status = Status(self, self._summary)
+        self.create_timer(0.05, self._give_up, clock=self.status.steady)
+
+    def _subscribe(self) -> None:
+        """Take each topic once, raw: into the bag as it came, then decoded."""
+        bag = self._bag
+        bag.subscribe(JointState, '/joint_states', self._on_joint_state)
+        bag.subscribe(JointState, '/remaster/settled', self._on_settled)
+        bag.subscribe(JointTrajectory, '/remaster/joint_solutions', self._on_solutions)
+        bag.subscribe(
+            JointTrajectory, '/joint_trajectory_controller/joint_trajectory', self._on_trajectory
+        )
+        self._measure = {}
+        for name, sensor in self.cell.sensors.items():
+            bag.subscribe(PointStamped, sensor.topic, self._on_point(name))
+            if sensor.single_shot and sensor.measure_service and self.p.call_measure:
+                self._measure[name] = self.create_client(Trigger, sensor.measure_service)
+        bag.subscribe(DiagnosticArray, STATUS, receiver(self._on_event, self._on_summary))
+        bag.subscribe_rest()
+
+    # What comes in
+
+    def _on_point(self, sensor: str) -> Callable[[PointStamped], None]:
+        def receive(message: PointStamped) -> None:
+            point = message.point
+            position = np.array([point.x, point.y, point.z])
+            if not np.all(np.isfinite(position)):
+                self.counts[f'{sensor}_not_finite'] += 1
+            elif self._taking is not None:
+                reading = MarkerReading(seconds(message.header.stamp), position)
+                self._taking.pairing.add_reading(sensor, reading)
+                self._finish_if_complete()
+
+        return receive
+
+    def _on_joint_state(self, message: JointState) -> None:
+        try:
+            self._q = self._order.positions(message)
+        except InputError as error:
+            self._trouble = str(error)
+            return
+        self._now, self._trouble = seconds(message.header.stamp), ''
+        if self._taking is not None:
+            self._taking.pairing.add_joint_state(self._now, self._q)
+            self._finish_if_complete()
+
+    def _on_trajectory(self, message: JointTrajectory) -> None:
+        if not message.points:
+            # The arm was stopped on its way: nobody knows what it will come from next.
+            self._from_q = None
+
+    def _on_solutions(self, message: JointTrajectory) -> None:
+        self._solutions = message if message.points else None
+
+    def _on_event(self, event: Event) -> None:
+        if (event.node, event.event) == ('pose_planner', 'pose'):
+            self._poses[event.values['stamp']] = _Pose(
+                int(event.values['pose']), event.values['split']
+            )
+
+    def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
+        if node == 'pose_planner' and self._taking is None:
+            if values.get('state') == 'complete':
+                self._close('complete')
+            elif values.get('state') == 'stopped' and self._observation:
+                self._close('stopped')
+
+    # A configuration
+
+    def _on_settled(self, message: JointState) -> None:
+        try:
+            q = self._order.positions(message)
+        except InputError as error:
+            self._trouble = str(error)
+            return
+        solution = self._which_solution(q)
+        if solution is None or self._solutions is None:
+            self.counts['settled_unknown'] += 1
+            self._trouble = 'settled at no joint solution of the announced pose'
+            return
+        stamp = stamp_key(self._solutions.header.stamp)
+        pose = self._poses.get(stamp)
+        if pose is None:
+            self.counts['settled_without_pose'] += 1
+            self._report(stamp, solution, 'rejected', 'the planner announced no such pose')
+            return
+        self._take(q, seconds(message.header.stamp), stamp, solution, pose)
+
+    def _which_solution(self, q: FloatArray) -> int | None:
+        """Which announced solution the arm stands at; None if none is near (0.02 rad)."""
+        if self._solutions is None:
+            return None
+        columns = [list(self._solutions.joint_names).index(n) for n in self.chain.joint_names]
+        targets = np.array([point.positions for point in self._solutions.points])[:, columns]
+        distance = np.max(np.abs(targets - q), axis=1)
+        nearest = int(np.argmin(distance))
+        return nearest if distance[nearest] < 0.02 else None
+
+    def _take(
+        self,
+        q: FloatArray,
+        settled_s: float,
+        stamp: str,
+        solution: int,
+        pose: _Pose,
+        future: Future | None = None,
+    ) -> None:
+        pairing = Pairing(settled_s, q, self.rules, self.p.motion_tolerance)
+        self._taking = _Taking(pairing, stamp, solution, pose, time.monotonic(), future)
+        for name, client in self._measure.items():
+            if not client.service_is_ready():
+                pairing.fail(name, f'the service {client.srv_name} is not there')
+                continue
+            client.call_async(Trigger.Request()).add_done_callback(self._measured(pairing, name))
+
+    def _measured(self, pairing: Pairing, sensor: str) -> Callable[[Future], None]:
+        def receive(future: Future) -> None:
+            response = future.result()
+            if response is not None and not response.success:
+                pairing.fail(sensor, response.message)
+                self._finish_if_complete()
+
+        return receive
+
+    def _give_up(self) -> None:
+        if self._taking is not None:
+            self._taking.pairing.give_up(self._now)
+            self._finish_if_complete()
+
+    def _finish_if_complete(self) -> None:
+        taking = self._taking
+        if taking is None or not taking.pairing.complete:
+            return
+        self._taking = None
+        decided = taking.pairing.decided.values()
+        good = [item for item in decided if isinstance(item, PairedReading)]
+        bad = [item for item in decided if not isinstance(item, PairedReading)]
+        for rejection in bad:
+            self.counts[f'{rejection.sensor}_{rejection.reason}'] += 1
+        for reading in good:
+            self.counts[f'{reading.sensor}_accepted'] += 1
+        why = '; '.join(f'{r.sensor}: {r.reason}: {r.detail}' for r in bad)
+        registration = taking.pose.split == 'registration'
+        if registration:
+            self.registrar.add(good)
+        else:
+            self._write(good, taking)
+        if taking.future is not None:
+            taking.future.set_result((good, why))
+            return
+        self._from_q = taking.pairing.q_settled
+        result = 'recorded' if not bad else 'partial' if good else 'rejected'
+        last = max((reading.stamp_s for reading in good), default=self._now)
+        self._report(
+            taking.stamp,
+            taking.solution,
+            result,
+            why,
+            registered='yes' if self.registrar.complete else 'no',
+            measuring_s=f'{last - taking.pairing.settled_stamp_s:.6f}',
+            measuring_wall_s=f'{time.monotonic() - taking.settled_wall:.6f}',
+        )
+
+    def _write(self, good: list[PairedReading], taking: _Taking) -> None:
+        """Write the observations of one configuration; on disk when this returns."""
+        for reading in sorted(good, key=lambda item: item.stamp_s):
+            self.writer.append(
+                Observation(
+                    observation=self._observation,
+                    pose=taking.pose.pose,
+                    configuration=self._configuration,
+                    split='validation' if taking.pose.split == 'validation' else 'optimization',
+                    stamp_s=reading.stamp_s,
+                    sensor=reading.sensor,
+                    marker=reading.marker,
+                    q=reading.q,
+                    position=reading.position,
+                    from_q=self._from_q,
+                    std=reading.std,
+                    samples=reading.samples,
+                )
+            )
+            self._observation += 1
+        if good:
+            self._configuration += 1
+
+    def _report(self, stamp: str, solution: int, result: str, why: str, **values: str) -> None:
+        self.counts[f'configurations_{result}'] += 1
+        self.status.event(
+            'configuration',
+            why or result,
+            level='ok' if result == 'recorded' else 'warn',
+            stamp=stamp,
+            solution=solution,
+            result=result,
+            reason=why,
+            **values,
+        )
+
+    # Registration by hand
+
+    async def _on_register(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+        """Take the point where the arm stands now; the third point completes the registration."""
+        if self._taking is not None:
+            response.message = 'a reading is under way; try again when it is done'
+            return response
+        if self._q is None:
+            response.message = 'no joint_states yet: is the robot running?'
+            return response
+        future: Future = Future()
+        pose = _Pose(-1, 'registration')
+        self._take(self._q, self._now, '', 0, pose, future)
+        good, why = await future
+        response.success = bool(good)
+        response.message = why or self.registrar.describe()
+        return response
+
+    # State
+
+    def _summary(self) -> tuple[str, str, dict[str, Any]]:
+        state = 'closed' if self._closed else 'measuring' if self._taking else 'waiting'
+        values = {
+            'state': state,
+            'exit_status': self._closed,
+            'session': self.p.session,
+            'observations': self._observation,
+            **dict(sorted(self.counts.items())),
+        }
+        return ('warn' if self._trouble else 'ok'), self._trouble or state, values
+
+    def _close(self, exit_status: str) -> None:
+        if not self._closed:
+            self._closed = exit_status
+            self.writer.close(exit_status)
+            self._bag.close()
+            self.status.publish()
+
+    def close(self) -> None:
+        """Close the session; what is recorded so far stays readable."""
+        if self._taking is not None and self._taking.future is not None:
+            self._taking.future.cancel()
+        self._close('stopped')
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run(Recorder, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

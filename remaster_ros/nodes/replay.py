@@ -1,0 +1,142 @@
+"""Publish a recorded bag again, byte for byte and in its own time, as ``ros2 bag play`` does."""
+
+from __future__ import annotations
+
+import importlib
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock as ClockMessage
+
+from remaster_ros.core.errors import InputError, RemasterError
+from remaster_ros.nodes.messages import stamp_of
+from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.storage.bag import LATCHED_TOPICS, BagReader
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the replay."""
+
+    bag: str = parameter('', 'folder of the bag, or of the session that holds it')
+    rate: float = parameter(1.0, 'how many times as fast as recorded', low=0.01, high=100.0)
+    publish_clock: bool = parameter(True, 'publish /clock with the recorded times')
+    wait_for: str = parameter(
+        '', 'a topic whose first subscriber is waited for before the first message'
+    )
+    wait_s: float = parameter(30.0, 'how long at most', unit='s', low=0.0, high=3600.0)
+
+
+class Replay(RemasterNode):
+    """See the module's text; it ends when the last message is out."""
+
+    def __init__(self) -> None:
+        super().__init__('replay')
+        self.p = declare(self, Parameters)
+        if not self.p.bag:
+            raise InputError('replay: parameter bag is empty; give the folder of a bag')
+        folder = Path(self.p.bag)
+        self._reader = BagReader(folder / 'bag' if (folder / 'bag').is_dir() else folder)
+        self._publishers_by_topic: dict[str, Publisher] = {}
+        self._clock_publisher = (
+            self.create_publisher(ClockMessage, '/clock', 10) if self.p.publish_clock else None
+        )
+        self._ending = threading.Event()
+        self._clock_sent = 0.0
+        self.sent = 0
+        for topic, type_name in self._reader.topics().items():
+            if topic != '/clock' or self._clock_publisher is None:
+                self._publishers_by_topic[topic] = self._publisher(topic, type_name)
+        self._thread = threading.Thread(target=self._play, daemon=True)
+        self._thread.start()
+
+    def _publisher(self, topic: str, type_name: str) -> Publisher:
+        latched = topic in LATCHED_TOPICS
+        qos = QoSProfile(
+            depth=1000,
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        return self.create_publisher(message_class(type_name), topic, qos)
+
+    def _play(self) -> None:
+        try:
+            self._wait_for_subscriber()
+            self._send_all()
+            # Give DDS the time to hand the last messages over.
+            self._ending.wait(1.0)
+            self.finished = True
+        except RemasterError as error:
+            self.failure = error
+
+    def _wait_for_subscriber(self) -> None:
+        topic = self.p.wait_for
+        if not topic:
+            self._ending.wait(1.0)
+            return
+        deadline = time.monotonic() + self.p.wait_s
+        while not self._ending.is_set() and self.count_subscribers(topic) == 0:
+            if time.monotonic() > deadline:
+                raise InputError(f'replay: nobody subscribed to {topic} in {self.p.wait_s:g} s')
+            time.sleep(0.05)
+        self._ending.wait(1.0)
+
+    def _send_all(self) -> None:
+        start_wall = first = None
+        for topic, _, data, stamp_ns in self._reader:
+            if start_wall is None or first is None:
+                start_wall, first = time.monotonic(), stamp_ns
+            due = start_wall + (stamp_ns - first) * 1e-9 / self.p.rate
+            while (ahead := due - time.monotonic()) > 0 and not self._ending.is_set():
+                self._publish_clock(first + (time.monotonic() - start_wall) * self.p.rate * 1e9)
+                self._ending.wait(min(ahead, 0.01))
+            if self._ending.is_set():
+                return
+            self._publish_clock(stamp_ns)
+            publisher = self._publishers_by_topic.get(topic)
+            if publisher is not None:
+                publisher.publish(data)
+                self.sent += 1
+        self.get_logger().info(f'{self.sent} messages published')
+
+    def _publish_clock(self, time_ns: float) -> None:
+        now = time.monotonic()
+        if self._clock_publisher is not None and now - self._clock_sent >= 0.009:
+            self._clock_sent = now
+            self._clock_publisher.publish(ClockMessage(clock=stamp_of(time_ns * 1e-9)))
+
+    def close(self) -> None:
+        """Stop publishing."""
+        self._ending.set()
+        self._thread.join(2.0)
+
+
+def message_class(type_name: str) -> Any:
+    """Return the class of a message type such as ``sensor_msgs/msg/JointState``.
+
+    Raises
+    ------
+    InputError
+        If this machine has no such type.
+    """
+    package, _, name = type_name.partition('/msg/')
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError):
+        raise InputError(f'this machine has no message type {type_name}') from None
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run(Replay, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

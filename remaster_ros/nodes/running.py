@@ -1,0 +1,119 @@
+"""Run a node as a process: signals, one-line errors, exit status."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import rclpy
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.executors import (
+    Executor,
+    ExternalShutdownException,
+    MultiThreadedExecutor,
+    SingleThreadedExecutor,
+)
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+
+from remaster_ros.core.errors import InsufficientDataError, RemasterError
+
+
+class RemasterNode(Node):
+    """A node that `run` can end.
+
+    Attributes
+    ----------
+    failure
+        Set (from any thread) to end the process with this error.
+    finished
+        Set (from any thread) to end the process with status 0.
+    """
+
+    failure: RemasterError | None = None
+    finished = False
+
+    # rclpy gives every endpoint an event handler that only warns of QoS mismatches, and looks at
+    # each of them for every message: half of what a message costs. All endpoints here are
+    # reliable; what does not match shows as "no sign of …" in /remaster/status.
+
+    def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
+        """As in rclpy, without default event handlers."""
+        kwargs.setdefault('event_callbacks', PublisherEventCallbacks(use_default_callbacks=False))
+        return super().create_publisher(*args, **kwargs)
+
+    def create_subscription(self, *args: Any, **kwargs: Any) -> Subscription:
+        """As in rclpy, without default event handlers."""
+        kwargs.setdefault(
+            'event_callbacks', SubscriptionEventCallbacks(use_default_callbacks=False)
+        )
+        return super().create_subscription(*args, **kwargs)
+
+    def now_s(self) -> float:
+        """Time of the node's clock, s; simulated where use_sim_time is set."""
+        return self.get_clock().now().nanoseconds * 1e-9
+
+    def close(self) -> None:
+        """Finish: files closed, threads joined. Called once, before the node is destroyed."""
+
+
+def run(
+    make_node: Callable[[], RemasterNode], args: Sequence[str] | None = None, threads: int = 1
+) -> int:
+    """Spin the node that `make_node` returns until a signal, its failure or its finish.
+
+    Parameters
+    ----------
+    threads
+        More than one lets a callback block (a service that measures) while others run.
+
+    Returns
+    -------
+    int
+        Exit status, see `exit_status`; 0 after SIGINT or SIGTERM. An error is one line on stderr.
+    """
+    stopping: list[int] = []
+
+    def stop(signum: int, frame: Any) -> None:
+        # launch sends SIGINT twice: the second must not interrupt the clean-up.
+        stopping.append(signum)
+
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        node = make_node()
+        executor: Executor = (
+            SingleThreadedExecutor() if threads == 1 else MultiThreadedExecutor(threads)
+        )
+        try:
+            executor.add_node(node)
+            while not (stopping or node.finished or node.failure) and rclpy.ok():
+                executor.spin_once(timeout_sec=0.2)
+        except ExternalShutdownException:
+            pass
+        finally:
+            executor.shutdown(2.0)
+            node.close()
+            node.destroy_node()
+        if node.failure is not None:
+            raise node.failure
+        return 0
+    except RemasterError as error:
+        return report(error)
+    finally:
+        rclpy.try_shutdown()
+
+
+def report(error: RemasterError) -> int:
+    """Print an error as one line on stderr; return the exit status it asks for.
+
+    2 for wrong usage, bad input or a device that does not do its part; 1 where the data do not
+    allow an answer.
+    """
+    print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
+    return 1 if isinstance(error, InsufficientDataError) else 2

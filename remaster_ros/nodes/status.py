@@ -1,0 +1,112 @@
+"""/remaster/status: every node's state, counts and reasons, and the events of a configuration.
+
+A DiagnosticArray carries either a node's *summary* (name = the node; published twice a second and
+at each change; what rqt_robot_monitor shows) or an *event* (name = ``node: event``), by which the
+nodes keep step: the planner announces a pose, the bridge and the recorder say what became of each
+of its joint solutions. Events are identified by the pose's stamp and the solution's number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+TOPIC = '/remaster/status'
+RELIABLE = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(
+    depth=10,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+LEVELS = {
+    'ok': DiagnosticStatus.OK,
+    'warn': DiagnosticStatus.WARN,
+    'error': DiagnosticStatus.ERROR,
+}
+
+
+@dataclass(frozen=True)
+class Event:
+    """One event: which node, what happened, in words, with values."""
+
+    node: str
+    event: str
+    message: str
+    values: dict[str, str]
+
+
+class Status:
+    """Publish a node's summary and events.
+
+    Parameters
+    ----------
+    node
+        The node that reports.
+    summary
+        Returns (level, message, values) now; level is ``ok``, ``warn`` or ``error``.
+    """
+
+    def __init__(self, node: Node, summary: Callable[[], tuple[str, str, dict[str, Any]]]) -> None:
+        self._node = node
+        self._summary = summary
+        self._publisher = node.create_publisher(DiagnosticArray, TOPIC, RELIABLE)
+        # A wall timer: status must go on when the simulated clock stands still.
+        self.steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(0.5, self.publish, clock=self.steady)
+
+    def publish(self) -> None:
+        """Publish the summary now."""
+        level, message, values = self._summary()
+        self._send(self._node.get_name(), level, message, values)
+
+    def event(self, event: str, message: str, level: str = 'ok', **values: Any) -> None:
+        """Publish an event now."""
+        self._send(f'{self._node.get_name()}: {event}', level, message, values)
+
+    def _send(self, name: str, level: str, message: str, values: dict[str, Any]) -> None:
+        status = DiagnosticStatus(
+            name=name,
+            level=LEVELS[level],
+            message=message,
+            hardware_id='remaster_ros',
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+        )
+        message_out = DiagnosticArray(status=[status])
+        message_out.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message_out)
+
+
+def receiver(
+    on_event: Callable[[Event], None],
+    on_summary: Callable[[str, str, dict[str, str]], None] | None = None,
+) -> Callable[[DiagnosticArray], None]:
+    """Return a callback that calls `on_event` for every event in a message.
+
+    `on_summary(node, message, values)` is called for every summary.
+    """
+
+    def receive(array: DiagnosticArray) -> None:
+        for status in array.status:
+            values = {pair.key: pair.value for pair in status.values}
+            name, separator, event = status.name.partition(': ')
+            if separator:
+                on_event(Event(name, event, status.message, values))
+            elif on_summary is not None:
+                on_summary(name, status.message, values)
+
+    return receive
+
+
+def listen(
+    node: Node,
+    on_event: Callable[[Event], None],
+    on_summary: Callable[[str, str, dict[str, str]], None] | None = None,
+) -> None:
+    """Subscribe `node` to /remaster/status with a `receiver` of these callbacks."""
+    node.create_subscription(DiagnosticArray, TOPIC, receiver(on_event, on_summary), RELIABLE)

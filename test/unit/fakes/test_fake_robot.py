@@ -1,0 +1,126 @@
+"""The fake arm takes and drops trajectories as joint_trajectory_controller does."""
+
+import numpy as np
+import pytest
+
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.fakes.robot import FakeArm, TrajectoryPoint
+from remaster_ros.fakes.world import SensorTruth, Truth, World
+from remaster_ros.storage.cell import config_path
+
+
+class SteppedWorld(World):
+    """A World whose time the test sets."""
+
+    time_s = 100.0
+
+    def now(self):
+        return self.time_s
+
+
+@pytest.fixture
+def world(tmp_path):
+    urdf = config_path('robots/lwr4plus.urdf').read_text()
+    chain = SerialChain.from_urdf(urdf)
+    rng = np.random.default_rng(5)
+    T = np.eye(4)
+    T[:3, 3] = [2.0, 0.0, 1.0]
+    truth = Truth(
+        5, rng.normal(0, 0.005, 7), {'mocap': SensorTruth(T, np.array([0.1, 0, 0]), np.pi)}
+    )
+    world = SteppedWorld.create(
+        tmp_path / 'world',
+        truth,
+        urdf=urdf,
+        base_link=chain.base_link,
+        tip_link=chain.tip_link,
+        rate=10.0,
+        start_q=np.array([0, 0.3, 0, -1.2, 0, 1.0, 0]),
+        link_radius_m=0.06,
+    )
+    yield world
+    world.close()
+
+
+@pytest.fixture
+def arm(world):
+    return FakeArm(world, np.random.default_rng(7))
+
+
+def go(arm, target, seconds=2.0, names=None, **kwargs):
+    return arm.command(names or arm.names, [TrajectoryPoint(seconds, target, **kwargs)])
+
+
+def test_it_follows_permuted_names(world, arm):
+    target = np.linspace(-0.3, 0.3, 7)
+    order = [3, 1, 0, 2, 6, 5, 4]
+    assert go(arm, target[order], names=[arm.names[i] for i in order]) is None
+    world.time_s += 10.0
+    stamp, names, q, velocity = arm.joint_state()
+    assert stamp == world.time_s
+    assert names != list(arm.names), 'joint_states must come in an order of their own'
+    np.testing.assert_allclose([dict(zip(names, q))[n] for n in arm.names], target, atol=2e-4)
+    np.testing.assert_allclose(velocity, 0, atol=1e-9)
+
+
+def test_it_does_not_clamp_to_limits(world, arm):
+    assert go(arm, np.full(7, 3.5)) is None
+    world.time_s += 10.0
+    np.testing.assert_allclose(arm.joint_state()[2], 3.5, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ('change', 'reason'),
+    [
+        ({'names': [f'joint_{i}' for i in range(7)]}, 'do not match'),
+        ({'names': [f'joint_{i + 1}' for i in range(6)]}, 'do not match'),
+        ({'velocities': [0.1] * 7}, 'velocity'),
+        ({'target': [np.nan] * 7}, 'finite'),
+        ({'target': [0.0] * 6}, '6 positions'),
+    ],
+)
+def test_what_it_cannot_follow_is_dropped_with_a_reason(world, arm, change, reason):
+    before = world.reported(world.now())[0]
+    change = dict(change)
+    assert reason in go(arm, change.pop('target', [0.0] * 7), **change)
+    world.time_s += 10.0
+    np.testing.assert_array_equal(world.reported(world.now())[0], before)
+
+
+def test_times_must_increase_and_not_end_in_the_past(arm):
+    points = [TrajectoryPoint(1.0, [0.0] * 7), TrajectoryPoint(1.0, [0.1] * 7)]
+    assert 'increase' in arm.command(arm.names, points)
+    assert 'past' in arm.command(arm.names, points[:1], start_s=50.0)
+
+
+def test_an_empty_trajectory_stops_it(world, arm):
+    go(arm, np.zeros(7), seconds=4.0)
+    world.time_s += 2.0
+    moving, velocity = world.reported(world.now())
+    assert np.max(np.abs(velocity)) > 0.1
+    assert arm.command(arm.names, []) is None
+    world.time_s += 2.0
+    stopped, velocity = world.reported(world.now())
+    assert np.max(np.abs(velocity)) < 1e-6
+    assert np.max(np.abs(stopped - moving)) < 0.1
+
+
+def test_another_process_sees_the_same_arm(world, arm):
+    """A second World on the same folder computes the same marker at the same time."""
+    go(arm, np.linspace(-0.4, 0.4, 7))
+    other = World.open(world.folder)
+    go(arm, np.linspace(0.2, -0.2, 7))
+    for t in (100.5, 101.0, 103.0):
+        np.testing.assert_array_equal(
+            other.marker_in_sensor('mocap', t), world.marker_in_sensor('mocap', t)
+        )
+    other.close()
+
+
+def test_the_marker_is_where_offsets_put_it(world):
+    """True angle = reported one + zero-offset."""
+    truth = world.truth
+    T = world.chain.forward(world.start_q + truth.joint_offsets)
+    expected = T @ [*truth.sensors['mocap'].marker, 1.0]
+    seen = truth.sensors['mocap'].T_R_N @ [*world.marker_in_sensor('mocap', 100.0), 1.0]
+    np.testing.assert_allclose(seen, expected, atol=1e-12)

@@ -1,0 +1,74 @@
+"""Node parameters: every config file fits; wrong values are refused with one line."""
+
+import dataclasses
+import importlib
+from pathlib import Path
+
+import pytest
+import yaml
+
+pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+
+from remaster_ros.core.errors import InputError
+from remaster_ros.nodes.parameters import check
+
+pytestmark = pytest.mark.ros
+
+CONFIG = Path(__file__).parents[3] / 'config'
+NODES = sorted(
+    path.stem
+    for path in (Path(__file__).parents[3] / 'remaster_ros' / 'nodes').glob('*.py')
+    if 'class Parameters' in path.read_text()
+)
+
+
+def fields_of(node):
+    kind = importlib.import_module(f'remaster_ros.nodes.{node}').Parameters
+    return {field.name: field for field in dataclasses.fields(kind)}
+
+
+def test_every_executable_has_parameters():
+    scripts = {path.name for path in (Path(__file__).parents[3] / 'scripts').iterdir()}
+    assert scripts == set(NODES)
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_defaults_are_within_their_own_ranges_and_described(node):
+    for field in fields_of(node).values():
+        assert check(node, field, field.default) == field.default
+        assert field.metadata['description']
+        if isinstance(field.default, float) and field.name.endswith(('_s', '_m')):
+            assert field.metadata['unit']
+
+
+@pytest.mark.parametrize('name', ['fake.yaml', 'real.yaml'])
+def test_config_files_fit_the_dataclasses(name):
+    """Every value in config/*.yaml names a parameter of its node and lies in its range."""
+    data = yaml.safe_load((CONFIG / name).read_text())
+    for node, section in data.items():
+        parameters = dict(section['ros__parameters'])
+        parameters.pop('use_sim_time', None)
+        if node == '/**':
+            assert not parameters
+            continue
+        fields = fields_of(node)
+        for key, value in parameters.items():
+            assert key in fields, f'{name}: {node} has no parameter {key}'
+            check(node, fields[key], value)
+
+
+def test_a_wrong_type_a_wrong_range_and_a_wrong_word_are_one_line_each():
+    fields = fields_of('robot_bridge')
+    for value in ('fast', True, [0.3]):
+        with pytest.raises(InputError, match=r'robot_bridge: parameter speed_share .*float'):
+            check('robot_bridge', fields['speed_share'], value)
+    for value in (1.5, float('nan'), -1):
+        with pytest.raises(InputError, match=r'must lie in 0.01 to 1.0'):
+            check('robot_bridge', fields['speed_share'], value)
+    field = fields_of('optitrack_markers')['transport']
+    with pytest.raises(InputError, match='one of multicast, unicast'):
+        check('optitrack_markers', field, 'broadcast')
+
+
+def test_whole_numbers_are_welcome_where_a_real_one_is_wanted():
+    assert check('robot_bridge', fields_of('robot_bridge')['settle_s'], 3) == 3.0
