@@ -111,7 +111,13 @@ def verdict(result: FitResult) -> Verdict:
     gain = before / max(after, 1e-9)
     where = 'on poses it never fitted' if validated else 'on the fitted poses'
     change = f'{before:.3f} mm to {after:.3f} mm {where}'
-    if gain >= NOTICEABLE_GAIN:
+    if not result.sampler.converged:
+        mood = 'bad'
+        headline = (
+            'The chains have not converged, so nothing is decided yet: '
+            f'for now the mean position error goes from {change}.'
+        )
+    elif gain >= NOTICEABLE_GAIN:
         mood = 'good'
         times = f'{gain:.1f} times' if gain < 10 else f'{gain:.0f} times'
         headline = f'The mean position error falls from {change}: {times} smaller.'
@@ -135,9 +141,8 @@ def verdict(result: FitResult) -> Verdict:
     if sampler.converged:
         points.append(f'The chains agree with each other ({sampler.message}).')
     else:
-        mood = 'bad'
         points.append(
-            f'The chains have not converged ({sampler.message}): do not trust the uncertainties; '
+            f'Do not trust offsets or uncertainties ({sampler.message}); '
             'fit again with more draws.'
         )
     unknown = [

@@ -196,7 +196,7 @@ def with_accuracy(result, split, before, after):
         ('validation', 1.0, 0.97, True, 'caution', 'hardly matter'),
         ('validation', 1.0, 1.5, True, 'bad', 'make it worse'),
         ('optimization', 4.0, 0.5, True, 'caution', 'on the fitted poses'),
-        ('validation', 4.0, 0.5, False, 'bad', '8.0 times smaller'),
+        ('validation', 4.0, 0.5, False, 'bad', 'have not converged'),
     ],
 )
 def test_the_verdict_is_honest(fit_result, split, before, after, converged, mood, words):
@@ -206,7 +206,7 @@ def test_the_verdict_is_honest(fit_result, split, before, after, converged, mood
     assert judged.mood == mood
     assert words in judged.headline
     told = ' '.join(judged.points)
-    assert ('have not converged' in told) != converged
+    assert ('fit again with more draws' in told) != converged
     assert ('no validation poses' in told) == (split == 'optimization')
 
 
