@@ -10,31 +10,30 @@ from __future__ import annotations
 
 import logging
 import os
-import struct
 import zlib
 from collections.abc import Collection, Iterator
 from io import BytesIO
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, NamedTuple
+from typing import IO, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Message, Schema
-from mcap.stream_reader import get_chunk_data_stream
+from mcap.records import Channel, Message, Schema
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from .. import __version__
 from ..core.errors import InputError
 from .bag_metadata import METADATA_FILE, TopicMetadata, metadata_text, qos_text
 from .files import cannot_write, make_new_folder, reason, sync_folder, write_atomically
+from .mcap_frames import CutOffError, frames, unchunked, without_zeros
+from .message_definitions import definition_of
 
 log = logging.getLogger('remaster_ros')
 
 LATCHED_TOPICS = frozenset(
     {'/remaster/joint_offsets', '/remaster/joint_offsets_std', '/remaster/registration'}
 )
-CHUNK_LIMIT = 1024**3
 
 
 class BagMessage(NamedTuple):
@@ -180,7 +179,7 @@ class BagWriter:
         self.close()
 
     def _add_topic(self, topic: str, msgtype: str) -> None:
-        definition, type_hash = _definition(msgtype)
+        definition, type_hash = definition_of(msgtype)
         if msgtype not in self._schemas:
             self._schemas[msgtype] = self._writer.register_schema(
                 msgtype, 'ros2msg', definition.encode()
@@ -276,16 +275,16 @@ class BagReader:
                 return
             file.seek(max(0, size - len(MCAP0_MAGIC)))
             closed = size > len(MCAP0_MAGIC) and file.read() == MCAP0_MAGIC
-            solid = size if closed else _without_zeros(file, size)
+            solid = size if closed else without_zeros(file, size)
             file.seek(len(MCAP0_MAGIC))
-            frames = _unchunked(_frames(file, size, zlib.crc32(MCAP0_MAGIC), solid))
+            records = unchunked(frames(file, size, zlib.crc32(MCAP0_MAGIC), solid))
             while True:
                 good = file.tell()
                 try:
-                    opcode, body = next(frames)
+                    opcode, body = next(records)
                 except StopIteration:
                     return
-                except _CutOffError:
+                except CutOffError:
                     if closed:
                         raise _damaged(path, f'a record at byte {good} does not fit') from None
                     self.complete = False
@@ -355,75 +354,6 @@ def recover_bag(folder: str | os.PathLike[str]) -> int:
     return reader.message_count
 
 
-class _CutOffError(Exception):
-    """A record reaches past the end of the file."""
-
-
-def _without_zeros(file: IO[bytes], size: int) -> int:
-    """Return the size of a file without the zeros at its end, which a power cut may leave."""
-    block = 1024 * 1024
-    for start in range((size - 1) // block * block, -1, -block):
-        file.seek(start)
-        if kept := len(file.read(block if start + block < size else size - start).rstrip(b'\0')):
-            return start + kept
-    return 0
-
-
-def _frames(
-    file: IO[bytes], size: int, crc: int | None, solid: int
-) -> Iterator[tuple[int, bytes]]:
-    """Yield opcode and content of every record up to the end of the data section.
-
-    A record that ends among zeros, with more zeros behind it, was not all written.
-    """
-    while True:
-        head = file.read(9)
-        if not head and crc is None:
-            return
-        if len(head) < 9:
-            raise _CutOffError
-        opcode, length = struct.unpack('<BQ', head)
-        end = file.tell() + length
-        # MCAP knows no opcodes 0 and 0x10 to 0x7f.
-        known = 0x01 <= opcode <= 0x0F or opcode >= 0x80
-        if not known or end > size or solid < end < size:
-            raise _CutOffError
-        body = file.read(length)
-        if opcode == Opcode.DATA_END:
-            (stated,) = struct.unpack('<I', body)
-            if stated and stated != crc:
-                raise ValueError('its checksum does not match')
-            return
-        if crc is not None:
-            crc = zlib.crc32(body, zlib.crc32(head, crc))
-        yield opcode, body
-
-
-def _unchunked(frames: Iterator[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
-    """Unpack the chunks that other recorders write."""
-    for opcode, body in frames:
-        if opcode != Opcode.CHUNK:
-            yield opcode, body
-            continue
-        chunk = Chunk.read(ReadDataStream(BytesIO(body)))
-        if max(chunk.uncompressed_size, _zstd_size(chunk)) > CHUNK_LIMIT:
-            raise ValueError(f'a chunk says it holds more than {CHUNK_LIMIT} bytes')
-        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-        try:
-            yield from _frames(BytesIO(stream.read(length)), length, crc=None, solid=length)
-        except _CutOffError:
-            raise ValueError('a record does not fit its chunk') from None
-
-
-def _zstd_size(chunk: Chunk) -> int:
-    """Return the size that a zstd frame announces, which may differ from what the chunk says."""
-    if chunk.compression != 'zstd':
-        return 0
-    import zstandard
-
-    return zstandard.frame_content_size(chunk.data)
-
-
 def _mcap_files(path: Path) -> list[Path]:
     if path.is_file() and path.suffix == '.mcap':
         return [path]
@@ -443,24 +373,3 @@ def _mcap_files(path: Path) -> list[Path]:
 def _damaged(path: Path, what: str) -> InputError:
     what = ' '.join(what.split())[:120]
     return InputError(f'{path}: damaged ({what}); take another copy of the bag')
-
-
-_typestore: Any = None
-
-
-def _definition(msgtype: str) -> tuple[str, str]:
-    """Return the message definition of one of Jazzy's types and its RIHS01 hash."""
-    global _typestore
-    from rosbags.typesys import Stores, get_typestore
-    from rosbags.typesys.store import TypesysError
-
-    if _typestore is None:
-        _typestore = get_typestore(Stores.ROS2_JAZZY)
-    try:
-        definition, _ = _typestore.generate_msgdef(msgtype, ros_version=2)
-        return definition, _typestore.hash_rihs01(msgtype)
-    except (KeyError, TypesysError):
-        raise InputError(
-            f'{msgtype!r}: not a message type of ROS 2 Jazzy; '
-            'write it as in sensor_msgs/msg/JointState'
-        ) from None

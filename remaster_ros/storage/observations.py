@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from ..core.chain import SerialChain
 from ..core.errors import InputError
-from ..core.types import BoolArray, FloatArray, IntArray, Measurements, Observation
+from ..core.types import FloatArray, Measurements, Observation
+from .csv_table import Table, split_line
 from .files import decode_text
+from .sequence_rules import SPLITS, RowKeys, SequenceRules, keeps_the_rules, row_keys
 
 log = logging.getLogger('remaster_ros')
 
 LIMIT_TOLERANCE_RAD = math.radians(1.0)
-SPLITS = ('optimization', 'validation')
-
-_NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
-_NUMBER_CHARACTERS = re.compile(r'[0-9+\-.eE,]*')
-_INTEGER_CHARACTERS = re.compile(r'[0-9+\-,]*')
-_INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
 
 
 @dataclass(frozen=True)
@@ -60,168 +54,6 @@ class Columns:
             *(*self.q, *self.from_q, *self.position, *self.std, 'samples', 'temperature_c'),
             *(self.effort if with_effort else ()),
         ]
-
-
-class _Table:
-    """Cells as text by column name, with what an error message needs to name a place."""
-
-    def __init__(self, path: Path, names: list[str], lines: list[str], first_line: int) -> None:
-        self.path = path
-        self.first_line = first_line
-        self.rows = len(lines)
-        width = len(names)
-        for number, line in enumerate(lines, start=first_line):
-            # Without quotes, counting commas is counting columns.
-            found = len(_fields(line, path, number)) if '"' in line else line.count(',') + 1
-            if found != width:
-                raise InputError(
-                    f'{path}, line {number}: {found} columns instead of the {width} of the '
-                    'header; give every column, empty where unknown'
-                )
-        text = ','.join(lines)
-        # One flat list: millions of cells in a list per row would keep the garbage collector busy.
-        cells = _fields(text, path, first_line) if '"' in text else text.split(',')
-        self.cells = {name: cells[i::width] for i, name in enumerate(names)}
-
-    def fault(self, row: int, column: str, problem: str) -> InputError:
-        """Return the error for one cell."""
-        cell = self.cells[column][row]
-        shown = repr(cell if len(cell) <= 40 else cell[:40] + '…')
-        line = self.first_line + row
-        return InputError(f'{self.path}, line {line}, column {column}: {shown} {problem}')
-
-    def integers(self, column: str, optional: bool = False) -> IntArray:
-        """Return a column of integers; -1 stands for an empty cell of an optional column."""
-        cells = self.cells[column]
-        if optional:
-            cells = [cell or '-1' for cell in cells]
-        try:
-            values = np.array(list(map(int, cells)), dtype=np.int64)
-        except (ValueError, OverflowError):
-            values = None
-        # int() also reads 1_000, blanks and other scripts' digits.
-        if values is None or not _INTEGER_CHARACTERS.fullmatch(','.join(cells)):
-            row = next(i for i, cell in enumerate(cells) if not _INTEGER.fullmatch(cell))
-            raise self.fault(row, column, 'is not an integer; correct it')
-        return values
-
-    def numbers(self, columns: Sequence[str], optional: bool = False) -> FloatArray:
-        """Return columns of finite numbers, (n, len(columns)); NaN where optional and empty."""
-        result = np.empty((self.rows, len(columns)))
-        for i, column in enumerate(columns):
-            cells = self.cells[column]
-            empty = 0
-            try:
-                if optional:
-                    values = [float(cell) if cell else math.nan for cell in cells]
-                    empty = cells.count('')
-                else:
-                    values = list(map(float, cells))
-                result[:, i] = values
-            except ValueError:
-                raise self._not_a_number(column, optional) from None
-            # float() also reads nan, inf, 1_000, blanks and other scripts' digits.
-            plain = _NUMBER_CHARACTERS.fullmatch(','.join(cells))
-            if not plain or np.count_nonzero(np.isfinite(result[:, i])) + empty < self.rows:
-                raise self._not_a_number(column, optional)
-        return result
-
-    def whole_or_empty(self, columns: Sequence[str]) -> FloatArray:
-        """Return optional columns of which a row fills all or none."""
-        values = self.numbers(columns, optional=True)
-        unknown = np.isnan(values)
-        partial = np.flatnonzero(unknown.any(axis=1) & ~unknown.all(axis=1))
-        if len(partial):
-            row = int(partial[0])
-            column = columns[int(np.argmax(unknown[row]))]
-            raise self.fault(
-                row, column, f'is empty though others of {columns[0]} … {columns[-1]} are not; '
-                'fill all of them or none'
-            )  # fmt: skip
-        return values
-
-    def choices(self, column: str, names: Sequence[str], remedy: str) -> IntArray:
-        """Return the index of every cell among `names`."""
-        index = {name: i for i, name in enumerate(names)}
-        values = np.array([index.get(cell, -1) for cell in self.cells[column]], dtype=np.int64)
-        if (values < 0).any():
-            raise self.fault(int(np.argmin(values)), column, remedy)
-        return values
-
-    def _not_a_number(self, column: str, optional: bool) -> InputError:
-        row = next(
-            row
-            for row, cell in enumerate(self.cells[column])
-            if not (optional and not cell)
-            and not (_NUMBER.fullmatch(cell) and math.isfinite(float(cell)))
-        )
-        remedy = 'leave the field empty where unknown' if optional else 'leave the row out'
-        return self.fault(row, column, f'is not a finite number; correct it or {remedy}')
-
-
-class RowKeys(NamedTuple):
-    """What the rules between rows are about, of one row."""
-
-    line: int
-    observation: int
-    pose: int
-    configuration: int
-    is_validation: bool
-    stamp_s: float
-
-
-class SequenceRules:
-    """What must hold between rows, given in their order.
-
-    Observation numbers are unique and grow with time, time never runs backwards, a pose belongs
-    to one split and a configuration to one pose.
-    """
-
-    def __init__(self) -> None:
-        self._last: RowKeys | None = None
-        self._of_observation: dict[int, RowKeys] = {}
-        self._of_pose: dict[int, RowKeys] = {}
-        self._of_configuration: dict[int, RowKeys] = {}
-
-    def problem(self, row: RowKeys) -> str:
-        """Return '' or what is wrong with the next row: "column …: …; remedy"."""
-        same = self._of_observation.get(row.observation)
-        if same is not None:
-            return (
-                f'column observation: {row.observation} is already on line {same.line}; '
-                'number every row once'
-            )
-        last = self._last
-        if last is not None and row.observation < last.observation:
-            return (
-                f'column observation: {row.observation} comes after {last.observation}; '
-                'number the rows in the order measured'
-            )
-        if last is not None and row.stamp_s < last.stamp_s:
-            return (
-                f'column stamp_s: {row.stamp_s} is before the row above it ({last.stamp_s}): '
-                'time runs backwards; give the rows in the order measured'
-            )
-        same = self._of_pose.get(row.pose)
-        if same is not None and same.is_validation != row.is_validation:
-            return (
-                f'column split: pose {row.pose} is {SPLITS[same.is_validation]} on line '
-                f'{same.line} and {SPLITS[row.is_validation]} here; give a pose one split'
-            )
-        same = self._of_configuration.get(row.configuration)
-        if same is not None and same.pose != row.pose:
-            return (
-                f'column configuration: {row.configuration} belongs to pose {same.pose} on line '
-                f'{same.line} and to pose {row.pose} here; give a configuration one pose'
-            )
-        return ''
-
-    def accept(self, row: RowKeys) -> None:
-        """Take a row without a problem as the last one."""
-        self._last = row
-        self._of_observation[row.observation] = row
-        self._of_pose.setdefault(row.pose, row)
-        self._of_configuration.setdefault(row.configuration, row)
 
 
 def parse_observations(
@@ -260,16 +92,16 @@ def parse_observations(
         lines.pop()
     if not lines:
         raise InputError(f'{path}: no header line; the first line names the columns')
-    names = _fields(lines[0], path, 1)
+    names = split_line(lines[0], path, 1)
     columns = Columns(len(chain))
     with_effort = _check_names(names, columns, path)
     if len(lines) < 2:
         raise InputError(f'{path}: no observations below the header; measure before fitting')
-    table = _Table(path, names, lines[1:], first_line=2)
+    table = Table(path, names, lines[1:], first_line=2)
     measurements = _columns(table, columns, chain, sensors, markers, with_effort)
-    if not _keeps_the_rules(measurements):
+    if not keeps_the_rules(measurements):
         rules = SequenceRules()
-        for row in _row_keys(measurements, first_line=2):
+        for row in row_keys(measurements, first_line=2):
             if problem := rules.problem(row):
                 raise InputError(f'{path}, line {row.line}, {problem}')
             rules.accept(row)
@@ -293,9 +125,9 @@ def check_row(
         As `parse_observations`.
     """
     columns = Columns(len(chain))
-    table = _Table(path, columns.names(), [text.rstrip('\n')], first_line=line)
+    table = Table(path, columns.names(), [text.rstrip('\n')], first_line=line)
     measurements = _columns(table, columns, chain, sensors, markers, with_effort=False)
-    row = next(_row_keys(measurements, first_line=line))
+    row = next(row_keys(measurements, first_line=line))
     if problem := rules.problem(row):
         raise InputError(f'{path}, line {line}, {problem}')
     return row
@@ -347,15 +179,6 @@ def format_measurements(m: Measurements, sensors: Sequence[str], markers: Sequen
     return format_header(m.q.shape[1], m.effort is not None) + ''.join(f'{row}\n' for row in lines)
 
 
-def _fields(line: str, path: Path, number: int) -> list[str]:
-    if '"' not in line:
-        return line.split(',')
-    try:
-        return next(csv.reader([line], strict=True))
-    except csv.Error as error:
-        raise InputError(f'{path}, line {number}: {error}; correct the quotes') from None
-
-
 def _check_names(names: list[str], columns: Columns, path: Path) -> bool:
     """Hold the header against the format; return whether the file has effort columns."""
     where = f'{path}, line 1'
@@ -389,7 +212,7 @@ def _check_names(names: list[str], columns: Columns, path: Path) -> bool:
 
 
 def _columns(
-    table: _Table,
+    table: Table,
     columns: Columns,
     chain: SerialChain,
     sensors: Sequence[str],
@@ -444,28 +267,6 @@ def _columns(
 
 def _not_among(key: str, names: Sequence[str]) -> str:
     return f'is not among the {key} of session.yaml ({", ".join(names)}); correct either'
-
-
-def _keeps_the_rules(m: Measurements) -> bool:
-    """Return whether `SequenceRules` would find no problem, in one look at all rows."""
-
-    def belongs(part: IntArray, whole: IntArray | BoolArray) -> bool:
-        _, first, group = np.unique(part, return_index=True, return_inverse=True)
-        return bool((whole[first][group] == whole).all())
-
-    return bool(
-        (np.diff(m.observation) > 0).all()
-        and (np.diff(m.stamp_s) >= 0).all()
-        and belongs(m.pose, m.is_validation)
-        and belongs(m.configuration, m.pose)
-    )
-
-
-def _row_keys(m: Measurements, first_line: int) -> Iterator[RowKeys]:
-    lines = range(first_line, first_line + len(m))
-    columns = (m.observation, m.pose, m.configuration, m.is_validation, m.stamp_s)
-    # Plain Python numbers: dictionaries of NumPy scalars are slow.
-    return map(RowKeys, lines, *(column.tolist() for column in columns))
 
 
 def _text(number: float) -> str:

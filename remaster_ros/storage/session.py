@@ -21,13 +21,13 @@ from .files import (
     write_atomically,
 )
 from .observations import (
-    SequenceRules,
     check_row,
     format_header,
     format_measurements,
     format_observation,
     parse_observations,
 )
+from .sequence_rules import SequenceRules
 from .session_yaml import read_header, write_header
 
 URDF_LIMIT = 16 * 1024**2

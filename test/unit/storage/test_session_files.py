@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from remaster_ros.core.errors import InputError
-from remaster_ros.storage.observations import SequenceRules, _keeps_the_rules, _row_keys
+from remaster_ros.storage.sequence_rules import SequenceRules, keeps_the_rules, row_keys
 from remaster_ros.storage.session import read_session, write_session
 
 DATA = Path(__file__).parents[4] / 'shared' / 'data'
@@ -312,10 +312,10 @@ def test_the_quick_look_at_all_rows_agrees_with_the_rules(session):
             columns[name][i] = columns[name][j]
         m = replace(session.measurements, **columns)
         rules, fine = SequenceRules(), True
-        for row in _row_keys(m, first_line=2):
+        for row in row_keys(m, first_line=2):
             fine = fine and not rules.problem(row)
             rules.accept(row)
-        assert _keeps_the_rules(m) == fine
+        assert keeps_the_rules(m) == fine
         broken += not fine
     assert 50 < broken < 250
 
