@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from .errors import InputError
 from .types import FloatArray
 
 
@@ -86,6 +87,38 @@ def matrix_from_rpy(rpy: ArrayLike) -> FloatArray:
     angles = np.asarray(rpy, dtype=float)
     matrices = Rotation.from_euler('xyz', angles.reshape(-1, 3)).as_matrix()
     return matrices.reshape(*angles.shape[:-1], 3, 3)
+
+
+def looking_at(position: ArrayLike, target: ArrayLike, roll_rad: float = 0.0) -> FloatArray:
+    """Return the rotation of a sensor at one point that looks at another along its z axis.
+
+    Parameters
+    ----------
+    position, target
+        Where it stands and what it looks at, m, (3,).
+    roll_rad
+        Turn about its z axis; without one its x axis is level.
+
+    Returns
+    -------
+    ndarray
+        (3, 3).
+
+    Raises
+    ------
+    InputError
+        The two are one point.
+    """
+    line = np.asarray(target, dtype=float) - np.asarray(position, dtype=float)
+    distance = np.linalg.norm(line)
+    if not distance > 0.0:
+        raise InputError(f'a sensor at {position} m cannot look at {target} m: give another place')
+    z = line / distance
+    x = np.cross((0.0, 0.0, 1.0), z)
+    # Straight up or down every x axis is level.
+    x = x / np.linalg.norm(x) if np.linalg.norm(x) > 1e-9 else np.array((1.0, 0.0, 0.0))
+    aimed = np.column_stack((x, np.cross(z, x), z))
+    return aimed @ rotation_vector_to_matrix((0.0, 0.0, roll_rad))
 
 
 def rotation_angle(rotation: ArrayLike) -> FloatArray:

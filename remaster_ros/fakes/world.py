@@ -129,9 +129,8 @@ class Truth:
         sensors = {}
         for name, place in placements.items():
             position = np.asarray(place['position_m'], float) + rng.normal(0, 0.03, 3)
-            T_R_N = transforms.transform(
-                _looking(position, np.asarray(place['look_at_m'], float), rng), position
-            )
+            turn = transforms.looking_at(position, place['look_at_m'], rng.uniform(-0.2, 0.2))
+            T_R_N = transforms.transform(turn, position)
             marker = np.asarray(markers[name], float) + rng.normal(0, marker_std_m, 3)
             sensors[name] = SensorTruth(T_R_N, marker, np.deg2rad(place['acceptance_deg']))
         return cls(seed, rng.normal(0, offset_std_rad, joints), sensors)
@@ -167,16 +166,6 @@ class Truth:
             data['repeatability_rad'],
             data['encoder_rad'],
         )
-
-
-def _looking(position: FloatArray, target: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Rotation whose z axis points from `position` to `target`, rolled at random."""
-    z = (target - position) / np.linalg.norm(target - position)
-    x = np.cross([0.0, 0.0, 1.0], z)
-    x /= np.linalg.norm(x)
-    aimed = np.column_stack([x, np.cross(z, x), z])
-    roll = transforms.rotation_vector_to_matrix(np.array([0.0, 0.0, rng.uniform(-0.2, 0.2)]))
-    return aimed @ roll
 
 
 class World:

@@ -5,6 +5,7 @@ import pytest
 from scipy.linalg import expm
 
 from remaster_ros.core import transforms
+from remaster_ros.core.errors import InputError
 
 RNG_SEED = 7
 
@@ -86,3 +87,22 @@ def test_twist_logarithm_is_the_inverse_of_the_matrix_exponential(rng, angle):
     generators[:, :3, :3] = np.swapaxes(np.cross(twists[:, None, 3:], np.eye(3)), -1, -2)
     T = np.array([expm(generator) for generator in generators])
     np.testing.assert_allclose(transforms.twist_logarithm(T), twists, atol=1e-9)
+
+
+@pytest.mark.parametrize('target', [[0.0, 0.1, 0.6], [1.9, 0.2, 5.0], [1.9, 0.2, -5.0]])
+def test_looking_at_points_z_at_the_target_with_x_level(target):
+    position = [1.9, 0.2, 1.3]
+    R = transforms.looking_at(position, target)
+    np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-14)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    line = np.subtract(target, position)
+    np.testing.assert_allclose(R[:, 2], line / np.linalg.norm(line), atol=1e-14)
+    assert R[2, 0] == pytest.approx(0.0, abs=1e-14)
+    rolled = transforms.looking_at(position, target, 0.3)
+    np.testing.assert_allclose(rolled[:, 2], R[:, 2], atol=1e-14)
+    assert R[:, 0] @ rolled[:, 0] == pytest.approx(np.cos(0.3))
+
+
+def test_looking_at_itself_is_refused():
+    with pytest.raises(InputError, match='another place'):
+        transforms.looking_at([1.0, 2.0, 3.0], [1.0, 2.0, 3.0])
