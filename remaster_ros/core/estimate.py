@@ -18,6 +18,7 @@ from .types import BoolArray, FloatArray, IntArray, Measurements, Session
 
 # Fewer rows of a sensor leave nothing to estimate its noise from.
 FEWEST_ROWS = 4
+FEWEST_POSES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +82,12 @@ class Problem:
         marker_names = tuple(session.marker_names[index] for index in markers)
         for index, name in enumerate(sensor_names):
             count = int(np.sum(sensor[fitted] == index))
+            poses = len(np.unique(given.pose[fitted][sensor[fitted] == index]))
+            if poses < FEWEST_POSES:
+                raise InsufficientDataError(
+                    f"sensor '{name}' saw {poses} poses to fit; at least {FEWEST_POSES} are needed "
+                    'to register it, and some thirty for good zero-offsets'
+                )
             if count < FEWEST_ROWS:
                 raise InsufficientDataError(
                     f"sensor '{name}' has {count} optimization rows; at least {FEWEST_ROWS} are "
@@ -186,7 +193,8 @@ def estimate(problem: Problem) -> Estimate:
         mode = find_mode(Posterior.of(model, kept_rows(keep), priors, free, z))
         return rows.target - model.predict(mode.z, rows)
 
-    judgement = find_outliers(rows, refit, rows.target - model.predict(z, rows))
+    errors = rows.target - model.predict(z, rows)
+    judgement = find_outliers(rows, refit, errors, model.sensor_names)
     kept = kept_rows(~judgement.gross)
     _require_information(kept, free, model)
     mode = find_mode(Posterior.of(model, kept, priors, free, z))

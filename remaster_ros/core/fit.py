@@ -107,6 +107,7 @@ def _fast(
     return Sampled(
         model=model,
         z=posterior.parameters(run.draws),
+        z_mean=posterior.parameters(run.draws.reshape(-1, posterior.size).mean(axis=0)),
         sigma=sigma,
         pose_sigma=pose_sigma,
         trace=readable(run.trace),

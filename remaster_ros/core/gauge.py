@@ -14,7 +14,8 @@ import numpy as np
 
 from .errors import InsufficientDataError
 from .model import Model, Rows
-from .posterior import RESOLUTION_M, Prior, prior_rows
+from .posterior import Prior, prior_rows
+from .start import robust_spread
 from .types import FloatArray, IntArray
 
 # Singular values (of unit columns, relative to the largest) that are rounding errors.
@@ -121,8 +122,7 @@ def _null_space(
     """Return the scale of each parameter, a basis of the null space, (size, d), and its pivots."""
     derivative = model.natural_jacobian(x, rows)
     errors = rows.target - model.predict(model.pinned(x), rows)
-    for _, span in rows.spans:
-        spread = np.sqrt(np.mean(errors[span] ** 2)) + RESOLUTION_M
+    for spread, (_, span) in zip(robust_spread(errors, rows), rows.spans, strict=True):
         derivative[span] /= spread
     flat = derivative.reshape(-1, model.size)[:, fitted]
     norm = np.linalg.norm(flat, axis=0)
@@ -219,10 +219,7 @@ def _unresolved(by_direction: FloatArray, pivots: list[int], model: Model) -> se
         active = [column for column, pivot in enumerate(pivots) if pivot not in held]
         if not active:
             return held
-        W = by_direction[:, active]
-        # A trace of information keeps the inverse finite where there is none.
-        covariance = np.linalg.inv(W.T @ W + 1e-12 * np.eye(len(active)))
-        std = np.sqrt(np.diag(covariance))
+        std = _standard_deviations(by_direction[:, active])
         limit = [UNKNOWN_ANGLE if _is_angle(model, pivots[c]) else 1e3 for c in active]
         joints = [i for i, c in enumerate(active) if pivots[c] < model.joints]
         loose = [i for i in range(len(active)) if std[i] > limit[i]]
@@ -236,6 +233,19 @@ def _unresolved(by_direction: FloatArray, pivots: list[int], model: Model) -> se
                 'measure poses that are spread further and turn the tool'
             )
         held.add(pivots[active[max(joints, key=lambda i: std[i])]])
+
+
+def _standard_deviations(by_direction: FloatArray) -> FloatArray:
+    """Return how far priors (m rows) let each direction (d columns) go, (d,); inf without any."""
+    norm = np.linalg.norm(by_direction, axis=0)
+    held = norm > 0.0
+    unit = by_direction[:, held] / norm[held]
+    values, vectors = np.linalg.eigh(unit.T @ unit)
+    # Directions that only one and the same prior holds: apart they are as good as free.
+    variance = (vectors**2) @ (1.0 / np.maximum(values, 1e-14))
+    std = np.full(len(norm), np.inf)
+    std[held] = np.sqrt(variance) / norm[held]
+    return std
 
 
 def _about_origin(model: Model, direction: FloatArray, scale: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ more than Gaussian tails, which real robots have, are not eaten.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +24,11 @@ LIMIT = 6.0
 # More than this share is no accident: the model or the session is wrong.
 LARGEST_SHARE = 0.1
 _QUANTILES = (0.5, 0.8)
+# The 80 % quantile may say this many times the median's standard deviation; more than a fifth of
+# gross errors shows in it.
+TAIL_LIMIT = 4.0
+# With fewer rows the robust fit follows half of them exactly, whatever they are.
+FEWEST_TO_JUDGE = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +48,10 @@ class Judgement:
 
 
 def find_outliers(
-    rows: Rows, refit: Callable[[BoolArray], FloatArray], errors: FloatArray
+    rows: Rows,
+    refit: Callable[[BoolArray], FloatArray],
+    errors: FloatArray,
+    sensor_names: Sequence[str],
 ) -> Judgement:
     """Leave gross rows out and fit again until the same rows stay out.
 
@@ -55,20 +63,23 @@ def find_outliers(
         Fits the rows that are True, (n,), and returns the errors of all, m, (n, 3).
     errors
         Errors of a first, robust fit, m, (n, 3).
+    sensor_names
+        For the messages.
 
     Raises
     ------
     InsufficientDataError
-        When more than a tenth of a sensor's rows would have to go.
+        When more than a tenth of a sensor's rows would have to go, or cannot even be told.
     """
+    _require_majority(rows, errors, sensor_names)
     gross = np.zeros(len(rows), dtype=bool)
     judgement = judge(rows, errors, gross)
     for _ in range(20):
-        _guard(rows, judgement.gross)
         if np.array_equal(judgement.gross, gross):
             break
         gross = judgement.gross
         judgement = judge(rows, refit(~gross), gross)
+    _guard(rows, judgement.gross, sensor_names)
     return judgement
 
 
@@ -152,13 +163,29 @@ def _robust_scale(lengths: FloatArray) -> float:
     return float(np.max(np.quantile(lengths, _QUANTILES) / expected)) + RESOLUTION_M
 
 
-def _guard(rows: Rows, gross: BoolArray) -> None:
-    for _, span in rows.spans:
+def _require_majority(rows: Rows, errors: FloatArray, sensor_names: Sequence[str]) -> None:
+    """Refuse data in which gross errors are so many that the others cannot be told."""
+    expected = chi.ppf(_QUANTILES, 3)
+    for sensor, span in rows.spans:
+        if span.stop - span.start < FEWEST_TO_JUDGE:
+            continue
+        half, most = np.quantile(np.linalg.norm(errors[span], axis=1), _QUANTILES)
+        if most / expected[1] > TAIL_LIMIT * (half / expected[0] + RESOLUTION_M):
+            raise InsufficientDataError(
+                f"sensor '{sensor_names[sensor]}': half of the observations agree within "
+                f'{_mm(half)} mm, but a fifth is off by more than {_mm(most)} mm: too many gross '
+                'errors to name them; look for mixed-up markers or a sensor that was moved'
+            )
+
+
+def _guard(rows: Rows, gross: BoolArray, sensor_names: Sequence[str]) -> None:
+    for sensor, span in rows.spans:
         out, of = int(gross[span].sum()), span.stop - span.start
         if out > max(1.0, LARGEST_SHARE * of):
             raise InsufficientDataError(
-                f'{out} of {of} observations of a sensor are beyond {LIMIT:g} sigma: the model '
-                'does not describe them; check units, joint order, markers and the URDF'
+                f"sensor '{sensor_names[sensor]}': {out} of {of} observations are beyond "
+                f'{LIMIT:g} sigma, too many to leave out; look for mixed-up markers or a sensor '
+                'that was moved'
             )
 
 

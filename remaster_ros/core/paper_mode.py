@@ -172,17 +172,25 @@ def fit_paper(
         chain, measurements, rows, problem.markers, problem.sensor_names, chains, rng
     )
     run = sample_paper(target, steps=steps, rng=rng, progress=progress)
-    # Registrations of all chains as corrections to one of them, about the data's centroid.
+    # Registrations of all chains as corrections to their mean, about the data's centroid.
     T_N_R = target.split(run.draws)[0]
     model = referenced(identity, measurements, problem.fitted, inverse(T_N_R[0, -1]))
+    x, _ = _paper_natural(target, model, run.draws)
+    mean = x.reshape(-1, model.size).mean(axis=0)
+    model = referenced(identity, measurements, problem.fitted, model.T_R_N(mean))
     rows = Rows.of(measurements, problem.fitted, model.reference)
     x, sigma = _paper_natural(target, model, run.draws)
     trace, trace_sigma = _paper_natural(target, model, run.trace)
     fitted = np.arange(model.joints + 6 * len(model.sensor_names))
-    mean = model.natural(model.pinned(x).reshape(-1, model.size).mean(axis=0))
-    gauge = _paper_gauge(find_gauge(model, mean, rows, (), fitted=fitted), model)
+    at_mean = model.vector(model.offsets(mean), problem.markers)
+    gauge = _paper_gauge(find_gauge(model, at_mean, rows, (), fitted=fitted), model)
     unseen = np.zeros(model.joints, dtype=bool)
     unseen[gauge.held] = True
+    z = model.pinned(x)
+    fixed = z.copy()
+    fixed[..., gauge.held] = 0.0
+    # Markers do not move here: their place is the mean in natural parameters, not in pinned ones.
+    middle = model.natural(fixed).reshape(-1, model.size).mean(axis=0)
     names = model.names[: len(fitted)]
     names += tuple(f'noise.{sensor}.sigma' for sensor in model.sensor_names)
     free = fitted[model.joints :]
@@ -192,7 +200,8 @@ def fit_paper(
     )
     return Sampled(
         model=model,
-        z=model.pinned(x),
+        z=z,
+        z_mean=model.pinned(middle),
         sigma=sigma,
         pose_sigma=np.zeros_like(sigma),
         trace=np.concatenate((trace[..., fitted], trace_sigma), axis=-1),
@@ -222,11 +231,14 @@ def _paper_natural(
 def _paper_gauge(gauge: Gauge, model: Model) -> Gauge:
     """Say of every direction that the paper's flat prior leaves it open."""
     held = [model.names[index] for index in gauge.held]
-    nothing = 'nothing: its prior is flat, and the chain wanders along it'
 
     def reworded(text: str) -> str:
         for name in held:
-            text = text.replace(f'{name} = 0', nothing)
+            text = text.replace(
+                f'{name} = 0',
+                'nothing: its prior is flat and the chain wanders along it '
+                f'(registrations and markers are given for {name} = 0)',
+            )
         return text
 
     return Gauge(

@@ -95,7 +95,7 @@ class FitResult:
     trace
         The chains from their first state, thinned where long, (chains, records, p).
     joint_offset_draws
-        rad, (chains, draws, k); zeros where a joint is held by the gauge.
+        rad, (chains, draws, k); zeros where a joint is held by the gauge (paper mode holds none).
     joint_offsets, joint_offsets_std, joint_offsets_interval95
         Posterior mean and std, rad, (k,), and 95 % interval, rad, (k, 2). A joint that neither
         data nor prior tell has mean 0, the std of a uniform turn, and the whole turn.
@@ -107,7 +107,8 @@ class FitResult:
         Every combination of parameters that the data cannot see.
     T_R_N, T_R_N_std_m, T_R_N_std_rad
         Registration of each sensor, (4, 4), with std of its translation and of its rotation
-        along and about the axes of R, (3,) each.
+        along and about the axes of R, (3,) each; like all of the rest for offsets of 0 where
+        nothing tells them.
     marker_positions, marker_std_m
         Markers in T, m, (3,) each.
     noise
@@ -160,6 +161,8 @@ class Sampled:
         Whose parameters were sampled.
     z
         Pinned parameters, (chains, draws, size).
+    z_mean
+        Its mean, joints that nothing tells at 0, (size,).
     sigma, pose_sigma
         Noise of each sensor, m, (chains, draws, sensors).
     trace, draws
@@ -182,6 +185,7 @@ class Sampled:
 
     model: Model
     z: FloatArray
+    z_mean: FloatArray
     sigma: FloatArray
     pose_sigma: FloatArray
     trace: FloatArray
@@ -202,9 +206,11 @@ def build_result(
     """Summarise the draws; ``seconds`` is how long they took, ``rng`` for section V-C."""
     model, measurements = sampled.model, problem.measurements
     joints = model.joints
-    flat = sampled.z.reshape(-1, model.size)
-    z_after = flat.mean(axis=0)
-    x_after, x_before = model.natural(z_after), model.natural(sampled.z_before)
+    # In pinned coordinates any value of a joint that nothing tells fits as well as 0.
+    z = sampled.z.copy()
+    z[..., np.flatnonzero(sampled.unfixed)] = 0.0
+    flat = z.reshape(-1, model.size)
+    x_after, x_before = model.natural(sampled.z_mean), model.natural(sampled.z_before)
     predicted_before = predicted_rows(problem, model, x_before)
     predicted_after = predicted_rows(problem, model, x_after)
 
@@ -248,9 +254,7 @@ def build_result(
         marker_positions_before=dict(zip(markers, model.markers(x_before), strict=True)),
         residuals_before=measurements.position - predicted_before,
         residuals_after=measurements.position - predicted_after,
-        accuracy=_accuracy(
-            problem, sampled, z_after, predicted_before, predicted_after, left_rows, rng
-        ),
+        accuracy=_accuracy(problem, sampled, predicted_before, predicted_after, left_rows, rng),
         left_out=tuple((int(measurements.observation[row]), why) for row, why in sampled.left_out),
     )
 
@@ -306,7 +310,6 @@ def _sampler_info(sampled: Sampled, seconds: float) -> SamplerInfo:
 def _accuracy(
     problem: Problem,
     sampled: Sampled,
-    z_after: FloatArray,
     predicted_before: FloatArray,
     predicted_after: FloatArray,
     left_rows: IntArray,
@@ -323,7 +326,7 @@ def _accuracy(
             problem.measurements.select(chosen),
             predicted_before[chosen],
             predicted_after[chosen],
-            _predictive(problem, sampled, z_after, chosen, rng),
+            _predictive(problem, sampled, chosen, rng),
             rng,
         )
     return result
@@ -332,7 +335,6 @@ def _accuracy(
 def _predictive(
     problem: Problem,
     sampled: Sampled,
-    z_after: FloatArray,
     chosen: IntArray,
     rng: np.random.Generator,
 ) -> Predictive | None:
@@ -349,7 +351,7 @@ def _predictive(
     return Predictive(
         predict=lambda z: model.predict(z, rows),
         before=sampled.z_before,
-        after=z_after,
+        after=sampled.z_mean,
         draws=flat[draws],
         sigma=sampled.sigma.reshape(-1, sensors)[draws][:, sensor_of_row],
         pose_sigma=sampled.pose_sigma.reshape(-1, sensors)[draws][:, sensor_of_row],

@@ -13,9 +13,13 @@ from .types import FloatArray
 Progress = Callable[[str, float], None]
 
 WARM_UP = 100
-# Below this share of proposals taken the proposal is adapted; three times, then a random walk.
-POOR_ACCEPTANCE = 0.3
-ADAPTATIONS = 3
+# Below this share of proposals taken the proposal is adapted to a random walk's draws; should
+# that not help, a random walk is what remains.
+POOR_ACCEPTANCE = 0.15
+# In tens of dimensions a Student t of few degrees of freedom hardly ever hits the bulk.
+ADAPTED_FREEDOM = 15.0
+PILOT_CHAINS = 32
+PILOT_STEPS = 1000
 WALK_STEPS_PER_DRAW = 20
 
 
@@ -34,7 +38,7 @@ def sample_posterior(
     """Sample the exact posterior about its mode.
 
     Independent proposals from the linearised posterior; where too few are taken, from a Student t
-    adapted to the draws so far; at last a random walk.
+    adapted to a pilot run; at last a random walk.
 
     Returns
     -------
@@ -43,14 +47,12 @@ def sample_posterior(
     name
         What was done, in words.
     """
-    posterior = mode.linearisation.posterior
+    log_density = mode.linearisation.posterior.log_density
     laplace = LaplaceProposal(mode)
-    start = laplace.dispersed(chains, rng)
-    proposal: Proposal = laplace
-    name = 'independence Metropolis-Hastings, Laplace proposal'
-    for attempt in range(ADAPTATIONS + 1):
-        run = independence_sampler(
-            posterior.log_density,
+
+    def independent(proposal: Proposal, start: FloatArray) -> Chains:
+        return independence_sampler(
+            log_density,
             proposal,
             chains=chains,
             draws=draws,
@@ -59,24 +61,36 @@ def sample_posterior(
             start=start,
             progress=lambda share: report('sampling', share),
         )
-        if run.acceptance_rate >= POOR_ACCEPTANCE:
-            return run, name
-        pooled = run.draws.reshape(-1, posterior.size)
-        covariance: FloatArray = np.cov(pooled.T) + 1e-4 * np.diag(
-            np.diag(_point_covariance(mode))
+
+    run = independent(laplace, laplace.dispersed(chains, rng))
+    if run.acceptance_rate >= POOR_ACCEPTANCE:
+        return run, 'independence Metropolis-Hastings, Laplace proposal'
+
+    factor: FloatArray = np.asarray(np.linalg.cholesky(_point_covariance(mode)))
+    pilot = random_walk_sampler(
+        log_density,
+        _gaussian_step(factor, PILOT_CHAINS),
+        start=laplace.dispersed(PILOT_CHAINS, rng),
+        steps=PILOT_STEPS,
+        burn_in=PILOT_STEPS // 2,
+        rng=rng,
+        thin=10,
+        progress=lambda share: report('adapting the sampler', share),
+    ).draws
+    pooled = pilot.reshape(-1, pilot.shape[-1])
+    factor = np.asarray(np.linalg.cholesky(np.cov(pooled.T)))
+    adapted = StudentT(pooled.mean(axis=0), factor, ADAPTED_FREEDOM)
+    start = pilot[rng.choice(PILOT_CHAINS, chains, replace=chains > PILOT_CHAINS), -1]
+    run = independent(adapted, start)
+    if run.acceptance_rate >= POOR_ACCEPTANCE:
+        return run, (
+            'independence Metropolis-Hastings, Student t proposal adapted to a random walk '
+            '(too few of the Laplace proposals were taken)'
         )
-        factor = np.asarray(1.1 * np.linalg.cholesky(covariance))
-        proposal = StudentT(pooled.mean(axis=0), factor, 5.0)
-        name = (
-            'independence Metropolis-Hastings, Student t proposal adapted '
-            f'{attempt + 1} time{"s" if attempt else ""} (the Laplace one was taken too rarely)'
-        )
-    d = posterior.size
     walk = random_walk_sampler(
-        posterior.log_density,
-        # 2.38 / sqrt(d): the best step for Gaussian targets (Gelman, Roberts and Gilks 1996).
-        lambda source: (2.38 / np.sqrt(d)) * source.standard_normal((chains, d)) @ factor.T,
-        start=run.draws[:, -1],
+        log_density,
+        _gaussian_step(factor, chains),
+        start=start,
         steps=(draws + WARM_UP) * WALK_STEPS_PER_DRAW,
         burn_in=WARM_UP * WALK_STEPS_PER_DRAW,
         rng=rng,
@@ -84,7 +98,14 @@ def sample_posterior(
         trace_every=WALK_STEPS_PER_DRAW,
         progress=lambda share: report('sampling by random walk', share),
     )
-    return walk, 'random-walk Metropolis (independent proposals were taken too rarely)'
+    return walk, 'random-walk Metropolis (too few independent proposals were taken)'
+
+
+def _gaussian_step(factor: FloatArray, chains: int) -> Callable[[np.random.Generator], FloatArray]:
+    """Return moves of 2.38 / sqrt(d) widths, best for Gaussians (Gelman, Roberts, Gilks 1996)."""
+    d = len(factor)
+    scaled = 2.38 / np.sqrt(d) * factor
+    return lambda rng: rng.standard_normal((chains, d)) @ scaled.T
 
 
 def _point_covariance(mode: Mode) -> FloatArray:

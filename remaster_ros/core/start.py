@@ -24,6 +24,8 @@ CAUCHY_WIDTH = 2.5
 # What the linear start expects of a robot out of the box, against which it weighs the nominal
 # marker positions.
 UNCALIBRATED_ERROR_M = 5e-3
+# A model that leaves more of the points' extent than this describes another robot, or none.
+LARGEST_RELATIVE_ERROR = 0.1
 
 
 def robust_start(
@@ -57,7 +59,7 @@ def robust_start(
     Raises
     ------
     InsufficientDataError
-        When the points of a sensor do not fix a registration.
+        When the points of a sensor do not fix a registration, or are not those of this robot.
     """
     chain = model.chain
     tool = chain.forward(measurements.q[rows])
@@ -81,6 +83,8 @@ def robust_start(
         z, cost = _refined(start, sorted_rows, priors, z)
         candidates.append((cost, start, z))
     _, start, z = min(candidates, key=lambda candidate: candidate[0])
+    sorted_rows = Rows.of(measurements, rows, start.reference)
+    _require_likeness(start, sorted_rows, sorted_rows.target - start.predict(z, sorted_rows))
     moved = referenced(model, measurements, rows, start.T_R_N(z))
     return moved, moved.vector(start.offsets(z), start.markers(z))
 
@@ -104,6 +108,19 @@ def referenced(
     return Model(
         model.chain, model.sensor_names, model.marker_names, reference, np.array(centroid)
     )
+
+
+def _require_likeness(model: Model, rows: Rows, errors: FloatArray) -> None:
+    """Refuse data that have nothing to do with the robot: wrong units, joints, markers."""
+    spread = robust_spread(errors, rows)
+    for error, (sensor, span) in zip(spread, rows.spans, strict=True):
+        extent = np.median(np.linalg.norm(rows.target[span] - model.centroid[sensor], axis=1))
+        if error > LARGEST_RELATIVE_ERROR * extent:
+            raise InsufficientDataError(
+                f"sensor '{model.sensor_names[sensor]}': the robot model leaves errors of "
+                f'{error * 1e3:.0f} mm in points {extent * 1e3:.0f} mm apart; check units, joint '
+                'order and signs, the URDF, and which marker was measured'
+            )
 
 
 def _linear_markers(
@@ -136,22 +153,20 @@ def _linear_markers(
         design[mine, :, start : start + 3] = rotations[mine]
     # Unknown marker = nominal + shift, the shift known to be small.
     target = -apply(tool, nominal[marker])
-    weight: FloatArray = np.ones(len(measured), dtype=np.float64)
+    root = np.ones(len(measured))
     pull = np.zeros((3 * markers, design.shape[2]))
     pull[:, 12 * sensors :] = np.eye(3 * markers) * (
         UNCALIBRATED_ERROR_M / max(marker_std_m, TIGHTEST_PRIOR)
     )
-    shift = np.zeros(3 * markers)
     for _ in range(6):
-        root = np.sqrt(weight)[:, None]
-        matrix = np.concatenate(((design * root[:, :, None]).reshape(-1, design.shape[2]), pull))
-        right = np.concatenate(((target * root).ravel(), np.zeros(3 * markers)))
-        solution = np.linalg.lstsq(matrix, right, rcond=None)[0]
-        shift = solution[12 * sensors :]
+        weighted = (design * root[:, None, None]).reshape(-1, design.shape[2])
+        matrix = np.concatenate((weighted, pull))
+        right = np.concatenate(((target * root[:, None]).ravel(), np.zeros(3 * markers)))
+        solution = np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0], dtype=float)
         length = np.linalg.norm(design @ solution - target, axis=1)
         scale = CAUCHY_WIDTH * (np.median(length) / MEDIAN_CHI3 + RESOLUTION_M)
-        weight = np.asarray(1.0 / (1.0 + (length / scale) ** 2))
-    return nominal + shift.reshape(-1, 3)
+        root = 1.0 / np.hypot(1.0, length / scale)
+    return nominal + solution[12 * sensors :].reshape(-1, 3)
 
 
 def _refined(
@@ -164,7 +179,7 @@ def _refined(
     free = np.setdiff1d(np.arange(model.size), (0, model.joints - 1))
     damping = 1e-6
     errors = rows.target - model.predict(z, rows)
-    spread = _spread(errors, rows)
+    spread = robust_spread(errors, rows)
     for _ in range(60):
         scale = np.repeat(spread, [span.stop - span.start for _, span in rows.spans])
         weight = 1.0 / (1.0 + _squares(errors) / (CAUCHY_WIDTH * scale) ** 2) / scale**2
@@ -188,7 +203,7 @@ def _refined(
         if not improved:
             break
         z, errors, damping = trial, trial_errors, max(damping / 10.0, 1e-12)
-        before, spread = spread, _spread(errors, rows)
+        before, spread = spread, robust_spread(errors, rows)
         settled = np.all(np.abs(spread - before) < 1e-3 * before)
         if settled and np.sqrt(step @ H @ step) < 1e-2 * np.sqrt(len(step)):
             break
@@ -200,7 +215,7 @@ def _squares(errors: FloatArray) -> FloatArray:
     return np.einsum('ni,ni->n', errors, errors)
 
 
-def _spread(errors: FloatArray, rows: Rows) -> FloatArray:
+def robust_spread(errors: FloatArray, rows: Rows) -> FloatArray:
     """Return the robust standard deviation per axis of each sensor's errors, m, (sensors,)."""
     length = np.sqrt(_squares(errors))
     return np.array([np.median(length[s]) / MEDIAN_CHI3 + RESOLUTION_M for _, s in rows.spans])

@@ -1,0 +1,51 @@
+"""Two real robots measured by others; the figures to reach are those of an independent fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from remaster_ros.core.fit import FitResult, fit_session
+from remaster_ros.storage.session import read_session
+
+DATA = Path(__file__).parents[3] / 'shared/data'
+
+
+def fit(name: str) -> tuple[FitResult, np.ndarray]:
+    if not (DATA / name).is_dir():
+        pytest.skip(f'the real data set {name} is not beside this repository (../shared/data)')
+    session = read_session(DATA / name)
+    result = fit_session(session, rng=np.random.default_rng(1))
+    held_out = result.residuals_after[session.measurements.is_validation]
+    return result, np.linalg.norm(held_out, axis=1)
+
+
+def test_ur10_with_two_solutions() -> None:
+    result, held_out = fit('ur10_two_solutions')
+    print(f'held-out mean {held_out.mean() * 1e3:.3f} mm')
+    assert len(held_out) == 508
+    assert held_out.mean() <= 1.02e-3
+    # Unmodelled errors of a millimetre are the robot's, not outliers.
+    assert len(result.left_out) <= 5
+    assert result.sampler.converged, result.sampler.message
+    # Its marker lies on the last axis within half a millimetre.
+    assert result.identifiable.tolist() == [False, True, True, True, True, False]
+    relative = result.accuracy['validation']['relative']
+    assert relative['after']['mean_mm'] == pytest.approx(1.73, abs=0.02)
+
+
+def test_irb120_with_three_points() -> None:
+    result, held_out = fit('irb120_three_points')
+    print(f'held-out mean {held_out.mean() * 1e3:.3f} mm')
+    assert len(held_out) == 10
+    assert held_out.mean() <= 0.64e-3
+    assert result.left_out == ()
+    assert result.sampler.converged, result.sampler.message
+    assert result.identifiable.tolist() == [False, True, True, True, True, False]
+    # Three markers whose nominal places say nothing, 10 mm and more apart.
+    p1, p2, p3 = (result.marker_positions[name] for name in ('p1', 'p2', 'p3'))
+    for a, b in ((p1, p2), (p2, p3), (p3, p1)):
+        assert 0.01 < np.linalg.norm(a - b) < 0.05
+    assert result.accuracy['validation']['relative']['before'] is None
