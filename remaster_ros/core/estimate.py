@@ -85,8 +85,8 @@ class Problem:
             poses = len(np.unique(given.pose[fitted][sensor[fitted] == index]))
             if poses < FEWEST_POSES:
                 raise InsufficientDataError(
-                    f"sensor '{name}' saw {poses} poses to fit; at least {FEWEST_POSES} are needed "
-                    'to register it, and some thirty for good zero-offsets'
+                    f"sensor '{name}' saw {poses} poses to fit; at least {FEWEST_POSES} are "
+                    'needed to register it, and some thirty for good zero-offsets'
                 )
             if count < FEWEST_ROWS:
                 raise InsufficientDataError(

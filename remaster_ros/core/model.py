@@ -23,7 +23,6 @@ the outer two joints move nothing but the priors. `pinned` and `natural` convert
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -326,11 +325,6 @@ class Rows:
     def group_of_row(self) -> IntArray:
         """Index of each row's group, (n,)."""
         return np.repeat(np.arange(len(self.group_start)), self.group_size)
-
-
-def used_indices(column: IntArray, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names that occur in a column of indices."""
-    return tuple(name for index, name in enumerate(names) if np.any(column == index))
 
 
 def _rotation_about(point: FloatArray, axis: FloatArray, angle: FloatArray) -> FloatArray:

@@ -48,7 +48,7 @@ def test_two_sensors_turn_together() -> None:
 
 
 def test_no_prediction_moves_along_a_direction() -> None:
-    """Each direction, applied as documented to natural parameters, leaves every marker in place."""
+    """Each direction, applied to natural parameters as documented, moves no marker."""
     found = estimate(Problem.of(scene(23, poses=10, sensor_count=2)[0]))
     model, measured = found.model, found.problem.measurements
     # Corrections about the origin of R, as the combinations have them.
@@ -109,5 +109,5 @@ def test_registrations_that_nothing_fixes_are_an_error() -> None:
         q=np.repeat(rows.q[:1], len(rows), axis=0),
         target=np.repeat(rows.target[:1], len(rows), axis=0),
     )
-    with pytest.raises(InsufficientDataError, match='do not determine .*registration'):
+    with pytest.raises(InsufficientDataError, match=r'do not determine .*registration'):
         find_gauge(model, model.natural(found.mode.z), one_point, ())

@@ -68,7 +68,7 @@ def test_every_chain_starts_as_the_paper_says_from_three_points_of_its_own() -> 
 
 def test_about_one_step_in_twenty_is_taken_at_the_mode() -> None:
     """The paper's noise and size; its proposals are as wide as measured there: about 5 %."""
-    session, truth = scene(44, poses=36, sigma_m=0.85e-3, pose_sigma_m=0.0, marker_std_m=0.0)
+    session, _ = scene(44, poses=36, sigma_m=0.85e-3, pose_sigma_m=0.0, marker_std_m=0.0)
     problem = Problem.of(session)
     fitted = fit_session(session, rng=np.random.default_rng(1), draws=100)
     identity = np.eye(4)[None]
