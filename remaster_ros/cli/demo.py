@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
+from remaster_ros.cli.options import number
 from remaster_ros.core.errors import InputError
 
 WITHOUT_ROS = (
@@ -24,7 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--full', action='store_true', help="the paper's size: 60 candidate poses each"
     )
     parser.add_argument(
-        '--rate', type=float, default=10.0, help='world time over wall time (1 to 20; default 10)'
+        '--rate',
+        type=number(1.0, 20.0),
+        default=10.0,
+        help='world time over wall time (1 to 20; default 10)',
     )
 
 

@@ -3,65 +3,91 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import logging
+import os
 import sys
+import traceback
 from collections.abc import Sequence
 
 from remaster_ros import __version__
-from remaster_ros.cli import accuracy, demo, fit, replay, simulate
+from remaster_ros.cli.options import Parser, integer
 from remaster_ros.core.errors import InsufficientDataError, RemasterError
 
-VERBS = (demo, simulate, fit, accuracy, replay)
+# Each verb is the module of that name beside this one, imported only when it is used: SciPy and
+# the rest take more than a second to load, and `remaster --help` needs none of it.
+VERBS = {
+    'demo': 'The whole pipeline on fake hardware: real nodes, real DDS, real sockets.',
+    'simulate': 'Make a session from a known truth, which is written beside it.',
+    'fit': 'Fit the zero-offsets of a session: fit.json, figures and report.html.',
+    'accuracy': 'Judge the zero-offsets of a fit on any session: the three metrics.',
+    'replay': 'Publish a recorded session again (as `ros2 bag play` does).',
+}
+TRACEBACK = 'REMASTER_TRACEBACK'
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Return the parser with every verb."""
-    parser = argparse.ArgumentParser(
+def build_parser(chosen: str | None) -> argparse.ArgumentParser:
+    """Return the parser with every verb, and with the options of the chosen one."""
+    parser = Parser(
         prog='remaster',
         description='Remaster a robot arm in place: joint zero-offsets with honest uncertainty.',
         epilog='Exit status: 0 done, 1 the data allow no answer, 2 wrong usage or bad input.',
     )
     parser.add_argument('--version', action='version', version=f'remaster {__version__}')
     verbs = parser.add_subparsers(dest='verb', required=True, metavar='VERB')
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument('--seed', type=_seed, default=0, help='seed of all randomness (default 0)')
-    common.add_argument('--quiet', action='store_true', help='print nothing but errors')
-    common.add_argument('--no-figures', action='store_true', help='write no figures, no report')
-    for verb in VERBS:
-        name = verb.__name__.rpartition('.')[2]
-        help_text = (verb.__doc__ or '').strip().splitlines()[0]
-        sub = verbs.add_parser(name, parents=[common], help=help_text, description=help_text)
-        verb.add_arguments(sub)
-        sub.set_defaults(run=verb.run)
+    for name, text in VERBS.items():
+        verb = verbs.add_parser(name, help=text, description=text)
+        if name != chosen:
+            continue
+        module = importlib.import_module(f'remaster_ros.cli.{name}')
+        module.add_arguments(verb)
+        verb.add_argument(
+            '--seed', type=integer(0), default=0, help='seed of all randomness (default 0)'
+        )
+        verb.add_argument('--quiet', action='store_true', help='print nothing but errors')
+        verb.add_argument('--no-figures', action='store_true', help='write no figures')
+        verb.set_defaults(run=module.run)
     return parser
-
-
-def _seed(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f'{value} is negative; a seed is 0 or more')
-    return value
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
-    args = build_parser().parse_args(argv)
+    argv = sys.argv[1:] if argv is None else list(argv)
+    args = build_parser(next(iter(argv), None)).parse_args(argv)
     logging.basicConfig(
         format='%(levelname)s: %(message)s',
         level=logging.ERROR if args.quiet else logging.WARNING,
     )
     try:
-        return args.run(args)
+        status = args.run(args)
+        # Here and not at exit, where it could not be caught: the reader may have gone.
+        sys.stdout.flush()
+        return status
     except RemasterError as error:
-        print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
+        _complain(str(error))
         return 1 if isinstance(error, InsufficientDataError) else 2
     except KeyboardInterrupt:
         print('stopped', file=sys.stderr)
         return 130
     except BrokenPipeError:
-        # The reader of our output has gone (`remaster fit … | head`).
-        sys.stderr.close()
-        return 1
+        # `remaster fit … | head` has seen enough. Nothing is left to flush into the closed pipe.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except OSError as error:
+        _complain(f'{error.filename}: {error.strerror}' if error.filename else str(error))
+        return 2
+    except Exception as error:
+        if os.environ.get(TRACEBACK):
+            traceback.print_exc()
+        _complain(
+            f'a fault of this program, please report it: {type(error).__name__}: {error} '
+            f'(set {TRACEBACK}=1 to see where)'
+        )
+        return 2
+
+
+def _complain(message: str) -> None:
+    print(f'error: {" ".join(message.split())}', file=sys.stderr)
 
 
 if __name__ == '__main__':

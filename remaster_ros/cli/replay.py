@@ -6,13 +6,17 @@ import argparse
 from typing import NoReturn
 
 from remaster_ros.cli.demo import run_node
+from remaster_ros.cli.options import number
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``remaster replay``."""
     parser.add_argument('bag', metavar='BAG', help='folder of the bag, or of the session with one')
     parser.add_argument(
-        '--rate', type=float, default=1.0, help='how many times as fast as recorded (default 1)'
+        '--rate',
+        type=number(0.01, 100.0),
+        default=1.0,
+        help='how many times as fast as recorded (0.01 to 100; default 1)',
     )
     parser.add_argument('--no-clock', action='store_true', help='do not publish /clock')
     parser.add_argument(

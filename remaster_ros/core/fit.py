@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from . import convergence
-from .accuracy import accuracy_of
 from .errors import InputError
-from .estimate import Estimate, Problem, estimate, hold_offsets
+from .estimate import Estimate, Problem, estimate
 from .paper_mode import BURN_IN_SHARE, STEPS, fit_paper
-from .result import FitResult, Sampled, build_result, predicted_rows
+from .result import FitResult, Sampled, build_result
 from .sampling import Progress, sample_posterior, silent
 from .types import FloatArray, Session
 
-__all__ = ['FitResult', 'accuracy_with_offsets', 'fit_session']
+__all__ = ['FitResult', 'fit_session']
 
 Sampler = Literal['fast', 'paper']
 
@@ -121,54 +119,3 @@ def _fast(
         z_before=found.before.z,
         left_out=found.left_out,
     )
-
-
-def accuracy_with_offsets(
-    session: Session, joint_offsets: FloatArray, rng: np.random.Generator
-) -> dict[str, Any]:
-    """Judge given zero-offsets on any session: `remaster accuracy`.
-
-    Registrations and markers are fitted to the session's optimization rows (all rows where it
-    has none), once with offsets at zero and once with the given ones, and applied to all rows.
-    The theoretical metric needs a posterior and is null.
-
-    Parameters
-    ----------
-    session
-        Any session of this robot.
-    joint_offsets
-        rad, (k,).
-    rng
-        Source of all randomness.
-
-    Returns
-    -------
-    dict
-        ``accuracy`` as fit.json has it.
-    """
-    if not np.any(~session.measurements.is_validation):
-        everything = np.zeros(len(session.measurements), dtype=bool)
-        session = replace(
-            session, measurements=replace(session.measurements, is_validation=everything)
-        )
-    problem = Problem.of(session)
-    if np.shape(joint_offsets) != (len(problem.chain),):
-        raise InputError(
-            f'{np.size(joint_offsets)} zero-offsets for a robot of {len(problem.chain)} joints'
-        )
-    found = estimate(problem)
-    model = found.model
-    predicted_before = predicted_rows(problem, model, model.natural(found.before.z))
-    given = hold_offsets(found.mode, np.asarray(joint_offsets, dtype=float))
-    predicted_after = predicted_rows(problem, model, model.natural(given.z))
-    validation = np.flatnonzero(problem.measurements.is_validation)
-    return {
-        name: accuracy_of(
-            problem.measurements.select(chosen),
-            predicted_before[chosen],
-            predicted_after[chosen],
-            None,
-            rng,
-        )
-        for name, chosen in (('optimization', found.kept), ('validation', validation))
-    }

@@ -109,7 +109,8 @@ def looking_at(position: ArrayLike, target: ArrayLike, roll_rad: float = 0.0) ->
     InputError
         The two are one point.
     """
-    line = np.asarray(target, dtype=float) - np.asarray(position, dtype=float)
+    position, target = np.asarray(position, dtype=float), np.asarray(target, dtype=float)
+    line = target - position
     distance = np.linalg.norm(line)
     if not distance > 0.0:
         raise InputError(f'a sensor at {position} m cannot look at {target} m: give another place')

@@ -15,14 +15,14 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
+from .figures import draw_figures
 from .files import make_folder, write_atomically
-from .results import fit_to_dict
+from .results import REPORT_FILE, fit_to_dict
 
 if TYPE_CHECKING:
     from ..core.result import FitResult
     from .scene import Scene
 
-REPORT_FILE = 'report.html'
 # Less than this is no gain a user would notice.
 NOTICEABLE_GAIN = 1.1
 
@@ -45,7 +45,7 @@ class Verdict(NamedTuple):
     points: list[str]
 
 
-def write_report(result: FitResult, folder: str | os.PathLike[str], figures: bool = True) -> Path:
+def write_report(result: FitResult, folder: str | os.PathLike[str]) -> Path:
     """Write report.html, and the figures as SVG files under ``figures``; return its path.
 
     Parameters
@@ -54,8 +54,6 @@ def write_report(result: FitResult, folder: str | os.PathLike[str], figures: boo
         The fit.
     folder
         Where to; made if missing.
-    figures
-        False leaves the figures out: tables only, made in an instant.
 
     Raises
     ------
@@ -64,15 +62,10 @@ def write_report(result: FitResult, folder: str | os.PathLike[str], figures: boo
     """
     folder = Path(folder)
     make_folder(folder)
-    drawings: dict[str, str] = {}
-    if figures:
-        # Matplotlib takes a second to import: only where something is drawn.
-        from .figures import draw_figures
-
-        drawings = draw_figures(result)
-        make_folder(folder / 'figures')
-        for name, text in drawings.items():
-            write_atomically(folder / 'figures' / f'{name}.svg', text)
+    drawings = draw_figures(result)
+    make_folder(folder / 'figures')
+    for name, text in drawings.items():
+        write_atomically(folder / 'figures' / f'{name}.svg', text)
     write_atomically(folder / REPORT_FILE, report_html(result, drawings))
     return folder / REPORT_FILE
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from ..core.result import FitResult
 
 FORMAT = 'remaster-fit/1'
+FIT_FILE = 'fit.json'
+REPORT_FILE = 'report.html'
 FIT_LIMIT = 64 * 1024**2
 
 
@@ -238,21 +240,33 @@ def read_fit(path: str | os.PathLike[str]) -> dict[str, Any]:
     return content
 
 
-def joint_offsets_rad(fit: dict[str, Any], joint_names: Sequence[str]) -> FloatArray:
-    """Return the offsets of a fit.json in the order of a robot's joints, rad, (k,).
+def joint_offsets_rad(
+    fit: dict[str, Any], joint_names: Sequence[str]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the offsets of a fit.json in the order of a robot's joints, and how sure they are.
+
+    Returns
+    -------
+    offsets, std
+        rad, (k,) each; the std of a joint that the data could not tell is 0.
 
     Raises
     ------
     InputError
-        The offsets are for other joints.
+        The offsets are for other joints, or a std is negative.
     """
-    offsets = {row['joint']: row['mean_deg'] for row in fit['joint_offsets']}
-    if set(offsets) != set(joint_names) or len(offsets) < len(fit['joint_offsets']):
+    rows = {row['joint']: row for row in fit['joint_offsets']}
+    if set(rows) != set(joint_names) or len(rows) < len(fit['joint_offsets']):
         raise InputError(
-            f'the offsets are for the joints {", ".join(offsets)}, '
+            f'the offsets are for the joints {", ".join(rows)}, '
             f'the robot has {", ".join(joint_names)}; use the fit of this robot'
         )
-    return np.radians([offsets[name] for name in joint_names])
+    ordered = [rows[name] for name in joint_names]
+    for row in ordered:
+        if not row['std_deg'] >= 0.0:
+            raise InputError(f'{row["joint"]}: std_deg is {row["std_deg"]}; fit again')
+    std = [row['std_deg'] if row['identifiable'] else 0.0 for row in ordered]
+    return np.radians([row['mean_deg'] for row in ordered]), np.radians(std)
 
 
 def prepare_folder(folder: str | os.PathLike[str]) -> None:
@@ -274,21 +288,36 @@ def prepare_folder(folder: str | os.PathLike[str]) -> None:
 
 
 def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = True) -> Path:
-    """Write fit.json, the files to apply the offsets, and the report; return the report's path.
+    """Write fit.json, the files to apply the offsets, and the report with its figures.
+
+    Without figures there is no report; that of an earlier fit in the folder would contradict
+    fit.json and is removed.
+
+    Returns
+    -------
+    Path
+        The report; fit.json without figures.
 
     Raises
     ------
     InputError
         The folder cannot be written to.
     """
-    # Matplotlib and the templates take a second to import: only where a report is made.
     from .apply import write_apply
-    from .report import write_report
 
     folder = Path(folder)
-    write_fit(result, folder / 'fit.json')
+    write_fit(result, folder / FIT_FILE)
     write_apply(result, folder / 'apply')
-    return write_report(result, folder, figures=figures)
+    if not figures:
+        try:
+            (folder / REPORT_FILE).unlink(missing_ok=True)
+        except OSError as error:
+            raise cannot_write(folder / REPORT_FILE, error) from None
+        return folder / FIT_FILE
+    # Matplotlib and the templates take a second to import: only where a report is made.
+    from .report import write_report
+
+    return write_report(result, folder)
 
 
 def urdf_sha256(session: Session) -> str:

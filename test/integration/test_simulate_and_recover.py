@@ -13,7 +13,8 @@ import pytest
 from calibration_scenes import CHAIN, scene
 
 from remaster_ros.core.errors import InputError, InsufficientDataError
-from remaster_ros.core.fit import FitResult, accuracy_with_offsets, fit_session
+from remaster_ros.core.fit import FitResult, fit_session
+from remaster_ros.core.judging import OffsetsJudgement, accuracy_with_offsets
 from remaster_ros.core.model import predict_in_sensor
 from remaster_ros.core.simulation import Truth
 from remaster_ros.core.transforms import quaternion_xyzw
@@ -201,18 +202,74 @@ def test_data_without_noise_are_no_trouble() -> None:
     assert np.abs(error).max() < 1e-5
 
 
+def judge(
+    session: Session, offsets: np.ndarray, std: np.ndarray | None = None
+) -> OffsetsJudgement:
+    return accuracy_with_offsets(session, offsets, std, np.random.default_rng(1))
+
+
 def test_accuracy_of_given_offsets() -> None:
     session, truth = scene(137, poses=15, validation=6)
-    found = accuracy_with_offsets(session, truth.joint_offsets, np.random.default_rng(1))
+    found = judge(session, truth.joint_offsets).accuracy
     for split in ('optimization', 'validation'):
         metric = found[split]['relative']
         assert metric['after']['mean_mm'] < 0.5 < metric['before']['mean_mm']
         assert found[split]['theoretical']['after'] is None
     held_out = session.select(np.flatnonzero(session.measurements.is_validation))
-    alone = accuracy_with_offsets(held_out, truth.joint_offsets, np.random.default_rng(1))
+    alone = judge(held_out, truth.joint_offsets).accuracy
     assert alone['optimization']['relative']['after']['mean_mm'] < 0.5
+    assert alone['validation'] is None
     with pytest.raises(InputError, match='6 zero-offsets for a robot of 7'):
-        accuracy_with_offsets(session, truth.joint_offsets[:6], np.random.default_rng(1))
+        judge(session, truth.joint_offsets[:6])
+    with pytest.raises(InputError, match='6 zero-offsets for a robot of 7'):
+        judge(session, truth.joint_offsets, np.zeros(6))
+
+
+def test_judging_the_fit_on_its_own_session_gives_its_own_accuracy() -> None:
+    """The theoretical metric differs by the correlations of the offsets, which are left out."""
+    session, _ = scene(139, poses=20, validation=8, sensor_count=2, outlier_share=0.01)
+    result = fit(session)
+    std = np.where(result.identifiable, result.joint_offsets_std, 0.0)
+    judged = judge(session, result.joint_offsets, std)
+    assert judged.left_out == result.left_out
+    assert judged.left_out
+    for split in ('optimization', 'validation'):
+        for metric, tolerance in (
+            ('relative', 1e-3),
+            ('post_registration', 2e-3),
+            ('theoretical', 0.05),
+        ):
+            for side, expected in result.accuracy[split][metric].items():
+                wide = 0.5 if side == 'after_offsets_only' else tolerance
+                mean = judged.accuracy[split][metric][side]['mean_mm']
+                assert mean == pytest.approx(expected['mean_mm'], rel=wide), (split, metric, side)
+
+
+def test_what_registration_and_markers_take_up_does_not_count() -> None:
+    """Any offset of the outer joints: the sensor's frame and the loosely known marker follow."""
+    session, truth = scene(140, poses=15, validation=6)
+    session = replace(session, marker_std_m=0.2)
+    turned = truth.joint_offsets + np.radians([30.0, 0, 0, 0, 0, 0, -20.0])
+    std = np.radians([0.0, *[0.01] * 5, 0.0])
+    for metric in ('relative', 'post_registration', 'theoretical'):
+        straight, other = (
+            judge(session, offsets, std).accuracy['validation'][metric]['after']['mean_mm']
+            for offsets in (truth.joint_offsets, turned)
+        )
+        assert other == pytest.approx(straight, rel=1e-3)
+
+
+def test_more_uncertain_offsets_promise_less() -> None:
+    """From 0.02 to 0.2 degrees the share of the offsets grows tenfold, that of the rest stays."""
+    session, truth = scene(141, poses=15, validation=6, sigma_m=0.01e-3, pose_sigma_m=0.01e-3)
+    errors = []
+    for degrees in (0.02, 0.2):
+        std = np.radians([0.0, *[degrees] * 5, 0.0])
+        theoretical = judge(session, truth.joint_offsets, std).accuracy['validation'][
+            'theoretical'
+        ]
+        errors.append(theoretical['after_offsets_only']['mean_mm'])
+    assert errors[1] == pytest.approx(10 * errors[0], rel=0.1)
 
 
 def test_progress_and_seconds_come_from_outside() -> None:

@@ -163,13 +163,10 @@ def test_the_same_fit_gives_the_same_page(fit_result, folder, tmp_path):
             assert path.read_bytes() == (tmp_path / path.relative_to(folder)).read_bytes()
 
 
-def test_without_figures_nothing_is_drawn(fit_result, tmp_path):
-    save_fit(fit_result, tmp_path, figures=False)
-    assert not (tmp_path / 'figures').exists()
-    html = (tmp_path / 'report.html').read_text(encoding='utf-8')
-    assert '<svg' not in html
-    assert '<script' not in html
-    assert len(html) < 1e5
+def test_without_figures_there_is_no_report_and_none_of_an_earlier_fit(fit_result, tmp_path):
+    (tmp_path / 'report.html').write_text('of an earlier fit')
+    assert save_fit(fit_result, tmp_path, figures=False) == tmp_path / 'fit.json'
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['apply', 'fit.json']
 
 
 def test_drawing_libraries_are_imported_only_for_a_report():

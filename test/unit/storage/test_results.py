@@ -34,9 +34,10 @@ def test_fit_json_is_the_fit(fit_result, tmp_path):
     assert fit == msgspec.json.decode(msgspec.json.encode(fit_to_dict(fit_result)))
     assert fit['format'] == 'remaster-fit/1'
     assert [row['joint'] for row in fit['joint_offsets']] == list(fit_result.joint_names)
-    np.testing.assert_allclose(
-        joint_offsets_rad(fit, fit_result.joint_names), fit_result.joint_offsets, atol=1e-14
-    )
+    offsets, std = joint_offsets_rad(fit, fit_result.joint_names)
+    np.testing.assert_allclose(offsets, fit_result.joint_offsets, atol=1e-14)
+    known = np.where(fit_result.identifiable, fit_result.joint_offsets_std, 0.0)
+    np.testing.assert_allclose(std, known, atol=1e-14)
     for i, row in enumerate(fit['joint_offsets']):
         assert row['identifiable'] == (row['why'] == '') == bool(fit_result.identifiable[i])
         assert row['interval95_deg'][0] <= row['mean_deg'] <= row['interval95_deg'][1]
@@ -60,6 +61,13 @@ def test_offsets_of_another_robot_are_refused(fit_result):
     fit = fit_to_dict(fit_result)
     with pytest.raises(InputError, match='use the fit of this robot'):
         joint_offsets_rad(fit, ['joint_1', 'joint_2'])
+
+
+def test_a_negative_spread_is_refused(fit_result):
+    fit = fit_to_dict(fit_result)
+    fit['joint_offsets'][2]['std_deg'] = -0.01
+    with pytest.raises(InputError, match=r'joint_3: std_deg is -0\.01'):
+        joint_offsets_rad(fit, fit_result.joint_names)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,115 @@
+"""The three metrics of a fit's zero-offsets on any session of the same robot."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from remaster_ros import __version__
+from remaster_ros.cli.console import progress_bar, say
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.judging import OffsetsJudgement, accuracy_with_offsets
+from remaster_ros.core.types import Session
+from remaster_ros.storage.files import make_folder, write_atomically
+from remaster_ros.storage.results import joint_offsets_rad, read_fit, urdf_sha256
+from remaster_ros.storage.session import read_session
+
+FORMAT = 'remaster-accuracy/1'
+DESCRIPTION = (
+    "Mean error and 95 % interval with all offsets at zero ('before') and with those of the fit "
+    "('after'). In both cases registrations and markers are fitted to this session's optimization "
+    'rows (to all rows where it has none) and applied to its validation rows. The theoretical '
+    "error draws the offsets with the fit's standard deviations, as if independent; joints that "
+    'the fit could not tell do not count: the registration or the marker takes them up.'
+)
+METRICS = {
+    'relative': 'relative (eq. 17)',
+    'post_registration': 'absolute, after registration',
+    'theoretical': 'theoretical (section V-C)',
+}
+
+log = logging.getLogger('remaster_ros')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``remaster accuracy``."""
+    parser.description = DESCRIPTION
+    parser.add_argument('session', metavar='SESSION', type=Path, help='session folder')
+    parser.add_argument(
+        '--offsets', metavar='FIT', type=Path, required=True, help='fit.json with the offsets'
+    )
+    parser.add_argument('--out', metavar='FILE', type=Path, help='write the metrics as JSON')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Judge the offsets, print a table, write JSON if asked to."""
+    session = read_session(args.session)
+    fit = read_fit(args.offsets)
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    offsets, std = joint_offsets_rad(fit, chain.joint_names)
+    warn_of_another_urdf(fit, session, args.offsets)
+    with progress_bar(args.quiet) as progress:
+        progress('fitting', 0.0)
+        judged = accuracy_with_offsets(session, offsets, std, np.random.default_rng(args.seed))
+    if args.out is not None:
+        content = {
+            'format': FORMAT,
+            'version': __version__,
+            'session': str(args.session),
+            'offsets': str(args.offsets),
+            'joint_offsets_deg': dict(zip(chain.joint_names, np.rad2deg(offsets).tolist())),
+            'accuracy': judged.accuracy,
+            'left_out': [{'observation': row, 'why': why} for row, why in judged.left_out],
+        }
+        make_folder(args.out.parent)
+        write_atomically(args.out, json.dumps(content, indent=2) + '\n')
+    say(args.quiet, table(judged))
+    if args.out is not None:
+        say(args.quiet, f'written: {args.out}')
+    return 0
+
+
+def warn_of_another_urdf(fit: dict[str, Any], session: Session, path: Path) -> None:
+    """Warn where the offsets were fitted on another model of the robot."""
+    robot = fit.get('robot')
+    fitted = robot.get('urdf_sha256') if isinstance(robot, dict) else None
+    if fitted is not None and fitted != urdf_sha256(session):
+        log.warning(
+            "%s: fitted with another URDF than this session's; the joints have the same names, "
+            'but the geometry may differ',
+            path,
+        )
+
+
+def table(judged: OffsetsJudgement) -> str:
+    """Return the metrics, one a line."""
+    lines = [f'{"mean error [95 % interval], mm":44s} {"before":24s} after']
+    for split, metrics in judged.accuracy.items():
+        if metrics is None:
+            lines.append(f'{split}: no such rows')
+            continue
+        lines.append(split)
+        for key, name in METRICS.items():
+            values = metrics[key]
+            if values['after'] is None:
+                lines.append(f'  {name:42s} {values["why"]}')
+                continue
+            before, after = interval(values['before']), interval(values['after'])
+            lines.append(f'  {name:42s} {before:24s} {after}')
+            if values.get('after_offsets_only'):
+                alone = interval(values['after_offsets_only'])
+                lines.append(f'  {"… without the noise":42s} {"":24s} {alone}')
+    for observation, why in judged.left_out:
+        lines.append(f'left out: observation {observation}: {why}')
+    return '\n'.join(lines)
+
+
+def interval(metric: dict[str, Any]) -> str:
+    """Return mean and interval as text."""
+    low, high = metric['interval95_mm']
+    return f'{metric["mean_mm"]:.3f} [{low:.3f}, {high:.3f}]'

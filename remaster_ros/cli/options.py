@@ -1,0 +1,64 @@
+"""Argument types of the command line: what cannot be is refused before any work is done."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line; an option's name is never guessed from its beginning."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**{**kwargs, 'allow_abbrev': False})
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and exit with status 2."""
+        self.exit(2, f'error: {message} (see {self.prog} --help)\n')
+
+
+def integer(low: int) -> Callable[[str], int]:
+    """Return an argument type: a whole number of at least `low`."""
+
+    def convert(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f'{text!r} is not a whole number') from None
+        if value < low:
+            raise argparse.ArgumentTypeError(f'{value} is less than {low}')
+        return value
+
+    return convert
+
+
+def number(low: float = 0.0, high: float = math.inf, unit: str = '') -> Callable[[str], float]:
+    """Return an argument type: a finite number from `low` to `high`."""
+    unit = f' {unit}' if unit else ''
+
+    def convert(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f'{text!r} is not a number') from None
+        if not math.isfinite(value):
+            raise argparse.ArgumentTypeError(f'{text} is not a finite number')
+        if value < low:
+            raise argparse.ArgumentTypeError(f'{value:g} is less than {low:g}{unit}')
+        if value > high:
+            raise argparse.ArgumentTypeError(f'{value:g} is more than {high:g}{unit}')
+        return value
+
+    return convert
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Argument type: distinct names with commas between."""
+    found = tuple(part.strip() for part in text.split(','))
+    if not all(found):
+        raise argparse.ArgumentTypeError(f'{text!r} is no list of names with commas between')
+    if len(set(found)) < len(found):
+        raise argparse.ArgumentTypeError(f'{text!r} names one of them twice')
+    return found

@@ -1,0 +1,268 @@
+"""A session from a known truth, planned and ordered as the planner node does it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.cli.console import progress_bar, say
+from remaster_ros.cli.options import integer, names, number
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.collision import ArmCapsules
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.inverse import FREE_JOINTS, InverseKinematics
+from remaster_ros.core.planning import LineOfSight, candidate_poses, plan_poses
+from remaster_ros.core.simulation import SimulatedSensor, Truth, simulate_session
+from remaster_ros.core.tour import Tour
+from remaster_ros.core.transforms import looking_at, quaternion_xyzw, transform
+from remaster_ros.core.types import FloatArray
+from remaster_ros.storage.cell import Cell, CellRobot, config_path, read_cell
+from remaster_ros.storage.files import decode_text, read_limited, write_atomically
+from remaster_ros.storage.session import URDF_LIMIT, write_session
+
+TRUTH_FILE = 'truth.json'
+# How far a sensor stands from where the cell has it: roughly known places are good to this.
+PLACEMENT_STD_M = 0.05
+ROLL_RAD = 0.2
+# As the planner node's default: distance kept from the joint limits.
+LIMIT_MARGIN_RAD = np.deg2rad(1.0)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``remaster simulate``."""
+    parser.add_argument('out', metavar='OUT', type=Path, help='new session folder')
+    parser.add_argument('--cell', default='demo', help='cell file, or a shipped one (demo)')
+    parser.add_argument(
+        '--robot',
+        metavar='NAME|URDF',
+        help="lwr4plus, iiwa7, iiwa14, or any URDF file (default: the cell's robot)",
+    )
+    parser.add_argument('--base-link', metavar='LINK', help='frame R (default: the root link)')
+    parser.add_argument('--tip-link', metavar='LINK', help='frame T (default: the only end)')
+    parser.add_argument(
+        '--poses',
+        type=integer(1),
+        default=60,
+        metavar='N',
+        help='candidate poses to fit (default 60; those that cannot be reached are dropped)',
+    )
+    parser.add_argument(
+        '--validation',
+        type=integer(0),
+        default=60,
+        metavar='N',
+        help='candidate poses held out (default 60)',
+    )
+    parser.add_argument(
+        '--sensors', type=names, metavar='NAME,…', help="of the cell's sensors (default: all)"
+    )
+    parser.add_argument(
+        '--noise-mm',
+        type=number(unit='mm'),
+        default=0.1,
+        metavar='S',
+        help='noise of every point, std per axis (default 0.1)',
+    )
+    parser.add_argument(
+        '--pose-noise-mm',
+        type=number(unit='mm'),
+        default=0.2,
+        metavar='S',
+        help='error common to all solutions of a pose, std per axis (default 0.2)',
+    )
+    parser.add_argument(
+        '--outliers',
+        type=number(high=1.0),
+        default=0.0,
+        metavar='SHARE',
+        help='share of the observations that are 20 mm off (default 0)',
+    )
+    parser.add_argument(
+        '--offset-std-deg',
+        type=number(high=10.0, unit='deg'),
+        default=0.3,
+        metavar='S',
+        help='the true zero-offsets are drawn with this std (default 0.3)',
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Plan, draw a truth, write the session and the truth."""
+    cell = read_cell(args.cell)
+    chain = choose_robot(cell, args.robot, args.base_link, args.tip_link)
+    choose_sensors(cell, args.sensors)
+    # One stream each: less noise, say, leaves the poses and the offsets as they were.
+    placement, planning, drawing = np.random.default_rng(args.seed).spawn(3)
+    sensors = {
+        name: SimulatedSensor(
+            sensor.marker,
+            place_sensor(cell, np.array(sensor.rough_position_m), placement),
+            args.noise_mm * 1e-3,
+            args.pose_noise_mm * 1e-3,
+        )
+        for name, sensor in cell.sensors.items()
+    }
+    with progress_bar(args.quiet) as progress:
+        progress('planning', 0.0)
+        counts = {'optimization': args.poses, 'validation': args.validation}
+        tour = plan_tour(chain, cell, sensors, counts, planning)
+        visits = visit(tour, chain)
+        progress('measuring', 0.9)
+        session, truth = simulate_session(
+            chain,
+            cell.urdf_text,
+            drawing,
+            poses=visits['optimization'],
+            validation_poses=visits['validation'],
+            sensors=sensors,
+            markers={name: np.array(position) for name, position in cell.markers.items()},
+            joint_offset_std=np.deg2rad(args.offset_std_deg),
+            marker_std_m=cell.marker_std_m,
+            outlier_share=args.outliers,
+        )
+        write_session(args.out, session)
+        text = json.dumps(truth_to_dict(truth, chain, args.seed), indent=2)
+        write_atomically(args.out / TRUTH_FILE, text + '\n')
+    say(args.quiet, tour.describe())
+    say(args.quiet, f'written: {args.out}, {len(session.measurements)} observations')
+    return 0
+
+
+def choose_robot(
+    cell: Cell, robot: str | None, base_link: str | None, tip_link: str | None
+) -> SerialChain:
+    """Put another robot into the cell where one is named; return the chain.
+
+    Raises
+    ------
+    InputError
+        No such robot, or a URDF that is none.
+    """
+    if robot is not None:
+        shipped = config_path(f'robots/{robot}.urdf')
+        path = shipped if shipped.is_file() else Path(robot)
+        known = ', '.join(sorted(file.stem for file in shipped.parent.glob('*.urdf')))
+        missing = f'--robot takes a URDF file, or one of {known}'
+        cell.urdf_text = decode_text(read_limited(path, URDF_LIMIT, missing), path)
+        cell.robot = CellRobot(str(path))
+    cell.robot.base_link = base_link or cell.robot.base_link
+    cell.robot.tip_link = tip_link or cell.robot.tip_link
+    try:
+        chain = cell.chain()
+    except InputError as error:
+        raise InputError(f'{cell.robot.urdf}: {error}') from None
+    if robot is not None and (
+        len(chain) <= FREE_JOINTS or cell.held_joint not in chain.joint_names
+    ):
+        # The cell's joint is another robot's: the inverse kinematics then choose by themselves.
+        cell.held_joint = ''
+    return chain
+
+
+def choose_sensors(cell: Cell, chosen: tuple[str, ...] | None) -> None:
+    """Leave the chosen sensors in the cell; aim at the first of them if need be.
+
+    Raises
+    ------
+    InputError
+        The cell has no such sensor.
+    """
+    if chosen is None:
+        return
+    for name in chosen:
+        if name not in cell.sensors:
+            raise InputError(
+                f'--sensors: no sensor {name!r} in the cell ({", ".join(cell.sensors)})'
+            )
+    cell.sensors = {name: cell.sensors[name] for name in chosen}
+    if cell.aim_at not in chosen:
+        cell.aim_at = chosen[0]
+
+
+def place_sensor(cell: Cell, rough: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return T_R_N of a sensor near its rough place that looks at the middle of the workspace."""
+    position = rough + rng.normal(0.0, PLACEMENT_STD_M, 3)
+    middle = (0.0, 0.0, sum(cell.poses.height_m) / 2)
+    return transform(looking_at(position, middle, rng.uniform(-ROLL_RAD, ROLL_RAD)), position)
+
+
+def plan_tour(
+    chain: SerialChain,
+    cell: Cell,
+    sensors: dict[str, SimulatedSensor],
+    counts: dict[str, int],
+    rng: np.random.Generator,
+) -> Tour:
+    """Plan poses that face one sensor and that all of them see, for every split with a count.
+
+    Raises
+    ------
+    InputError
+        No closed form for this robot, or no pose to fit that it can take.
+    """
+    inverse = InverseKinematics(chain, cell.held(chain))
+    arm = ArmCapsules(chain, cell.link_radius_m)
+    sights = [
+        LineOfSight(
+            name,
+            sensor.T_R_N[:3, 3],
+            np.array(cell.markers[sensor.marker]),
+            np.deg2rad(cell.sensors[name].max_angle_deg),
+        )
+        for name, sensor in sensors.items()
+    ]
+    aim = sensors[cell.aim_at].T_R_N[:3, 3]
+    plans = {}
+    for split, count in counts.items():
+        if count:
+            candidates = candidate_poses(count, cell.poses.ranges(), aim, rng)
+            plans[split] = plan_poses(inverse, arm, candidates, sights, LIMIT_MARGIN_RAD)
+    tour = Tour(chain, plans)
+    if not tour.poses['optimization']:
+        raise InputError(
+            f'{tour.describe()}: no pose is left to fit; give more --poses, or a --cell with '
+            'ranges of poses that suit this robot'
+        )
+    return tour
+
+
+def visit(tour: Tour, chain: SerialChain) -> dict[str, list[FloatArray]]:
+    """Return each split's joint solutions, (m, k) per pose, in the order of the visits."""
+    visits: dict[str, list[FloatArray]] = {'optimization': [], 'validation': []}
+    q = np.clip(np.zeros(len(chain)), chain.lower, chain.upper)
+    while (stop := tour.next(q)) is not None:
+        visits[stop.split].append(stop.solutions)
+        q = stop.solutions[-1]
+    return visits
+
+
+def truth_to_dict(truth: Truth, chain: SerialChain, seed: int) -> dict[str, Any]:
+    """Return everything that an estimate of the session is to find."""
+    return {
+        'format': 'remaster-truth/1',
+        'seed': seed,
+        'robot': chain.name,
+        'joint_offsets': [
+            {'joint': name, 'offset_deg': float(np.rad2deg(offset))}
+            for name, offset in zip(chain.joint_names, truth.joint_offsets)
+        ],
+        'registration': {
+            name: {
+                'translation_m': sensor.T_R_N[:3, 3].tolist(),
+                'rotation_xyzw': quaternion_xyzw(sensor.T_R_N[:3, :3]).tolist(),
+            }
+            for name, sensor in truth.sensors.items()
+        },
+        'markers': {
+            name: {'position_m': position.tolist()} for name, position in truth.markers.items()
+        },
+        'noise': {
+            name: {'sigma_m': sensor.sigma_m, 'pose_sigma_m': sensor.pose_sigma_m}
+            for name, sensor in truth.sensors.items()
+        },
+        'outliers': list(truth.outliers),
+    }
