@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from remaster_ros.cli.console import progress_bar, say
+from remaster_ros.cli.options import integer
 from remaster_ros.core.fit import FitResult, fit_session
 from remaster_ros.storage.results import prepare_folder, save_fit
 from remaster_ros.storage.session import read_session
@@ -24,8 +25,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default='fast',
         help="'fast' (default), or 'paper': the source paper's own chain, with its faults",
     )
-    parser.add_argument('--chains', type=int, default=4, help='number of chains (default 4)')
-    parser.add_argument('--draws', type=int, help='draws per chain (default: the sampler says)')
+    parser.add_argument(
+        '--chains', type=integer(2), default=4, metavar='N', help='number of chains (default 4)'
+    )
+    parser.add_argument(
+        '--draws',
+        type=integer(100),
+        metavar='N',
+        help='draws of each chain (default 1000); with the paper sampler its steps (200000)',
+    )
 
 
 def run(args: argparse.Namespace) -> int:

@@ -53,12 +53,12 @@ def build_parser(chosen: str | None) -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     argv = sys.argv[1:] if argv is None else list(argv)
-    args = build_parser(next(iter(argv), None)).parse_args(argv)
-    logging.basicConfig(
-        format='%(levelname)s: %(message)s',
-        level=logging.ERROR if args.quiet else logging.WARNING,
-    )
     try:
+        args = build_parser(next(iter(argv), None)).parse_args(argv)
+        logging.basicConfig(
+            format='%(levelname)s: %(message)s',
+            level=logging.ERROR if args.quiet else logging.WARNING,
+        )
         status = args.run(args)
         # Here and not at exit, where it could not be caught: the reader may have gone.
         sys.stdout.flush()

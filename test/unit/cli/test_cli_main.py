@@ -1,0 +1,74 @@
+"""Whatever a verb raises becomes one line on stderr and an exit status."""
+
+from __future__ import annotations
+
+import types
+
+import pytest
+
+from remaster_ros.cli import main as cli
+from remaster_ros.core.errors import DeviceError, InputError, InsufficientDataError
+
+
+@pytest.fixture
+def run_raising(monkeypatch, capsys):
+    """Return a function that runs a verb that raises; gives status and stderr."""
+
+    def run(error):
+        def raise_it(args):
+            raise error
+
+        verb = types.SimpleNamespace(add_arguments=lambda parser: None, run=raise_it)
+        monkeypatch.setattr(cli.importlib, 'import_module', lambda name: verb)
+        status = cli.main(['fit'])
+        out, err = capsys.readouterr()
+        assert out == ''
+        return status, err
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ('error', 'status', 'line'),
+    [
+        (
+            InputError('a.csv, line 3: bad;\n  correct it'),
+            2,
+            'error: a.csv, line 3: bad; correct it',
+        ),
+        (DeviceError('the tracker is mute'), 2, 'error: the tracker is mute'),
+        (InsufficientDataError('two poses'), 1, 'error: two poses'),
+        (OSError(28, 'No space left on device', 'fit.json'), 2, 'error: fit.json: No space left'),
+        (KeyboardInterrupt(), 130, 'stopped'),
+        (ZeroDivisionError('division by zero'), 2, 'error: a fault of this program'),
+    ],
+)
+def test_errors_are_one_line(run_raising, error, status, line):
+    found, err = run_raising(error)
+    assert found == status
+    assert err.startswith(line)
+    assert err.count('\n') == 1
+
+
+def test_a_fault_of_the_program_can_be_traced(run_raising, monkeypatch):
+    monkeypatch.setenv(cli.TRACEBACK, '1')
+    status, err = run_raising(ZeroDivisionError('division by zero'))
+    assert status == 2
+    assert 'Traceback' in err
+    assert 'in raise_it' in err
+
+
+def test_every_verb_takes_the_common_options():
+    for verb in cli.VERBS:
+        help_text = cli.build_parser(verb)
+        actions = help_text._subparsers._group_actions[0].choices[verb]._option_string_actions
+        assert {'--seed', '--quiet', '--no-figures'} <= set(actions), verb
+
+
+def test_help_lists_the_verbs(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(['--help'])
+    assert stop.value.code == 0
+    out = capsys.readouterr().out
+    assert all(verb in out for verb in cli.VERBS)
+    assert 'Exit status' in out

@@ -1,0 +1,124 @@
+"""The parts of `remaster simulate`: robot, sensors, placement, order of the visits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from remaster_ros.cli import simulate
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.planning import order_solutions
+from remaster_ros.core.simulation import SimulatedSensor
+from remaster_ros.storage.cell import read_cell
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def cell():
+    return read_cell('demo')
+
+
+def place_all(cell, seed):
+    rng = np.random.default_rng(seed)
+    return {
+        name: SimulatedSensor(
+            sensor.marker, simulate.place_sensor(cell, np.array(sensor.rough_position_m), rng)
+        )
+        for name, sensor in cell.sensors.items()
+    }
+
+
+def test_a_shipped_robot_goes_by_its_name_and_keeps_the_held_joint(cell):
+    chain = simulate.choose_robot(cell, 'iiwa14', None, None)
+    assert chain.name == 'iiwa14'
+    assert 'iiwa14' in cell.urdf_text
+    assert list(cell.held(chain)) == [2]
+
+
+def test_any_urdf_goes_by_its_path_with_the_links_asked_for(cell):
+    path = ROOT / 'config/robots/iiwa7.urdf'
+    chain = simulate.choose_robot(cell, str(path), 'base_link', 'link_6')
+    assert len(chain) == 6
+    assert chain.tip_link == 'link_6'
+    # Six joints leave none to hold.
+    assert cell.held(chain) is None
+
+
+def test_an_unknown_robot_is_refused_with_the_names_there_are(cell):
+    with pytest.raises(InputError, match='one of iiwa14, iiwa7, lwr4plus'):
+        simulate.choose_robot(cell, 'nix', None, None)
+
+
+def test_a_urdf_that_is_none_is_named(cell, tmp_path):
+    path = tmp_path / 'robot.urdf'
+    path.write_text('<robot name="x">')
+    with pytest.raises(InputError, match=r'robot\.urdf: '):
+        simulate.choose_robot(cell, str(path), None, None)
+
+
+def test_the_tool_faces_a_sensor_that_is_there(cell):
+    simulate.choose_sensors(cell, ('mocap',))
+    assert list(cell.sensors) == ['mocap']
+    assert cell.aim_at == 'mocap'
+    with pytest.raises(InputError, match=r"no sensor 'sonar' in the cell \(mocap\)"):
+        simulate.choose_sensors(cell, ('sonar',))
+
+
+def test_sensors_stand_near_their_rough_place_and_look_at_the_workspace(cell):
+    """Five std of the placement; another seed gives another place."""
+    for name, sensor in place_all(cell, 3).items():
+        T, rough = sensor.T_R_N, np.array(cell.sensors[name].rough_position_m)
+        assert np.all(np.abs(T[:3, 3] - rough) < 5 * simulate.PLACEMENT_STD_M)
+        to_middle = np.array([0.0, 0.0, 0.6]) - T[:3, 3]
+        np.testing.assert_allclose(T[:3, 2], to_middle / np.linalg.norm(to_middle), atol=1e-12)
+    assert not np.allclose(
+        place_all(cell, 3)['mocap'].T_R_N, place_all(cell, 4)['mocap'].T_R_N, atol=1e-3
+    )
+
+
+@pytest.fixture
+def planned(cell):
+    chain = cell.chain()
+    counts = {'optimization': 12, 'validation': 6}
+    sensors = place_all(cell, 5)
+    tour = simulate.plan_tour(chain, cell, sensors, counts, np.random.default_rng(5))
+    return chain, sensors, tour
+
+
+def test_every_planned_solution_is_visited_nearest_first(planned):
+    chain, _, tour = planned
+    visits = simulate.visit(tour, chain)
+    q = np.zeros(len(chain))
+    for split, poses in visits.items():
+        assert len(poses) == tour.poses[split] > 0
+        assert sum(map(len, poses)) == tour.configurations[split]
+        for solutions in poses:
+            order = order_solutions(solutions, q, chain.velocity_limits)
+            np.testing.assert_array_equal(order, np.arange(len(solutions)))
+            tools = chain.forward(solutions)
+            np.testing.assert_allclose(tools, np.broadcast_to(tools[0], tools.shape), atol=1e-7)
+            q = solutions[-1]
+
+
+def test_the_tool_faces_the_sensor_it_aims_at(planned):
+    chain, sensors, tour = planned
+    for poses in simulate.visit(tour, chain).values():
+        for solutions in poses:
+            T = chain.forward(solutions[0])
+            line = sensors['tracker'].T_R_N[:3, 3] - T[:3, 3]
+            np.testing.assert_allclose(T[:3, 2], line / np.linalg.norm(line), atol=1e-6)
+
+
+def test_ranges_out_of_reach_are_refused(cell):
+    cell.poses.radius_m = (4.0, 5.0)
+    with pytest.raises(InputError, match=r'dropped poses: 5 out of reach: no pose is left'):
+        simulate.plan_tour(
+            cell.chain(),
+            cell,
+            place_all(cell, 1),
+            {'optimization': 5, 'validation': 0},
+            np.random.default_rng(1),
+        )
