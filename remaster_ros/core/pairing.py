@@ -27,7 +27,8 @@ class SensorRules:
     dwell_s
         Length of the average after the arm has settled, s (streams).
     min_samples
-        Fewer accepted samples in the dwell are no measurement (streams).
+        While the dwell has fewer, it is prolonged, up to the time-out: a marker that was hidden
+        for a moment costs a moment and not the configuration (streams).
     max_std_m
         A larger standard deviation on any axis over the dwell is no still marker, m (streams).
     timeout_s
@@ -145,9 +146,13 @@ class Pairing:
 
     def _late(self, rules: SensorRules, allowed: float) -> Rejection:
         count = len(self._readings[rules.sensor])
+        if 0 < count < rules.min_samples and not rules.single_shot:
+            detail = f'{count} usable samples in {allowed:.1f} s (at least {rules.min_samples})'
+            return Rejection(rules.sensor, 'too_few', detail)
         what = 'no joint state followed the reading' if count else 'no reading'
-        detail = f'{what} within {allowed:.1f} s after settling ({count} samples came)'
-        return Rejection(rules.sensor, 'stale', detail)
+        return Rejection(
+            rules.sensor, 'stale', f'{what} within {allowed:.1f} s after the arm settled'
+        )
 
     def _decide(self, stamp_s: float) -> None:
         for name, rules in self.rules.items():
@@ -160,15 +165,32 @@ class Pairing:
                 end = readings[0].stamp_s
                 used = readings[:1]
             else:
-                end = self.settled_stamp_s + rules.dwell_s
-                # The dwell is over for this sensor once it has sent something later than its end.
-                if not readings or readings[-1].stamp_s <= end:
+                dwell = self._dwell(rules, readings)
+                if dwell is None:
                     continue
-                used = [reading for reading in readings if reading.stamp_s <= end]
+                end, used = dwell
             # Without a later joint state nobody knows that the arm stood still to the end.
             if not self._joints or self._joints[-1][0] < end:
                 continue
             self.decided[name] = self._judge(rules, used, end)
+
+    def _dwell(
+        self, rules: SensorRules, readings: list[MarkerReading]
+    ) -> tuple[float, list[MarkerReading]] | None:
+        """End of a stream's dwell and the readings in it; None while it lasts."""
+        end = self.settled_stamp_s + rules.dwell_s
+        # The dwell is over for this sensor once it has sent something later than its end.
+        if not readings or readings[-1].stamp_s <= end:
+            return None
+        used = [reading for reading in readings if reading.stamp_s <= end]
+        if len(used) < rules.min_samples:
+            if len(readings) < rules.min_samples:
+                return None
+            used = readings[: rules.min_samples]
+            end = used[-1].stamp_s
+            if end > self.settled_stamp_s + rules.dwell_s + rules.timeout_s:
+                return None
+        return end, used
 
     def _judge(
         self, rules: SensorRules, used: list[MarkerReading], end: float
@@ -187,9 +209,6 @@ class Pairing:
         if rules.single_shot:
             std = None
         else:
-            if len(used) < rules.min_samples:
-                detail = f'{len(used)} usable samples in the dwell (at least {rules.min_samples})'
-                return Rejection(rules.sensor, 'too_few', detail)
             std = positions.std(axis=0, ddof=1) if len(used) > 1 else np.zeros(3)
             if not np.all(std <= rules.max_std_m):
                 detail = f'std {1e3 * std.max():.3f} mm (allowed {1e3 * rules.max_std_m:.3f} mm)'

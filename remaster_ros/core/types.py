@@ -166,9 +166,10 @@ class Measurements:
 
     def select(self, rows: BoolArray | IntArray) -> Measurements:
         """Return the given rows (a mask or indices), in that order."""
-        return Measurements(
-            **{name: None if value is None else value[rows] for name, value in vars(self).items()}
-        )
+        columns: dict[str, Any] = {
+            name: None if value is None else value[rows] for name, value in vars(self).items()
+        }
+        return Measurements(**columns)
 
 
 @dataclass(frozen=True)

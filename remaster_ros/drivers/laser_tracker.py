@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from types import TracebackType
 
 import numpy as np
@@ -190,7 +191,7 @@ class LaserTrackerClient:
         self._ask(Command.SET_MEASUREMENT_MODE, codes.STATIONARY)
         self._ask(Command.SET_STATIONARY_MODE, round(s.integration_s * 1e3), True)
         self._ask(Command.SET_STATISTIC_MODE, codes.STANDARD_STATISTICS, codes.STANDARD_STATISTICS)
-        self._ask(Command.SET_SEARCH, s.search_radius_m, round(s.search_timeout_s * 1e3))
+        self._set_search()
         if s.reflector_id is not None:
             self._ask(Command.SET_REFLECTOR, s.reflector_id)
         if s.environment is not None:
@@ -198,6 +199,15 @@ class LaserTrackerClient:
             self._ask(Command.SET_ENVIRONMENT, e.temperature_c, e.pressure_hpa, e.humidity_percent)
         self._check_settings()
         self.request_status()
+
+    def set_search_radius(self, radius_m: float) -> None:
+        """Set how far (m) about the place it is told, or points to, the instrument searches."""
+        self.settings = replace(self.settings, search_radius_m=radius_m)
+        self._set_search()
+
+    def _set_search(self) -> None:
+        s = self.settings
+        self._ask(Command.SET_SEARCH, s.search_radius_m, round(s.search_timeout_s * 1e3))
 
     def find_reflector(self, distance_m: float | None = None) -> None:
         """Search a spiral about the place the tracker points to, and lock the reflector.

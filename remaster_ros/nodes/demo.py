@@ -13,7 +13,7 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,7 +68,7 @@ class Conductor(Node):
         super().__init__('demo')
         self.p = declare(self, Parameters)
         self.summaries: dict[str, dict[str, str]] = {}
-        self.times = ConfigurationTimes()
+        self.times = ConfigurationTimes(self.p.rate)
         self.planned = ''
         listen(self, self._on_event, self._on_summary)
         self._clients_by_name: dict[str, Any] = {}
@@ -128,7 +128,7 @@ class Demo:
         self._trigger('/remaster/fit', timeout_s=300.0)
         result = read_fit(self.fit / 'fit.json')
         self.processes.stop()
-        print_times(self.console, self.node.times, self.p.rate)
+        print_times(self.console, self.node.times)
         print_offsets(self.console, result, world.truth)
         self.console.print(f'session: {self.session}')
         name = 'report.html' if self.p.figures else 'fit.json'
@@ -262,7 +262,7 @@ def _domain_environment() -> dict[str, str]:
     return {name: os.environ[name] for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE')}
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(args: list[str] | None = None) -> int:
     """Run the demo; returns its exit status."""
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

@@ -15,11 +15,19 @@ from remaster_ros.nodes.status import Event
 class ConfigurationTimes:
     """Where the time of each configuration went, from the nodes' events.
 
-    Motion, settle and measuring are world time as the nodes' stamps have it. Software is wall
-    time: from the bridge's word that the arm has settled to its next command, less the measuring.
+    Motion, settle and measuring are world time. Measuring is what the slowest instrument took:
+    the dwell of a stream, or search and integration of a laser tracker. Software is wall time:
+    from the bridge's word that the arm has settled to its next command, less the measuring.
+
+    Parameters
+    ----------
+    rate
+        World time over wall time.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._instrument_s = 0.0
         self._open: dict[tuple[str, str], dict[str, float]] = {}
         self._last: dict[str, float] | None = None
         self._registration: set[str] = set()
@@ -40,22 +48,25 @@ class ConfigurationTimes:
             self._open[key].update(
                 motion=float(values['motion_s']), settle=float(values['settle_s'])
             )
+        elif event.event == 'measured':
+            self._instrument_s = float(values['instrument_wall_s']) * self._rate
         elif event.event == 'configuration' and 'measuring_s' in values and key in self._open:
-            self._open[key]['measuring'] = float(values['measuring_s'])
+            self._open[key]['measuring'] = max(float(values['measuring_s']), self._instrument_s)
+            self._instrument_s = 0.0
             self.rows.append(self._open[key])
 
-    def columns(self, rate: float) -> dict[str, np.ndarray]:
+    def columns(self) -> dict[str, np.ndarray]:
         """Return motion, settle, measuring (world s) and software (wall s) of complete rows."""
         needed = ('motion', 'settle', 'measuring', 'until_command')
         rows = [row for row in self.rows if all(name in row for name in needed)]
         table = {name: np.array([row[name] for row in rows]) for name in needed}
-        software = table.pop('until_command') - table['measuring'] / rate
+        software = table.pop('until_command') - table['measuring'] / self._rate
         return {**table, 'software': software}
 
 
-def print_times(console: Console, times: ConfigurationTimes, rate: float) -> None:
+def print_times(console: Console, times: ConfigurationTimes) -> None:
     """Print the table of times per configuration."""
-    columns = times.columns(rate)
+    columns = times.columns()
     table = Table(title=f'time per configuration, s ({len(columns["motion"])} configurations)')
     for heading in ('', 'median', '95 %', 'largest'):
         table.add_column(heading, justify='left' if not heading else 'right')

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,9 +49,16 @@ class Parameters:
     integration_s: float = parameter(
         1.0, 'averaging time of one measurement', unit='s', low=0.05, high=60.0
     )
-    search_radius_m: float = parameter(
+    first_search_radius_m: float = parameter(
         0.6,
-        'how far about the expected place the reflector is searched',
+        'how far about where it points the tracker searches before it is registered',
+        unit='m',
+        low=1e-3,
+        high=5.0,
+    )
+    search_radius_m: float = parameter(
+        0.05,
+        'how far about the expected place it searches afterwards',
         unit='m',
         low=1e-3,
         high=5.0,
@@ -87,7 +93,7 @@ class LaserTrackerMarkers(RemasterNode):
         self._state, self._trouble = 'connecting', ''
         self._temperature_c: float | None = None
         settings = LaserTrackerSettings(
-            search_radius_m=self.p.search_radius_m,
+            search_radius_m=self.p.first_search_radius_m,
             search_timeout_s=self.p.search_timeout_s,
             integration_s=self.p.integration_s,
         )
@@ -96,6 +102,7 @@ class LaserTrackerMarkers(RemasterNode):
         )
         # One command is under way at a time: a measurement waits for a search to end.
         self._instrument = threading.Lock()
+        self._narrow = False
         self._arrival_s: float | None = None
         self._commanded = threading.Event()
         self._ending = threading.Event()
@@ -171,10 +178,19 @@ class LaserTrackerMarkers(RemasterNode):
             with self._instrument:
                 try:
                     if self.tracker.status is not TrackerStatus.READY:
-                        self.tracker.ensure_locked(self._expected(), attempts=1)
+                        self._lock()
                 except DeviceError as error:
                     # The request that follows tries again, and reports.
                     self._trouble = str(error)
+
+    def _lock(self) -> FloatArray | None:
+        """Search once if the beam is broken; returns where the reflector should be, if known."""
+        expected = self._expected()
+        if expected is not None and not self._narrow:
+            self.tracker.set_search_radius(self.p.search_radius_m)
+            self._narrow = True
+        self.tracker.ensure_locked(expected, attempts=1)
+        return expected
 
     def _connect(self) -> bool:
         """Try until the instrument answers; fails the node after the start time-out."""
@@ -213,28 +229,31 @@ class LaserTrackerMarkers(RemasterNode):
         if self._state != 'ready':
             response.message = f'the laser tracker is {self._state}: {self._trouble}'
             return response
+        began = time.monotonic()
         with self._instrument:
             try:
                 reading = self._measure()
             except DeviceError as error:
                 self._trouble = response.message = str(error)
                 return response
+        took = time.monotonic() - began
         self._trouble = ''
         self._temperature_c = reading.temperature_c
         message = PointStamped()
         message.header.stamp = stamp_of(reading.stamp_s)
         message.header.frame_id = self.p.sensor
         message.point.x, message.point.y, message.point.z = map(float, reading.position)
+        # What the instrument took is not the software's time.
+        self.status.event('measured', 'measured', instrument_wall_s=f'{took:.6f}')
         self._publisher.publish(message)
         response.success, response.message = True, 'measured'
         return response
 
     def _measure(self) -> TrackerReading:
         failure: DeviceError | None = None
-        expected = self._expected()
         for _ in range(self.p.attempts):
             try:
-                self.tracker.ensure_locked(expected, attempts=1)
+                expected = self._lock()
                 reading = self.tracker.measure()
             except LaserTrackerError as error:
                 if not self.tracker.connected:
@@ -253,7 +272,11 @@ class LaserTrackerMarkers(RemasterNode):
 
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
         level = 'ok' if not self._trouble else 'warn' if self._state == 'ready' else 'error'
-        values = {'state': self._state, 'lock': self.tracker.status.value, **self.tracker.counts}
+        values: dict[str, Any] = {
+            'state': self._state,
+            'lock': self.tracker.status.value,
+            **self.tracker.counts,
+        }
         if self._temperature_c is not None:
             values['temperature_c'] = self._temperature_c
         return level, self._trouble or self._state, values
@@ -265,7 +288,7 @@ class LaserTrackerMarkers(RemasterNode):
         self._thread.join(2.0)
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(args: list[str] | None = None) -> int:
     """Run the node."""
     return run(LaserTrackerMarkers, args, threads=3)
 

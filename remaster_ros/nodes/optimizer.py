@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -97,7 +96,7 @@ class Optimizer(RemasterNode):
         return 'ok', self._state, {'session': self.p.session, 'out': self.p.out}
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(args: list[str] | None = None) -> int:
     """Run the node."""
     return run(Optimizer, args, threads=2)
 

@@ -7,7 +7,6 @@ their reason in /remaster/status, which also says what is wrong when nothing com
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -132,7 +131,7 @@ class OptiTrackMarkers(RemasterNode):
         self.client.stop()
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(args: list[str] | None = None) -> int:
     """Run the node."""
     return run(OptiTrackMarkers, args)
 

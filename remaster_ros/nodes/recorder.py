@@ -6,9 +6,8 @@ are on disk; the bridge moves on only then.
 
 from __future__ import annotations
 
-import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -33,7 +32,7 @@ from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import TOPIC as STATUS
 from remaster_ros.nodes.status import Event, Status, receiver
 from remaster_ros.storage.cell import Cell, read_cell
-from remaster_ros.storage.session import SessionWriter
+from remaster_ros.storage.session import ExitStatus, SessionWriter
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,6 @@ class _Taking:
     stamp: str
     solution: int
     pose: _Pose
-    settled_wall: float
     future: Future | None = None
 
 
@@ -247,7 +245,7 @@ class Recorder(RemasterNode):
         future: Future | None = None,
     ) -> None:
         pairing = Pairing(settled_s, q, self.rules, self.p.motion_tolerance)
-        self._taking = _Taking(pairing, stamp, solution, pose, time.monotonic(), future)
+        self._taking = _Taking(pairing, stamp, solution, pose, future)
         for name, client in self._measure.items():
             if not client.service_is_ready():
                 pairing.fail(name, f'the service {client.srv_name} is not there')
@@ -299,7 +297,6 @@ class Recorder(RemasterNode):
             why,
             registered='yes' if self.registrar.complete else 'no',
             measuring_s=f'{last - taking.pairing.settled_stamp_s:.6f}',
-            measuring_wall_s=f'{time.monotonic() - taking.settled_wall:.6f}',
         )
 
     def _write(self, good: list[PairedReading], taking: _Taking) -> None:
@@ -369,7 +366,7 @@ class Recorder(RemasterNode):
         }
         return ('warn' if self._trouble else 'ok'), self._trouble or state, values
 
-    def _close(self, exit_status: str) -> None:
+    def _close(self, exit_status: ExitStatus) -> None:
         if not self._closed:
             self._closed = exit_status
             self.writer.close(exit_status)
@@ -383,7 +380,7 @@ class Recorder(RemasterNode):
         self._close('stopped')
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(args: list[str] | None = None) -> int:
     """Run the node."""
     return run(Recorder, args)
 

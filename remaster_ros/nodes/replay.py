@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import threading
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,7 +50,7 @@ class Replay(RemasterNode):
         self._ending = threading.Event()
         self._clock_sent = 0.0
         self.sent = 0
-        for topic, type_name in self._reader.topics().items():
+        for topic, type_name in self._reader.topics.items():
             if topic != '/clock' or self._clock_publisher is None:
                 self._publishers_by_topic[topic] = self._publisher(topic, type_name)
         self._thread = threading.Thread(target=self._play, daemon=True)
@@ -133,7 +132,7 @@ def message_class(type_name: str) -> Any:
         raise InputError(f'this machine has no message type {type_name}') from None
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(args: list[str] | None = None) -> int:
     """Run the node."""
     return run(Replay, args)
 

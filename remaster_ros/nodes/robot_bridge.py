@@ -8,7 +8,6 @@ configuration has settled the arm stays until the recorder has said what became 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -283,7 +282,7 @@ class RobotBridge(RemasterNode):
             self._hold('the bridge stops')
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(args: list[str] | None = None) -> int:
     """Run the node."""
     return run(RobotBridge, args)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import rclpy
@@ -62,7 +62,7 @@ class RemasterNode(Node):
 
 
 def run(
-    make_node: Callable[[], RemasterNode], args: Sequence[str] | None = None, threads: int = 1
+    make_node: Callable[[], RemasterNode], args: list[str] | None = None, threads: int = 1
 ) -> int:
     """Spin the node that `make_node` returns until a signal, its failure or its finish.
 

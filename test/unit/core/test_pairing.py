@@ -63,13 +63,25 @@ def test_an_arm_that_moves_during_the_dwell_is_rejected():
     assert rejection.reason == 'moving'
 
 
+def test_a_marker_hidden_for_a_moment_prolongs_the_dwell():
+    """Three samples in the dwell, then a gap: the fifth sample ends it, and no later one counts."""
+    pairing = Pairing(10.0, Q, (STREAM,))
+    for stamp in (10.1, 10.2, 10.3, 10.9, 11.0, 11.1):
+        pairing.add_reading('mocap', MarkerReading(stamp, np.zeros(3)))
+    run(pairing, skip_stream=True, until=1.5)
+    reading = pairing.decided['mocap']
+    assert (reading.samples, reading.stamp_s) == (5, 11.0)
+
+
 def test_too_few_samples_are_rejected():
     pairing = Pairing(10.0, Q, (STREAM,))
     for stamp in (10.1, 10.2, 10.3, 10.6):
         pairing.add_reading('mocap', MarkerReading(stamp, np.zeros(3)))
     run(pairing, skip_stream=True)
+    assert not pairing.complete
+    pairing.give_up(12.6)
     assert pairing.decided['mocap'].reason == 'too_few'
-    assert '3 usable samples' in pairing.decided['mocap'].detail
+    assert '4 usable samples' in pairing.decided['mocap'].detail
 
 
 def test_an_unsteady_marker_is_rejected():
@@ -86,7 +98,7 @@ def test_silence_is_stale_after_the_timeout_and_not_before():
     assert not pairing.decided
     pairing.give_up(12.6)
     assert pairing.decided['mocap'].reason == 'stale'
-    assert '0 samples' in pairing.decided['mocap'].detail
+    assert 'no reading' in pairing.decided['mocap'].detail
 
 
 def test_a_single_shot_waits_for_the_joint_state_that_vouches_for_it():
