@@ -21,8 +21,20 @@ WITHOUT_ROS = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``remaster demo``."""
     parser.add_argument('--out', metavar='DIR', help='new folder (default: remaster_demo_N)')
-    parser.add_argument(
-        '--full', action='store_true', help="the paper's size: 60 candidate poses each"
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument(
+        '--candidates',
+        type=int,
+        default=14,
+        metavar='N',
+        help='candidate poses for optimization and for validation, each (default 14)',
+    )
+    size.add_argument(
+        '--full',
+        dest='candidates',
+        action='store_const',
+        const=60,
+        help="the paper's size: 60 candidate poses each",
     )
     parser.add_argument(
         '--rate',
@@ -40,7 +52,7 @@ def run(args: argparse.Namespace) -> NoReturn:
         {
             'out': str(out),
             'seed': args.seed,
-            'full': args.full,
+            'candidates': args.candidates,
             'rate': args.rate,
             'figures': not args.no_figures,
             'quiet': args.quiet,

@@ -8,6 +8,7 @@ import logging
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Sequence
 
 from remaster_ros import __version__
@@ -59,6 +60,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             format='%(levelname)s: %(message)s',
             level=logging.ERROR if args.quiet else logging.WARNING,
         )
+        if not os.environ.get(TRACEBACK):
+            # An overflow on the way to an error or a verdict that says the same in words.
+            warnings.simplefilter('ignore', RuntimeWarning)
         status = args.run(args)
         # Here and not at exit, where it could not be caught: the reader may have gone.
         sys.stdout.flush()

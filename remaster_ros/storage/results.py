@@ -253,7 +253,7 @@ def joint_offsets_rad(
     Raises
     ------
     InputError
-        The offsets are for other joints, or a std is negative.
+        The offsets are for other joints, or are no angles.
     """
     rows = {row['joint']: row for row in fit['joint_offsets']}
     if set(rows) != set(joint_names) or len(rows) < len(fit['joint_offsets']):
@@ -263,8 +263,11 @@ def joint_offsets_rad(
         )
     ordered = [rows[name] for name in joint_names]
     for row in ordered:
-        if not row['std_deg'] >= 0.0:
-            raise InputError(f'{row["joint"]}: std_deg is {row["std_deg"]}; fit again')
+        for key, low in (('mean_deg', -360.0), ('std_deg', 0.0)):
+            if not low <= row[key] <= 360.0:
+                raise InputError(
+                    f'{row["joint"]}: {key} is {row[key]:g}, not {low:g} to 360; fit again'
+                )
     std = [row['std_deg'] if row['identifiable'] else 0.0 for row in ordered]
     return np.radians([row['mean_deg'] for row in ordered]), np.radians(std)
 

@@ -239,7 +239,10 @@ class TestOffsets:
             (lambda fit: fit.update(format='other/1'), "format is 'other/1'"),
             (lambda fit: fit.pop('joint_offsets'), 'joint_offsets'),
             (lambda fit: fit['joint_offsets'][2].update(mean_deg='0.1'), r'mean_deg'),
-            (lambda fit: fit['joint_offsets'][2].update(std_deg=-1), 'joint_3: std_deg is -1'),
+            (
+                lambda fit: fit['joint_offsets'][2].update(std_deg=-1),
+                'std_deg is -1, not 0 to 360',
+            ),
             (lambda fit: fit['joint_offsets'].pop(), 'use the fit of this robot'),
             (lambda fit: fit['joint_offsets'][2].update(joint='A3'), 'use the fit of this robot'),
         ],

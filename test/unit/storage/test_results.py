@@ -63,10 +63,13 @@ def test_offsets_of_another_robot_are_refused(fit_result):
         joint_offsets_rad(fit, ['joint_1', 'joint_2'])
 
 
-def test_a_negative_spread_is_refused(fit_result):
+@pytest.mark.parametrize(
+    ('key', 'value'), [('std_deg', -0.01), ('std_deg', 1e30), ('mean_deg', -1e300)]
+)
+def test_offsets_that_are_no_angles_are_refused(fit_result, key, value):
     fit = fit_to_dict(fit_result)
-    fit['joint_offsets'][2]['std_deg'] = -0.01
-    with pytest.raises(InputError, match=r'joint_3: std_deg is -0\.01'):
+    fit['joint_offsets'][2][key] = value
+    with pytest.raises(InputError, match=f'joint_3: {key} is {value:g}, not '.replace('+', r'\+')):
         joint_offsets_rad(fit, fit_result.joint_names)
 
 
