@@ -1,54 +1,67 @@
-# Two commands do all the set-up on a fresh Linux machine with Python 3.11+ and pip:
-#   make demo    the main job on fake hardware; ends by saying where the report is
-#   make test    the tests
-# With an installed ROS 2 Jazzy sourced, its rclpy is used; else the pip wheels are installed.
+# Everything from a fresh clone on a Linux machine with Python 3.11+ and pip:
+#   make demo     the main job on fake hardware; ends by saying where the report is
+#                 (OUT=folder SEED=n ARGS='--full' are handed on)
+#   make test     the tests (PYTEST='-k name' is handed on)
+#   make check    lint, types, layers, tests: what CI runs
+#   make bench    the benchmarks
+#   make docs     docs/parameters.md from the code
+# The first of them makes a virtual environment. With ROS 2 Jazzy sourced its rclpy is used and the
+# system's NumPy kept; else the ROS 2 wheels are installed. PYTHON=... chooses the interpreter.
 
 SHELL := /bin/bash
-PYTHON ?= $(shell for v in python3 python3.12 python3.11 python3.13; do \
-	$$v -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null && echo $$v && break; done)
-VENV := .venv
-BIN := $(VENV)/bin
-# A sourced ROS shows itself by ROS_DISTRO and an importable rclpy; the environment then sees the
-# system's packages and keeps the NumPy that its messages were compiled against.
-HAVE_ROS := $(shell test "$$ROS_DISTRO" = jazzy && $(PYTHON) -c 'import rclpy' 2>/dev/null && echo yes)
+.NOTPARALLEL:
+.PHONY: help demo test lint check bench docs format clean
 
-.PHONY: demo test check bench clean format
-
-ifeq ($(HAVE_ROS),yes)
-VENV_OPTIONS := --system-site-packages
-EXTRAS := test,check
+ifneq ($(and $(ROS_DISTRO),$(AMENT_PREFIX_PATH)),)
+KIND := ros
+VENV := .venv-ros
 CONSTRAINTS := constraints-ros.txt
 else
-VENV_OPTIONS :=
-EXTRAS := jazzy,test,check
+KIND := wheels
+VENV := .venv
 CONSTRAINTS := constraints.txt
 endif
+BIN := $(VENV)/bin
+export PYTHON
 
-$(VENV)/installed: setup.py $(CONSTRAINTS)
-	@test -n "$(PYTHON)" || { echo 'error: no Python 3.11 to 3.13 found; install one, or set PYTHON=' >&2; exit 2; }
-	$(PYTHON) -m venv $(VENV_OPTIONS) $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'setuptools<80' wheel
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -c $(CONSTRAINTS) -e '.[$(EXTRAS)]'
-	touch $@
+# A process of another environment with ROS wheels leaves this behind; with it set, the wheels of
+# ours would not set up their library path.
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+
+help:
+	@sed -n '1,9s/^# \{0,1\}//p' Makefile
+
+$(VENV)/installed: setup.py setup.cfg $(CONSTRAINTS) tools/make-venv
+	@tools/make-venv $(VENV) $(KIND)
+	@touch $@
 
 demo: $(VENV)/installed
-	$(BIN)/remaster demo $(if $(OUT),--out $(OUT)) $(if $(SEED),--seed $(SEED))
+	$(BIN)/remaster demo $(if $(OUT),--out '$(OUT)') $(if $(SEED),--seed $(SEED)) $(ARGS)
 
+# Plugins that happen to be on the machine stay out: launch_testing of ROS breaks with pytest 9.
 test: $(VENV)/installed
-	$(BIN)/python -m pytest $(PYTEST)
+	PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest \
+		-p pytest_timeout -p _hypothesis_pytestplugin $(PYTEST)
 
-check: $(VENV)/installed
+lint: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+check: lint test
+
+bench: $(VENV)/installed
+	@for script in $(wildcard benchmarks/bench_*.py); do \
+		echo "== $$script"; $(BIN)/python $$script || exit 1; done
+
+docs: $(VENV)/installed
+	$(BIN)/python docs/make_parameters.py
+
 format: $(VENV)/installed
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(VENV)/installed
-	for script in benchmarks/bench_*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
-
 clean:
-	rm -rf $(VENV) build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .venv-ros build install log *.egg-info
+	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -1,17 +1,13 @@
 """Package of remaster_ros: ament_python at the root, and a plain pip package too."""
 
-from glob import glob
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
 NAME = 'remaster_ros'
 
-# What `ros2 run remaster_ros <executable>` finds. pip puts console scripts into bin/ and never
-# into lib/<package>/, so thin wrapper scripts are installed as data files; only `remaster` goes
-# on PATH.
-EXECUTABLES = sorted(glob('scripts/*'))
-
+# The ROS 2 Jazzy wheels that a machine without ROS needs. A bare `ros-rclpy` would be another
+# distribution.
 JAZZY = [
     'ros-jazzy-' + name
     for name in (
@@ -28,14 +24,26 @@ JAZZY = [
     )
 ]
 
+# What judges in the tests: clients and readers of others, and their statistics and kinematics.
+JUDGES = [
+    'NatNetClient==0.8.3',
+    'natnet==0.3.0',
+    'CESAPI==1.1.3',
+    'mcap-ros2-support>=0.5',
+    'arviz-stats>=0.4',
+    'pin>=2.7',
+]
+
+
+def files(folder: str, pattern: str = '*') -> list[str]:
+    """Return the files of a folder, sorted."""
+    return sorted(str(path) for path in Path(folder).glob(pattern) if path.is_file())
+
 
 def config_files() -> list[tuple[str, list[str]]]:
     """Return the data_files entries for config/, keeping its folders."""
-    folders = ['config', *(str(p) for p in Path('config').iterdir() if p.is_dir())]
-    return [
-        (f'share/{NAME}/{folder}', [p for p in glob(f'{folder}/*') if Path(p).is_file()])
-        for folder in folders
-    ]
+    folders = ['config', *sorted(str(path) for path in Path('config').iterdir() if path.is_dir())]
+    return [(f'share/{NAME}/{folder}', files(folder)) for folder in folders]
 
 
 setup(
@@ -51,26 +59,27 @@ setup(
     packages=[*find_packages(include=[NAME, f'{NAME}.*']), f'{NAME}.config'],
     package_dir={f'{NAME}.config': 'config'},
     package_data={
-        f'{NAME}.config': ['*.yaml', 'robots/*', 'cells/*'],
+        f'{NAME}.config': ['*.yaml', '*.rviz', 'robots/*', 'cells/*'],
         f'{NAME}.storage': ['*.jinja'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        (f'share/{NAME}/launch', glob('launch/*.py')),
-        (f'lib/{NAME}', EXECUTABLES),
+        (f'share/{NAME}/launch', files('launch', '*.py')),
+        # What `ros2 run remaster_ros <executable>` finds. pip puts console scripts into bin/ and
+        # never into lib/<package>/, so these thin scripts are data files.
+        (f'lib/{NAME}', files('scripts')),
         *config_files(),
     ],
     install_requires=[
-        'setuptools',
         'numpy>=1.26',
         'scipy>=1.11',
-        'pyyaml>=6',
+        'PyYAML>=6',
         'EAIK>=1.2',
         'msgspec>=0.18',
         'rich>=13',
-        'jinja2>=3.1',
-        'matplotlib>=3.8',
+        'Jinja2>=3.1',
+        'matplotlib>=3.6',
         'plotly>=5.20',
         'mcap>=1.2',
         'rosbags>=0.10',
@@ -78,16 +87,13 @@ setup(
     extras_require={
         'jazzy': JAZZY,
         'natnetclient': ['NatNetClient==0.8.3'],
+        # colcon, with which a test builds the package, runs pytest only where it is in this list.
         'test': [
-            'pytest>=8',
+            'pytest>=7.4',
             'pytest-timeout',
             'hypothesis',
-            'NatNetClient==0.8.3',
-            'natnet==0.3.0',
-            'CESAPI==1.1.3',
-            'mcap-ros2-support>=0.5',
-            'arviz-stats',
-            'pin>=3',
+            'colcon-common-extensions',
+            *JUDGES,
         ],
         'check': ['ruff', 'mypy', 'types-PyYAML', 'import-linter'],
     },

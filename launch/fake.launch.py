@@ -1,7 +1,7 @@
 """The same six nodes in front of the three fakes; the fake robot draws the hidden World.
 
-Then ``ros2 service call /remaster/collect std_srvs/srv/Trigger`` begins. `remaster demo` starts
-and conducts the same nodes by itself.
+``ros2 service call /remaster/collect std_srvs/srv/Trigger`` begins, ``…/fit`` fits. `remaster
+demo` starts and conducts the same nodes by itself.
 """
 
 from pathlib import Path
@@ -13,6 +13,7 @@ from launch_ros.actions import Node
 
 from launch import LaunchDescription
 
+FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
 NODES = (
     'pose_planner',
     'robot_bridge',
@@ -21,7 +22,6 @@ NODES = (
     'recorder',
     'optimizer',
 )
-FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
 
 
 def generate_launch_description():
@@ -29,9 +29,19 @@ def generate_launch_description():
     params = LaunchConfiguration('params')
     return LaunchDescription(
         [
-            DeclareLaunchArgument('params', default_value=str(share / 'config' / 'fake.yaml')),
+            DeclareLaunchArgument(
+                'params',
+                default_value=str(share / 'config' / 'fake.yaml'),
+                description='parameter file of nodes and fakes',
+            ),
             *(
-                Node(package='remaster_ros', executable=name, name=name, parameters=[params])
+                Node(
+                    package='remaster_ros',
+                    executable=name,
+                    name=name,
+                    parameters=[params],
+                    output='screen',
+                )
                 for name in (*FAKES, *NODES)
             ),
         ]

@@ -1,4 +1,8 @@
-"""The six nodes on real hardware: one robot behind ros2_control, a bar and a tracker."""
+"""The six nodes on real hardware: an arm behind ros2_control, a camera bar and a laser tracker.
+
+``ros2 launch remaster_ros real.launch.py params:=my.yaml controller:=/arm_controller``; then
+``ros2 service call /remaster/collect std_srvs/srv/Trigger`` begins.
+"""
 
 from pathlib import Path
 
@@ -22,6 +26,14 @@ NODES = (
 def generate_launch_description():
     share = Path(get_package_share_directory('remaster_ros'))
     params = LaunchConfiguration('params')
+    # More than one node listens to what the arm is told, so all of them are remapped.
+    remappings = [
+        (
+            '/joint_trajectory_controller/joint_trajectory',
+            [LaunchConfiguration('controller'), '/joint_trajectory'],
+        ),
+        ('/joint_states', LaunchConfiguration('joint_states')),
+    ]
     return LaunchDescription(
         [
             DeclareLaunchArgument(
@@ -29,8 +41,25 @@ def generate_launch_description():
                 default_value=str(share / 'config' / 'real.yaml'),
                 description='parameter file; copy config/real.yaml and put in your addresses',
             ),
+            DeclareLaunchArgument(
+                'controller',
+                default_value='/joint_trajectory_controller',
+                description="name of the arm's joint_trajectory_controller",
+            ),
+            DeclareLaunchArgument(
+                'joint_states',
+                default_value='/joint_states',
+                description='topic of its joint_state_broadcaster',
+            ),
             *(
-                Node(package='remaster_ros', executable=name, name=name, parameters=[params])
+                Node(
+                    package='remaster_ros',
+                    executable=name,
+                    name=name,
+                    parameters=[params],
+                    remappings=remappings,
+                    output='screen',
+                )
                 for name in NODES
             ),
         ]

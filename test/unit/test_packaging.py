@@ -1,0 +1,185 @@
+"""What is declared (setup.py, package.xml, constraints, launch files, docs) is what is there."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import importlib.util
+import re
+import runpy
+import sys
+import types
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+# The contract of design.md.
+EXECUTABLES = {
+    'pose_planner',
+    'robot_bridge',
+    'optitrack_markers',
+    'laser_tracker_markers',
+    'recorder',
+    'optimizer',
+    'replay',
+    'fake_robot',
+    'fake_optitrack',
+    'fake_laser_tracker',
+    'demo',
+}
+# Modules whose distribution has another name.
+DISTRIBUTION = {'yaml': 'pyyaml', 'markupsafe': 'jinja2', 'zstandard': 'mcap'}
+# Brought by rclpy itself, as wheel and as Debian package.
+WITH_RCLPY = {'rcl_interfaces'}
+
+
+@pytest.fixture
+def setup_arguments(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    setuptools = pytest.importorskip('setuptools', reason='needs setuptools, as pip does')
+    found: dict[str, Any] = {}
+    monkeypatch.setattr(setuptools, 'setup', lambda **arguments: found.update(arguments))
+    monkeypatch.chdir(ROOT)
+    runpy.run_path(str(ROOT / 'setup.py'))
+    return found
+
+
+def normal(name: str) -> str:
+    """Return the distribution of a requirement, as pip compares names."""
+    return re.sub(r'[-_.]+', '-', re.split(r'[<>=~!\[; ]', name)[0]).lower()
+
+
+def imported(folder: Path) -> set[str]:
+    """Return the top-level modules that the code in a folder imports, but not from the library."""
+    names = set()
+    for path in folder.rglob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.split('.')[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+                names.add(node.module.split('.')[0])
+    return names - sys.stdlib_module_names - {'remaster_ros'}
+
+
+def pins(name: str) -> dict[str, str]:
+    lines = (ROOT / name).read_text(encoding='utf-8').splitlines()
+    lines = [line for line in lines if line and not line.startswith('#')]
+    return {normal(line): line for line in lines}
+
+
+def test_the_version_is_the_same_everywhere(setup_arguments: dict[str, Any]) -> None:
+    version = setup_arguments['version']
+    assert ElementTree.parse(ROOT / 'package.xml').getroot().findtext('version') == version
+    assert importlib.import_module('remaster_ros').__version__ == version
+    heads = re.findall(r'^(\d+\.\d+\.\d+)', (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
+    assert heads[0] == version
+
+
+def test_executables_are_those_of_the_contract(setup_arguments: dict[str, Any]) -> None:
+    installed = dict(setup_arguments['data_files'])['lib/remaster_ros']
+    assert {Path(path).name for path in installed} >= EXECUTABLES
+    for path in installed:
+        assert (ROOT / path).stat().st_mode & 0o111 == 0o111, f'{path} is not executable'
+        assert (ROOT / path).read_text().startswith('#!/usr/bin/env python3\n')
+    assert [
+        line.split(' = ')[0] for line in setup_arguments['entry_points']['console_scripts']
+    ] == ['remaster']
+
+
+def test_every_configuration_file_is_installed_twice(setup_arguments: dict[str, Any]) -> None:
+    """Under share/ for ROS users, in the package for those without."""
+    there = {str(path.relative_to(ROOT)) for path in ROOT.glob('config/**/*') if path.is_file()}
+    shared = {
+        path
+        for folder, paths in setup_arguments['data_files']
+        for path in paths
+        if 'config' in folder
+    }
+    patterns = setup_arguments['package_data']['remaster_ros.config']
+    packaged = {
+        str(path.relative_to(ROOT)) for p in patterns for path in (ROOT / 'config').glob(p)
+    }
+    assert shared == there
+    assert packaged == there
+
+
+def test_every_import_is_declared(setup_arguments: dict[str, Any]) -> None:
+    declared = {normal(line) for line in setup_arguments['install_requires']}
+    ros = {
+        normal(line).removeprefix('ros-jazzy-')
+        for line in setup_arguments['extras_require']['jazzy']
+    }
+    optional = {normal(line) for line in setup_arguments['extras_require']['natnetclient']}
+    root = ElementTree.parse(ROOT / 'package.xml').getroot()
+    depends = {element.text for element in root.findall('exec_depend')}
+    for module in imported(ROOT / 'remaster_ros') - WITH_RCLPY:
+        name = normal(DISTRIBUTION.get(module, module))
+        assert name in declared | ros | optional, f'{module} is imported but not required'
+        if name in ros:
+            assert module in depends, f'{module} is missing in package.xml'
+
+
+def test_every_requirement_is_pinned_exactly(setup_arguments: dict[str, Any]) -> None:
+    wheels, system = pins('constraints.txt'), pins('constraints-ros.txt')
+    for line in wheels.values():
+        assert re.fullmatch(r'[a-z0-9-]+==[0-9a-z.]+', line), line
+    extras = setup_arguments['extras_require']
+    for line in (
+        *setup_arguments['install_requires'],
+        *(r for name in extras for r in extras[name]),
+    ):
+        assert normal(line) in wheels, f'constraints.txt has no {line}'
+    # Where both have an exact version, only what NumPy 1 or launch_testing ask for may differ.
+    differing = {n for n in wheels.keys() & system if '==' in system[n] and wheels[n] != system[n]}
+    numpy_2 = {'arviz-stats', 'pin', 'eigenpy', *(n for n in wheels if n.startswith('cmeel-'))}
+    assert differing <= numpy_2 | {'pytest'}
+
+
+def test_parameters_page_is_up_to_date() -> None:
+    pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+    path = ROOT / 'docs' / 'make_parameters.py'
+    spec = importlib.util.spec_from_file_location('make_parameters', path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert module.PAGE.read_text(encoding='utf-8') == module.page(), 'run: make docs'
+
+
+@pytest.mark.parametrize(
+    ('name', 'others'),
+    [('real', set()), ('fake', {'fake_robot', 'fake_optitrack', 'fake_laser_tracker'})],
+)
+def test_launch_files_start_the_six_nodes(
+    name: str, others: set[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Run with stand-ins for launch, which is not on every machine that runs this."""
+    nodes: list[dict[str, Any]] = []
+    stand_ins = {
+        'launch': {'LaunchDescription': list},
+        'launch.actions': {'DeclareLaunchArgument': lambda *args, **kwargs: args},
+        'launch.substitutions': {'LaunchConfiguration': str},
+        'launch_ros': {},
+        'launch_ros.actions': {'Node': lambda **arguments: nodes.append(arguments)},
+        'ament_index_python': {},
+        'ament_index_python.packages': {'get_package_share_directory': lambda package: ROOT},
+    }
+    for module, members in stand_ins.items():
+        monkeypatch.setitem(sys.modules, module, types.SimpleNamespace(**members))
+    declared = runpy.run_path(str(ROOT / 'launch' / f'{name}.launch.py'))[
+        'generate_launch_description'
+    ]()
+    six = EXECUTABLES - {'replay', 'demo', 'fake_robot', 'fake_optitrack', 'fake_laser_tracker'}
+    assert {node['executable'] for node in nodes} == six | others
+    assert all(node['name'] == node['executable'] for node in nodes)
+    assert ('params',) in declared
+    assert (ROOT / 'config' / f'{name}.yaml').is_file()
+
+
+def test_links_in_the_pages_lead_somewhere() -> None:
+    for page in (ROOT / 'README.md', *(ROOT / 'docs').glob('*.md')):
+        for target in re.findall(r'\]\(([^)#]+)', page.read_text(encoding='utf-8')):
+            if '://' not in target:
+                assert (page.parent / target).exists(), f'{page.name}: {target}'
