@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
-from remaster_ros.cli.options import number
+from remaster_ros.cli.options import integer, number
 from remaster_ros.core.errors import InputError
 
 WITHOUT_ROS = (
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     size = parser.add_mutually_exclusive_group()
     size.add_argument(
         '--candidates',
-        type=int,
+        type=integer(1),
         default=14,
         metavar='N',
         help='candidate poses for optimization and for validation, each (default 14)',
@@ -78,7 +78,7 @@ def run_node(name: str, parameters: dict[str, object]) -> NoReturn:
     """
     if importlib.util.find_spec('rclpy') is None:
         raise InputError(f'remaster {name} {WITHOUT_ROS}')
-    command = [sys.executable, '-m', f'remaster_ros.nodes.{name}', '--ros-args']
+    command = [sys.executable, '-m', 'remaster_ros.nodes', name, '--ros-args']
     for key, value in parameters.items():
         # JSON is YAML; text in double quotes stays text whatever it looks like.
         command += ['-p', f'{key}:={json.dumps(value)}']

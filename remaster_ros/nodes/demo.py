@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+import yaml
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -53,7 +54,9 @@ class Parameters:
 
     out: str = parameter('', 'folder of everything the demo writes; must be new or empty')
     seed: int = parameter(0, 'seed of the hidden World and of all randomness', low=0)
-    full: bool = parameter(False, "the paper's size: 60 candidate poses each")
+    candidates: int = parameter(
+        14, 'candidate poses for optimization and for validation, each', low=1, high=1000
+    )
     rate: float = parameter(
         10.0, 'how many times as fast as the wall clock world time runs', low=1.0, high=20.0
     )
@@ -129,7 +132,9 @@ class Demo:
         result = read_fit(self.fit / 'fit.json')
         self.processes.stop()
         print_times(self.console, self.node.times)
+        # Only here, after everything that estimates has ended, is the truth opened.
         print_offsets(self.console, result, world.truth)
+        (self.out / 'truth.yaml').write_text(yaml.safe_dump(world.truth.to_dict()))
         self.console.print(f'session: {self.session}')
         name = 'report.html' if self.p.figures else 'fit.json'
         self.console.print(f'report: {self.fit / name}')
@@ -139,7 +144,7 @@ class Demo:
         command_port, data_port = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM)
         tracker_port = free_port(socket.SOCK_STREAM)
         ports = {'command_port': command_port, 'data_port': data_port}
-        size = 60 if self.p.full else 14
+        size = self.p.candidates
         own: dict[str, dict[str, Any]] = {
             **{name: {'world': str(self.hidden)} for name in FAKES},
             'pose_planner': {

@@ -41,7 +41,7 @@ class NodeProcesses:
 
     def start(self, name: str, parameters_file: Path, parameters: Mapping[str, Any]) -> None:
         """Start node `name` with a parameter file and values that override it."""
-        command = [sys.executable, '-m', f'remaster_ros.nodes.{name}', '--ros-args']
+        command = [sys.executable, '-m', 'remaster_ros.nodes', name, '--ros-args']
         command += ['--params-file', str(parameters_file)]
         for key, value in parameters.items():
             # With the node's name: a bare one gives way to what the file says of that node.

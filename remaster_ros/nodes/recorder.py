@@ -6,7 +6,7 @@ are on disk; the bridge moves on only then.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -80,6 +80,7 @@ class _Taking:
     stamp: str
     solution: int
     pose: _Pose
+    from_q: FloatArray | None
     future: Future | None = None
 
 
@@ -127,6 +128,9 @@ class Recorder(RemasterNode):
         self._poses: dict[str, _Pose] = {}
         self._solutions: JointTrajectory | None = None
         self._taking: _Taking | None = None
+        # Topics come in no common order: what belongs to a dwell may be here before /settled is.
+        self._recent_joints: deque[tuple[float, FloatArray]] = deque(maxlen=500)
+        self._recent_readings: deque[tuple[str, MarkerReading]] = deque(maxlen=500)
         self._q: FloatArray | None = None
         self._now = 0.0
         self._from_q: FloatArray | None = None
@@ -165,8 +169,10 @@ class Recorder(RemasterNode):
             position = np.array([point.x, point.y, point.z])
             if not np.all(np.isfinite(position)):
                 self.counts[f'{sensor}_not_finite'] += 1
-            elif self._taking is not None:
-                reading = MarkerReading(seconds(message.header.stamp), position)
+                return
+            reading = MarkerReading(seconds(message.header.stamp), position)
+            self._recent_readings.append((sensor, reading))
+            if self._taking is not None:
                 self._taking.pairing.add_reading(sensor, reading)
                 self._finish_if_complete()
 
@@ -179,6 +185,7 @@ class Recorder(RemasterNode):
             self._trouble = str(error)
             return
         self._now, self._trouble = seconds(message.header.stamp), ''
+        self._recent_joints.append((self._now, self._q))
         if self._taking is not None:
             self._taking.pairing.add_joint_state(self._now, self._q)
             self._finish_if_complete()
@@ -245,7 +252,13 @@ class Recorder(RemasterNode):
         future: Future | None = None,
     ) -> None:
         pairing = Pairing(settled_s, q, self.rules, self.p.motion_tolerance)
-        self._taking = _Taking(pairing, stamp, solution, pose, future)
+        # Now, not when the reading is done: a stop may come in between.
+        self._taking = _Taking(pairing, stamp, solution, pose, self._from_q, future)
+        self._from_q = q
+        for stamp_s, recent in self._recent_joints:
+            pairing.add_joint_state(stamp_s, recent)
+        for sensor, reading in self._recent_readings:
+            pairing.add_reading(sensor, reading)
         for name, client in self._measure.items():
             if not client.service_is_ready():
                 pairing.fail(name, f'the service {client.srv_name} is not there')
@@ -287,7 +300,6 @@ class Recorder(RemasterNode):
         if taking.future is not None:
             taking.future.set_result((good, why))
             return
-        self._from_q = taking.pairing.q_settled
         result = 'recorded' if not bad else 'partial' if good else 'rejected'
         last = max((reading.stamp_s for reading in good), default=self._now)
         self._report(
@@ -313,7 +325,7 @@ class Recorder(RemasterNode):
                     marker=reading.marker,
                     q=reading.q,
                     position=reading.position,
-                    from_q=self._from_q,
+                    from_q=taking.from_q,
                     std=reading.std,
                     samples=reading.samples,
                 )

@@ -1,0 +1,95 @@
+"""A node that cannot work says so in one line and ends with status 2."""
+
+import socket
+
+import pytest
+from conftest import node_arguments
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
+
+
+def refuse(start, node, *, timeout=60, **parameters):
+    """Start a node that must refuse; return its one line."""
+    process = start(f'remaster_ros.nodes.{node}', *node_arguments(**parameters))
+    out, err = process.communicate(timeout=timeout)
+    assert process.returncode == 2, out + err
+    lines = [line for line in err.splitlines() if line.startswith('error:')]
+    assert len(lines) == 1, err
+    assert 'Traceback' not in err
+    return lines[0]
+
+
+def test_a_parameter_out_of_range(start):
+    line = refuse(start, 'robot_bridge', speed_share=1.5)
+    assert 'robot_bridge: parameter speed_share is 1.5; it must lie in 0.01 to 1.0' in line
+
+
+def test_an_unknown_parameter(start):
+    line = refuse(start, 'robot_bridge', sped_share=0.3)
+    assert "unknown parameter 'sped_share'" in line
+    assert 'speed_share' in line.replace('sped_share', '')
+
+
+def test_a_missing_cell_file(start, tmp_path):
+    assert 'nowhere.yaml' in refuse(start, 'pose_planner', cell=tmp_path / 'nowhere.yaml')
+
+
+def test_a_session_folder_that_is_in_use(start, tmp_path):
+    (tmp_path / 'session').mkdir()
+    (tmp_path / 'session' / 'observations.csv').write_text('mine\n')
+    assert str(tmp_path / 'session') in refuse(start, 'recorder', session=tmp_path / 'session')
+
+
+def test_an_optitrack_server_that_never_answers(start):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
+        silent.bind(('127.0.0.1', 0))
+        line = refuse(
+            start,
+            'optitrack_markers',
+            server_address='127.0.0.1',
+            local_address='127.0.0.1',
+            command_port=silent.getsockname()[1],
+            start_timeout_s=2.0,
+        )
+    assert 'OptiTrack' in line
+    assert '127.0.0.1' in line
+
+
+def test_a_laser_tracker_that_never_answers(start):
+    with socket.socket() as silent:
+        silent.bind(('127.0.0.1', 0))
+        silent.listen()
+        port = silent.getsockname()[1]
+        line = refuse(
+            start, 'laser_tracker_markers', host='127.0.0.1', port=port, start_timeout_s=2.0
+        )
+    assert f'127.0.0.1:{port}' in line
+
+
+def test_a_laser_tracker_that_is_not_there(start):
+    with socket.socket() as probe:
+        probe.bind(('127.0.0.1', 0))
+        port = probe.getsockname()[1]
+    line = refuse(start, 'laser_tracker_markers', host='127.0.0.1', port=port, start_timeout_s=1.0)
+    assert f'127.0.0.1:{port}' in line
+
+
+@pytest.mark.parametrize('fake', ['fake_optitrack', 'fake_laser_tracker'])
+def test_a_port_in_use(start, tmp_path, fake):
+    from remaster_ros.fakes.setup import make_world
+    from remaster_ros.storage.cell import read_cell
+
+    make_world(tmp_path / 'world', read_cell('demo'), seed=1, rate=1.0).close()
+    kind = socket.SOCK_DGRAM if fake == 'fake_optitrack' else socket.SOCK_STREAM
+    with socket.socket(socket.AF_INET, kind) as taken:
+        taken.bind(('127.0.0.1', 0))
+        if kind == socket.SOCK_STREAM:
+            taken.listen()
+        port = taken.getsockname()[1]
+        name = 'command_port' if fake == 'fake_optitrack' else 'port'
+        line = refuse(start, fake, world=tmp_path / 'world', **{name: port})
+    assert str(port) in line
+
+
+def test_a_bag_that_is_not_there(start, tmp_path):
+    assert str(tmp_path / 'none') in refuse(start, 'replay', bag=tmp_path / 'none')

@@ -1,0 +1,98 @@
+"""Ctrl-C at any moment: every process gone within 5 s, the session readable."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from conftest import wait_until
+
+from remaster_ros.storage.session import read_session
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(180)]
+
+
+def children(pid):
+    """Return the pids of the processes that descend from `pid`."""
+    found = []
+    for entry in Path('/proc').iterdir():
+        if entry.name.isdigit():
+            try:
+                fields = (entry / 'stat').read_text().rpartition(')')[2].split()
+            except OSError:
+                continue
+            if int(fields[1]) == pid:
+                found += [int(entry.name), *children(int(entry.name))]
+    return found
+
+
+def alive(pids):
+    states = []
+    for pid in pids:
+        try:
+            states.append(Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0])
+        except OSError:
+            continue
+    return [state for state in states if state != 'Z']
+
+
+def observations(session):
+    try:
+        return (session / 'observations.csv').read_text().count('\n') - 1
+    except OSError:
+        return -1
+
+
+def stop(process, signum=signal.SIGINT):
+    """Send the signal; return how long until the demo and all its children were gone."""
+    pids = [process.pid, *children(process.pid)]
+    began = time.monotonic()
+    os.kill(process.pid, signum)
+    process.wait(timeout=20)
+    wait_until(lambda: not alive(pids), 20, 'the processes to end')
+    return time.monotonic() - began, len(pids)
+
+
+@pytest.mark.parametrize('moment_s', [0.7, 3.0])
+def test_while_it_starts(start, tmp_path, moment_s):
+    process = start('remaster_ros.cli.main', 'demo', '--out', tmp_path / 'out')
+    time.sleep(moment_s)
+    seconds, _ = stop(process)
+    assert seconds < 5.0
+    assert 'Traceback' not in process.stderr.read()
+
+
+@pytest.mark.parametrize('signum', [signal.SIGINT, signal.SIGTERM])
+def test_while_it_collects(start, tmp_path, signum):
+    out = tmp_path / 'out'
+    process = start('remaster_ros.cli.main', 'demo', '--out', out, '--no-figures')
+    wait_until(lambda: observations(out / 'session') >= 6, 90, 'six observations')
+    seconds, processes = stop(process, signum)
+    assert processes >= 10
+    assert seconds < 5.0
+    assert process.returncode == 130
+    assert 'Traceback' not in process.stderr.read()
+    assert (
+        yaml.safe_load((out / 'session' / 'session.yaml').read_text())['exit_status'] == 'stopped'
+    )
+    session = read_session(out / 'session')
+    assert len(session.measurements) >= 6
+    for log in (out / 'log').iterdir():
+        assert 'Traceback' not in log.read_text(), log
+
+
+def test_a_killed_demo_leaves_no_process(start, tmp_path):
+    """Even SIGKILL: the kernel tells the children that their parent has died."""
+    out = tmp_path / 'out'
+    process = start('remaster_ros.cli.main', 'demo', '--out', out, '--no-figures')
+    wait_until(lambda: observations(out / 'session') >= 0, 60, 'the session')
+    pids = children(process.pid)
+    assert len(pids) >= 9
+    process.kill()
+    process.wait(timeout=10)
+    wait_until(lambda: not alive(pids), 10, 'the orphans to end')
+    assert (
+        yaml.safe_load((out / 'session' / 'session.yaml').read_text())['exit_status'] == 'stopped'
+    )
