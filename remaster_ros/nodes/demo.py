@@ -182,10 +182,14 @@ class Demo:
             self._spin()
 
     def _ready(self) -> bool:
-        waiting = [name for name in NODES if name not in self.node.summaries]
-        tracker = self.node.summaries.get('laser_tracker_markers', {}).get('state')
-        frames = self.node.summaries.get('optitrack_markers', {}).get('frames', '0')
-        return not waiting and tracker == 'ready' and frames != '0'
+        """Whether every node is up, the robot is heard and both sensors are there."""
+        said = self.node.summaries
+        return (
+            all(name in said for name in NODES)
+            and said['pose_planner']['robot'] == 'heard'
+            and said['laser_tracker_markers']['state'] == 'ready'
+            and said['optitrack_markers']['published'] != '0'
+        )
 
     def _trigger(self, service: str, timeout_s: float = 30.0) -> None:
         future = None

@@ -285,6 +285,7 @@ class PosePlanner(RemasterNode):
         values = {
             'state': self.state,
             'phase': self.phase,
+            'robot': 'silent' if self._q is None else 'heard',
             'poses_done': tour.visited if tour else 0,
             'poses': sum(tour.poses.values()) if tour else 0,
             'configurations_done': sum(self.outcomes.values()),

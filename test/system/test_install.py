@@ -82,8 +82,10 @@ def by_pip(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, st
     pytest.importorskip('setuptools', reason='pip builds with it')
     folder = tmp_path_factory.mktemp('pip')
     source, prefix = copy_of_the_source(folder / 'source'), folder / 'prefix'
-    options = ['--no-deps', '--no-build-isolation', '--no-index', '--prefix', str(prefix)]
-    command = [sys.executable, '-m', 'pip', 'install', '--quiet', *options, str(source)]
+    # Without --ignore-installed pip would take the checkout that is tested out of its environment.
+    options = ['--ignore-installed', '--no-deps', '--no-build-isolation', '--no-index']
+    command = [sys.executable, '-m', 'pip', 'install', '--quiet', *options]
+    command += ['--prefix', str(prefix), str(source)]
     done = run(command, environment(), folder)
     assert done.returncode == 0, done.stderr
     (packages,) = prefix.glob('lib/python3*/site-packages')

@@ -68,7 +68,12 @@ def test_while_it_starts(start, tmp_path, moment_s):
 def test_while_it_collects(start, tmp_path, signum):
     out = tmp_path / 'out'
     process = start('remaster_ros.cli.main', 'demo', '--out', out, '--no-figures')
-    wait_until(lambda: observations(out / 'session') >= 6, 90, 'six observations')
+    wait_until(
+        lambda: observations(out / 'session') >= 6 or process.poll() is not None,
+        90,
+        'six observations',
+    )
+    assert process.poll() is None, process.communicate()
     seconds, processes = stop(process, signum)
     assert processes >= 10
     assert seconds < 5.0
