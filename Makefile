@@ -2,7 +2,7 @@
 #   make demo     the main job on fake hardware; ends by saying where the report is
 #                 (OUT=folder SEED=n ARGS='--full' are handed on)
 #   make test     the tests (PYTEST='-k name' is handed on)
-#   make check    lint, types, layers, tests: what CI runs
+#   make check    lint, types, layers; CI runs this and make test
 #   make bench    the benchmarks
 #   make docs     docs/parameters.md from the code
 # The first of them makes a virtual environment. With ROS 2 Jazzy sourced its rclpy is used and the
@@ -10,7 +10,7 @@
 
 SHELL := /bin/bash
 .NOTPARALLEL:
-.PHONY: help demo test lint check bench docs format clean
+.PHONY: help demo test check bench docs format clean
 
 ifneq ($(and $(ROS_DISTRO),$(AMENT_PREFIX_PATH)),)
 KIND := ros
@@ -43,13 +43,11 @@ test: $(VENV)/installed
 	PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest \
 		-p pytest_timeout -p _hypothesis_pytestplugin $(PYTEST)
 
-lint: $(VENV)/installed
+check: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-
-check: lint test
 
 bench: $(VENV)/installed
 	@for script in $(wildcard benchmarks/bench_*.py); do \

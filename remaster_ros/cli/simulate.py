@@ -15,7 +15,7 @@ from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.collision import ArmCapsules
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.inverse import FREE_JOINTS, InverseKinematics
-from remaster_ros.core.planning import LineOfSight, candidate_poses, plan_poses
+from remaster_ros.core.planning import candidate_poses, plan_poses
 from remaster_ros.core.simulation import SimulatedSensor, Truth, simulate_session
 from remaster_ros.core.tour import Tour
 from remaster_ros.core.transforms import looking_at, quaternion_xyzw, transform
@@ -206,15 +206,7 @@ def plan_tour(
     """
     inverse = InverseKinematics(chain, cell.held(chain))
     arm = ArmCapsules(chain, cell.link_radius_m)
-    sights = [
-        LineOfSight(
-            name,
-            sensor.T_R_N[:3, 3],
-            np.array(cell.markers[sensor.marker]),
-            np.deg2rad(cell.sensors[name].max_angle_deg),
-        )
-        for name, sensor in sensors.items()
-    ]
+    sights = cell.lines_of_sight({name: s.T_R_N[:3, 3] for name, s in sensors.items()})
     aim = sensors[cell.aim_at].T_R_N[:3, 3]
     plans = {}
     for split, count in counts.items():

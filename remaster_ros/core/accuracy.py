@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .types import FloatArray, IntArray, Measurements
+from remaster_ros.core.types import FloatArray, IntArray, Measurements
 
 THEORETICAL_DRAWS = 2000
 # Of more configurations the theoretical measure takes this many at random: its means and

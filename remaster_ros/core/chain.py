@@ -12,10 +12,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .errors import InputError
-from .transforms import apply, inverse, rotation_vector_to_matrix
-from .types import BoolArray, FloatArray
-from .urdf import UrdfJoint, UrdfModel, parse_urdf
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.transforms import apply, inverse, rotation_vector_to_matrix
+from remaster_ros.core.types import BoolArray, FloatArray
+from remaster_ros.core.urdf import UrdfJoint, UrdfModel, parse_urdf
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .chain import SerialChain
-from .errors import InputError
-from .types import BoolArray, FloatArray
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.types import BoolArray, FloatArray
 
 # Joints from the third on move their origin up and down; what carries them cannot reach the floor.
 FIRST_MOVING_POINT = 3

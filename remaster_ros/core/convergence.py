@@ -13,8 +13,8 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.stats import norm, rankdata
 
-from .errors import InsufficientDataError
-from .types import FloatArray
+from remaster_ros.core.errors import InsufficientDataError
+from remaster_ros.core.types import FloatArray
 
 MINIMUM_DRAWS = 8
 

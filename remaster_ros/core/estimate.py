@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .chain import SerialChain
-from .errors import InputError, InsufficientDataError
-from .gauge import Gauge, find_gauge
-from .laplace import Mode, find_mode
-from .model import Model, Rows
-from .outliers import Judgement, find_outliers
-from .posterior import Posterior, Prior, base_prior, marker_prior
-from .start import robust_start
-from .types import BoolArray, FloatArray, IntArray, Measurements, Session
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.errors import InputError, InsufficientDataError
+from remaster_ros.core.gauge import Gauge, find_gauge
+from remaster_ros.core.laplace import Mode, find_mode
+from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.outliers import Judgement, find_outliers
+from remaster_ros.core.posterior import Posterior, Prior, base_prior, marker_prior
+from remaster_ros.core.start import robust_start
+from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Measurements, Session
 
 # Fewer rows of a sensor leave nothing to estimate its noise from.
 FEWEST_ROWS = 4

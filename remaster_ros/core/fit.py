@@ -7,13 +7,13 @@ from typing import Literal
 
 import numpy as np
 
-from . import convergence
-from .errors import InputError
-from .estimate import Estimate, Problem, estimate
-from .paper_mode import BURN_IN_SHARE, STEPS, fit_paper
-from .result import FitResult, Sampled, build_result
-from .sampling import Progress, sample_posterior, silent
-from .types import FloatArray, Session
+from remaster_ros.core import convergence
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.estimate import Estimate, Problem, estimate
+from remaster_ros.core.paper_mode import BURN_IN_SHARE, STEPS, fit_paper
+from remaster_ros.core.result import FitResult, Sampled, build_result
+from remaster_ros.core.sampling import Progress, sample_posterior, silent
+from remaster_ros.core.types import FloatArray, Session
 
 __all__ = ['FitResult', 'fit_session']
 

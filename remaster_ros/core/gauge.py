@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .errors import InsufficientDataError
-from .model import Model, Rows
-from .posterior import Prior, prior_rows
-from .start import robust_spread
-from .types import FloatArray, IntArray
+from remaster_ros.core.errors import InsufficientDataError
+from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.posterior import Prior, prior_rows
+from remaster_ros.core.start import robust_spread
+from remaster_ros.core.types import FloatArray, IntArray
 
 # Singular values (of unit columns, relative to the largest) that are rounding errors.
 ROUNDING = 1e-9

@@ -22,10 +22,10 @@ import numpy as np
 from eaik.IK_HP import HPRobot
 from numpy.typing import ArrayLike
 
-from .chain import SerialChain
-from .errors import InputError
-from .transforms import inverse, rotation_angle, twist_logarithm
-from .types import FloatArray, JointSolution
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.transforms import inverse, rotation_angle, twist_logarithm
+from remaster_ros.core.types import FloatArray, JointSolution
 
 FREE_JOINTS = 6
 

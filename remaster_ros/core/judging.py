@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from .accuracy import (
+from remaster_ros.core.accuracy import (
     THEORETICAL_CONFIGURATIONS,
     THEORETICAL_DRAWS,
     Predictive,
     accuracy_of,
 )
-from .errors import InputError
-from .estimate import Estimate, Problem, estimate, hold_offsets
-from .laplace import Mode, linearise
-from .model import Rows
-from .result import predicted_rows
-from .types import FloatArray, IntArray, Session
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.estimate import Estimate, Problem, estimate, hold_offsets
+from remaster_ros.core.laplace import Mode, linearise
+from remaster_ros.core.model import Rows
+from remaster_ros.core.result import predicted_rows
+from remaster_ros.core.types import FloatArray, IntArray, Session
 
 
 @dataclass(frozen=True)

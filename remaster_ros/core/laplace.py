@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .errors import InsufficientDataError
-from .metropolis import StudentT, log_student_t
-from .posterior import RESOLUTION_M, Posterior, prior_rows
-from .types import FloatArray
+from remaster_ros.core.errors import InsufficientDataError
+from remaster_ros.core.metropolis import StudentT, log_student_t
+from remaster_ros.core.posterior import RESOLUTION_M, Posterior, prior_rows
+from remaster_ros.core.types import FloatArray
 
 # Tails of the proposal: of the noise always, of the parameters in this share of the draws. They
 # bound the importance weights where the linear picture is too narrow.

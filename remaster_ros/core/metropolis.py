@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.special import gammaln
 
-from .types import FloatArray
+from remaster_ros.core.types import FloatArray
 
 LogDensity = Callable[[FloatArray], FloatArray]
 

@@ -28,15 +28,15 @@ from functools import cached_property
 
 import numpy as np
 
-from .chain import SerialChain
-from .transforms import (
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.transforms import (
     apply,
     inverse,
     matrix_to_rotation_vector,
     rotation_vector_to_matrix,
     transform,
 )
-from .types import FloatArray, IntArray, Measurements
+from remaster_ros.core.types import FloatArray, IntArray, Measurements
 
 REGISTRATION_AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 

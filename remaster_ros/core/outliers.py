@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi
 
-from .errors import InsufficientDataError
-from .model import Rows
-from .posterior import RESOLUTION_M
-from .types import BoolArray, FloatArray
+from remaster_ros.core.errors import InsufficientDataError
+from remaster_ros.core.model import Rows
+from remaster_ros.core.posterior import RESOLUTION_M
+from remaster_ros.core.types import BoolArray, FloatArray
 
 LIMIT = 6.0
 # More than this share is no accident: the model or the session is wrong.

@@ -13,18 +13,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .chain import SerialChain
-from .errors import InsufficientDataError
-from .estimate import Problem
-from .gauge import Gauge, find_gauge
-from .laplace import find_mode
-from .metropolis import Chains, random_walk_sampler
-from .model import Model, Rows
-from .posterior import Posterior
-from .result import Sampled
-from .start import referenced, register
-from .transforms import inverse, transform
-from .types import FloatArray, IntArray, Measurements
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.errors import InsufficientDataError
+from remaster_ros.core.estimate import Problem
+from remaster_ros.core.gauge import Gauge, find_gauge
+from remaster_ros.core.laplace import find_mode
+from remaster_ros.core.metropolis import Chains, random_walk_sampler
+from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.posterior import Posterior
+from remaster_ros.core.result import Sampled
+from remaster_ros.core.start import referenced, register
+from remaster_ros.core.transforms import inverse, transform
+from remaster_ros.core.types import FloatArray, IntArray, Measurements
 
 STEPS = 200_000
 BURN_IN_SHARE = 0.875

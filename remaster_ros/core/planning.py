@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import qmc
 
-from .collision import ArmCapsules
-from .errors import InputError
-from .inverse import InverseKinematics
-from .transforms import rotation_vector_to_matrix, transform
-from .types import BoolArray, FloatArray, IntArray
+from remaster_ros.core.collision import ArmCapsules
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.inverse import InverseKinematics
+from remaster_ros.core.transforms import rotation_vector_to_matrix, transform
+from remaster_ros.core.types import BoolArray, FloatArray, IntArray
 
 OUT_OF_REACH = 'out of reach'
 JOINT_LIMITS = 'outside the joint limits'

@@ -23,9 +23,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .model import Model, Rows
-from .transforms import matrix_from_quaternion_xyzw, matrix_to_rotation_vector
-from .types import BasePrior, FloatArray, IntArray
+from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.transforms import matrix_from_quaternion_xyzw, matrix_to_rotation_vector
+from remaster_ros.core.types import BasePrior, FloatArray, IntArray
 
 # No sensor of this kind resolves better than 0.1 µm; keeps noise-free (simulated) data proper.
 RESOLUTION_M = 1e-7

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .errors import InputError, InsufficientDataError
-from .transforms import apply, transform
-from .types import FloatArray
+from remaster_ros.core.errors import InputError, InsufficientDataError
+from remaster_ros.core.transforms import apply, transform
+from remaster_ros.core.types import FloatArray
 
 MINIMUM_POINTS = 3
 # Points that stray from their best line by less than this share of their spread along it leave

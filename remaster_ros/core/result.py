@@ -8,19 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from . import convergence
-from .accuracy import (
+from remaster_ros.core import convergence
+from remaster_ros.core.accuracy import (
     THEORETICAL_CONFIGURATIONS,
     THEORETICAL_DRAWS,
     Predictive,
     accuracy_of,
 )
-from .chain import SerialChain
-from .estimate import Problem
-from .gauge import Gauge, GaugeDirection
-from .model import Model, Rows, predict_in_sensor
-from .transforms import matrix_to_rotation_vector
-from .types import BoolArray, FloatArray, IntArray, Session
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.estimate import Problem
+from remaster_ros.core.gauge import Gauge, GaugeDirection
+from remaster_ros.core.model import Model, Rows, predict_in_sensor
+from remaster_ros.core.transforms import matrix_to_rotation_vector
+from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Session
 
 # The usual limit of R-hat, and effective draws enough for two digits of a 95 % interval.
 R_HAT_LIMIT = 1.01

@@ -6,9 +6,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .laplace import LaplaceProposal, Mode
-from .metropolis import Chains, Proposal, StudentT, independence_sampler, random_walk_sampler
-from .types import FloatArray
+from remaster_ros.core.laplace import LaplaceProposal, Mode
+from remaster_ros.core.metropolis import (
+    Chains,
+    Proposal,
+    StudentT,
+    independence_sampler,
+    random_walk_sampler,
+)
+from remaster_ros.core.types import FloatArray
 
 Progress = Callable[[str, float], None]
 

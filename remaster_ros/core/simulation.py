@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .chain import SerialChain
-from .errors import InputError
-from .transforms import apply, inverse
-from .types import BoolArray, FloatArray, IntArray, Measurements, Session
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.transforms import apply, inverse
+from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Measurements, Session
 
 DEFAULT_OFFSET_STD = np.radians(0.3)
 

@@ -10,12 +10,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .errors import InsufficientDataError
-from .model import Model, Rows
-from .posterior import RESOLUTION_M, TIGHTEST_PRIOR, Prior, prior_rows
-from .registration import register_points
-from .transforms import apply
-from .types import FloatArray, IntArray, Measurements
+from remaster_ros.core.errors import InsufficientDataError
+from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.posterior import RESOLUTION_M, TIGHTEST_PRIOR, Prior, prior_rows
+from remaster_ros.core.registration import register_points
+from remaster_ros.core.transforms import apply
+from remaster_ros.core.types import FloatArray, IntArray, Measurements
 
 # Median length of a standard normal vector in three dimensions.
 MEDIAN_CHI3 = 1.5382

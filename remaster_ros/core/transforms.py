@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from .errors import InputError
-from .types import FloatArray
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.types import FloatArray
 
 
 def transform(rotation: ArrayLike, translation: ArrayLike) -> FloatArray:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .errors import InputError
-from .transforms import matrix_from_rpy, transform
-from .types import FloatArray
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.transforms import matrix_from_rpy, transform
+from remaster_ros.core.types import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

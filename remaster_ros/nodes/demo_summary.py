@@ -93,7 +93,9 @@ def print_offsets(console: Console, fit: dict[str, Any], truth: Truth) -> None:
                 f'{off:+.1f}',
             ]
         else:
-            cells = ['not identifiable', f'{row["std_deg"]:.2f}', f'{true:.4f}', '']
+            # A joint that nothing tells has the spread of a whole turn: no figure to print.
+            std = f'{row["std_deg"]:.2f}' if row['std_deg'] < 90 else 'n/a'
+            cells = ['not identifiable', std, f'{true:.4f}', '']
         table.add_row(row['joint'], *cells)
     console.print(table)
     for row in fit['joint_offsets']:

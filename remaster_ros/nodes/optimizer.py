@@ -40,7 +40,7 @@ class Optimizer(RemasterNode):
     def __init__(self) -> None:
         super().__init__('optimizer')
         self.p = declare(self, Parameters)
-        self._state = 'waiting'
+        self._state, self._ending = 'waiting', False
         self._busy = threading.Lock()
         self._means = self.create_publisher(JointState, '/remaster/joint_offsets', LATCHED)
         self._stds = self.create_publisher(JointState, '/remaster/joint_offsets_std', LATCHED)
@@ -80,6 +80,8 @@ class Optimizer(RemasterNode):
         return result, save_fit(result, out, figures=self.p.figures)
 
     def _progress(self, stage: str, share: float) -> None:
+        if self._ending:
+            raise RemasterError('stopped')
         self._state = f'{stage} {100 * share:.0f} %'
 
     def _publish(self, result: FitResult) -> None:
@@ -91,6 +93,10 @@ class Optimizer(RemasterNode):
             message = JointState(name=list(result.joint_names), position=values.tolist())
             message.header.stamp = stamp
             publisher.publish(message)
+
+    def close(self) -> None:
+        """End a fit under way at its next step."""
+        self._ending = True
 
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
         return 'ok', self._state, {'session': self.p.session, 'out': self.p.out}

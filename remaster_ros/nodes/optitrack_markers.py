@@ -35,8 +35,8 @@ class Parameters:
     client: str = parameter(
         'builtin', 'which NatNet client to use', choices=('builtin', 'natnetclient')
     )
-    server_address: str = parameter('192.168.0.10', 'the computer that runs Motive')
-    local_address: str = parameter(
+    server: str = parameter('192.168.0.10', 'the computer that runs Motive')
+    local_interface: str = parameter(
         '', "this computer's network card towards it; empty lets the routing decide"
     )
     transport: str = parameter('multicast', 'as set in Motive', choices=('multicast', 'unicast'))
@@ -47,6 +47,9 @@ class Parameters:
     rigid_body: str = parameter('', 'name of the rigid body in Motive; empty for the only one')
     member: int = parameter(
         1, 'number of the marker in that body; 0 for a lone marker without a body', low=0, high=999
+    )
+    marker_id: int = parameter(
+        0, 'id of the marker on the wire instead of body and member; 0 for these', low=0
     )
     start_timeout_s: float = parameter(
         20.0, 'how long to wait for the first reading, wall time', unit='s', low=0.1, high=3600.0
@@ -80,11 +83,14 @@ class OptiTrackMarkers(RemasterNode):
     def _make_client(self) -> MarkerFollower:
         lone = self.p.member == 0
         marker = MarkerChoice(
-            rigid_body=self.p.rigid_body, member=max(self.p.member, 1), lone_marker=lone
+            rigid_body=self.p.rigid_body,
+            member=max(self.p.member, 1),
+            marker_id=self.p.marker_id or None,
+            lone_marker=lone,
         )
         settings = NatNetSettings(
-            server=self.p.server_address,
-            local_interface=self.p.local_address,
+            server=self.p.server,
+            local_interface=self.p.local_interface,
             transport='unicast' if self.p.transport == 'unicast' else 'multicast',
             multicast_group=self.p.multicast_group,
             command_port=self.p.command_port,

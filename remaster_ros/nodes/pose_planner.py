@@ -22,7 +22,7 @@ from remaster_ros.core import transforms
 from remaster_ros.core.collision import ArmCapsules
 from remaster_ros.core.errors import InputError, InsufficientDataError, RemasterError
 from remaster_ros.core.inverse import InverseKinematics
-from remaster_ros.core.planning import LineOfSight, Plan, candidate_poses, plan_poses
+from remaster_ros.core.planning import Plan, candidate_poses, plan_poses
 from remaster_ros.core.tour import REGISTRATION, Stop, Tour, registration_tour
 from remaster_ros.core.types import FloatArray
 from remaster_ros.nodes.messages import JointOrder, duration_of, stamp_key, transform_array
@@ -226,15 +226,7 @@ class PosePlanner(RemasterNode):
 
     def _plan(self, count: int, aim: FloatArray, sensors_R: dict[str, FloatArray]) -> Plan:
         """Plan poses that face `aim` and that every sensor sees; positions in R, m, (3,)."""
-        sights = [
-            LineOfSight(
-                name,
-                sensors_R[name],
-                np.array(self.cell.markers[sensor.marker]),
-                np.deg2rad(sensor.max_angle_deg),
-            )
-            for name, sensor in self.cell.sensors.items()
-        ]
+        sights = self.cell.lines_of_sight(sensors_R)
         candidates = candidate_poses(count, self.cell.poses.ranges(), aim, self._rng)
         margin = np.deg2rad(self.p.limit_margin_deg)
         return plan_poses(self._inverse, self._arm, candidates, sights, margin)

@@ -30,9 +30,6 @@ class Parameters:
     """Parameters of the bridge."""
 
     cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
-    controller_topic: str = parameter(
-        '/joint_trajectory_controller/joint_trajectory', 'where the controller takes trajectories'
-    )
     speed_share: float = parameter(
         0.3, 'share of each joint velocity limit that is used', low=0.01, high=1.0
     )
@@ -98,7 +95,7 @@ class RobotBridge(RemasterNode):
         self.counts = {'commanded': 0, 'settled': 0, 'failed': 0}
         self._trouble = ''
         self._controller = self.create_publisher(
-            JointTrajectory, self.p.controller_topic, RELIABLE
+            JointTrajectory, '/joint_trajectory_controller/joint_trajectory', RELIABLE
         )
         self._settled = self.create_publisher(JointState, '/remaster/settled', RELIABLE)
         self.create_subscription(JointState, '/joint_states', self._on_joint_state, RELIABLE)

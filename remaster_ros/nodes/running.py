@@ -61,6 +61,15 @@ class RemasterNode(Node):
         """Finish: files closed, threads joined. Called once, before the node is destroyed."""
 
 
+class _Executor(MultiThreadedExecutor):
+    """rclpy's, but it waits for the callbacks under way before it takes their guards away."""
+
+    def shutdown(self, timeout_sec: float | None = None) -> bool:
+        """Stop executing callbacks and wait for their end."""
+        self._executor.shutdown(wait=True, cancel_futures=True)
+        return super().shutdown(timeout_sec)
+
+
 def run(
     make_node: Callable[[], RemasterNode], args: list[str] | None = None, threads: int = 1
 ) -> int:
@@ -87,9 +96,7 @@ def run(
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
-        executor: Executor = (
-            SingleThreadedExecutor() if threads == 1 else MultiThreadedExecutor(threads)
-        )
+        executor: Executor = SingleThreadedExecutor() if threads == 1 else _Executor(threads)
         try:
             executor.add_node(node)
             while not (stopping or node.finished or node.failure) and rclpy.ok():
@@ -97,8 +104,9 @@ def run(
         except ExternalShutdownException:
             pass
         finally:
-            executor.shutdown(2.0)
+            # First, as it ends what a callback may be waiting for.
             node.close()
+            executor.shutdown(2.0)
             node.destroy_node()
         if node.failure is not None:
             raise node.failure

@@ -14,15 +14,15 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ..core.chain import SerialChain
-from ..core.transforms import matrix_from_rpy, rotation_vector_to_matrix
-from ..core.types import FloatArray
-from .files import make_folder, write_atomically
-from .results import urdf_sha256
-from .safe_yaml import dump_yaml
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.transforms import matrix_from_rpy, rotation_vector_to_matrix
+from remaster_ros.core.types import FloatArray
+from remaster_ros.storage.files import make_folder, write_atomically
+from remaster_ros.storage.results import urdf_sha256
+from remaster_ros.storage.safe_yaml import dump_yaml
 
 if TYPE_CHECKING:
-    from ..core.result import FitResult
+    from remaster_ros.core.result import FitResult
 
 REMASTER_FILE = 'remaster.txt'
 LAYER_FILE = 'offset_layer.yaml'

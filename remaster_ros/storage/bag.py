@@ -22,12 +22,18 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Message, Schema
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from .. import __version__
-from ..core.errors import InputError
-from .bag_metadata import METADATA_FILE, TopicMetadata, metadata_text, qos_text
-from .files import cannot_write, make_new_folder, reason, sync_folder, write_atomically
-from .mcap_frames import CutOffError, frames, unchunked, without_zeros
-from .message_definitions import definition_of
+from remaster_ros import __version__
+from remaster_ros.core.errors import InputError
+from remaster_ros.storage.bag_metadata import METADATA_FILE, TopicMetadata, metadata_text, qos_text
+from remaster_ros.storage.files import (
+    cannot_write,
+    make_new_folder,
+    reason,
+    sync_folder,
+    write_atomically,
+)
+from remaster_ros.storage.mcap_frames import CutOffError, frames, unchunked, without_zeros
+from remaster_ros.storage.message_definitions import definition_of
 
 log = logging.getLogger('remaster_ros')
 

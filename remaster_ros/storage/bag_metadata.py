@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from .safe_yaml import dump_yaml
+from remaster_ros.storage.safe_yaml import dump_yaml
 
 METADATA_FILE = 'metadata.yaml'
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Mapping
 from math import radians
 from pathlib import Path
 
@@ -12,7 +13,8 @@ import yaml
 
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.errors import InputError
-from remaster_ros.core.planning import PoseRanges
+from remaster_ros.core.planning import LineOfSight, PoseRanges
+from remaster_ros.core.types import FloatArray
 
 
 class CellRobot(msgspec.Struct, forbid_unknown_fields=True):
@@ -93,6 +95,19 @@ class Cell(msgspec.Struct, forbid_unknown_fields=True):
             return None
         index = chain.joint_names.index(self.held_joint)
         return {index: tuple(np.deg2rad(self.held_values_deg))}
+
+    def lines_of_sight(self, sensors_R: Mapping[str, FloatArray]) -> list[LineOfSight]:
+        """Return what every pose must keep free, for sensors at these origins in R, m, (3,)."""
+        return [
+            LineOfSight(
+                name,
+                sensors_R[name],
+                np.array(self.markers[sensor.marker]),
+                radians(sensor.max_angle_deg),
+            )
+            for name, sensor in self.sensors.items()
+            if name in sensors_R
+        ]
 
 
 def config_path(name: str) -> Path:

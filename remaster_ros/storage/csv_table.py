@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.errors import InputError
-from ..core.types import FloatArray, IntArray
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.types import FloatArray, IntArray
 
 _NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
 _NUMBER_CHARACTERS = re.compile(r'[0-9+\-.eE,]*')

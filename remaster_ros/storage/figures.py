@@ -19,13 +19,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from ..core.types import BoolArray, FloatArray
+from remaster_ros.core.types import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-    from ..core.result import FitResult
+    from remaster_ros.core.result import FitResult
 
 INK, GRID, PAPER = '#1b1f25', '#d8dce1', '#fefefd'
 BEFORE, AFTER = '#e07b39', '#3b82c4'

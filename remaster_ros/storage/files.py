@@ -6,7 +6,7 @@ import contextlib
 import os
 from pathlib import Path
 
-from ..core.errors import InputError
+from remaster_ros.core.errors import InputError
 
 
 def read_limited(path: Path, limit: int, missing: str) -> bytes:

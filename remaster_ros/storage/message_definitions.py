@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..core.errors import InputError
+from remaster_ros.core.errors import InputError
 
 _typestore: Any = None
 

@@ -11,12 +11,18 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.chain import SerialChain
-from ..core.errors import InputError
-from ..core.types import FloatArray, Measurements, Observation
-from .csv_table import Table, split_line
-from .files import decode_text
-from .sequence_rules import SPLITS, RowKeys, SequenceRules, keeps_the_rules, row_keys
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.types import FloatArray, Measurements, Observation
+from remaster_ros.storage.csv_table import Table, split_line
+from remaster_ros.storage.files import decode_text
+from remaster_ros.storage.sequence_rules import (
+    SPLITS,
+    RowKeys,
+    SequenceRules,
+    keeps_the_rules,
+    row_keys,
+)
 
 log = logging.getLogger('remaster_ros')
 

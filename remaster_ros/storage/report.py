@@ -15,13 +15,13 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from .figures import draw_figures
-from .files import make_folder, write_atomically
-from .results import REPORT_FILE, fit_to_dict
+from remaster_ros.storage.figures import draw_figures
+from remaster_ros.storage.files import make_folder, write_atomically
+from remaster_ros.storage.results import REPORT_FILE, fit_to_dict
 
 if TYPE_CHECKING:
-    from ..core.result import FitResult
-    from .scene import Scene
+    from remaster_ros.core.result import FitResult
+    from remaster_ros.storage.scene import Scene
 
 # Less than this is no gain a user would notice.
 NOTICEABLE_GAIN = 1.1
@@ -79,7 +79,7 @@ def report_html(result: FitResult, drawings: dict[str, str]) -> str:
     environment.filters |= {'fixed': _fixed, 'signed': _signed}
     scene: Scene | None = None
     if drawings:
-        from .scene import draw_scene
+        from remaster_ros.storage.scene import draw_scene
 
         scene = draw_scene(result)
     return environment.from_string(template.read_text(encoding='utf-8')).render(
@@ -200,7 +200,7 @@ def _marker_rows(result: FitResult) -> list[dict[str, Any]]:
 
 def _inline(name: str, svg: str) -> str:
     """Make a figure part of the page: its colours, its font, its width, identifiers of its own."""
-    from .figures import GRID, INK, PAPER
+    from remaster_ros.storage.figures import GRID, INK, PAPER
 
     svg = svg[svg.index('<svg') :]
     for color, ours in ((INK, 'var(--ink)'), (GRID, 'var(--line)'), (PAPER, 'none')):

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from .. import __version__
-from ..core.errors import InputError
-from ..core.transforms import quaternion_xyzw
-from ..core.types import FloatArray, Session
-from .files import cannot_write, make_folder, read_limited, write_atomically
+from remaster_ros import __version__
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.transforms import quaternion_xyzw
+from remaster_ros.core.types import FloatArray, Session
+from remaster_ros.storage.files import cannot_write, make_folder, read_limited, write_atomically
 
 if TYPE_CHECKING:
-    from ..core.result import FitResult
+    from remaster_ros.core.result import FitResult
 
 FORMAT = 'remaster-fit/1'
 FIT_FILE = 'fit.json'
@@ -306,7 +306,7 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
     InputError
         The folder cannot be written to.
     """
-    from .apply import write_apply
+    from remaster_ros.storage.apply import write_apply
 
     folder = Path(folder)
     write_fit(result, folder / FIT_FILE)
@@ -318,7 +318,7 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
             raise cannot_write(folder / REPORT_FILE, error) from None
         return folder / FIT_FILE
     # Matplotlib and the templates take a second to import: only where a report is made.
-    from .report import write_report
+    from remaster_ros.storage.report import write_report
 
     return write_report(result, folder)
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..core.transforms import apply
-from ..core.types import FloatArray, IntArray
+from remaster_ros.core.transforms import apply
+from remaster_ros.core.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from ..core.result import FitResult
+    from remaster_ros.core.result import FitResult
 
 BEFORE, AFTER, ARM, SENSOR, TEXT = '#e07b39', '#3b82c4', '#7d8896', '#2f9e78', '#808a96'
 ARMS_SHOWN = 5

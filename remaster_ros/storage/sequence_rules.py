@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.types import BoolArray, IntArray, Measurements
+from remaster_ros.core.types import BoolArray, IntArray, Measurements
 
 SPLITS = ('optimization', 'validation')
 

@@ -9,10 +9,10 @@ from typing import Literal
 
 import numpy as np
 
-from ..core.chain import SerialChain
-from ..core.errors import InputError
-from ..core.types import Observation, Session
-from .files import (
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.types import Observation, Session
+from remaster_ros.storage.files import (
     cannot_write,
     decode_text,
     make_new_folder,
@@ -20,15 +20,15 @@ from .files import (
     sync_folder,
     write_atomically,
 )
-from .observations import (
+from remaster_ros.storage.observations import (
     check_row,
     format_header,
     format_measurements,
     format_observation,
     parse_observations,
 )
-from .sequence_rules import SequenceRules
-from .session_yaml import read_header, write_header
+from remaster_ros.storage.sequence_rules import SequenceRules
+from remaster_ros.storage.session_yaml import read_header, write_header
 
 URDF_LIMIT = 16 * 1024**2
 OBSERVATIONS_LIMIT = 1024**3

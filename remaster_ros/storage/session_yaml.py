@@ -12,10 +12,10 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from ..core.errors import InputError
-from ..core.types import BasePrior, Session
-from .files import decode_text, read_limited
-from .safe_yaml import YamlError, dump_yaml, load_yaml
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.types import BasePrior, Session
+from remaster_ros.storage.files import decode_text, read_limited
+from remaster_ros.storage.safe_yaml import YamlError, dump_yaml, load_yaml
 
 FORMAT = 'remaster-session/1'
 YAML_LIMIT = 256 * 1024

@@ -46,8 +46,8 @@ def test_an_optitrack_server_that_never_answers(start):
         line = refuse(
             start,
             'optitrack_markers',
-            server_address='127.0.0.1',
-            local_address='127.0.0.1',
+            server='127.0.0.1',
+            local_interface='127.0.0.1',
             command_port=silent.getsockname()[1],
             start_timeout_s=2.0,
         )

@@ -64,7 +64,7 @@ def test_an_arm_that_moves_during_the_dwell_is_rejected():
 
 
 def test_a_marker_hidden_for_a_moment_prolongs_the_dwell():
-    """Three samples in the dwell, then a gap: the fifth sample ends it, and no later one counts."""
+    """Three samples in the dwell, then a gap: the fifth ends it, and no later one counts."""
     pairing = Pairing(10.0, Q, (STREAM,))
     for stamp in (10.1, 10.2, 10.3, 10.9, 11.0, 11.1):
         pairing.add_reading('mocap', MarkerReading(stamp, np.zeros(3)))
