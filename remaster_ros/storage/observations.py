@@ -27,6 +27,8 @@ from remaster_ros.storage.sequence_rules import (
 log = logging.getLogger('remaster_ros')
 
 LIMIT_TOLERANCE_RAD = math.radians(1.0)
+FARTHEST_M = 200.0
+"""More than any tracker's range: such a number is in millimetres, or broken."""
 
 
 @dataclass(frozen=True)
@@ -268,6 +270,14 @@ def _columns(
                 f'({chain.lower[joint]:.6g} to {chain.upper[joint]:.6g} rad); are the units '
                 'radians, the joints base to tip, and the limits of the URDF right?',
             )
+    far = np.argwhere(np.abs(measurements.position) > FARTHEST_M)
+    if len(far):
+        row, axis = far[0]
+        raise table.fault(
+            int(row),
+            columns.position[axis],
+            f'm is further than {FARTHEST_M:g} m away, beyond any sensor; are the units metres?',
+        )
     return measurements
 
 

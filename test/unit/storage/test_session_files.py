@@ -128,6 +128,12 @@ def test_joint_limits_have_one_degree_of_grace(folder, excess_deg, accepted):
         refused(folder, 'line 7', 'q1_rad')
 
 
+@pytest.mark.parametrize('value', ['512.3', '-1e200'])
+def test_positions_in_millimetres_are_refused(folder, value):
+    cell(folder, 3, 'y_m', value)
+    refused(folder, 'line 3', 'y_m', 'are the units metres?')
+
+
 def edit(path, old, new):
     text = path.read_text()
     assert old in text
