@@ -251,7 +251,12 @@ class RobotBridge(RemasterNode):
         )
 
     def _hold(self, reason: str) -> None:
-        """Stop the arm where it is; the configuration under way is commanded again later."""
+        """Stop the arm where it is; the configuration under way is commanded again later.
+
+        An arm that has settled stands already: its reading goes on, only no command follows it.
+        """
+        if self._visit is not None and self._visit.settled:
+            return
         if not self._held:
             self._controller.publish(JointTrajectory(joint_names=list(self.chain.joint_names)))
             self._held = True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -282,10 +283,9 @@ def prepare_folder(folder: str | os.PathLike[str]) -> None:
     """
     folder = Path(folder)
     make_folder(folder)
-    probe = folder / f'.{os.getpid()}.tmp'
     try:
-        probe.write_bytes(b'')
-        probe.unlink()
+        # A file without a name: an interrupt leaves nothing behind.
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise cannot_write(folder, error) from None
 

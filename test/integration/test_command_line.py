@@ -228,7 +228,15 @@ def test_help_needs_no_numpy() -> None:
 def start(*args: object) -> subprocess.Popen[str]:
     command = [sys.executable, '-m', 'remaster_ros.cli.main', *map(str, args)]
     pipe = subprocess.PIPE
-    return subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, cwd=ROOT)
+    return subprocess.Popen(
+        command,
+        stdout=pipe,
+        stderr=pipe,
+        text=True,
+        cwd=ROOT,
+        # A shell that runs the tests in the background has them, and what they start, ignore it.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
 
 
 def test_a_reader_that_has_gone_is_no_error(made: Path) -> None:
