@@ -140,3 +140,16 @@ def registration_tour(chain: SerialChain, plan: Plan, markers_T: Sequence[FloatA
     poses = tuple(plan.poses[i] for i in (*best, *rest))
     ordered = Plan(poses, plan.dropped, plan.dropped_solutions)
     return Tour(chain, {REGISTRATION: ordered}, in_order=True, one_solution=True)
+
+
+def nearest_solution(
+    solutions: FloatArray, q: FloatArray, tolerance_rad: float = 0.02
+) -> int | None:
+    """Return which solution (m, k) the arm stands at, rad; None if no joint-wise match is near.
+
+    The tolerance is far above what an arm that arrived is off by, and far below what tells two
+    solutions of a pose apart.
+    """
+    distance = np.max(np.abs(solutions - q), axis=1)
+    nearest = int(np.argmin(distance))
+    return nearest if distance[nearest] <= tolerance_rad else None

@@ -23,6 +23,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.pairing import PairedReading, Pairing, SensorRules
+from remaster_ros.core.tour import nearest_solution
 from remaster_ros.core.types import FloatArray, MarkerReading, Measurements, Observation, Session
 from remaster_ros.nodes.bagging import BagRecorder
 from remaster_ros.nodes.messages import JointOrder, seconds, stamp_key
@@ -233,14 +234,11 @@ class Recorder(RemasterNode):
         self._take(q, seconds(message.header.stamp), stamp, solution, pose)
 
     def _which_solution(self, q: FloatArray) -> int | None:
-        """Which announced solution the arm stands at; None if none is near (0.02 rad)."""
         if self._solutions is None:
             return None
         columns = [list(self._solutions.joint_names).index(n) for n in self.chain.joint_names]
         targets = np.array([point.positions for point in self._solutions.points])[:, columns]
-        distance = np.max(np.abs(targets - q), axis=1)
-        nearest = int(np.argmin(distance))
-        return nearest if distance[nearest] < 0.02 else None
+        return nearest_solution(targets, q)
 
     def _take(
         self,

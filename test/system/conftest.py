@@ -56,6 +56,24 @@ def start(ros_environment):
             process.communicate()
 
 
+@pytest.fixture
+def client(ros_environment):
+    """Return a node in the test's own DDS domain that is spun by hand."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=int(ros_environment['ROS_DOMAIN_ID']))
+    node = rclpy.create_node('test_client', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    node.spin_some = lambda: executor.spin_once(timeout_sec=0.02)
+    yield node
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
 def node_arguments(params_file=None, **values):
     """Return the arguments that give a node its parameters."""
     args = ['--ros-args']

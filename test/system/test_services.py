@@ -13,24 +13,6 @@ from remaster_ros.storage.session import read_session
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 
 
-@pytest.fixture
-def client(ros_environment):
-    """Return a node in the test's own DDS domain that is spun by hand."""
-    import rclpy
-    from rclpy.executors import SingleThreadedExecutor
-
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=int(ros_environment['ROS_DOMAIN_ID']))
-    node = rclpy.create_node('test_client', context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    node.spin_some = lambda: executor.spin_once(timeout_sec=0.02)
-    yield node
-    executor.shutdown()
-    node.destroy_node()
-    rclpy.shutdown(context=context)
-
-
 def call(client, service):
     """Call a Trigger service and return its response."""
     from std_srvs.srv import Trigger
