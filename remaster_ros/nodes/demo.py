@@ -7,6 +7,7 @@ its truth is opened only at the very end, to be compared with the estimate.
 from __future__ import annotations
 
 import os
+import random
 import shutil
 import signal
 import socket
@@ -141,8 +142,9 @@ class Demo:
 
     def _start(self) -> None:
         common = config_path('fake.yaml')
-        command_port, data_port = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM)
-        tracker_port = free_port(socket.SOCK_STREAM)
+        command_port, data_port, tracker_port = free_ports(
+            socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM
+        )
         ports = {'command_port': command_port, 'data_port': data_port}
         size = self.p.candidates
         own: dict[str, dict[str, Any]] = {
@@ -259,11 +261,23 @@ def new_folder(path: Path) -> Path:
     return path
 
 
-def free_port(kind: int) -> int:
-    """Return a port on loopback that nobody uses now."""
+def free_ports(*kinds: int) -> list[int]:
+    """Return a port on loopback for each kind of socket, all different and used by nobody now.
+
+    They lie above the ports that Linux gives to sockets without one (32768 to 60999): nine
+    processes open dozens of these before the ports found here are bound.
+    """
+    candidates = iter(random.SystemRandom().sample(range(61001, 65001), 1000))
+    return [next(port for port in candidates if _is_free(kind, port)) for kind in kinds]
+
+
+def _is_free(kind: int, port: int) -> bool:
     with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(('127.0.0.1', 0))
-        return int(probe.getsockname()[1])
+        try:
+            probe.bind(('127.0.0.1', port))
+        except OSError:
+            return False
+        return True
 
 
 def _domain_environment() -> dict[str, str]:
