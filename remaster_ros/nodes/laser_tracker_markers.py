@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
@@ -28,7 +29,7 @@ from remaster_ros.drivers.laser_tracker import (
     TrackerReading,
     TrackerStatus,
 )
-from remaster_ros.nodes.messages import stamp_of, transform_array
+from remaster_ros.nodes.messages import stamp_of, temperature_topic, transform_array
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import LATCHED, RELIABLE, Status
@@ -107,6 +108,9 @@ class LaserTrackerMarkers(RemasterNode):
         self._commanded = threading.Event()
         self._ending = threading.Event()
         self._publisher = self.create_publisher(PointStamped, sensor.topic, RELIABLE)
+        self._temperatures = self.create_publisher(
+            Temperature, temperature_topic(sensor.topic), RELIABLE
+        )
         self.create_subscription(PoseStamped, '/remaster/target_pose', self._on_pose, RELIABLE)
         self.create_subscription(
             TransformStamped, '/remaster/registration', self._on_registration, LATCHED
@@ -238,7 +242,7 @@ class LaserTrackerMarkers(RemasterNode):
                 return response
         took = time.monotonic() - began
         self._trouble = ''
-        self._temperature_c = reading.temperature_c
+        self._publish_temperature(reading)
         message = PointStamped()
         message.header.stamp = stamp_of(reading.stamp_s)
         message.header.frame_id = self.p.sensor
@@ -248,6 +252,16 @@ class LaserTrackerMarkers(RemasterNode):
         self._publisher.publish(message)
         response.success, response.message = True, 'measured'
         return response
+
+    def _publish_temperature(self, reading: TrackerReading) -> None:
+        """Publish it under the reading's stamp, before the point."""
+        self._temperature_c = reading.temperature_c
+        if not np.isfinite(reading.temperature_c):
+            return
+        message = Temperature(temperature=float(reading.temperature_c))
+        message.header.stamp = stamp_of(reading.stamp_s)
+        message.header.frame_id = self.p.sensor
+        self._temperatures.publish(message)
 
     def _measure(self) -> TrackerReading:
         failure: DeviceError | None = None

@@ -36,6 +36,11 @@ def duration_of(time_s: float) -> Duration:
     return Duration(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
 
 
+def temperature_topic(marker_topic: str) -> str:
+    """Return where a sensor that has a thermometer publishes it: beside its marker."""
+    return f'{marker_topic.rpartition("/")[0]}/temperature'
+
+
 class JointOrder:
     """Take joint positions by name from messages that have them in any order.
 

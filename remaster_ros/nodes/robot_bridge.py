@@ -276,7 +276,9 @@ class RobotBridge(RemasterNode):
         missing = self._missing()
         busy = self._visit is not None
         text = missing or ('moving or measuring' if busy else 'waiting for a pose')
-        return ('warn' if missing else 'ok'), text, {**self.counts, 'held': self._held}
+        # By the pose the planner sees whether a bridge that was started again knows it.
+        values = {**self.counts, 'held': self._held, 'pose': self._stamp()}
+        return ('warn' if missing else 'ok'), text, values
 
     def close(self) -> None:
         """Leave the arm standing still."""
