@@ -195,7 +195,7 @@ def decode_frame(payload: bytes, version: Version) -> Frame:
     skeletons = reader.section(version, lambda r: _read_skeleton(r, version), 8)
     assets = reader.section(version, _read_asset, 12) if version >= (4, 1) else ()
     labeled_layout = _LABELED_3 if version >= (3, 0) else _LABELED_2
-    labeled = _labeled(reader.row_section(version, labeled_layout))
+    labeled = _labeled(reader.row_section(version, labeled_layout), version)
     force_plates = reader.section(version, _read_analog, 8) if version >= (2, 9) else ()
     devices = reader.section(version, _read_analog, 8) if version >= (2, 11) else ()
 
@@ -211,8 +211,8 @@ def decode_frame(payload: bytes, version: Version) -> Frame:
         )
     _require_finite((timestamp, latency), 'time')
     _require_finite(chain.from_iterable(other_markers), 'position of a marker')
-    for marker_set in marker_sets:
-        _require_finite(chain.from_iterable(marker_set.positions), 'position of a marker')
+    in_sets = chain.from_iterable([marker_set.positions for marker_set in marker_sets])
+    _require_finite(chain.from_iterable(in_sets), 'position of a marker')
     _require_tracked_bodies_finite(bodies)
     return Frame(
         number=number,
@@ -275,14 +275,25 @@ def encode_frame(frame: Frame, version: Version) -> bytes:
     return b''.join(parts)
 
 
-def _labeled(rows: list[tuple]) -> tuple[LabeledMarker, ...]:
+def _labeled(rows: list[tuple], version: Version) -> tuple[LabeledMarker, ...]:
     """Build the labelled markers; one sum tells whether any number needs a closer look."""
-    markers = tuple(LabeledMarker(row[0], row[1:4], *row[4:]) for row in rows)
+    # Past the named tuple's own constructor, which takes as long as all the rest of a frame.
+    make = tuple.__new__
+    if version >= (3, 0):
+        markers = [
+            make(LabeledMarker, (label, (x, y, z), size, params, residual))
+            for label, x, y, z, size, params, residual in rows
+        ]
+    else:
+        markers = [
+            make(LabeledMarker, (label, (x, y, z), size, params, None))
+            for label, x, y, z, size, params in rows
+        ]
     if not math.isfinite(sum(chain.from_iterable(rows))):
         for marker in markers:
             if not marker.params & OCCLUDED:
                 _require_finite(marker.position, f'position of marker {marker.id}')
-    return markers
+    return tuple(markers)
 
 
 def _require_finite(values: Iterable[float], what: str) -> None:
@@ -312,19 +323,18 @@ def _body(row: tuple) -> RigidBody:
 
 
 def _read_body_2(reader: Reader) -> RigidBody:
-    body_id, *pose = reader.unpack(_BODY_2)
+    body_id, x, y, z, *orientation = reader.unpack(_BODY_2)
     count = reader.count(_BODY_MARKER_BYTES)
     positions = reader.rows(wire.VEC3, count)
-    ids = reader.rows(wire.I32, count)
-    sizes = reader.rows(wire.F32, count)
+    ids = reader.numbers('i', count)
+    sizes = reader.numbers('f', count)
     mean_error, params = reader.unpack(_BODY_2_END)
     markers = tuple(
-        BodyMarker(p, i, s)  # type: ignore[arg-type]
-        for p, (i,), (s,) in zip(positions, ids, sizes, strict=True)
+        [tuple.__new__(BodyMarker, marker) for marker in zip(positions, ids, sizes, strict=True)]
     )
     if params & TRACKING_VALID:
         _require_finite(chain.from_iterable(positions), f'position of a marker of body {body_id}')
-    return RigidBody(body_id, tuple(pose[:3]), tuple(pose[3:]), mean_error, params, markers)  # type: ignore[arg-type]
+    return RigidBody(body_id, (x, y, z), tuple(orientation), mean_error, params, markers)  # type: ignore[arg-type]
 
 
 def _write_body(body: RigidBody, version: Version) -> bytes:
@@ -366,8 +376,8 @@ def _read_asset(reader: Reader) -> Asset:
     asset_id = reader.integer()
     bodies = _read_bodies_3(reader)
     _require_tracked_bodies_finite(bodies)
-    markers = _labeled(reader.rows(_LABELED_3, reader.count(_LABELED_3.size)))
-    return Asset(asset_id, bodies, markers)
+    rows = reader.rows(_LABELED_3, reader.count(_LABELED_3.size))
+    return Asset(asset_id, bodies, _labeled(rows, (4, 1)))
 
 
 def _write_asset(asset: Asset, version: Version) -> bytes:
@@ -388,7 +398,7 @@ def _read_analog(reader: Reader) -> AnalogDevice:
 
 
 def _read_channel(reader: Reader) -> tuple[float, ...]:
-    return tuple(value for (value,) in reader.rows(wire.F32, reader.count(wire.F32.size)))
+    return reader.numbers('f', reader.count(wire.F32.size))
 
 
 def _write_analog(device: AnalogDevice) -> bytes:

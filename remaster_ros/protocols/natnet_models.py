@@ -184,7 +184,7 @@ def _read_rigid_body(reader: Reader, version: Version) -> RigidBodyDescription:
     if version >= (3, 0):
         count = reader.count(wire.VEC3.size + wire.I32.size)
         positions = tuple(reader.rows(wire.VEC3, count))
-        labels = tuple(label for (label,) in reader.rows(wire.I32, count))
+        labels = reader.numbers('i', count)
         if version >= (4, 0):
             names = tuple(reader.text() for _ in range(count))
     return RigidBodyDescription(

@@ -7,9 +7,10 @@ bytes left could not hold.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterable
 from struct import Struct
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 Version = tuple[int, int]
 """NatNet bitstream version, (major, minor)."""
@@ -89,6 +90,15 @@ class Reader:
             )
         self.offset = stop
         return list(layout.iter_unpack(memoryview(self._data)[start:stop]))
+
+    def numbers(self, kind: Literal['i', 'f'], count: int) -> tuple[Any, ...]:
+        """Read `count` numbers in a row: ``i`` for i32, ``f`` for f32."""
+        start = self.offset
+        stop = start + 4 * count
+        if stop > self.end:
+            raise ProtocolError(f'{count} numbers wanted at byte {start}, {self.left} bytes left')
+        self.offset = stop
+        return struct.unpack_from(f'<{count}{kind}', self._data, start)
 
     def integer(self) -> int:
         """Read one i32."""
