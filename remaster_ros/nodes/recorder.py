@@ -33,7 +33,7 @@ from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import TOPIC as STATUS
 from remaster_ros.nodes.status import Event, Status, receiver
 from remaster_ros.storage.cell import Cell, read_cell
-from remaster_ros.storage.session import ExitStatus, SessionWriter
+from remaster_ros.storage.session_writer import ExitStatus, SessionWriter
 
 
 @dataclass(frozen=True)
@@ -151,9 +151,7 @@ class Recorder(RemasterNode):
         bag.subscribe(JointState, '/joint_states', self._on_joint_state)
         bag.subscribe(JointState, '/remaster/settled', self._on_settled)
         bag.subscribe(JointTrajectory, '/remaster/joint_solutions', self._on_solutions)
-        bag.subscribe(
-            JointTrajectory, '/joint_trajectory_controller/joint_trajectory', self._on_trajectory
-        )
+        bag.subscribe(JointTrajectory, '/joint_trajectory_controller/joint_trajectory')
         self._measure = {}
         for name, sensor in self.cell.sensors.items():
             bag.subscribe(PointStamped, sensor.topic, self._on_point(name))
@@ -191,11 +189,6 @@ class Recorder(RemasterNode):
             self._taking.pairing.add_joint_state(self._now, self._q)
             self._finish_if_complete()
 
-    def _on_trajectory(self, message: JointTrajectory) -> None:
-        if not message.points:
-            # The arm was stopped on its way: nobody knows what it will come from next.
-            self._from_q = None
-
     def _on_solutions(self, message: JointTrajectory) -> None:
         self._solutions = message if message.points else None
 
@@ -204,6 +197,9 @@ class Recorder(RemasterNode):
             self._poses[event.values['stamp']] = _Pose(
                 int(event.values['pose']), event.values['split']
             )
+        elif (event.node, event.event) == ('robot_bridge', 'stopped'):
+            # On its way: nobody knows what it will come from next.
+            self._from_q = None
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
         if node == 'pose_planner' and self._taking is None:

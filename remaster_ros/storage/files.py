@@ -54,7 +54,11 @@ def decode_text(data: bytes, path: Path) -> str:
 def make_folder(folder: Path) -> None:
     """Create an output folder with its parents; an `InputError` says why it cannot be."""
     try:
+        new = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
+        # From the top: a folder whose own name is lost takes all in it along.
+        for path in reversed(new):
+            sync_folder(path.parent)
     except OSError as error:
         raise cannot_write(folder, error) from None
 
@@ -82,16 +86,107 @@ def write_atomically(path: Path, data: str | bytes) -> None:
     """
     temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
     try:
-        with temporary.open('wb') as file:
-            file.write(data.encode() if isinstance(data, str) else data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+        try:
+            write_all(descriptor, data.encode() if isinstance(data, str) else data)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        os.replace(temporary, path)
         sync_folder(path.parent)
     except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise cannot_write(path, error) from None
+
+
+def remove_leftovers(folder: Path) -> list[str]:
+    """Remove the temporary files of atomic writes that a crash cut short; return their names."""
+    removed = []
+    for path in sorted(folder.glob('.*.tmp')):
+        try:
+            os.unlink(path)
+        except OSError as error:
+            raise cannot_write(path, error) from None
+        removed.append(path.name)
+    return removed
+
+
+class AppendFile:
+    """A file that grows by pieces, each durable when `append` returns, or not there at all.
+
+    Parameters
+    ----------
+    path
+        The file; made where there is none, its name durable.
+
+    Raises
+    ------
+    InputError
+        The folder or the file cannot be written to.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._descriptor: int | None = None
+        try:
+            self._descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+            self.size = os.fstat(self._descriptor).st_size
+            # Also where it is there: who made it may have been killed before this.
+            sync_folder(path.parent)
+        except OSError as error:
+            self.close()
+            raise cannot_write(path, error) from None
+
+    @property
+    def descriptor(self) -> int:
+        """The open file; an `InputError` where it is closed."""
+        if self._descriptor is None:
+            raise InputError(f'{self.path}: closed; open it again')
+        return self._descriptor
+
+    def append(self, data: bytes) -> None:
+        """Write a piece; durable on return.
+
+        Raises
+        ------
+        InputError
+            The disk does not take it; the file ends as before. Where the disk does not take
+            that either, the file is closed: nobody knows how it ends until it is read again.
+        """
+        descriptor = self.descriptor
+        try:
+            write_all(descriptor, data)
+            os.fsync(descriptor)
+        except OSError as error:
+            # Half a piece in the middle of the file would make all of it unreadable.
+            with contextlib.suppress(InputError):
+                self.truncate(self.size)
+            raise cannot_write(self.path, error) from None
+        self.size += len(data)
+
+    def truncate(self, size: int) -> None:
+        """Cut the file, durable on return; an `InputError` where the disk does not take it."""
+        try:
+            os.ftruncate(self.descriptor, size)
+            os.fsync(self.descriptor)
+        except OSError as error:
+            self.close()
+            raise cannot_write(self.path, error) from None
+        self.size = size
+
+    def close(self) -> None:
+        """Close the file; closing again does nothing."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+
+def write_all(descriptor: int, data: bytes) -> None:
+    """Write all of `data`, however many calls the system takes for it."""
+    written = 0
+    while written < len(data):
+        written += os.write(descriptor, data[written:])
 
 
 def sync_folder(folder: Path) -> None:

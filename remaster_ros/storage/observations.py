@@ -73,7 +73,8 @@ def parse_observations(
 ) -> Measurements:
     """Read observations.csv.
 
-    A last line without its line end was cut while it was written: it is dropped with a warning.
+    What was cut off while it was written is dropped with a warning: a last line without its line
+    end, and last lines with the zeros that a power cut leaves.
 
     Parameters
     ----------
@@ -91,9 +92,9 @@ def parse_observations(
     InputError
         One line naming file, line, column and remedy.
     """
-    end = data.rfind(b'\n') + 1
+    end = _whole_lines(data, most=len(sensors))
     if end < len(data):
-        torn = data.count(b'\n') + 1
+        torn = data.count(b'\n', 0, end) + 1
         log.warning('%s, line %d: cut off while being written, and dropped', path, torn)
     lines = decode_text(data[:end], path).replace('\r\n', '\n').split('\n')[:-1]
     while lines and not lines[-1]:
@@ -114,6 +115,19 @@ def parse_observations(
                 raise InputError(f'{path}, line {row.line}, {problem}')
             rules.accept(row)
     return measurements
+
+
+def _whole_lines(data: bytes, most: int) -> int:
+    """Return how many bytes at the beginning are whole lines.
+
+    The rows of one configuration are written in one piece, a row for each of the (`most`) sensors:
+    zeros further up are no crash's work, and left for the reader to refuse.
+    """
+    end = data.rfind(b'\n') + 1
+    zero = data.find(b'\0')
+    if zero < 0 or data.count(b'\n', zero) > most:
+        return end
+    return data.rfind(b'\n', 0, zero) + 1
 
 
 def check_row(

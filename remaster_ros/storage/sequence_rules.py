@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import ChainMap
+from collections.abc import Iterator, MutableMapping
 from typing import NamedTuple
 
 import numpy as np
@@ -32,9 +33,18 @@ class SequenceRules:
 
     def __init__(self) -> None:
         self._last: RowKeys | None = None
-        self._of_observation: dict[int, RowKeys] = {}
-        self._of_pose: dict[int, RowKeys] = {}
-        self._of_configuration: dict[int, RowKeys] = {}
+        self._of_observation: MutableMapping[int, RowKeys] = {}
+        self._of_pose: MutableMapping[int, RowKeys] = {}
+        self._of_configuration: MutableMapping[int, RowKeys] = {}
+
+    def branch(self) -> SequenceRules:
+        """Return rules that know the same rows; what they accept stays unknown here."""
+        rules = SequenceRules()
+        rules._last = self._last
+        rules._of_observation = ChainMap({}, self._of_observation)
+        rules._of_pose = ChainMap({}, self._of_pose)
+        rules._of_configuration = ChainMap({}, self._of_configuration)
+        return rules
 
     def problem(self, row: RowKeys) -> str:
         """Return '' or what is wrong with the next row: "column …: …; remedy"."""

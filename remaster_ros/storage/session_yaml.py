@@ -14,7 +14,7 @@ import numpy as np
 
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.types import BasePrior, Session
-from remaster_ros.storage.files import decode_text, read_limited
+from remaster_ros.storage.files import decode_text
 from remaster_ros.storage.safe_yaml import YamlError, dump_yaml, load_yaml
 
 FORMAT = 'remaster-session/1'
@@ -74,15 +74,14 @@ class SessionHeader(msgspec.Struct):
         return priors
 
 
-def read_header(path: Path) -> SessionHeader:
-    """Read and check session.yaml.
+def parse_header(data: bytes, path: Path) -> SessionHeader:
+    """Check the content of session.yaml; `path` is for messages.
 
     Raises
     ------
     InputError
         One line naming file, line or key, and the remedy.
     """
-    data = read_limited(path, YAML_LIMIT, 'a session folder holds session.yaml')
     try:
         content = load_yaml(decode_text(data, path))
     except YamlError as error:

@@ -15,7 +15,8 @@ import pytest
 
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.types import Observation
-from remaster_ros.storage.session import SessionWriter, read_session, write_session
+from remaster_ros.storage.session import read_session, write_session
+from remaster_ros.storage.session_writer import SessionWriter
 
 
 def observations(session):
@@ -51,7 +52,9 @@ def test_the_folder_is_readable_after_every_observation(session, tmp_path):
     for name, value in vars(session.measurements).items():
         if name != 'effort':
             np.testing.assert_array_equal(getattr(read.measurements, name), value, err_msg=name)
-    assert sorted(os.listdir(folder)) == ['observations.csv', 'robot.urdf', 'session.yaml']
+    assert sorted(os.listdir(folder)) == [
+        'SHA256SUMS', 'journal.jsonl', 'observations.csv', 'robot.urdf', 'session.yaml',
+    ]  # fmt: skip
 
 
 def test_both_writers_write_the_same_bytes(session, tmp_path):
@@ -138,7 +141,8 @@ def test_a_folder_with_files_is_refused(session, tmp_path):
 
 KILLED = """
 import sys
-from remaster_ros.storage.session import SessionWriter, read_session
+from remaster_ros.storage.session import read_session
+from remaster_ros.storage.session_writer import SessionWriter
 sys.path.insert(0, {tests!r})
 from test_session_writer import observations
 session = read_session({source!r})

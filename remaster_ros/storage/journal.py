@@ -1,0 +1,167 @@
+"""Append-only journals: JSON lines with a checksum each, durable before anybody is told.
+
+A crash can leave only the last line incomplete: cut anywhere, also inside a character, or with
+zeros where the file system had reserved blocks but not yet written them. Such a line was never
+acknowledged; it is reported and dropped. A damaged line that others follow is not a crash's work,
+and the file is refused.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import zlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from remaster_ros.core.errors import InputError
+from remaster_ros.storage.files import AppendFile, cannot_write, read_limited
+
+JOURNAL_LIMIT = 1024**3
+
+Record = dict[str, Any]
+
+
+class JournalText(NamedTuple):
+    """A journal as read.
+
+    Attributes
+    ----------
+    records
+        What the whole lines say.
+    size
+        How many bytes these lines are.
+    torn
+        How many bytes behind them are no whole line.
+    """
+
+    records: list[Record]
+    size: int
+    torn: int
+
+
+class Journal:
+    """Write a journal, or go on with one; what `append` returned from is on the disk.
+
+    Opening cuts off what a crash has left of a line. While it is open, nobody else can open it
+    for writing; the lock goes with the process, however that ends.
+
+    Parameters
+    ----------
+    path
+        The file; made where there is none, its name durable.
+
+    Attributes
+    ----------
+    records
+        Every record so far.
+    lost
+        What was cut off when opening, in words; '' where nothing was.
+
+    Raises
+    ------
+    InputError
+        Another process writes it, it is damaged, or it cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = AppendFile(path)
+        try:
+            self._lock()
+            self.records, size, torn = read_journal(path)
+            self.lost = torn_words(path, len(self.records), torn)
+            if torn:
+                self._file.truncate(size)
+        except BaseException:
+            self._file.close()
+            raise
+
+    def _lock(self) -> None:
+        try:
+            fcntl.flock(self._file.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f'{self.path}: another process is writing it; end that one, or name another folder'
+            ) from None
+        except OSError as error:
+            raise cannot_write(self.path, error) from None
+
+    def append(self, record: Record) -> None:
+        """Write one record; durable on return.
+
+        Raises
+        ------
+        InputError
+            The disk does not take it; the file is as it was before.
+        """
+        self._file.append(format_record(record))
+        self.records.append(record)
+
+    def close(self) -> None:
+        """Close the file and let others open it; closing again does nothing."""
+        self._file.close()
+
+
+def read_journal(path: Path) -> JournalText:
+    """Read a journal that is perhaps just being written, or was when the power failed.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or a line that others follow is damaged.
+    """
+    data = read_limited(path, JOURNAL_LIMIT, 'without its journal a session cannot be resumed')
+    records: list[Record] = []
+    size = 0
+    lines = data.split(b'\n')
+    for line in lines[:-1]:
+        record = parse_record(line)
+        if record is None:
+            break
+        records.append(record)
+        size += len(line) + 1
+    rest = data[size:]
+    # Zeros may hide the line end of the torn line, and a whole line may only come before it.
+    following = rest.split(b'\n')[1:]
+    if any(parse_record(line) is not None for line in following):
+        raise InputError(
+            f'{path}, line {len(records) + 1}: damaged, though whole lines follow; '
+            'take another copy of the file'
+        )
+    return JournalText(records, size, len(rest))
+
+
+def torn_words(path: Path, whole: int, torn: int) -> str:
+    """Say what of a journal with `whole` good lines is dropped; '' where nothing is."""
+    if not torn:
+        return ''
+    return (
+        f'{path}, line {whole + 1}: {torn} bytes of a line cut off while being written are dropped'
+    )
+
+
+def format_record(record: Record) -> bytes:
+    """Return a record as one line: JSON whose last member is the CRC-32 of what is before it."""
+    text = json.dumps(record, ensure_ascii=False, separators=(',', ':'), allow_nan=False)
+    body = text[:-1].encode()
+    return body + _seal(body) + b'\n'
+
+
+def parse_record(line: bytes) -> Record | None:
+    """Undo `format_record` for a line without its end; None where it is not whole."""
+    body, seal = line[:-_SEAL_LENGTH], line[-_SEAL_LENGTH:]
+    if _seal(body) != seal:
+        return None
+    try:
+        record = json.loads(body + b'}')
+    except (ValueError, RecursionError):
+        return None
+    return record if isinstance(record, dict) else None
+
+
+def _seal(body: bytes) -> bytes:
+    return b',"crc32":"%08x"}' % zlib.crc32(body)
+
+
+_SEAL_LENGTH = len(_seal(b''))
