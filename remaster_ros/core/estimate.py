@@ -8,6 +8,7 @@ import numpy as np
 
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.errors import InputError, InsufficientDataError
+from remaster_ros.core.extension import Extension
 from remaster_ros.core.gauge import Gauge, find_gauge
 from remaster_ros.core.laplace import Mode, find_mode
 from remaster_ros.core.model import Model, Rows
@@ -118,7 +119,7 @@ class Problem:
             if name in self.session.base_prior
         )
 
-    def empty_model(self) -> Model:
+    def empty_model(self, extension: Extension | None = None) -> Model:
         """Return a model with registrations still unknown."""
         count = len(self.sensor_names)
         return Model(
@@ -127,6 +128,7 @@ class Problem:
             self.marker_names,
             np.tile(np.eye(4), (count, 1, 1)),
             np.zeros((count, 3)),
+            extension,
         )
 
 
@@ -162,8 +164,8 @@ class Estimate:
         return self.mode.linearisation.posterior
 
 
-def estimate(problem: Problem) -> Estimate:
-    """Find the mode.
+def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
+    """Find the mode, with the parameters of an extension where one is given.
 
     Raises
     ------
@@ -171,7 +173,7 @@ def estimate(problem: Problem) -> Estimate:
         Where the data do not determine the parameters, or disagree with the model altogether.
     """
     measurements = problem.measurements
-    empty = problem.empty_model()
+    empty = problem.empty_model(extension)
     model, z = robust_start(
         empty,
         measurements,
@@ -184,7 +186,7 @@ def estimate(problem: Problem) -> Estimate:
     rows = Rows.of(measurements, problem.fitted, model.reference)
     gauge = find_gauge(model, model.natural(z), rows, priors)
     free = np.setdiff1d(np.arange(model.size), gauge.held)
-    z[gauge.held] = 0.0
+    z[gauge.held[gauge.held < model.joints]] = 0.0
 
     def kept_rows(keep: BoolArray) -> Rows:
         return Rows.of(measurements, np.sort(rows.source[keep]), model.reference)

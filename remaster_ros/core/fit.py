@@ -10,6 +10,7 @@ import numpy as np
 from remaster_ros.core import convergence
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.estimate import Estimate, Problem, estimate
+from remaster_ros.core.extension import Extension
 from remaster_ros.core.paper_mode import BURN_IN_SHARE, STEPS, fit_paper
 from remaster_ros.core.result import FitResult, Sampled, build_result
 from remaster_ros.core.sampling import Progress, sample_posterior, silent
@@ -31,6 +32,7 @@ def fit_session(
     draws: int | None = None,
     progress: Progress | None = None,
     clock: Callable[[], float] | None = None,
+    extension: Extension | None = None,
 ) -> FitResult:
     """Fit a session's optimization rows.
 
@@ -51,6 +53,8 @@ def fit_session(
         Called with the stage and the share of it that is done.
     clock
         Returns seconds, to time the sampler; core has no clock of its own.
+    extension
+        Further physical effects to fit; the paper's model has none.
 
     Raises
     ------
@@ -59,6 +63,8 @@ def fit_session(
     InsufficientDataError
         Data that do not allow an answer.
     """
+    if extension is not None and sampler == 'paper':
+        raise InputError("the paper's model has no further effects; use the fast sampler")
     if chains < 2:
         raise InputError(f'{chains} chain(s) cannot be judged; use at least 2')
     default = STEPS if sampler == 'paper' else FAST_DRAWS
@@ -78,7 +84,7 @@ def fit_session(
             progress=lambda share: report('sampling', share),
         )
     else:
-        sampled = _fast(estimate(problem), chains, draws, rng, report)
+        sampled = _fast(estimate(problem, extension), chains, draws, rng, report)
     seconds = clock() - started if clock is not None else np.nan
     return build_result(problem, sampled, seconds, rng)
 
@@ -100,8 +106,7 @@ def _fast(
         return np.concatenate((natural, sigma, separate), axis=-1)
 
     sigma, pose_sigma = posterior.noise(run.draws[..., len(posterior.free) :])
-    unfixed = np.zeros(model.joints, dtype=bool)
-    unfixed[found.gauge.held] = True
+    unfixed = np.isin(np.arange(model.joints), found.gauge.held)
     return Sampled(
         model=model,
         z=posterior.parameters(run.draws),

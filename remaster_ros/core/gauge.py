@@ -8,13 +8,13 @@ any other is fixed by holding one joint at zero, and said so.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from remaster_ros.core.errors import InsufficientDataError
 from remaster_ros.core.model import Model, Rows
-from remaster_ros.core.posterior import Prior, prior_rows
+from remaster_ros.core.posterior import Prior, extension_root, prior_rows
 from remaster_ros.core.start import robust_spread
 from remaster_ros.core.types import FloatArray, IntArray
 
@@ -57,7 +57,8 @@ class Gauge:
     directions
         One per dimension of the null space.
     held
-        Indices of the joints held at zero, (h,).
+        Indices of the joints held at zero and of the effects held where they were linearised,
+        (h,).
     why
         For each joint what the data cannot tell it from; '' where they can, k strings.
     """
@@ -94,14 +95,15 @@ def find_gauge(
     fitted = np.arange(model.size) if fitted is None else fitted
     scale, null, pivots = _null_space(model, x, rows, fitted)
     _, by_x = prior_rows(model, priors, x, natural=True)
-    held = _unresolved(by_x @ null, pivots, model)
+    held = _unresolved(by_x @ null, pivots, model, scale)
 
     directions, why = [], [''] * model.joints
     for column, pivot in enumerate(pivots):
         combination = _about_origin(model, null[:, column], scale)
         words = _in_words(model, combination)
         if pivot in held:
-            fixed_by = f'{model.names[pivot]} = 0'
+            at = x[pivot] if pivot >= model.core else 0.0
+            fixed_by = f'{model.names[pivot]} = {at:g}'
         else:
             fixed_by = _resolving_priors(priors, x, null[:, column], model)
         entries = {
@@ -137,6 +139,10 @@ def _null_space(
     basis = np.zeros((model.size, int(unseen.sum())))
     basis[fitted] = (vectors[unseen] / norm).T
     basis, pivots = _reduce(basis, scale, _kinds(model))
+    # A prior on effects counts as data for what is nearly unseen: it is what keeps them apart.
+    root = np.zeros((len(rooted := extension_root(model)), model.size))
+    root[:, model.core :] = rooted
+    triangle = np.asarray(np.linalg.qr(np.concatenate((triangle, root[:, fitted] / norm)), 'r'))
     for direction, pivot in _nearly_null(triangle, fitted, norm, pivots, model):
         basis = np.column_stack((basis, direction))
         pivots.append(pivot)
@@ -170,15 +176,18 @@ def _nearly_null(
 
 
 def _is_angle(model: Model, index: int) -> bool:
+    if index >= model.core:
+        return False
     return index < model.joints or model.names[index].rsplit('.', 1)[-1].startswith('r')
 
 
-def _kinds(model: Model) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the indices of joints, markers and registrations: the order pivots are sought in."""
+def _kinds(model: Model) -> tuple[IntArray, ...]:
+    """Return the indices of effects, joints, markers and registrations: the order of pivots."""
     end = model.joints + 6 * len(model.sensor_names)
     return (
+        np.arange(model.core, model.size),
         np.arange(model.joints),
-        np.arange(end, model.size),
+        np.arange(end, model.core),
         np.arange(model.joints, end),
     )
 
@@ -195,7 +204,7 @@ def _reduce(
     for column in range(work.shape[1]):
         for kind in kinds:
             part = np.abs(work[kind][:, column:])
-            if part.max() > NEGLIGIBLE * np.abs(work[:, column:]).max():
+            if part.max(initial=0.0) > NEGLIGIBLE * np.abs(work[:, column:]).max():
                 break
         row, offset = divmod(int(np.argmax(part)), part.shape[1])
         pivot = int(kind[row])
@@ -212,7 +221,9 @@ def _reduce(
     return null[:, order], [pivots[index] for index in order]
 
 
-def _unresolved(by_direction: FloatArray, pivots: list[int], model: Model) -> set[int]:
+def _unresolved(
+    by_direction: FloatArray, pivots: list[int], model: Model, scale: FloatArray
+) -> set[int]:
     """Return the pivots that no prior resolves; all of them must be joints, to be held."""
     held: set[int] = set()
     while True:
@@ -220,12 +231,15 @@ def _unresolved(by_direction: FloatArray, pivots: list[int], model: Model) -> se
         if not active:
             return held
         std = _standard_deviations(by_direction[:, active])
-        limit = [UNKNOWN_ANGLE if _is_angle(model, pivots[c]) else 1e3 for c in active]
-        joints = [i for i, c in enumerate(active) if pivots[c] < model.joints]
-        loose = [i for i in range(len(active)) if std[i] > limit[i]]
+        loose = [i for i, c in enumerate(active) if std[i] > _limit(model, pivots[c], scale)]
         if not loose:
             return held
-        joints = [i for i in loose if i in joints]
+        # Effects may have any unit, so all that nothing knows of are held at once.
+        effects = {pivots[active[i]] for i in loose if pivots[active[i]] >= model.core}
+        held |= effects
+        joints = [i for i in loose if pivots[active[i]] < model.joints]
+        if effects:
+            continue
         if not joints:
             names = ', '.join(model.names[pivots[active[i]]] for i in loose)
             raise InsufficientDataError(
@@ -233,6 +247,14 @@ def _unresolved(by_direction: FloatArray, pivots: list[int], model: Model) -> se
                 'measure poses that are spread further and turn the tool'
             )
         held.add(pivots[active[max(joints, key=lambda i: std[i])]])
+
+
+def _limit(model: Model, index: int, scale: FloatArray) -> float:
+    """Return the prior std from which on a parameter counts as unknown."""
+    if index >= model.core:
+        # Of any unit: a million times what the data would leave it if it were alone.
+        return 1e6 / float(scale[index])
+    return UNKNOWN_ANGLE if _is_angle(model, index) else 1e3
 
 
 def _standard_deviations(by_direction: FloatArray) -> FloatArray:
@@ -313,11 +335,17 @@ def _resolving_priors(
     priors: Sequence[Prior], x: FloatArray, direction: FloatArray, model: Model
 ) -> str:
     """Name the priors that hold a direction: those that change along it."""
-    pull = [
-        float(np.linalg.norm(prior_rows(model, [prior], x, natural=True)[1] @ direction))
+    core = replace(model, extension=None)
+    pull = {
+        prior.description: float(
+            np.linalg.norm(
+                prior_rows(core, [prior], x[: model.core], natural=True)[1]
+                @ direction[: model.core]
+            )
+        )
         for prior in priors
-    ]
-    names = [
-        prior.description for prior, p in zip(priors, pull, strict=True) if p > 1e-3 * max(pull)
-    ]
-    return _listed(names)
+    }
+    pull['the prior on the effects'] = float(
+        np.linalg.norm(extension_root(model) @ model.theta(direction))
+    )
+    return _listed([name for name, p in pull.items() if p > 1e-3 * max(pull.values())])

@@ -87,8 +87,8 @@ def accuracy_with_offsets(
     found = estimate(problem)
     model = found.model
     given = hold_offsets(found.mode, np.asarray(joint_offsets, dtype=float))
-    predicted_before = predicted_rows(problem, model, model.natural(found.before.z))
-    predicted_after = predicted_rows(problem, model, model.natural(given.z))
+    predicted_before = predicted_rows(problem, model, found.before.z)
+    predicted_after = predicted_rows(problem, model, given.z)
     draws = None if joint_offsets_std is None else _draws(found, given, joint_offsets_std, rng)
     validation = np.flatnonzero(problem.measurements.is_validation)
     accuracy = {

@@ -5,7 +5,8 @@ The model of one observation (eq. 8 of Van Wyk et al., with the marker's positio
     p_N = inverse(T_R_N) f(q + joint_offsets, marker)
 
 Parameters are one flat vector x, base units m and rad, in the order joint offsets (k),
-registration of each sensor (6), position of each marker (3). A registration is a correction C
+registration of each sensor (6), position of each marker (3), and theta (m) of an `Extension` where
+there is one. A registration is a correction C
 applied to the robot's points on their way to the sensor, along and about the axes of the base R::
 
     inverse(T_R_N) = inverse(T_R_N of the reference) C,    C(p) = c + exp(r) (p - c) + t
@@ -18,7 +19,8 @@ there equal distances in N.
 turning joint k the same as turning the markers about its axis: no data can tell them apart. The
 samplers use coordinates in which this is exact at any size: C' = C Rot_1(offset of joint 1) and
 marker' = Rot_k(offset of joint k) marker. Predictions depend on C', marker' and the inner joints;
-the outer two joints move nothing but the priors. `pinned` and `natural` convert.
+the outer two joints move nothing but the priors. `pinned` and `natural` convert. Displacements of
+an extension turn with joint 1 like the arm they belong to, so this holds with an extension too.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from functools import cached_property
 import numpy as np
 
 from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.extension import Extension
 from remaster_ros.core.transforms import (
     apply,
     inverse,
@@ -86,6 +89,8 @@ class Model:
         The registration T_R_N at (t, r) = 0 of each sensor, (sensors, 4, 4).
     centroid
         Point in R about which each sensor's correction turns, m, (sensors, 3).
+    extension
+        Further parameters, given for every row of the `Measurements`; None without any.
     """
 
     chain: SerialChain
@@ -93,6 +98,7 @@ class Model:
     marker_names: tuple[str, ...]
     reference: FloatArray
     centroid: FloatArray
+    extension: Extension | None = None
 
     @property
     def joints(self) -> int:
@@ -100,9 +106,14 @@ class Model:
         return len(self.chain)
 
     @property
+    def core(self) -> int:
+        """Number of parameters without the extension's: offsets, registrations, markers."""
+        return self.joints + 6 * len(self.sensor_names) + 3 * len(self.marker_names)
+
+    @property
     def size(self) -> int:
         """Length of the parameter vector."""
-        return self.joints + 6 * len(self.sensor_names) + 3 * len(self.marker_names)
+        return self.core + (len(self.extension.names) if self.extension is not None else 0)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -112,6 +123,8 @@ class Model:
             names += [f'registration.{sensor}.{axis}' for axis in REGISTRATION_AXES]
         for marker in self.marker_names:
             names += [f'marker.{marker}.{axis}' for axis in 'xyz']
+        if self.extension is not None:
+            names += [f'effect.{name}' for name in self.extension.names]
         return tuple(names)
 
     def registration(self, sensor: int) -> slice:
@@ -125,9 +138,10 @@ class Model:
         return slice(start, start + 3)
 
     def vector(self, joint_offsets: FloatArray, markers: FloatArray) -> FloatArray:
-        """Assemble the vector of these offsets and markers at the reference registrations."""
+        """Assemble the vector of these offsets and markers at the references, theta0 included."""
         corrections = np.zeros(6 * len(self.sensor_names))
-        return np.concatenate((joint_offsets, corrections, np.ravel(markers)))
+        theta0 = self.extension.theta0 if self.extension is not None else np.zeros(0)
+        return np.concatenate((joint_offsets, corrections, np.ravel(markers), theta0))
 
     def offsets(self, x: FloatArray) -> FloatArray:
         """Return the joint offsets, rad, (..., k)."""
@@ -136,7 +150,12 @@ class Model:
     def markers(self, x: FloatArray) -> FloatArray:
         """Return the marker positions in T, m, (..., markers, 3)."""
         start = self.joints + 6 * len(self.sensor_names)
-        return x[..., start:].reshape(*x.shape[:-1], len(self.marker_names), 3)
+        part = x[..., start : self.core]
+        return part.reshape(*x.shape[:-1], len(self.marker_names), 3)
+
+    def theta(self, x: FloatArray) -> FloatArray:
+        """Return the extension's parameters, (..., m)."""
+        return x[..., self.core :]
 
     def corrections(self, x: FloatArray) -> FloatArray:
         """Return the corrections C as transforms, (..., sensors, 4, 4)."""
@@ -175,7 +194,7 @@ class Model:
         tool = _rotation_about(*self.tool_axis, sign * x[..., self.joints - 1])
         markers = apply(tool[..., None, :, :], self.markers(x))
         start = self.joints + 6 * len(self.sensor_names)
-        result[..., start:] = markers.reshape(*x.shape[:-1], -1)
+        result[..., start : self.core] = markers.reshape(*x.shape[:-1], -1)
         return result
 
     @cached_property
@@ -205,10 +224,13 @@ class Model:
         ndarray
             m, (..., n, 3).
         """
-        offsets = self._inner_offsets(z)
+        turns, shifts = self._extended(z, rows)
         points = self.chain.positions(
-            rows.q, self.markers(z)[..., rows.marker, :], offsets[..., None, :]
+            rows.q,
+            self.markers(z)[..., rows.marker, :],
+            self._inner_offsets(z)[..., None, :] + turns,
         )
+        points += shifts
         corrections = self.corrections(z)
         for sensor, span in rows.spans:
             turn = corrections[..., sensor, :3, :3]
@@ -234,12 +256,29 @@ class Model:
         offsets[..., [0, self.joints - 1]] = 0.0
         return offsets
 
+    def _extended(self, x: FloatArray, rows: Rows) -> tuple[FloatArray, FloatArray]:
+        """Return the joint angles, rad, and displacements, m, that theta adds to each row."""
+        if self.extension is None:
+            return np.zeros(self.joints), np.zeros(3)
+        given, theta = self.extension, self.theta(x)
+        turns = _along_last(given.joint, theta)
+        shifts = given.displacement0 + _along_last(given.displacement, theta - given.theta0)
+        return turns[..., rows.source, :], shifts[..., rows.source, :]
+
     def _derivative(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> FloatArray:
         markers = self.markers(x)[rows.marker]
         derivative = np.zeros((len(rows.q), 3, self.size))
-        tool = self.chain.forward(rows.q, offsets)
-        points = apply(tool, markers)
-        by_joints = self.chain.position_jacobian(rows.q, markers, offsets)
+        turns, shifts = self._extended(x, rows)
+        base = _rotation_about(*self.base_axis, offsets[0])[:3, :3]
+        shifts = shifts @ base.T
+        tool = self.chain.forward(rows.q, offsets + turns)
+        points = apply(tool, markers) + shifts
+        by_joints = self.chain.position_jacobian(rows.q, markers, offsets + turns)
+        by_theta = None
+        if self.extension is not None:
+            by_theta = by_joints @ self.extension.joint[rows.source]
+            by_theta += base @ self.extension.displacement[rows.source]
+            by_joints[..., 0] += np.cross(self.base_axis[1], shifts)
         correction = self.corrections(x)
         for sensor, span in rows.spans:
             turn = correction[sensor, :3, :3]
@@ -256,6 +295,8 @@ class Model:
             for marker in range(len(self.marker_names)):
                 seen = rows.marker[span] == marker
                 derivative[span, :, self.marker(marker)] = by_marker * seen[:, None, None]
+            if by_theta is not None:
+                derivative[span, :, self.core :] = turn @ by_theta[span]
         return derivative
 
 
@@ -325,6 +366,13 @@ class Rows:
     def group_of_row(self) -> IntArray:
         """Index of each row's group, (n,)."""
         return np.repeat(np.arange(len(self.group_start)), self.group_size)
+
+
+def _along_last(tensor: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Return tensor (n, a, m) times vectors (..., m), (..., n, a): one product, nothing copied."""
+    n, a, m = tensor.shape
+    product = vectors.reshape(-1, m) @ tensor.reshape(-1, m).T
+    return product.reshape(*vectors.shape[:-1], n, a)
 
 
 def _rotation_about(point: FloatArray, axis: FloatArray, angle: FloatArray) -> FloatArray:

@@ -83,16 +83,31 @@ def prior_rows(
     Numerical differences: the priors are smooth, few, and written as plain functions. ``natural``
     says that z and the derivative are in natural, not in pinned coordinates.
     """
-    if not priors:
-        return np.zeros(0), np.zeros((0, model.size))
-    step = 1e-6
-    points = np.concatenate(
-        (z[None], z + step * np.eye(model.size), z - step * np.eye(model.size))
-    )
+    # Priors are on the core; theta's is linear, so differences would only cost.
+    step, core = 1e-6 * np.eye(model.core, model.size), model.core
+    points = np.concatenate((z[None], z + step, z - step))
     x = points if natural else model.natural(points)
-    values = np.concatenate([prior.residual(x) for prior in priors], axis=-1)
-    size = model.size
-    return values[0], (values[1 : size + 1] - values[size + 1 :]).T / (2.0 * step)
+    values = np.concatenate(
+        [np.zeros((len(x), 0)), *(prior.residual(x) for prior in priors)], axis=-1
+    )
+    by_z = np.zeros((values.shape[1], model.size))
+    by_z[:, :core] = (values[1 : core + 1] - values[core + 1 :]).T / 2e-6
+    root = extension_root(model)
+    by_theta = np.concatenate((np.zeros((len(root), core)), root), axis=1)
+    return (
+        np.concatenate((values[0], root @ model.theta(z))),
+        np.concatenate((by_z, by_theta)),
+    )
+
+
+def extension_root(model: Model) -> FloatArray:
+    """Return W with W theta standard normal by the extension's prior, (rank, m)."""
+    if model.extension is None:
+        return np.zeros((0, 0))
+    values, vectors = np.linalg.eigh(model.extension.prior_precision)
+    kept = values > 1e-12 * max(values.max(initial=0.0), 0.0)
+    root: FloatArray = np.sqrt(values[kept])[:, None] * vectors[:, kept].T
+    return root
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,6 +216,9 @@ class Posterior:
             x = self.model.natural(z)
             for prior in self.priors:
                 value -= 0.5 * np.sum(prior.residual(x) ** 2, axis=-1)
+        if self.model.extension is not None:
+            theta = self.model.theta(z)
+            value -= 0.5 * np.sum((theta @ self.model.extension.prior_precision) * theta, axis=-1)
         inside = np.all(eta[..., len(self.model.sensor_names) :] >= 0.0, axis=-1)
         return np.where(inside, value, -np.inf)
 

@@ -18,8 +18,8 @@ from remaster_ros.core.accuracy import (
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.estimate import Problem
 from remaster_ros.core.gauge import Gauge, GaugeDirection
-from remaster_ros.core.model import Model, Rows, predict_in_sensor
-from remaster_ros.core.transforms import matrix_to_rotation_vector
+from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.transforms import apply, inverse, matrix_to_rotation_vector
 from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Session
 
 # The usual limit of R-hat, and effective draws enough for two digits of a 95 % interval.
@@ -121,6 +121,12 @@ class FitResult:
         The three metrics as fit.json has them.
     left_out
         (observation, reason) of every gross error.
+    theta_names, theta_units
+        Of the extension's m parameters; empty without one.
+    theta, theta_std
+        Posterior mean and std in these units, (m,).
+    theta_draws
+        (chains, draws, m).
     """
 
     session: Session
@@ -149,6 +155,11 @@ class FitResult:
     residuals_after: FloatArray
     accuracy: Mapping[str, Any]
     left_out: tuple[tuple[int, str], ...]
+    theta_names: tuple[str, ...]
+    theta_units: tuple[str, ...]
+    theta: FloatArray
+    theta_std: FloatArray
+    theta_draws: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,8 +222,8 @@ def build_result(
     z[..., np.flatnonzero(sampled.unfixed)] = 0.0
     flat = z.reshape(-1, model.size)
     x_after, x_before = model.natural(sampled.z_mean), model.natural(sampled.z_before)
-    predicted_before = predicted_rows(problem, model, x_before)
-    predicted_after = predicted_rows(problem, model, x_after)
+    predicted_before = predicted_rows(problem, model, sampled.z_before)
+    predicted_after = predicted_rows(problem, model, sampled.z_mean)
 
     offset_draws = sampled.z[..., :joints]
     pooled = flat[:, :joints]
@@ -256,18 +267,21 @@ def build_result(
         residuals_after=measurements.position - predicted_after,
         accuracy=_accuracy(problem, sampled, predicted_before, predicted_after, left_rows, rng),
         left_out=tuple((int(measurements.observation[row]), why) for row, why in sampled.left_out),
+        theta_names=model.extension.names if model.extension is not None else (),
+        theta_units=model.extension.units if model.extension is not None else (),
+        theta=model.theta(sampled.z_mean),
+        theta_std=model.theta(flat).std(axis=0, ddof=1),
+        theta_draws=model.theta(sampled.z),
     )
 
 
-def predicted_rows(problem: Problem, model: Model, x: FloatArray) -> FloatArray:
-    """Return where the sensors should see the markers of all rows by natural parameters x."""
-    return predict_in_sensor(
-        problem.chain,
-        problem.measurements,
-        model.offsets(x),
-        model.T_R_N(x),
-        model.markers(x),
-    )
+def predicted_rows(problem: Problem, model: Model, z: FloatArray) -> FloatArray:
+    """Return where the sensors should see the markers of all rows by pinned z, (n, 3)."""
+    measurements = problem.measurements
+    rows = Rows.of(measurements, np.arange(len(measurements)), model.reference)
+    predicted = np.empty((len(measurements), 3))
+    predicted[rows.source] = model.predict(z, rows)
+    return apply(inverse(model.reference)[measurements.sensor], predicted)
 
 
 def _noise(sampled: Sampled, sensors: tuple[str, ...]) -> dict[str, NoiseEstimate]:

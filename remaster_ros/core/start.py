@@ -7,6 +7,7 @@ problem), each refined by damped Gauss–Newton steps on a Cauchy cost; the best
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -105,9 +106,7 @@ def referenced(
     for index, T_R_N in enumerate(reference):
         mine = rows[measurements.sensor[rows] == index]
         centroid.append(apply(T_R_N, np.median(measurements.position[mine], axis=0)))
-    return Model(
-        model.chain, model.sensor_names, model.marker_names, reference, np.array(centroid)
-    )
+    return replace(model, reference=reference, centroid=np.array(centroid))
 
 
 def _require_likeness(model: Model, rows: Rows, errors: FloatArray) -> None:
@@ -174,9 +173,10 @@ def _refined(
 ) -> tuple[FloatArray, float]:
     """Minimise the Cauchy cost by damped Gauss–Newton; return the solution and its spread.
 
-    The outer joints stay at 0: in pinned coordinates the data do not depend on them.
+    The outer joints stay at 0: in pinned coordinates the data do not depend on them. The
+    extension stays where it was linearised.
     """
-    free = np.setdiff1d(np.arange(model.size), (0, model.joints - 1))
+    free = np.setdiff1d(np.arange(model.core), (0, model.joints - 1))
     damping = 1e-6
     errors = rows.target - model.predict(z, rows)
     spread = robust_spread(errors, rows)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from calibration_scenes import CHAIN, scene
 
+from remaster_ros.core.extension import Extension
 from remaster_ros.core.model import Model, Rows, predict_in_sensor
 from remaster_ros.core.transforms import apply, rotation_vector_to_matrix, transform
 
@@ -100,6 +103,49 @@ def test_the_derivative_is_that_of_the_prediction(model: Model, measured, x, kin
         around = [model.predict(model.pinned(x + sign * steps), rows) for sign in (1.0, -1.0)]
     numerical = np.moveaxis(around[0] - around[1], 0, -1) / (2.0 * step)
     np.testing.assert_allclose(derivative, numerical, atol=1e-8)
+
+
+@pytest.fixture
+def extended(model: Model, measured) -> Model:
+    """The same with three effects of no particular meaning, about as large as real ones."""
+    rng = np.random.default_rng(4)
+    n = len(measured)
+    extension = Extension(
+        ('a', 'b', 'c'),
+        ('rad', 'm', '1'),
+        0.01 * rng.standard_normal((n, 7, 3)),
+        0.01 * rng.standard_normal((n, 3, 3)),
+        0.001 * rng.standard_normal((n, 3)),
+        rng.standard_normal(3),
+        np.diag([1.0, 4.0, 0.0]),
+    )
+    return replace(model, extension=extension)
+
+
+def test_effects_turn_joints_and_displace_markers(extended: Model, measured, x) -> None:
+    """Row by row as the extension's documentation has it, joint 1 held as in most fits."""
+    theta = np.array([1.0, -2.0, 0.5])
+    given = extended.extension
+    x = np.concatenate((x, theta))
+    x[[0, 6]] = 0.0
+    rows = rows_of(measured, extended)
+    assert extended.names[-3:] == ('effect.a', 'effect.b', 'effect.c')
+    for place, row in enumerate(rows.source[:5]):
+        q = measured.q[row] + given.joint[row] @ theta
+        point = CHAIN.positions(q, extended.markers(x)[measured.marker[row]], extended.offsets(x))
+        point += given.displacement0[row] + given.displacement[row] @ (theta - given.theta0)
+        expected = apply(extended.corrections(x)[measured.sensor[row]], point)
+        for z in (x, np.stack((x, x))):
+            predicted = extended.predict(z, rows)[..., place, :]
+            np.testing.assert_allclose(predicted, np.broadcast_to(expected, predicted.shape))
+
+
+@pytest.mark.parametrize('kind', ['pinned', 'natural'])
+def test_the_derivative_with_effects_is_that_of_the_prediction(
+    extended: Model, measured, x, kind: str
+) -> None:
+    x = np.concatenate((x, [0.7, -0.4, 0.2]))
+    test_the_derivative_is_that_of_the_prediction(extended, measured, x, kind)
 
 
 def test_rows_are_grouped_by_sensor_and_pose(measured, model: Model) -> None:
