@@ -1,0 +1,200 @@
+"""Draws effects of the hidden world: which joint, which way, which sign.
+
+Signs are drawn too, but for what can only give way to a load or grow when it warms. Every draw is
+of about the largest size that is plausible; `HiddenWorld.of_size` makes it smaller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from hidden_effects import ARC_MINUTE, Circumstances, HiddenEffect
+from hidden_world import HiddenWorld
+
+from remaster_ros.core.types import FloatArray
+
+Draw = Callable[[np.random.Generator, int, Circumstances, tuple[str, ...]], HiddenEffect]
+"""(rng, number of joints, circumstances, names of the sensors) -> an effect."""
+
+
+def _sign(rng: np.random.Generator) -> float:
+    return float(rng.choice((-1.0, 1.0)))
+
+
+def _direction(rng: np.random.Generator, size: int) -> FloatArray:
+    values = rng.standard_normal(size)
+    return values / np.linalg.norm(values)
+
+
+def _one_value(kind: str, largest: float, first_joint: int = 1) -> Draw:
+    """Draw a joint and a sign."""
+
+    def draw(
+        rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
+    ) -> HiddenEffect:
+        joint = int(rng.integers(first_joint, k + 1))
+        return HiddenEffect(kind, (joint,), np.array([largest * _sign(rng)]))
+
+    return draw
+
+
+def _of_sensor(kind: str, largest: float, size: int = 1, forms: tuple[str, ...] = ('',)) -> Draw:
+    """Draw a sensor, a direction and a form."""
+
+    def draw(
+        rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
+    ) -> HiddenEffect:
+        detail = {'sensor': str(rng.choice(sensors)), 'form': str(rng.choice(forms))}
+        return HiddenEffect(kind, (), largest * _direction(rng, size), detail)
+
+    return draw
+
+
+def _two_joints(kind: str, largest: float, forms: tuple[str, ...] = ('',)) -> Draw:
+    """Draw the joint that errs and the one that it follows."""
+
+    def draw(
+        rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
+    ) -> HiddenEffect:
+        joint, by = (int(j) for j in 1 + rng.choice(k, 2, replace=False))
+        form = str(rng.choice(forms))
+        values = largest * _direction(rng, 2 if form == 'sin/cos' else 1)
+        return HiddenEffect(kind, (joint,), values, {'by': by, 'form': form})
+
+    return draw
+
+
+def _draw_compliance(
+    rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
+) -> HiddenEffect:
+    loaded = 1 + np.flatnonzero(np.ptp(c.torque, axis=0) > 0.5)
+    count = min(int(rng.choice((1, 1, 2))), len(loaded))
+    joints = np.sort(rng.choice(loaded, count, replace=False))
+    values = 4e-4 * rng.uniform(0.3, 1.0, count)
+    return HiddenEffect('joint_compliance', tuple(int(j) for j in joints), values)
+
+
+def _draw_eccentricity(
+    rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
+) -> HiddenEffect:
+    orders = ((1,), (2,), (1, 2))[rng.integers(3)]
+    values = 20 * ARC_MINUTE * _direction(rng, 2 * len(orders))
+    joint = int(rng.integers(1, k + 1))
+    return HiddenEffect('encoder_eccentricity', (joint,), values, {'orders': orders})
+
+
+def _draw_gear(
+    rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
+) -> HiddenEffect:
+    # Twice the ratio of a strain wave gear of 50 to 160.
+    order = int(2 * rng.integers(50, 161))
+    values = 10 * ARC_MINUTE * _direction(rng, 2)
+    joint = int(rng.integers(1, k + 1))
+    return HiddenEffect('gear_periodic', (joint,), values, {'orders': (order,)})
+
+
+def _draw_curve(
+    rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
+) -> HiddenEffect:
+    orders = np.arange(4, 25)
+    # Weights of a Gaussian bell: waves shorter than its width hardly occur.
+    weight = np.exp(-0.5 * (orders * np.deg2rad(rng.uniform(4.0, 10.0))) ** 2)
+    amplitudes = weight * np.abs(rng.standard_normal(len(orders)))
+    amplitudes /= np.sqrt(0.5 * np.sum(amplitudes**2))
+    phases = rng.uniform(0, 2 * np.pi, len(orders))
+    detail = {'orders': orders, 'amplitudes': amplitudes, 'phases': phases}
+    joint = int(rng.integers(1, k + 1))
+    return HiddenEffect('joint_error_curve', (joint,), np.array([8 * ARC_MINUTE]), detail)
+
+
+def _draw_link(
+    rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
+) -> HiddenEffect:
+    long = np.flatnonzero(np.linalg.norm(c.segments, axis=1) > 0.02)
+    joint = int(rng.choice(long[long > 0]))
+    return HiddenEffect('link_length', (joint,), np.array([5e-3 * _sign(rng)]))
+
+
+def _draw_tilt(
+    rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
+) -> HiddenEffect:
+    joint = int(rng.integers(2, k + 1))
+    return HiddenEffect('joint_axis_tilt', (joint,), 0.01 * _direction(rng, 2))
+
+
+def _draw_marker(
+    rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
+) -> HiddenEffect:
+    return HiddenEffect('marker_offset', (), 10e-3 * _direction(rng, 3))
+
+
+def _no_joint(kind: str, largest: float) -> Draw:
+    """Nothing to draw: one value, whose sign physics gives."""
+
+    def draw(
+        rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
+    ) -> HiddenEffect:
+        return HiddenEffect(kind, (), np.array([largest]))
+
+    return draw
+
+
+def _at_some_time(draw: Draw) -> Draw:
+    def timed(
+        rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
+    ) -> HiddenEffect:
+        effect = draw(rng, k, c, sensors)
+        share = float(rng.uniform(0.15, 0.4))
+        return replace(effect, detail={**effect.detail, 'share_of_time': share})
+
+    return timed
+
+
+DRAWS: dict[str, Draw] = {
+    'joint_compliance': _draw_compliance,
+    'encoder_eccentricity': _draw_eccentricity,
+    'encoder_scale': _one_value('encoder_scale', 5e-3),
+    'gear_periodic': _draw_gear,
+    'joint_error_curve': _draw_curve,
+    'backlash': _one_value('backlash', 15 * ARC_MINUTE),
+    'settling': _one_value('settling', 3e-3),
+    'joint_coupling': _two_joints('joint_coupling', 5e-3, ('linear', 'sin/cos')),
+    'link_length': _draw_link,
+    'joint_axis_tilt': _draw_tilt,
+    'marker_offset': _draw_marker,
+    'thermal_growth': _no_joint('thermal_growth', 2e-4),
+    'base_compliance': _no_joint('base_compliance', 1e-4),
+    'registration_drift': _of_sensor('registration_drift', 1e-6, 3),
+    'sensor_scale': _of_sensor('sensor_scale', 1e-2, 1, ('all', 'depth')),
+    'sensor_distortion': _of_sensor('sensor_distortion', 0.2),
+    'foreign_torque': _two_joints('foreign_torque', 4e-4),
+    'creeping_joint': _one_value('creeping_joint', 1e-6, 2),
+    'slipped_joint': _at_some_time(_one_value('slipped_joint', 15 * ARC_MINUTE, 2)),
+    'warm_joint': _one_value('warm_joint', 5e-4, 2),
+    'bent_coupling': _two_joints('bent_coupling', 3e-3),
+    'sagging_tool': _no_joint('sagging_tool', 3e-3),
+    'bumped_sensor': _at_some_time(_of_sensor('bumped_sensor', 3e-3, 3)),
+}
+
+
+def draw_effect(
+    world: HiddenWorld, kind: str, rng: np.random.Generator, size_m: float
+) -> HiddenEffect:
+    """Draw an effect of that kind of which so much is left (see `HiddenWorld.size_m`).
+
+    Drawn again as long as it would have to be larger than is plausible: a joint that hardly moves
+    shows no eccentricity. Where no draw gets there, the most visible of them is taken.
+    """
+    best, best_size = None, 0.0
+    for _ in range(30):
+        effect = DRAWS[kind](rng, world.arm.joints, world.circumstances, tuple(world.sensors))
+        largest = world.size_m(effect)
+        if largest > best_size:
+            best, best_size = effect, largest
+        if largest >= size_m:
+            break
+    if best is None or best_size < 1e-6:
+        raise ValueError(f'{kind} cannot be seen on these visits')
+    return world.of_size(best, size_m)
