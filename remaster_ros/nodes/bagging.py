@@ -13,7 +13,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
 from remaster_ros.nodes.status import LATCHED, RELIABLE
-from remaster_ros.storage.bag import BagWriter
+from remaster_ros.storage.bag_writer import BagWriter
 
 
 class BagRecorder:

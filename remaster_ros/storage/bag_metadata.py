@@ -25,19 +25,42 @@ class TopicMetadata:
     count: int = 0
 
 
-def metadata_text(
-    file_name: str, topics: list[TopicMetadata], first_ns: int | None, last_ns: int
-) -> str:
-    """Return metadata.yaml for a bag of one MCAP file; `first_ns` is None where it is empty."""
-    start = {'nanoseconds_since_epoch': _NEVER_NS if first_ns is None else first_ns}
-    duration = {'nanoseconds': 0 if first_ns is None else last_ns - first_ns}
-    count = sum(topic.count for topic in topics)
+@dataclass
+class FileMetadata:
+    """A file of a bag as metadata.yaml lists it; `first_ns` is None where it holds nothing."""
+
+    name: str
+    first_ns: int | None = None
+    last_ns: int = 0
+    count: int = 0
+
+    def add(self, stamp_ns: int) -> None:
+        """Count a message."""
+        if self.first_ns is None:
+            self.first_ns = stamp_ns
+        self.last_ns = stamp_ns
+        self.count += 1
+
+    def span(self) -> dict[str, Any]:
+        """Return start, duration and number of messages as metadata.yaml has them."""
+        first = self.first_ns
+        return {
+            'starting_time': {'nanoseconds_since_epoch': _NEVER_NS if first is None else first},
+            'duration': {'nanoseconds': 0 if first is None else self.last_ns - first},
+            'message_count': self.count,
+        }
+
+
+def metadata_text(files: list[FileMetadata], topics: list[TopicMetadata]) -> str:
+    """Return metadata.yaml for a bag of these MCAP files, in the order recorded."""
+    filled = [file for file in files if file.count]
+    whole = FileMetadata('', count=sum(file.count for file in files))
+    if filled:
+        whole.first_ns, whole.last_ns = filled[0].first_ns, filled[-1].last_ns
     information: dict[str, Any] = {
         'version': 9,
         'storage_identifier': 'mcap',
-        'duration': duration,
-        'starting_time': start,
-        'message_count': count,
+        **whole.span(),
         'topics_with_message_count': [
             {
                 'topic_metadata': {
@@ -53,15 +76,8 @@ def metadata_text(
         ],
         'compression_format': '',
         'compression_mode': '',
-        'relative_file_paths': [file_name],
-        'files': [
-            {
-                'path': file_name,
-                'starting_time': dict(start),
-                'duration': dict(duration),
-                'message_count': count,
-            }
-        ],
+        'relative_file_paths': [file.name for file in files],
+        'files': [{'path': file.name, **file.span()} for file in files],
         'custom_data': None,
         'ros_distro': 'jazzy',
     }

@@ -59,6 +59,13 @@ def write_manifest(folder: Path, names: Iterable[str]) -> None:
     write_atomically(folder / MANIFEST, ''.join(lines))
 
 
+def add_to_manifest(folder: Path, name: str) -> None:
+    """Write down one more closed file; what is written down already stays."""
+    lines = {**read_manifest(folder), name: sha256_of(folder / name)}
+    text = ''.join(f'{checksum}  {file}\n' for file, checksum in sorted(lines.items()))
+    write_atomically(folder / MANIFEST, text)
+
+
 def remove_manifest(folder: Path) -> None:
     """Take the manifest away, durable on return, before its files are changed."""
     path = folder / MANIFEST
