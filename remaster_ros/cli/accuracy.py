@@ -25,12 +25,18 @@ DESCRIPTION = (
     "('after'). In both cases registrations and markers are fitted to this session's optimization "
     'rows (to all rows where it has none) and applied to its validation rows. The theoretical '
     "error draws the offsets with the fit's standard deviations, as if independent; joints that "
-    'the fit could not tell do not count: the registration or the marker takes them up.'
+    'the fit could not tell do not count: the registration or the marker takes them up. It is '
+    "compared in the sensor's frame and, as the source paper does, in the robot base, at the "
+    'visited and at 1,000 random configurations.'
 )
+SIDES = ('before', 'after')
 METRICS = {
     'relative': 'relative (eq. 17)',
     'post_registration': 'absolute, after registration',
     'theoretical': 'theoretical (section V-C)',
+    'paper_theoretical': 'theoretical, in the base frame',
+    'theoretical_random': 'theoretical, 1,000 random places',
+    'paper_theoretical_random': '… in the base frame',
 }
 
 log = logging.getLogger('remaster_ros')
@@ -99,11 +105,11 @@ def table(judged: OffsetsJudgement) -> str:
             if values['after'] is None:
                 lines.append(f'  {name:42s} {values["why"]}')
                 continue
-            before, after = interval(values['before']), interval(values['after'])
+            before, after = (interval(values[side]) for side in SIDES)
             lines.append(f'  {name:42s} {before:24s} {after}')
             if values.get('after_offsets_only'):
-                alone = interval(values['after_offsets_only'])
-                lines.append(f'  {"… without the noise":42s} {"":24s} {alone}')
+                before, after = (interval(values[f'{side}_offsets_only']) for side in SIDES)
+                lines.append(f'  {"… without the noise":42s} {before:24s} {after}')
     for observation, why in judged.left_out:
         lines.append(f'left out: observation {observation}: {why}')
     return '\n'.join(lines)

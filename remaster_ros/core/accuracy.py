@@ -1,50 +1,30 @@
 """The paper's three measures of accuracy, section V of Van Wyk et al.
 
-All are free of the gauge: the relative error compares distances; the absolute ones compare points
-in the sensor's frame, where a turn of joint 1 and of the registration cancel. Means and the 2.5
-and 97.5 % quantiles are over configurations (and draws), in mm, as in Tables III to VIII.
+The first two are free of the gauge: the relative error compares distances; the absolute one
+compares points in the sensor's frame, where a turn of joint 1 and of the registration cancel. Of
+the third there are two versions, see `theoretical`. Means and the 2.5 and 97.5 % quantiles are
+over configurations (and draws), in mm, as in Tables III to VIII.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
+from remaster_ros.core.theoretical import (
+    RANDOM_CONFIGURATIONS,
+    Distances,
+    Predictive,
+    random_configurations,
+    theoretical_distances,
+)
 from remaster_ros.core.types import FloatArray, IntArray, Measurements
 
-THEORETICAL_DRAWS = 2000
-# Of more configurations the theoretical measure takes this many at random: its means and
-# quantiles are those of a sample anyway.
-THEORETICAL_CONFIGURATIONS = 2000
-_BLOCK_ROWS = 40_000
-
-
-class Predictive(NamedTuple):
-    """What the theoretical measure is computed from.
-
-    Attributes
-    ----------
-    predict
-        Parameters (draws, p) to predicted markers (draws, n, 3) in one rigid frame.
-    before, after
-        The parameters with offsets at zero and with the estimate, (p,).
-    draws
-        Joint draws of the posterior, (draws, p).
-    sigma, pose_sigma
-        The noise of each draw for each row, m, (draws, n).
-    group
-        Rows of one sensor at one pose have the same number here, (n,).
-    """
-
-    predict: Callable[[FloatArray], FloatArray]
-    before: FloatArray
-    after: FloatArray
-    draws: FloatArray
-    sigma: FloatArray
-    pose_sigma: FloatArray
-    group: IntArray
+# Of more pairs of solutions (100,000 rows at three dozen poses have 1e8) this many are drawn.
+MOST_PAIRS = 200_000
+THEORETICAL = ('theoretical', 'paper_theoretical')
 
 
 def summary(errors: FloatArray) -> dict[str, Any]:
@@ -58,32 +38,33 @@ def unavailable(names: Sequence[str], why: str) -> dict[str, Any]:
     return {**dict.fromkeys(names), 'why': why}
 
 
-def solution_pairs(measurements: Measurements) -> IntArray:
+def solution_pairs(measurements: Measurements, rng: np.random.Generator) -> IntArray:
     """Return the rows i < j seen by the same sensor on the same marker at the same pose, (m, 2).
 
     The sums of eq. 17 of Van Wyk et al.; rows of one configuration are the same solution and make
-    no pair.
+    no pair. Of more than 200,000 pairs as many are drawn at random.
     """
-    order = np.lexsort(
-        (
-            np.arange(len(measurements)),
-            measurements.pose,
-            measurements.marker,
-            measurements.sensor,
-        )
-    )
-    key = np.stack((measurements.sensor, measurements.marker, measurements.pose), axis=1)[order]
-    cuts = np.flatnonzero(np.any(np.diff(key, axis=0) != 0, axis=1)) + 1
-    pairs = [np.zeros((0, 2), dtype=np.int64)]
-    for cluster in np.split(order, cuts):
-        first, second = np.triu_indices(len(cluster), 1)
-        pairs.append(np.stack((cluster[first], cluster[second]), axis=1))
-    found = np.concatenate(pairs)
+    key = (measurements.pose, measurements.marker, measurements.sensor)
+    order = np.lexsort((np.arange(len(measurements)), *key))
+    changes = np.any([np.diff(column[order]) != 0 for column in key], axis=0)
+    start = np.concatenate(([0], np.flatnonzero(changes) + 1))
+    size = np.diff(np.append(start, len(measurements)))
+    count = size * (size - 1) // 2
+    total = int(count.sum())
+    number = np.arange(total) if total <= MOST_PAIRS else rng.integers(total, size=MOST_PAIRS)
+    # The number of a pair: its cluster, and its place in the list (0,1) (0,2) (1,2) (0,3) ….
+    cluster = np.searchsorted(np.cumsum(count), number, side='right')
+    place = number - (np.cumsum(count) - count)[cluster]
+    second = ((1.0 + np.sqrt(1.0 + 8.0 * place)) / 2.0).astype(np.int64)
+    first = place - second * (second - 1) // 2
+    pairs = order[start[cluster, None] + np.stack((first, second), axis=1)]
     configuration = measurements.configuration
-    return found[configuration[found[:, 0]] != configuration[found[:, 1]]]
+    return pairs[configuration[pairs[:, 0]] != configuration[pairs[:, 1]]]
 
 
-def relative_errors(measurements: Measurements, predicted: FloatArray) -> FloatArray:
+def relative_errors(
+    measurements: Measurements, predicted: FloatArray, pairs: IntArray
+) -> FloatArray:
     """Return the difference of measured and modelled distances between solutions (eq. 17).
 
     Parameters
@@ -92,101 +73,96 @@ def relative_errors(measurements: Measurements, predicted: FloatArray) -> FloatA
         n observations.
     predicted
         Where the model has the markers, in any one frame per sensor, m, (n, 3).
+    pairs
+        Of `solution_pairs`, (m, 2).
 
     Returns
     -------
     ndarray
-        m, one per pair of `solution_pairs`.
+        m, (m,).
     """
-    first, second = solution_pairs(measurements).T
+    first, second = pairs.T
     measured = np.linalg.norm(measurements.position[first] - measurements.position[second], axis=1)
     modelled = np.linalg.norm(predicted[first] - predicted[second], axis=1)
     return np.abs(measured - modelled)
 
 
-def theoretical_errors(
-    predictive: Predictive, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the distances of section V-C: from the applied model to what the posterior allows.
-
-    For every draw and configuration the marker's place by the drawn parameters, with the drawn
-    noise added, against its place by the model without and with offsets. As the registrations
-    are drawn too, the places are compared in the sensor's frame.
-
-    Returns
-    -------
-    before, after, after_offsets_only
-        m, (draws x n,) each; the last without the noise.
-    """
-    group = predictive.group
-    n = len(group)
-    reference_before = predictive.predict(predictive.before[None])
-    reference_after = predictive.predict(predictive.after[None])
-    parts: tuple[list[FloatArray], ...] = ([], [], [])
-    block = max(1, _BLOCK_ROWS // n)
-    for start in range(0, len(predictive.draws), block):
-        chosen = slice(start, start + block)
-        places = predictive.predict(predictive.draws[chosen])
-        count = len(places)
-        # The pose-common part is one draw per sensor and pose.
-        common = rng.standard_normal((count, int(group.max()) + 1, 3))[:, group]
-        noisy = (
-            places
-            + predictive.pose_sigma[chosen, :, None] * common
-            + predictive.sigma[chosen, :, None] * rng.standard_normal((count, n, 3))
-        )
-        for part, a, b in zip(
-            parts,
-            (noisy, noisy, places),
-            (reference_before, reference_after, reference_after),
-            strict=True,
-        ):
-            part.append(np.linalg.norm(a - b, axis=-1).ravel())
-    before, after, offsets_only = (np.concatenate(part) for part in parts)
-    return before, after, offsets_only
-
-
 def accuracy_of(
     measurements: Measurements,
+    splits: Mapping[str, IntArray],
     predicted_before: FloatArray,
     predicted_after: FloatArray,
     predictive: Predictive | None,
     rng: np.random.Generator,
-) -> dict[str, Any] | None:
-    """Return the three metrics before and after on these observations, as fit.json has them.
+) -> dict[str, Any]:
+    """Return the three metrics before and after, as fit.json has them.
 
     Parameters
     ----------
     measurements
-        n observations; with none the result is None.
+        n observations.
+    splits
+        Name -> indices of its rows; a split without rows gives None.
     predicted_before, predicted_after
         Modelled markers in the sensors' frames with offsets at zero and as estimated, m, (n, 3).
     predictive
         For the theoretical metric; None where no posterior is at hand.
+    rng
+        For the theoretical metric.
     """
-    if len(measurements) == 0:
-        return None
+    at_random: dict[str, Any] = {}
+    if predictive is not None:
+        bare = predictive.without_extension()
+        rows = random_configurations(bare.model, measurements, RANDOM_CONFIGURATIONS, rng)
+        everywhere = np.arange(RANDOM_CONFIGURATIONS)
+        both = theoretical_distances(bare, rows, everywhere, rng)
+        at_random = _theoretical(both, suffix='_random')
     result: dict[str, Any] = {}
-    if len(solution_pairs(measurements)) > 0:
-        result['relative'] = {
-            'before': summary(relative_errors(measurements, predicted_before)),
-            'after': summary(relative_errors(measurements, predicted_after)),
+    for name, chosen in splits.items():
+        if len(chosen) == 0:
+            result[name] = None
+            continue
+        result[name] = _measured(
+            measurements.select(chosen), predicted_before[chosen], predicted_after[chosen], rng
+        )
+        if predictive is None:
+            missing = unavailable(Distances._fields, 'it needs draws of the posterior')
+            result[name] |= {key + s: missing for s in ('', '_random') for key in THEORETICAL}
+        else:
+            both = theoretical_distances(predictive, measurements, chosen, rng)
+            result[name] |= _theoretical(both) | at_random
+    return result
+
+
+def _measured(
+    measurements: Measurements,
+    predicted_before: FloatArray,
+    predicted_after: FloatArray,
+    rng: np.random.Generator,
+) -> dict[str, Any]:
+    """Return the two metrics that need no posterior."""
+    predicted = {'before': predicted_before, 'after': predicted_after}
+    pairs = solution_pairs(measurements, rng)
+    if len(pairs) > 0:
+        relative = {
+            side: summary(relative_errors(measurements, points, pairs))
+            for side, points in predicted.items()
         }
     else:
-        result['relative'] = unavailable(
+        relative = unavailable(
             ('before', 'after'),
             'no pose has two joint solutions seen by the same sensor on the same marker',
         )
-    result['post_registration'] = {
-        'before': summary(np.linalg.norm(measurements.position - predicted_before, axis=1)),
-        'after': summary(np.linalg.norm(measurements.position - predicted_after, axis=1)),
+    absolute = {
+        side: summary(np.linalg.norm(measurements.position - points, axis=1))
+        for side, points in predicted.items()
     }
-    names = ('before', 'after', 'after_offsets_only')
-    if predictive is None:
-        result['theoretical'] = unavailable(names, 'it needs draws of the posterior')
-    else:
-        errors = theoretical_errors(predictive, rng)
-        result['theoretical'] = {
-            name: summary(values) for name, values in zip(names, errors, strict=True)
-        }
-    return result
+    return {'relative': relative, 'post_registration': absolute}
+
+
+def _theoretical(both: Sequence[Distances], suffix: str = '') -> dict[str, Any]:
+    """Return the summaries of the invariant and of the paper's version."""
+    return {
+        name + suffix: {side: summary(values) for side, values in distances._asdict().items()}
+        for name, distances in zip(THEORETICAL, both, strict=True)
+    }

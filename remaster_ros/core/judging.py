@@ -7,18 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from remaster_ros.core.accuracy import (
-    THEORETICAL_CONFIGURATIONS,
-    THEORETICAL_DRAWS,
-    Predictive,
-    accuracy_of,
-)
+from remaster_ros.core.accuracy import accuracy_of
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.estimate import Estimate, Problem, estimate, hold_offsets
 from remaster_ros.core.laplace import Mode, linearise
-from remaster_ros.core.model import Rows
 from remaster_ros.core.result import predicted_rows
-from remaster_ros.core.types import FloatArray, IntArray, Session
+from remaster_ros.core.theoretical import Predictive
+from remaster_ros.core.types import FloatArray, Session
+
+DRAWS = 2000
 
 
 @dataclass(frozen=True)
@@ -89,18 +86,27 @@ def accuracy_with_offsets(
     given = hold_offsets(found.mode, np.asarray(joint_offsets, dtype=float))
     predicted_before = predicted_rows(problem, model, found.before.z)
     predicted_after = predicted_rows(problem, model, given.z)
-    draws = None if joint_offsets_std is None else _draws(found, given, joint_offsets_std, rng)
-    validation = np.flatnonzero(problem.measurements.is_validation)
-    accuracy = {
-        name: accuracy_of(
-            problem.measurements.select(chosen),
-            predicted_before[chosen],
-            predicted_after[chosen],
-            _predictive(found, given, draws, chosen, rng),
-            rng,
+    predictive = None
+    if joint_offsets_std is not None:
+        sigma, pose_sigma = found.posterior.noise(given.eta)
+        predictive = Predictive(
+            model=model,
+            before=found.before.z,
+            after=given.z,
+            draws=_draws(found, given, joint_offsets_std, rng),
+            sigma=np.tile(np.hypot(sigma, pose_sigma), (DRAWS, 1)),
         )
-        for name, chosen in (('optimization', found.kept), ('validation', validation))
-    }
+    accuracy = accuracy_of(
+        problem.measurements,
+        {
+            'optimization': found.kept,
+            'validation': np.flatnonzero(problem.measurements.is_validation),
+        },
+        predicted_before,
+        predicted_after,
+        predictive,
+        rng,
+    )
     observation = problem.measurements.observation
     left_out = tuple((int(observation[row]), why) for row, why in found.left_out)
     return OffsetsJudgement(accuracy, left_out)
@@ -120,37 +126,11 @@ def _draws(
     scale = 1.0 / np.sqrt(np.diag(information)[others])
     factor = np.linalg.cholesky(information[np.ix_(others, others)] * np.outer(scale, scale))
 
-    shift = joint_offsets_std[joints] * rng.standard_normal((THEORETICAL_DRAWS, len(joints)))
+    shift = joint_offsets_std[joints] * rng.standard_normal((DRAWS, len(joints)))
     pull = shift @ (information[np.ix_(joints, others)] * scale)
-    noise = rng.standard_normal((THEORETICAL_DRAWS, len(others)))
+    noise = rng.standard_normal((DRAWS, len(others)))
     answer = np.linalg.solve(factor.T, noise.T - np.linalg.solve(factor, pull.T)).T * scale
-    draws = np.tile(given.z, (THEORETICAL_DRAWS, 1))
+    draws = np.tile(given.z, (DRAWS, 1))
     draws[:, joints] += shift
     draws[:, others] += answer
     return draws
-
-
-def _predictive(
-    found: Estimate,
-    given: Mode,
-    draws: FloatArray | None,
-    chosen: IntArray,
-    rng: np.random.Generator,
-) -> Predictive | None:
-    if draws is None or len(chosen) == 0:
-        return None
-    if len(chosen) > THEORETICAL_CONFIGURATIONS:
-        chosen = rng.choice(chosen, THEORETICAL_CONFIGURATIONS, replace=False)
-    rows = Rows.of(found.problem.measurements, chosen, found.model.reference)
-    sensor_of_row = rows.group_sensor[rows.group_of_row]
-    sigma, pose_sigma = found.posterior.noise(given.eta)
-    shape = (len(draws), len(rows))
-    return Predictive(
-        predict=lambda z: found.model.predict(z, rows),
-        before=found.before.z,
-        after=given.z,
-        draws=draws,
-        sigma=np.broadcast_to(sigma[sensor_of_row], shape),
-        pose_sigma=np.broadcast_to(pose_sigma[sensor_of_row], shape),
-        group=rows.group_of_row,
-    )

@@ -9,16 +9,12 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.core import convergence
-from remaster_ros.core.accuracy import (
-    THEORETICAL_CONFIGURATIONS,
-    THEORETICAL_DRAWS,
-    Predictive,
-    accuracy_of,
-)
+from remaster_ros.core.accuracy import accuracy_of
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.estimate import Problem
 from remaster_ros.core.gauge import Gauge, GaugeDirection
 from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.theoretical import Predictive
 from remaster_ros.core.transforms import apply, inverse, matrix_to_rotation_vector
 from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Session
 
@@ -330,44 +326,18 @@ def _accuracy(
     rng: np.random.Generator,
 ) -> dict[str, Any]:
     """Compute the metrics on the fitted rows and on all of the validation rows."""
-    validation = np.flatnonzero(problem.measurements.is_validation)
-    result = {}
-    for name, chosen in (
-        ('optimization', np.setdiff1d(problem.fitted, left_rows)),
-        ('validation', validation),
-    ):
-        result[name] = accuracy_of(
-            problem.measurements.select(chosen),
-            predicted_before[chosen],
-            predicted_after[chosen],
-            _predictive(problem, sampled, chosen, rng),
-            rng,
-        )
-    return result
-
-
-def _predictive(
-    problem: Problem,
-    sampled: Sampled,
-    chosen: IntArray,
-    rng: np.random.Generator,
-) -> Predictive | None:
-    if len(chosen) == 0:
-        return None
-    if len(chosen) > THEORETICAL_CONFIGURATIONS:
-        chosen = rng.choice(chosen, THEORETICAL_CONFIGURATIONS, replace=False)
-    model = sampled.model
-    rows = Rows.of(problem.measurements, chosen, model.reference)
-    flat = sampled.z.reshape(-1, model.size)
-    draws = rng.choice(len(flat), min(THEORETICAL_DRAWS, len(flat)), replace=False)
     sensors = sampled.sigma.shape[-1]
-    sensor_of_row = rows.group_sensor[rows.group_of_row]
-    return Predictive(
-        predict=lambda z: model.predict(z, rows),
+    predictive = Predictive(
+        model=sampled.model,
         before=sampled.z_before,
         after=sampled.z_mean,
-        draws=flat[draws],
-        sigma=sampled.sigma.reshape(-1, sensors)[draws][:, sensor_of_row],
-        pose_sigma=sampled.pose_sigma.reshape(-1, sensors)[draws][:, sensor_of_row],
-        group=rows.group_of_row,
+        draws=sampled.z.reshape(-1, sampled.model.size),
+        sigma=np.hypot(sampled.sigma, sampled.pose_sigma).reshape(-1, sensors),
+    )
+    splits = {
+        'optimization': np.setdiff1d(problem.fitted, left_rows),
+        'validation': np.flatnonzero(problem.measurements.is_validation),
+    }
+    return accuracy_of(
+        problem.measurements, splits, predicted_before, predicted_after, predictive, rng
     )
