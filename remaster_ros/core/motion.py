@@ -1,4 +1,4 @@
-"""What limits motion: joint limits and the share of the joint velocity limits."""
+"""What limits motion: joint limits, the share of the joint velocity limits, and how to stop."""
 
 from __future__ import annotations
 
@@ -12,6 +12,14 @@ from remaster_ros.core.types import FloatArray
 
 RAMP_S = 0.5
 """How long a move takes to reach its speed, and to lose it, s."""
+BRAKE_S = 0.25
+"""How long a stop takes to lose the speed, s; the arm's own servo comes on top."""
+STANDSTILL_S = 1.0
+"""Within this time of a stop no joint moves faster than `STANDSTILL_RAD_S`, s."""
+STANDSTILL_RAD_S = 1e-3
+
+_UNKNOWN_VELOCITY = 1.0
+"""Where a robot model has no velocity limit, rad/s: slow for any arm."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +32,62 @@ class Waypoint:
 
 
 @dataclass(frozen=True)
+class Move:
+    """A straight move in joint space: ramp up, cruise, ramp down; all joints arrive together.
+
+    A controller that joins positions and velocities by cubics, as joint_trajectory_controller
+    does, follows the ramps at constant acceleration.
+
+    Attributes
+    ----------
+    start, end
+        Joint positions at rest, rad, (k,).
+    speed
+        Share of the way per second while cruising, 1/s.
+    """
+
+    start: FloatArray
+    end: FloatArray
+    speed: float
+
+    @property
+    def cruise_s(self) -> float:
+        """Time between the two ramps, s."""
+        return 1.0 / self.speed - RAMP_S
+
+    @property
+    def duration_s(self) -> float:
+        """Time from start to end, s."""
+        return self.cruise_s + 2 * RAMP_S
+
+    def waypoints(self) -> tuple[Waypoint, ...]:
+        """Return the end of each phase."""
+        way = self.end - self.start
+        velocity, ramp = self.speed * way, 0.5 * RAMP_S * self.speed * way
+        points = [Waypoint(RAMP_S, self.start + ramp, velocity)]
+        if self.cruise_s > 1e-6:
+            points.append(Waypoint(RAMP_S + self.cruise_s, self.end - ramp, velocity))
+        points.append(Waypoint(self.duration_s, self.end, np.zeros_like(way)))
+        return tuple(points)
+
+    def at(self, time_s: float) -> tuple[FloatArray, FloatArray]:
+        """Return where the arm should be (rad) and how fast (rad/s), (k,) each."""
+        left = self.duration_s - time_s
+        if time_s <= 0.0:
+            share, rate = 0.0, 0.0
+        elif left <= 0.0:
+            share, rate = 1.0, 0.0
+        elif time_s < RAMP_S:
+            share, rate = 0.5 * self.speed * time_s**2 / RAMP_S, self.speed * time_s / RAMP_S
+        elif left < RAMP_S:
+            share, rate = 1.0 - 0.5 * self.speed * left**2 / RAMP_S, self.speed * left / RAMP_S
+        else:
+            share, rate = self.speed * (time_s - 0.5 * RAMP_S), self.speed
+        way = self.end - self.start
+        return self.start + share * way, rate * way
+
+
+@dataclass(frozen=True)
 class MotionLimits:
     """Limits of commanded joint positions and velocities.
 
@@ -32,7 +96,7 @@ class MotionLimits:
     names
         Joint names, base to tip.
     lower, upper
-        Position limits, rad, (k,).
+        Position limits in reported angles, rad, (k,).
     velocity
         Largest allowed joint velocities (the share of the limits), rad/s, (k,).
     """
@@ -43,11 +107,33 @@ class MotionLimits:
     velocity: FloatArray
 
     @classmethod
-    def of(cls, chain: SerialChain, speed_share: float) -> MotionLimits:
-        """Take the limits of a chain, with a share (0 to 1) of its velocity limits."""
-        # An unknown limit is infinite in the chain; 1 rad/s is slow for any arm.
-        limits = np.where(np.isfinite(chain.velocity_limits), chain.velocity_limits, 1.0)
-        return cls(chain.joint_names, chain.lower, chain.upper, speed_share * limits)
+    def of(
+        cls, chain: SerialChain, speed_share: float, offsets: FloatArray | None = None
+    ) -> MotionLimits:
+        """Take the limits of a chain.
+
+        A joint's stops are at true angles, which are the reported ones plus the offset: in
+        reported angles the limits are shifted by minus the offset. The robot's own controller
+        watches the limits in reported angles, so the shifted ones never reach beyond them.
+
+        Parameters
+        ----------
+        chain
+            The arm.
+        speed_share
+            Share (0 to 1) of its velocity limits that is used.
+        offsets
+            Joint zero-offsets in use, rad, (k,); None for none.
+        """
+        shift = np.zeros(len(chain)) if offsets is None else np.asarray(offsets, float)
+        known = np.isfinite(chain.velocity_limits)
+        velocity = np.where(known, chain.velocity_limits, _UNKNOWN_VELOCITY)
+        return cls(
+            chain.joint_names,
+            np.maximum(chain.lower, chain.lower - shift),
+            np.minimum(chain.upper, chain.upper - shift),
+            speed_share * velocity,
+        )
 
     def outside(self, q: FloatArray) -> str:
         """Return which joint of `q` (rad, (k,)) lies outside, in words; '' if none does."""
@@ -59,25 +145,19 @@ class MotionLimits:
                 )
         return ''
 
-    def trajectory(self, start: FloatArray, end: FloatArray) -> tuple[Waypoint, ...]:
-        """Return the fastest move within the velocities: ramp up, cruise, ramp down.
+    def move(self, start: FloatArray, end: FloatArray) -> Move:
+        """Return the fastest move between two places, (k,) each, within the velocities."""
+        way = np.abs(end - start)
+        speed = float(np.min(self.velocity / np.maximum(way, 1e-12)))
+        # A short way is over before the cruising speed is reached.
+        return Move(start, end, min(speed, 1.0 / RAMP_S))
 
-        All joints start and arrive together. A controller that joins positions and velocities by
-        cubics, as joint_trajectory_controller does, follows the ramps at constant acceleration.
+    def stop(self, q: FloatArray, velocity: FloatArray) -> Waypoint:
+        """Return where an arm at `q` (rad) that moves at `velocity` (rad/s), (k,), is to stand.
 
-        Parameters
-        ----------
-        start, end
-            Joint positions at rest, rad, (k,).
+        Each joint brakes evenly in `BRAKE_S`, but never beyond a limit.
         """
-        way = end - start
-        # Share of the way per second; a short way is over before the cruising speed is reached.
-        speed = float(np.min(self.velocity / np.maximum(np.abs(way), 1e-12)))
-        speed = min(speed, 1.0 / RAMP_S)
-        cruise_s = 1.0 / speed - RAMP_S
-        velocity, ramp = speed * way, 0.5 * RAMP_S * speed * way
-        points = [Waypoint(RAMP_S, start + ramp, velocity)]
-        if cruise_s > 1e-6:
-            points.append(Waypoint(RAMP_S + cruise_s, end - ramp, velocity))
-        points.append(Waypoint(2 * RAMP_S + cruise_s, np.array(end, float), np.zeros_like(way)))
-        return tuple(points)
+        way = 0.5 * BRAKE_S * np.clip(velocity, -self.velocity, self.velocity)
+        # A joint that is already outside is left where it is, not sent back at a stop.
+        end = np.clip(q + way, np.minimum(self.lower, q), np.maximum(self.upper, q))
+        return Waypoint(BRAKE_S, end, np.zeros_like(end))

@@ -1,8 +1,7 @@
 """A fake arm behind ros2_control: joint_trajectory_controller and joint_state_broadcaster.
 
 It does what the real controller of Jazzy does with a trajectory: permutes by joint name, drops
-with a log line what it cannot follow, does not clamp to limits, and holds when the trajectory is
-empty.
+with a log line what it cannot follow, an empty trajectory too, and does not clamp to limits.
 """
 
 from __future__ import annotations
@@ -63,9 +62,6 @@ class FakeArm:
             Why the trajectory was dropped, for the log; None when it is followed.
         """
         now = self.world.now()
-        if not points:
-            self._hold(now)
-            return None
         reason = self._refuse(names, points, start_s, now)
         if reason is not None:
             return reason
@@ -80,13 +76,6 @@ class FakeArm:
         self.world.begin_motion(max(start_s, now), waypoints)
         return None
 
-    def _hold(self, now: float) -> None:
-        """Stop where the arm is, in the time that braking takes."""
-        q, velocity = self.world.reported(now)
-        braking_s = 0.15
-        end = q + 0.5 * braking_s * velocity
-        self.world.begin_motion(now, [Waypoint(braking_s, end, np.zeros_like(end))])
-
     def _refuse(
         self, names: Sequence[str], points: Sequence[TrajectoryPoint], start_s: float, now: float
     ) -> str | None:
@@ -94,6 +83,8 @@ class FakeArm:
         missing = sorted(set(self.names) - set(names))
         if unknown or missing or len(names) != len(self.names):
             return f'incoming joints do not match: unknown {unknown}, missing {missing}'
+        if not points:
+            return 'the trajectory is empty'
         times = [0.0, *(point.time_from_start_s for point in points)]
         if any(later <= earlier for earlier, later in pairwise(times)):
             return 'time_from_start does not increase'

@@ -154,7 +154,8 @@ class LaserTrackerMarkers(RemasterNode):
             self._T_N_R = transforms.inverse(transform_array(message))
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
-        if message.points:
+        # One point alone is a stop on the way, where nothing is to be found.
+        if len(message.points) > 1:
             duration = message.points[-1].time_from_start
             self._arrival_s = self.now_s() + duration.sec + 1e-9 * duration.nanosec
             self._commanded.set()

@@ -148,6 +148,10 @@ class PosePlanner(RemasterNode):
         self.T_R_N[message.child_frame_id] = transform_array(message)
 
     def _on_event(self, event: Event) -> None:
+        if (event.node, event.event) == ('robot_bridge', 'halted') and self.state == 'running':
+            # It goes on when somebody has looked at the arm and calls /remaster/collect.
+            self._set_state('paused', event.message)
+            return
         final = (event.node, event.event) in (
             ('recorder', 'configuration'),
             ('robot_bridge', 'failed'),

@@ -1,28 +1,43 @@
 """Command the joint solutions of a pose one by one; say when the arm has settled.
 
-The bridge never commands outside the joint limits, one configuration at a time, and only while the
-planner says ``running`` and is heard from. Settled is judged from joint_states. After a
-configuration has settled the arm stays until the recorder has said what became of it.
+The bridge never commands outside the joint limits, one configuration at a time, and only while
+planner, recorder and robot are heard from and the planner says ``running``. After a configuration
+has settled the arm stays until the recorder has said what became of it. The rules are those of
+`remaster_ros.core.visiting`; this is their ROS shell.
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.errors import InputError
-from remaster_ros.core.motion import MotionLimits
-from remaster_ros.core.settling import SettleDetector, SettleRules
+from remaster_ros.core.motion import MotionLimits, Waypoint
+from remaster_ros.core.settling import SettleRules
 from remaster_ros.core.types import FloatArray
+from remaster_ros.core.visiting import (
+    Action,
+    Drive,
+    Failed,
+    Halted,
+    Settled,
+    Stop,
+    Visitor,
+    VisitRules,
+)
 from remaster_ros.nodes.messages import JointOrder, duration_of, seconds, stamp_key, stamp_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import RELIABLE, Event, Status, listen
 from remaster_ros.storage.cell import read_cell
+from remaster_ros.storage.results import joint_offsets_rad, read_fit
 
 
 @dataclass(frozen=True)
@@ -32,6 +47,10 @@ class Parameters:
     cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
     speed_share: float = parameter(
         0.3, 'share of each joint velocity limit that is used', low=0.01, high=1.0
+    )
+    offsets: str = parameter(
+        '',
+        'fit.json whose joint offsets shift the joint limits; empty for offsets not known yet',
     )
     settle_s: float = parameter(
         3.0, 'how long the arm must stand still before a reading', unit='s', low=0.1, high=60.0
@@ -59,18 +78,16 @@ class Parameters:
         low=0.5,
         high=60.0,
     )
-
-
-@dataclass
-class _Visit:
-    """One commanded configuration of the current pose."""
-
-    solution: int
-    target: FloatArray
-    detector: SettleDetector
-    commanded_s: float
-    deadline_s: float
-    settled: bool = False
+    stall_s: float = parameter(
+        1.0,
+        'an arm that stands for so long and not at its target has been stopped',
+        unit='s',
+        low=0.2,
+        high=60.0,
+    )
+    emergency_stop_topic: str = parameter(
+        '', "std_msgs/Bool, true while the robot's own safety stops it; empty where there is none"
+    )
 
 
 class RobotBridge(RemasterNode):
@@ -79,154 +96,128 @@ class RobotBridge(RemasterNode):
     def __init__(self) -> None:
         super().__init__('robot_bridge')
         self.p = declare(self, Parameters)
-        cell = read_cell(self.p.cell)
-        self.chain = cell.chain()
-        self.limits = MotionLimits.of(self.chain, self.p.speed_share)
+        self.chain = read_cell(self.p.cell).chain()
+        limits = MotionLimits.of(self.chain, self.p.speed_share, self._offsets(self.chain))
+        self._visitor = Visitor(limits, self._rules())
         self._order = JointOrder(self.chain.joint_names)
-        self._q: FloatArray | None = None
-        self._now = 0.0
-        self._heard = {'planner': 0.0, 'recorder': 0.0, 'robot': 0.0}
-        self._planner_state = 'unknown'
-        self._pose: JointTrajectory | None = None
-        self._next = 0
-        self._visit: _Visit | None = None
-        self._held = False
+        self._pose_stamp = ''
         self._settled_wall = time.monotonic()
-        self.counts = {'commanded': 0, 'settled': 0, 'failed': 0}
-        self._trouble = ''
+        self.counts = {'commanded': 0, 'settled': 0, 'failed': 0, 'stopped': 0}
         self._controller = self.create_publisher(
             JointTrajectory, '/joint_trajectory_controller/joint_trajectory', RELIABLE
         )
         self._settled = self.create_publisher(JointState, '/remaster/settled', RELIABLE)
+        self.status = Status(self, self._summary)
         self.create_subscription(JointState, '/joint_states', self._on_joint_state, RELIABLE)
         self.create_subscription(
             JointTrajectory, '/remaster/joint_solutions', self._on_solutions, RELIABLE
         )
-        self.status = Status(self, self._summary)
+        if self.p.emergency_stop_topic:
+            self.create_subscription(
+                Bool, self.p.emergency_stop_topic, self._on_emergency_stop, RELIABLE
+            )
         listen(self, self._on_event, self._on_summary)
         self.create_timer(0.1, self._watch, clock=self.status.steady)
+
+    def _offsets(self, chain: SerialChain) -> FloatArray | None:
+        """Return the offsets in use, rad, (k,); what a fit could not tell counts as none."""
+        if not self.p.offsets:
+            return None
+        offsets, std = joint_offsets_rad(read_fit(self.p.offsets), chain.joint_names)
+        return np.where(std > 0.0, offsets, 0.0)
+
+    def _rules(self) -> VisitRules:
+        p = self.p
+        return VisitRules(
+            settle=SettleRules(p.settle_s, p.arrive_tolerance, p.still_tolerance),
+            arrive_timeout_s=p.arrive_timeout_s,
+            answer_timeout_s=p.answer_timeout_s,
+            heartbeat_s=p.heartbeat_s,
+            stall_s=p.stall_s,
+        )
 
     # What comes in
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
+        now = time.monotonic()
         if node == 'pose_planner':
-            self._heard['planner'] = time.monotonic()
-            self._planner_state = values.get('state', 'unknown')
-            if self._planner_state != 'running':
-                self._hold(f'planner is {self._planner_state}')
+            self._do(self._visitor.planner_says(values.get('state', 'unknown'), now))
         elif node == 'recorder':
-            self._heard['recorder'] = time.monotonic()
+            self._do(self._visitor.recorder_says(values.get('waiting_for', ''), now))
 
     def _on_event(self, event: Event) -> None:
-        visit, pose = self._visit, self._pose
-        if event.node != 'recorder' or event.event != 'configuration' or visit is None:
+        if (event.node, event.event) != ('recorder', 'configuration'):
             return
-        if pose is None or event.values.get('stamp') != stamp_key(pose.header.stamp):
-            return
-        if event.values.get('solution') == str(visit.solution) and visit.settled:
-            self._visit = None
-            self._go_on()
+        solution = event.values.get('solution', '')
+        if event.values.get('stamp') == self._pose_stamp and solution.isdecimal():
+            self._do(self._visitor.answered(int(solution), time.monotonic()))
 
     def _on_solutions(self, message: JointTrajectory) -> None:
-        if not message.points:
-            self._pose, self._visit = None, None
-            self._hold('stopped')
+        try:
+            columns = [list(message.joint_names).index(name) for name in self.chain.joint_names]
+            solutions = [[point.positions[c] for c in columns] for point in message.points]
+        except (ValueError, IndexError):
+            self.get_logger().error(
+                f'joint_solutions dropped: they are for {", ".join(message.joint_names)}, '
+                f'the cell has {", ".join(self.chain.joint_names)}'
+            )
             return
-        columns = [list(message.joint_names).index(name) for name in self.chain.joint_names]
-        for point in message.points:
-            point.positions = [point.positions[column] for column in columns]
-        self._pose, self._next, self._visit = message, 0, None
-        self._go_on()
+        self._pose_stamp = stamp_key(message.header.stamp)
+        targets = np.reshape(np.array(solutions, float), (-1, len(self.chain)))
+        self._do(self._visitor.plan(targets, time.monotonic()))
 
     def _on_joint_state(self, message: JointState) -> None:
-        self._heard['robot'] = time.monotonic()
+        now = time.monotonic()
         try:
             q = self._order.positions(message)
         except InputError as error:
-            self._trouble = str(error)
+            self._do(self._visitor.unreadable(str(error), now))
             return
-        if not np.all(np.isfinite(q)):
-            self._trouble = 'joint_states are not finite'
-            return
-        self._q, self._now, self._trouble = q, seconds(message.header.stamp), ''
-        visit = self._visit
-        if visit is None:
-            return
-        if visit.settled:
-            if self._now > visit.deadline_s:
-                self._fail(visit, 'the recorder did not say what became of it')
-            return
-        state = visit.detector.update(self._now, q)
-        if state == 'settled':
-            visit.settled, self._settled_wall = True, time.monotonic()
-            visit.deadline_s = self._now + self.p.answer_timeout_s
-            self.counts['settled'] += 1
-            self._publish_settled(visit)
-        elif self._now > visit.deadline_s:
-            distance = np.max(np.abs(q - visit.target))
-            where = f'{distance:.4f} rad from the target' if state == 'elsewhere' else 'not still'
-            self._fail(visit, f'did not arrive and settle in time: {where}')
+        self._do(self._visitor.report(seconds(message.header.stamp), q, now))
+
+    def _on_emergency_stop(self, message: Bool) -> None:
+        self._do(self._visitor.emergency(message.data, time.monotonic()))
+
+    def _watch(self) -> None:
+        self._do(self._visitor.tick(time.monotonic()))
 
     # What goes out
 
-    def _publish_settled(self, visit: _Visit) -> None:
-        message = JointState(
-            name=list(self.chain.joint_names), position=visit.detector.mean.tolist()
+    def _do(self, actions: list[Action]) -> None:
+        for action in actions:
+            match action:
+                case Drive():
+                    self._drive(action)
+                case Stop():
+                    self._stop(action)
+                case Settled():
+                    self._announce(action)
+                case Failed(solution, reason):
+                    self.counts['failed'] += 1
+                    self._event('failed', reason, 'warn', solution=solution, reason=reason)
+                case Halted(reason):
+                    self._event('halted', reason, 'error')
+                    self.status.publish()
+
+    def _drive(self, drive: Drive) -> None:
+        self._send(drive.waypoints)
+        self.counts['commanded'] += 1
+        self._event(
+            'commanded',
+            f'solution {drive.solution} commanded',
+            solution=drive.solution,
+            since_settled_wall_s=f'{time.monotonic() - self._settled_wall:.6f}',
         )
-        message.header.stamp = stamp_of(self._now)
-        self._settled.publish(message)
-        still = visit.detector.still_since or self._now
-        self.status.event(
-            'settled',
-            f'solution {visit.solution} settled',
-            stamp=self._stamp(),
-            solution=visit.solution,
-            motion_s=f'{still - visit.commanded_s:.6f}',
-            settle_s=f'{self._now - still:.6f}',
-        )
 
-    def _fail(self, visit: _Visit, reason: str) -> None:
-        self._visit = None
-        self._report_failure(visit.solution, reason)
-        self._go_on()
+    def _stop(self, stop: Stop) -> None:
+        self._send((stop.waypoint,))
+        self.counts['stopped'] += 1
+        self._event('stopped', stop.reason, 'warn')
+        self.get_logger().info(f'stopping the arm: {stop.reason}')
 
-    def _report_failure(self, solution: int, reason: str) -> None:
-        self.counts['failed'] += 1
-        self.status.event(
-            'failed', reason, level='warn', stamp=self._stamp(), solution=solution, reason=reason
-        )
-
-    def _stamp(self) -> str:
-        return stamp_key(self._pose.header.stamp) if self._pose is not None else ''
-
-    def _missing(self) -> str:
-        """Who has been silent too long, or why the arm must not move; '' if it may."""
-        now = time.monotonic()
-        silent = [name for name, heard in self._heard.items() if now - heard > self.p.heartbeat_s]
-        if silent:
-            return f'no sign of {", ".join(silent)} for {self.p.heartbeat_s:g} s'
-        if self._planner_state != 'running':
-            return f'planner is {self._planner_state}'
-        return self._trouble
-
-    def _go_on(self) -> None:
-        """Command the next solution of the pose, if the arm may move."""
-        while self._pose is not None and self._visit is None:
-            if self._next >= len(self._pose.points):
-                return
-            if self._q is None or self._missing():
-                return
-            solution, self._next = self._next, self._next + 1
-            target = np.array(self._pose.points[solution].positions)
-            outside = self.limits.outside(target)
-            if outside:
-                self._report_failure(solution, outside)
-                continue
-            self._command(solution, target)
-
-    def _command(self, solution: int, target: FloatArray) -> None:
-        assert self._q is not None
-        trajectory = self.limits.trajectory(self._q, target)
+    def _send(self, waypoints: tuple[Waypoint, ...]) -> None:
+        # A stop is a trajectory too: an empty one is refused by some versions of
+        # joint_trajectory_controller, and the arm goes on.
         message = JointTrajectory(joint_names=list(self.chain.joint_names))
         message.points = [
             JointTrajectoryPoint(
@@ -234,56 +225,36 @@ class RobotBridge(RemasterNode):
                 velocities=point.velocity.tolist(),
                 time_from_start=duration_of(point.time_s),
             )
-            for point in trajectory
+            for point in waypoints
         ]
         self._controller.publish(message)
-        self._held = False
-        rules = SettleRules(self.p.settle_s, self.p.arrive_tolerance, self.p.still_tolerance)
-        deadline = self._now + trajectory[-1].time_s + self.p.settle_s + self.p.arrive_timeout_s
-        self._visit = _Visit(solution, target, SettleDetector(target, rules), self._now, deadline)
-        self.counts['commanded'] += 1
-        self.status.event(
-            'commanded',
-            f'solution {solution} commanded',
-            stamp=self._stamp(),
-            solution=solution,
-            since_settled_wall_s=f'{time.monotonic() - self._settled_wall:.6f}',
+
+    def _announce(self, settled: Settled) -> None:
+        self._settled_wall = time.monotonic()
+        self.counts['settled'] += 1
+        message = JointState(name=list(self.chain.joint_names), position=settled.q.tolist())
+        message.header.stamp = stamp_of(settled.stamp_s)
+        self._settled.publish(message)
+        self._event(
+            'settled',
+            f'solution {settled.solution} settled',
+            solution=settled.solution,
+            motion_s=f'{settled.motion_s:.6f}',
+            settle_s=f'{settled.settle_s:.6f}',
         )
 
-    def _hold(self, reason: str) -> None:
-        """Stop the arm where it is; the configuration under way is commanded again later.
+    def _event(self, event: str, message: str, level: str = 'ok', **values: Any) -> None:
+        self.status.event(event, message, level=level, stamp=self._pose_stamp, **values)
 
-        An arm that has settled stands already: its reading goes on, only no command follows it.
-        """
-        if self._visit is not None and self._visit.settled:
-            return
-        if not self._held:
-            self._controller.publish(JointTrajectory(joint_names=list(self.chain.joint_names)))
-            self._held = True
-            self.get_logger().info(f'holding: {reason}')
-        if self._visit is not None:
-            self._next, self._visit = self._visit.solution, None
-
-    def _watch(self) -> None:
-        """Stop on silence; go on when everyone is back."""
-        missing = self._missing()
-        if missing and self._visit is not None:
-            self._hold(missing)
-        elif not missing:
-            self._go_on()
-
-    def _summary(self) -> tuple[str, str, dict[str, object]]:
-        missing = self._missing()
-        busy = self._visit is not None
-        text = missing or ('moving or measuring' if busy else 'waiting for a pose')
-        # By the pose the planner sees whether a bridge that was started again knows it.
-        values = {**self.counts, 'held': self._held, 'pose': self._stamp()}
-        return ('warn' if missing else 'ok'), text, values
+    def _summary(self) -> tuple[str, str, dict[str, Any]]:
+        blocked = self._visitor.blocked(time.monotonic())
+        text = 'moving or measuring' if self._visitor.busy else 'waiting for a pose'
+        values = {**self.counts, 'halted': self._visitor.halted}
+        return ('warn' if blocked else 'ok'), blocked or text, values
 
     def close(self) -> None:
         """Leave the arm standing still."""
-        if self._visit is not None and not self._visit.settled:
-            self._hold('the bridge stops')
+        self._do(self._visitor.planner_says('gone: the bridge stops', time.monotonic()))
 
 
 def main(args: list[str] | None = None) -> int:
