@@ -15,6 +15,9 @@ BoolArray = NDArray[np.bool_]
 
 Split = Literal['optimization', 'validation']
 
+FARTHEST_M = 200.0
+"""More than any tracker's range: such a number is in millimetres, or broken."""
+
 
 @dataclass(frozen=True)
 class JointSolution:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from remaster_ros.core.errors import InputError
-from remaster_ros.core.types import FloatArray
+from remaster_ros.core.types import FARTHEST_M, FloatArray
 from remaster_ros.drivers.laser_tracker_link import LaserTrackerError, TrackerLink
 from remaster_ros.drivers.laser_tracker_settings import (
     Environment,
@@ -289,10 +289,12 @@ class LaserTrackerClient:
             timeout_s = self.settings.integration_s + 2 * self.settings.reply_timeout_s
         try:
             result, stamp_s = self._link.measure(timeout_s)
-            position = np.array(result.values)
-            if not np.all(np.isfinite([*result.values, *result.std])):
+            position, std = np.array(result.values), np.array(result.std)
+            # Comparisons with NaN are false.
+            if not (np.all(np.abs(position) <= FARTHEST_M) and np.all(np.abs(std) <= FARTHEST_M)):
                 raise LaserTrackerError(
-                    f'{self.name}: the result is not a number {result.values}; measure again',
+                    f'{self.name}: the result {result.values} ± {result.std} m is no place within '
+                    f'{FARTHEST_M:g} m; measure again',
                     Status.NO_STATIONARY_RESULT,
                 )
             # Whoever changed the units or the frame meanwhile has changed the numbers.
@@ -306,7 +308,7 @@ class LaserTrackerClient:
         return TrackerReading(
             stamp_s=stamp_s,
             position=position,
-            std=np.array(result.std),
+            std=std,
             temperature_c=result.temperature,
             pressure_hpa=result.pressure,
             humidity_percent=result.humidity,

@@ -285,6 +285,8 @@ def _no_marker(status: StreamStatus) -> Diagnosis:
         Dropped.AMBIGUOUS: f'{name} is not the only one in view: remove or mask reflections',
         Dropped.UNLABELLED: f'{name} belongs to no rigid body: check marker_id',
         Dropped.JUMP: f'{name} jumps about: look for reflections that are taken for it',
+        Dropped.IMPLAUSIBLE: f'{name} is nowhere that a bar sees, or its stamps are not of one '
+        f'clock: restart streaming in Motive',
         Dropped.STALE: 'the time of the frames stands still: restart streaming in Motive',
         Dropped.DISAGREEMENT: f'the two decoders disagree about {name}: set client to builtin',
         Dropped.DUPLICATE: 'the same frame comes again and again: restart streaming in Motive',

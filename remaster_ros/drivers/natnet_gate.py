@@ -10,7 +10,7 @@ from enum import StrEnum
 import numpy as np
 
 from remaster_ros.core.errors import InputError
-from remaster_ros.core.types import FloatArray
+from remaster_ros.core.types import FARTHEST_M, FloatArray
 from remaster_ros.protocols.natnet_frames import (
     MODEL_FILLED,
     NOT_LIVE,
@@ -22,8 +22,12 @@ from remaster_ros.protocols.natnet_frames import (
 
 REORDER_WINDOW = 16
 """A frame number further back than this is a restarted stream, not a late datagram."""
+MOST_LOST = 10_000_000
+"""A frame number further ahead, half a day of frames, is another stream's or damaged."""
 RESTART_S = 1.0
 """A frame time further back than this is a restarted stream too."""
+MAX_AGE_S = 10.0
+"""A reading that claims to be older when it is sent has stamps of another clock."""
 JUMP_MARGIN_M = 0.005
 """Far above any noise; what a marker may move between frames beyond `max_speed_m_s`."""
 
@@ -50,6 +54,8 @@ class Dropped(StrEnum):
     MODEL_FILLED = 'model_filled'
     JUMP = 'jump'
     """Further from the last reading than the marker could have moved."""
+    IMPLAUSIBLE = 'implausible'
+    """Further away, or longer on its way, than any bar's reading can be."""
     DISAGREEMENT = 'disagreement'
     """A third-party client read something else from the same datagram."""
 
@@ -217,7 +223,7 @@ class MarkerGate:
         found = self._order(frame) or self._find(frame)
         if isinstance(found, LabeledMarker):
             reading = _sample(frame, found, received_s, ticks_per_s)
-            found = self._jump(reading) or found
+            found = _implausible(reading) or self._jump(reading) or found
         if isinstance(found, Dropped):
             self.dropped[found] += 1
             self.last_reason = found
@@ -241,7 +247,7 @@ class MarkerGate:
         if self._last_number is not None:
             step = frame.number - self._last_number
             back_s = self._last_timestamp - frame.timestamp
-            if step < -REORDER_WINDOW or back_s > RESTART_S:
+            if not -REORDER_WINDOW <= step <= MOST_LOST or back_s > RESTART_S:
                 self.restarts += 1
                 self._last_timestamp = -math.inf
                 self._last_reading = None
@@ -286,6 +292,11 @@ class MarkerGate:
         if moved > JUMP_MARGIN_M + self._choice.max_speed_m_s * elapsed:
             return Dropped.JUMP
         return None
+
+
+def _implausible(reading: MarkerSample) -> Dropped | None:
+    near = np.max(np.abs(reading.position)) <= FARTHEST_M
+    return None if near and reading.age_s <= MAX_AGE_S else Dropped.IMPLAUSIBLE
 
 
 def _sample(

@@ -13,7 +13,7 @@ import numpy as np
 
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.errors import InputError
-from remaster_ros.core.types import FloatArray, Measurements, Observation
+from remaster_ros.core.types import FARTHEST_M, FloatArray, Measurements, Observation
 from remaster_ros.storage.csv_table import Table, split_line
 from remaster_ros.storage.files import decode_text
 from remaster_ros.storage.sequence_rules import (
@@ -27,8 +27,6 @@ from remaster_ros.storage.sequence_rules import (
 log = logging.getLogger('remaster_ros')
 
 LIMIT_TOLERANCE_RAD = math.radians(1.0)
-FARTHEST_M = 200.0
-"""More than any tracker's range: such a number is in millimetres, or broken."""
 
 
 @dataclass(frozen=True)

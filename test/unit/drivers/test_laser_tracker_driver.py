@@ -364,7 +364,9 @@ def test_a_result_nobody_asked_for_is_not_that_of_the_next_measurement():
 @pytest.mark.parametrize(
     ('answers', 'words'),
     [
-        ([dataclasses.replace(RESULT, values=(np.nan, 0.0, 0.0))], 'not a number'),
+        ([dataclasses.replace(RESULT, values=(np.nan, 0.0, 0.0))], 'no place within 200 m'),
+        ([dataclasses.replace(RESULT, values=(2000.0, 0.0, 0.0))], 'no place within 200 m'),
+        ([dataclasses.replace(RESULT, std=(0.0, np.inf, 0.0))], 'no place within 200 m'),
         ([dataclasses.replace(RESULT, status=10009)], r'\(10009\)'),
         ([ErrorReport(Command.START_MEASUREMENT, 10013)], r'\(10013\)'),
         ([ErrorReport(Command.UNKNOWN, 98)], r'\(98\)'),

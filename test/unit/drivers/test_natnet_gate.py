@@ -100,6 +100,23 @@ def test_lost_frames_are_counted_and_a_restarted_stream_is_followed():
     assert (gate.restarts, gate.lost) == (2, 3)
 
 
+def test_a_first_reading_that_cannot_be_keeps_no_later_one_out():
+    gate, admit = gate_for()
+    assert admit(frame(1, marker(x=3e38))) is None
+    old = frame(2, marker(), mid_exposure=1, transmitted=2**63)
+    assert admit(old) is None, 'it says that it took thousands of years'
+    assert gate.dropped[Dropped.IMPLAUSIBLE] == 2
+    assert admit(frame(3, marker())) is not None
+
+
+def test_a_damaged_frame_number_is_not_taken_for_lost_frames():
+    gate, admit = gate_for()
+    for number in (1, 2, 2**31 - 1, 3, 5):
+        admit(frame(number, marker(), timestamp=0.01 * min(number, 3)))
+    assert gate.lost == 1
+    assert gate.restarts == 2
+
+
 def test_a_fast_but_possible_move_is_no_jump():
     _gate, admit = gate_for(max_speed_m_s=5.0)
     assert admit(frame(1, marker(x=0.50))) is not None

@@ -1,0 +1,73 @@
+"""A short run of what benchmarks/bench_fuzz.py does ten million times."""
+
+from __future__ import annotations
+
+import random
+import time
+
+import fuzzing
+import pytest
+
+SEED = random.SystemRandom().randrange(10**6)
+
+
+@pytest.fixture
+def rng():
+    print(f'seed {SEED}')
+    return random.Random(SEED)
+
+
+@pytest.mark.parametrize('version', [(2, 6), (2, 11), (3, 1), (4, 3)])
+def test_no_datagram_harms_the_optitrack_client(rng, version):
+    client = fuzzing.NatNetClientTarget(rng, version)
+    with fuzzing.silent_natnet_driver():
+        fuzzing.run(
+            fuzzing.natnet_mutator(rng, version),
+            [fuzzing.decode_as_any_version(rng), client],
+            5000,
+        )
+    assert client.samples > 50, 'hardly anything came through: the fuzzer tests next to nothing'
+    assert client.strangers > 5
+
+
+def test_no_packet_harms_the_laser_tracker_client(rng):
+    client = fuzzing.TrackerClientTarget(rng)
+    fuzzing.run(fuzzing.emscon_mutator(rng), [fuzzing.read_from_both_sides(rng), client], 5000)
+    assert client.readings > 20
+    assert client.errors > 20
+
+
+def test_every_valid_message_is_taken():
+    """The seeds of the fuzzer are what they claim to be."""
+    for version in fuzzing.VERSIONS:
+        for datagram in fuzzing.natnet_seeds(version)[:5]:
+            fuzzing.natnet.decode_message(datagram, version)
+    for packet in fuzzing.emscon_seeds():
+        taken = 0
+        for side in ('client', 'server'):
+            reader = fuzzing.emscon.PacketReader(side)
+            reader.receive_data(packet)
+            try:
+                taken += reader.next_event() is not fuzzing.emscon.NEED_DATA
+            except fuzzing.emscon.ProtocolError:
+                continue
+        assert taken, packet
+
+
+def test_the_fuzzer_itself_finds_a_crash_and_a_hang(rng, monkeypatch):
+    def crash(data):
+        if len(data) % 7 == 0:
+            raise KeyError('found')
+
+    make = fuzzing.natnet_mutator(rng, (3, 1))
+    with pytest.raises(fuzzing.FuzzError, match=r"KeyError: 'found'; input [0-9a-f]"):
+        fuzzing.run(make, [crash], 1000)
+
+    def hang(data):
+        until = time.thread_time() + 0.02
+        while time.thread_time() < until:
+            pass
+
+    monkeypatch.setattr(fuzzing, 'TIME_LIMIT_S', 0.01)
+    with pytest.raises(fuzzing.FuzzError, match='processor time'):
+        fuzzing.run(make, [hang], 1)
