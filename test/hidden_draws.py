@@ -112,16 +112,23 @@ def _draw_curve(
 def _draw_link(
     rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
 ) -> HiddenEffect:
-    long = np.flatnonzero(np.linalg.norm(c.segments, axis=1) > 0.02)
-    joint = int(rng.choice(long[long > 0]))
-    return HiddenEffect('link_length', (joint,), np.array([5e-3 * _sign(rng)]))
+    joint = int(rng.integers(1, k))
+    segment = c.segments[joint]
+    length = np.linalg.norm(segment)
+    axis = str(rng.choice(('x', 'y', 'z')))
+    # Offsets of a link are as likely as a wrong length, where it has one.
+    if length > 0.02 and (rng.random() < 0.5 or abs(segment['xyz'.index(axis)]) > 0.1 * length):
+        axis = 'along'
+    return HiddenEffect('link_length', (joint,), np.array([5e-3 * _sign(rng)]), {'axis': axis})
 
 
 def _draw_tilt(
     rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
 ) -> HiddenEffect:
     joint = int(rng.integers(2, k + 1))
-    return HiddenEffect('joint_axis_tilt', (joint,), 0.01 * _direction(rng, 2))
+    axis = c.axes[joint - 1]
+    across = np.cross(axis, rng.standard_normal(3))
+    return HiddenEffect('joint_axis_tilt', (joint,), 0.01 * across / np.linalg.norm(across))
 
 
 def _draw_marker(

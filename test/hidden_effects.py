@@ -118,10 +118,6 @@ class HiddenEffect:
         """Return the same effect, so many times as large."""
         return replace(self, values=factor * self.values)
 
-    def parts(self) -> list[HiddenEffect]:
-        """Return the effect of one unit of each of its values alone."""
-        return [replace(self, values=unit) for unit in np.eye(len(self.values))]
-
     def add_to(self, deviation: Deviation, c: Circumstances) -> None:
         """Deviate as the rule says."""
         (NAMED | UNNAMED)[self.kind].rule(self, deviation, c)
@@ -186,15 +182,16 @@ def _coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 
 def _link_length(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """The segment after joint j is longer by that much, m."""
+    """The next joint lies further along the link after joint j, or along an axis of it, m."""
     j = e.joints[0]
-    d.shift[:, j] += e.values[0] * c.segments[j] / np.linalg.norm(c.segments[j])
+    axis = e.detail.get('axis', 'along')
+    along = c.segments[j] if axis == 'along' else np.eye(3)['xyz'.index(axis)]
+    d.shift[:, j] += e.values[0] * along / np.linalg.norm(along)
 
 
 def _tilt(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Joint j's frame is turned about two axes across its own, rad each."""
-    j = e.joints[0]
-    d.tilt[:, j - 1] += e.values @ _across(c.axes[j - 1])
+    """Joint j's frame is turned about its x, y, z before its own turn, rad."""
+    d.tilt[:, e.joints[0] - 1] += e.values
 
 
 def _marker(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
@@ -276,13 +273,6 @@ def _after(e: HiddenEffect, c: Circumstances) -> FloatArray:
     return (c.time_s > e.detail['share_of_time'] * c.time_s[-1]).astype(float)
 
 
-def _across(axis: FloatArray) -> FloatArray:
-    """Two unit vectors at right angles to an axis and to each other, (2, 3)."""
-    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    first /= np.linalg.norm(first)
-    return np.array([first, np.cross(axis, first)])
-
-
 @dataclass(frozen=True)
 class Cell:
     """Where an effect enters, what drives it, its form, and its rule."""
@@ -316,7 +306,7 @@ UNNAMED = {
     'creeping_joint': Cell('joint_angle', 'time', 'linear', _creep),
     'slipped_joint': Cell('joint_angle', 'time', 'step', _slip),
     'warm_joint': Cell('joint_angle', 'temperature', 'linear', _warm_joint),
-    'bent_coupling': Cell('joint_angle', 'other_joint', 'quadratic', _bent_coupling),
+    'bent_coupling': Cell('joint_angle', 'angle', 'quadratic', _bent_coupling),
     'sagging_tool': Cell('marker', 'gravity', 'linear', _sagging_tool),
     'bumped_sensor': Cell('sensor_frame', 'time', 'step', _bumped_sensor),
 }

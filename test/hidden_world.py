@@ -72,6 +72,8 @@ class Noise:
         The errors grow with this power of the distance (0: everywhere the same).
     outlier_share
         Share of the observations that are gross errors of 3 to 30 mm.
+    held_out_outliers
+        Whether rows held out have them too.
     """
 
     sigma_m: float = 0.1e-3
@@ -79,6 +81,7 @@ class Noise:
     depth_ratio: float = 1.0
     range_power: float = 0.0
     outlier_share: float = 0.0
+    held_out_outliers: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,7 +288,10 @@ class HiddenWorld:
         common = rng.standard_normal((groups.max() + 1, 3))[groups]
         std, pose_std = noise.sigma_m * spread, noise.pose_sigma_m * spread
         position = clean + std * rng.standard_normal((n, 3)) + pose_std * common
-        outliers = np.flatnonzero(rng.random(n) < noise.outlier_share)
+        gross = rng.random(n) < noise.outlier_share
+        if not noise.held_out_outliers:
+            gross &= ~self.visits.is_validation[self.configuration]
+        outliers = np.flatnonzero(gross)
         direction = rng.standard_normal((len(outliers), 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         position[outliers] += rng.uniform(3e-3, 30e-3, (len(outliers), 1)) * direction

@@ -1,0 +1,300 @@
+"""Was the hidden effect found: its name, its joint, its size?
+
+The judge is strict. Right is who names exactly what was hidden, no less and no more. One thing
+alone is forgiven: naming a look-alike that this session's data cannot tell from the truth, and
+saying so. "Cannot tell" is decided by the oracle, which knows the noise: the best test between
+the two, with everything else fitted, must have a noncentrality below `INDISTINGUISHABLE`, so that
+it would not be sure at two standard deviations. "Saying so" means that ``confusable_with`` has
+the truth.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from hidden_effects import UNNAMED, HiddenEffect
+from hidden_oracle import Oracle
+from hidden_world import HiddenTruth, HiddenWorld
+from scipy.interpolate import BSpline
+
+from remaster_ros.core.types import FloatArray
+
+INDISTINGUISHABLE = 4.0
+SIZE_STD = 3.0
+# A free curve has no single size: it must agree with the true one to this share of its RMS.
+CURVE_SHARE = 0.4
+
+Cause = tuple[str, tuple[int, ...], str]
+"""Name, joints, and for a cell without a name its place and driver; for a sensor its name."""
+
+
+@dataclass
+class Judgement:
+    """What came of a session.
+
+    Attributes
+    ----------
+    hidden, named
+        Causes.
+    named_right
+        All of the hidden ones and nothing else were named, or look-alikes as said above.
+    forgiven
+        Look-alikes were involved.
+    first_right
+        The first cause named is one that was hidden.
+    size_right
+        Every parameter lies within 3 std of the truth, where the names are right and not forgiven;
+        None where they are not.
+    deviations
+        (value - truth) / std of every parameter compared.
+    """
+
+    hidden: list[Cause]
+    named: list[Cause]
+    named_right: bool
+    forgiven: bool
+    first_right: bool
+    size_right: bool | None
+    deviations: dict[str, float] = field(default_factory=dict)
+
+
+def judge(world: HiddenWorld, truth: HiddenTruth, discovery: Any) -> Judgement:
+    """Compare what was found in a session with what was hidden in it."""
+    hidden = {cause: effect for effect in truth.effects for cause in causes(effect)}
+    found: dict[Cause, list[Any]] = {}
+    for effect in discovery.effects:
+        for cause in _claimed(effect):
+            found.setdefault(cause, []).append(effect)
+    missing = {cause: effect for cause, effect in hidden.items() if cause not in found}
+    extra = {cause: claims for cause, claims in found.items() if cause not in hidden}
+    forgiven = bool(missing) and _forgiven(Oracle(world, truth), missing, extra)
+    named_right = (not missing and not extra) or forgiven
+    deviations: dict[str, float] = {}
+    size_right = None
+    if named_right and not forgiven and hidden:
+        deviations = _deviations(world, truth.effects, discovery.effects)
+        limits = {name: CURVE_SHARE if name == 'curve' else SIZE_STD for name in deviations}
+        size_right = all(abs(z) <= limits[name] for name, z in deviations.items())
+    first = next(iter(found), None)
+    return Judgement(
+        list(hidden), list(found), named_right, forgiven, first in hidden, size_right, deviations
+    )
+
+
+def causes(effect: HiddenEffect) -> list[Cause]:
+    """Return what has to be named: one cause for each joint that gives way, else one."""
+    if effect.kind == 'joint_compliance':
+        return [(effect.kind, (joint,), '') for joint in effect.joints]
+    if effect.kind == 'joint_coupling':
+        return [(effect.kind, (effect.joints[0], effect.detail['by']), '')]
+    if effect.kind in UNNAMED:
+        return [_without_name(effect)]
+    return [(effect.kind, effect.joints, effect.detail.get('sensor', ''))]
+
+
+def _without_name(effect: HiddenEffect) -> Cause:
+    cell = UNNAMED[effect.kind]
+    joints, driver = effect.joints, cell.driver
+    if 'by' in effect.detail:
+        joints = (*joints, effect.detail['by'])
+        driver = f'{driver}_of_joint_{effect.detail["by"]}'
+    return 'unnamed', joints, f'{cell.place} {driver}'
+
+
+def _claimed(effect: Any) -> list[Cause]:
+    joints = tuple(effect.joints)
+    if effect.name == 'unnamed':
+        return [('unnamed', joints, f'{effect.place} {effect.driver}')]
+    if effect.name == 'joint_compliance':
+        return [(effect.name, (joint,), '') for joint in joints]
+    sensor = ''
+    if effect.place == 'sensor_frame':
+        sensor = effect.parameters[0].name.rpartition('_')[2]
+    return [(effect.name, joints, sensor)]
+
+
+def _forgiven(
+    oracle: Oracle, missing: dict[Cause, HiddenEffect], extra: dict[Cause, list[Any]]
+) -> bool:
+    """Whether what was named instead of the missing cannot be told from them, and says so."""
+    if len(missing) != len(extra):
+        return False
+    rivals = [rival for claims in extra.values() for claim in claims for rival in _parts(claim)]
+    listed = {
+        (other.name, tuple(other.joints))
+        for claims in extra.values()
+        for claim in claims
+        for other in claim.confusable_with
+    }
+    if not rivals or any((name, joints) not in listed for name, joints, _ in missing):
+        return False
+    return all(
+        oracle.information(effect, *rivals) < INDISTINGUISHABLE for effect in missing.values()
+    )
+
+
+def _parts(claim: Any) -> list[HiddenEffect]:
+    """Return the named effect as this world would hide it, a unit of each of its parameters."""
+    return [
+        part
+        for parameter in claim.parameters
+        if (part := _part(parameter.name, tuple(claim.joints))) is not None
+    ]
+
+
+# What the estimate calls a parameter -> the same thing in the terms of the hidden world.
+_PATTERNS = {
+    r'compliance_(?P<j>\d+)': 'joint_compliance',
+    r'sin(?P<order>\d+)_\d+': 'encoder_eccentricity',
+    r'cos(?P<order>\d+)_\d+': 'encoder_eccentricity',
+    r'scale_(?P<j>\d+)': 'encoder_scale',
+    r'half_backlash_\d+': 'backlash',
+    r'settling_\d+': 'settling',
+    r'coupling_\d+_by_(?P<by>\d+)': 'joint_coupling',
+    r'length_\d+': 'link_length',
+    r'offset_(?P<axis>[xyz])_\d+': 'link_length',
+    r'tilt_(?P<axis>[xyz])_\d+': 'joint_axis_tilt',
+    r'growth': 'thermal_growth',
+    r'base_compliance': 'base_compliance',
+    r'drift_(?P<axis>[xyz])_(?P<sensor>\w+)': 'registration_drift',
+    r'scale_z_(?P<sensor>[a-z]\w*)': 'sensor_scale',
+    r'scale_(?P<sensor>[a-z]\w+)': 'sensor_scale',
+    r'radial_(?P<sensor>[a-z]+)': 'sensor_distortion',
+}
+
+
+def _part(name: str, joints: tuple[int, ...]) -> HiddenEffect | None:
+    for pattern, kind in _PATTERNS.items():
+        match = re.fullmatch(pattern, name)
+        if match is None:
+            continue
+        detail: dict[str, Any] = match.groupdict()
+        values = np.ones(1)
+        if kind == 'joint_compliance':
+            joints = (int(detail['j']),)
+        elif kind == 'encoder_eccentricity':
+            detail = {'orders': (int(detail['order']),)}
+            values = np.array([1.0, 0.0] if name.startswith('sin') else [0.0, 1.0])
+        elif kind == 'joint_coupling':
+            detail = {'by': int(detail['by']), 'form': 'linear'}
+            joints = joints[:1]
+        elif kind in ('joint_axis_tilt', 'registration_drift'):
+            values = np.eye(3)['xyz'.index(detail['axis'])]
+        elif kind == 'sensor_scale':
+            detail['form'] = 'depth' if name.startswith('scale_z_') else 'all'
+        elif kind == 'link_length' and 'axis' not in detail:
+            detail = {'axis': 'along'}
+        return HiddenEffect(kind, joints, values, detail)
+    return None
+
+
+def _deviations(
+    world: HiddenWorld, effects: Sequence[HiddenEffect], found: Sequence[Any]
+) -> dict[str, float]:
+    """Compare every true value with its estimate; one that was not estimated counts as zero.
+
+    For want of its own, a value that was not estimated is given the std of its neighbours in the
+    same effect.
+    """
+    deviations = {}
+    for effect in effects:
+        claims = [claim for claim in found if set(_claimed(claim)) & set(causes(effect))]
+        estimates = {
+            parameter.name: (parameter.value, parameter.std)
+            for claim in claims
+            for parameter in claim.parameters
+        }
+        if effect.kind == 'joint_error_curve':
+            deviations['curve'] = _curve_deviation(world, effect, estimates)
+            continue
+        spread = max(std for _, std in estimates.values())
+        for name, true in expected(world, effect).items():
+            value, std = estimates.get(name, (0.0, spread))
+            deviations[name] = (value - true) / std
+    return deviations
+
+
+def expected(world: HiddenWorld, effect: HiddenEffect) -> dict[str, float]:
+    """Return the true parameters under the names that an estimate gives them.
+
+    Without a name to a cell there is no size to compare but that of a line.
+    """
+    j = effect.joints[0] if effect.joints else 0
+    values = [float(value) for value in effect.values]
+    sensor, by = effect.detail.get('sensor'), effect.detail.get('by')
+    match effect.kind:
+        case 'joint_compliance':
+            return {f'compliance_{i}': v for i, v in zip(effect.joints, values, strict=True)}
+        case 'encoder_eccentricity' | 'gear_periodic':
+            orders = effect.detail['orders']
+            names = [f'{wave}{order}_{j}' for order in orders for wave in ('sin', 'cos')]
+            return dict(zip(names, values, strict=True))
+        case 'encoder_scale':
+            return {f'scale_{j}': values[0]}
+        case 'backlash':
+            return {f'half_backlash_{j}': 0.5 * values[0]}
+        case 'settling':
+            return {f'settling_{j}': values[0]}
+        case 'joint_coupling' if effect.detail['form'] == 'linear':
+            return {f'coupling_{j}_by_{by}': values[0]}
+        case 'joint_coupling':
+            return {f'sin_{j}_by_{by}': values[0], f'cos_{j}_by_{by}': values[1]}
+        case 'link_length':
+            axis = effect.detail['axis']
+            return {f'length_{j}' if axis == 'along' else f'offset_{axis}_{j}': values[0]}
+        case 'joint_axis_tilt':
+            return {f'tilt_{a}_{j}': float(t) for a, t in zip('xyz', values) if abs(t) > 1e-12}
+        case 'thermal_growth':
+            return {'growth': values[0]}
+        case 'base_compliance':
+            return {'base_compliance': values[0]}
+        case 'registration_drift':
+            return {f'drift_{a}_{sensor}': v for a, v in zip('xyz', values, strict=True)}
+        case 'sensor_scale':
+            prefix = 'scale_z' if effect.detail['form'] == 'depth' else 'scale'
+            return {f'{prefix}_{sensor}': values[0]}
+        case 'sensor_distortion':
+            return {f'radial_{sensor}': values[0]}
+        case 'marker_offset':
+            return {
+                f'{axis}_{name}': float(
+                    world.true_markers[name][i] + effect.values[i] - nominal[i]
+                )
+                for name, nominal in world.markers.items()
+                for i, axis in enumerate('xyz')
+            }
+        case 'foreign_torque':
+            return {f'joint_{j}_by_gravity_torque_of_joint_{by}': values[0]}
+        case 'creeping_joint' | 'slipped_joint':
+            return {f'joint_{j}_by_time': values[0]}
+        case 'warm_joint':
+            return {f'joint_{j}_by_temperature': values[0]}
+        case _:
+            return {}
+
+
+def _curve_deviation(
+    world: HiddenWorld, effect: HiddenEffect, estimates: dict[str, tuple[float, float]]
+) -> float:
+    """RMS of estimated minus true curve over the configurations, as a share of the true one's.
+
+    Offset and slope of both are left out: the one is a zero-offset, the other hardly seen.
+    """
+    peaks = np.deg2rad([float(re.findall(r'_at_([-+.\d]+)deg', n)[0]) for n in estimates])
+    weights = np.array([value for value, _ in estimates.values()])
+    step = np.mean(np.diff(peaks))
+    knots = peaks[0] + step * np.arange(-2, len(peaks) + 2)
+    q = world.visits.q[:, effect.joints[0] - 1]
+    inside = np.clip(q, knots[3], knots[-4])
+    estimated = BSpline(knots, weights, 3)(inside)
+    waves = zip(effect.detail['orders'], effect.detail['amplitudes'], effect.detail['phases'])
+    true = effect.values[0] * sum(a * np.cos(order * q + phase) for order, a, phase in waves)
+    return float(np.std(_detrended(q, estimated - true)) / np.std(_detrended(q, true)))
+
+
+def _detrended(q: FloatArray, values: FloatArray) -> FloatArray:
+    return values - np.polyval(np.polyfit(q, values, 1), q)

@@ -1,0 +1,100 @@
+"""Sessions with something hidden in them, or nothing: for tests and benchmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from hidden_draws import draw_effect
+from hidden_oracle import Oracle
+from hidden_tours import world
+from hidden_world import HiddenTruth, HiddenWorld, Noise
+
+from remaster_ros.core.types import Session
+
+NOISES = {
+    'independent': Noise(0.15e-3),
+    'pose_common': Noise(0.08e-3, 0.15e-3),
+    'range': Noise(0.12e-3, 0.05e-3, range_power=3.0),
+    'depth': Noise(0.12e-3, 0.08e-3, depth_ratio=3.0),
+}
+OUTLIER_SHARE = 0.03
+# An effect is drawn as one that plausibly leaves this much, then scaled.
+VISIBLE_M = 0.2e-3
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What to hide, and in what.
+
+    Attributes
+    ----------
+    seed
+        Of everything.
+    kinds
+        Of the effects; none for a session without.
+    multiple
+        Size of each effect, as a multiple of the size at which the best possible test, which
+        knows what to look for, finds it in 90 % of sessions.
+    size_m
+        Size instead, where not None (see `HiddenWorld.size_m`).
+    robot, sensors, noise
+        See `hidden_tours.world` and `NOISES`.
+    outliers, held_out_outliers
+        Whether 3 % of the rows to fit, and of those held out, are gross errors.
+    """
+
+    seed: int
+    kinds: tuple[str, ...] = ()
+    multiple: float = 4.0
+    size_m: float | None = None
+    robot: str = 'iiwa7'
+    sensors: tuple[str, ...] = ('mocap',)
+    noise: str = 'independent'
+    outliers: bool = False
+    held_out_outliers: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenSession:
+    """A session, the world it was made in, and what only judges may know.
+
+    ``best_size_m`` is the size at which the best possible test finds each effect in 90 %.
+    """
+
+    session: Session
+    world: HiddenWorld
+    truth: HiddenTruth
+    best_size_m: tuple[float, ...]
+
+
+def hidden_session(recipe: Recipe) -> HiddenSession:
+    """Make the session of a recipe; the same recipe gives the same session."""
+    rng = np.random.default_rng([recipe.seed, 7])
+    hidden = world(recipe.robot, rng, sensors=recipe.sensors)
+    noise = replace(
+        NOISES[recipe.noise],
+        outlier_share=OUTLIER_SHARE if recipe.outliers else 0.0,
+        held_out_outliers=recipe.held_out_outliers,
+    )
+    noise_seed = [recipe.seed, 8]
+    # The noise of the session itself, so that the oracle knows which rows are gross errors.
+    _, plain = hidden.measure((), noise, np.random.default_rng(noise_seed))
+    oracle = Oracle(hidden, plain)
+    effects, best = [], []
+    for kind in recipe.kinds:
+        effect = draw_effect(hidden, kind, rng, recipe.size_m or VISIBLE_M)
+        now = hidden.size_m(effect)
+        best.append(now * oracle.size_for_power(effect))
+        effects.append(
+            effect if recipe.size_m else hidden.of_size(effect, recipe.multiple * best[-1])
+        )
+    session, truth = hidden.measure(effects, noise, np.random.default_rng(noise_seed))
+    return HiddenSession(session, hidden, truth, tuple(best))
+
+
+def held_out_noise_m(hidden: HiddenSession) -> float:
+    """RMS of the noise on the rows held out: what a perfect model would leave, m."""
+    rows = hidden.session.measurements
+    error = (rows.position - hidden.truth.clean)[rows.is_validation]
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
