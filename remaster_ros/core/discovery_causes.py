@@ -1,0 +1,274 @@
+"""The chosen cells as causes: grouped by name, compared with their look-alikes, put in words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from remaster_ros.core.discovery_evidence import Solution, solve
+from remaster_ros.core.discovery_noise import Residuals
+from remaster_ros.core.discovery_screen import Catalogue, screen
+from remaster_ros.core.discovery_select import Selection, log_prior
+from remaster_ros.core.effects.cell import Cell
+from remaster_ros.core.effects.registry import EFFECTS
+from remaster_ros.core.result import FitResult
+
+# Look-alikes within this of the evidence are named; within the other, the leaders tie.
+CONFUSABLE = 5.0
+TIED = 1.0
+SHORTLIST = 10
+# Columns that agree to this in every pose are the same change under two names.
+SAME = 1.0 - 1e-6
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of an effect: posterior mean and standard deviation in its unit."""
+
+    name: str
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class LookAlike:
+    """Another cause that explains the data nearly as well.
+
+    Attributes
+    ----------
+    name, joints
+        As of an effect.
+    log_evidence_gain
+        Of the look-alike in the effect's place.
+    separate_by
+        Which measurements would decide.
+    same
+        No measurement of these markers could: the two displace every pose alike.
+    """
+
+    name: str
+    joints: tuple[int, ...]
+    log_evidence_gain: float
+    separate_by: str
+    same: bool = False
+
+
+@dataclass(frozen=True)
+class FoundEffect:
+    """A cause; fields as in discovery.json.
+
+    Attributes
+    ----------
+    size_m
+        RMS of what it does to the marker after absorption, over the fitted rows, m.
+    tied
+        A look-alike that measurements could tell apart explains the data as well.
+    """
+
+    name: str
+    joints: tuple[int, ...]
+    place: str
+    driver: str
+    form: str
+    parameters: tuple[Parameter, ...]
+    p_value: float
+    log_evidence_gain: float
+    confusable_with: tuple[LookAlike, ...]
+    cause: str
+    size_m: float
+    tied: bool = False
+
+    def sampled(self, result: FitResult) -> FoundEffect:
+        """Return the effect with its parameters as the extended model's posterior has them."""
+        index = {name: i for i, name in enumerate(result.theta_names)}
+        parameters = tuple(
+            replace(
+                parameter,
+                value=float(result.theta[index[parameter.name]]),
+                std=float(result.theta_std[index[parameter.name]]),
+            )
+            if parameter.name in index
+            else parameter
+            for parameter in self.parameters
+        )
+        return replace(self, parameters=parameters)
+
+
+def describe(
+    data: Residuals,
+    selection: Selection,
+    cells: Sequence[Cell],
+    rng: np.random.Generator,
+    progress: Callable[[float], None],
+) -> tuple[FoundEffect, ...]:
+    """Return the chosen cells as causes, the largest first."""
+    solution = selection.solution
+    if not solution.cells:
+        return ()
+    catalogue = Catalogue.of(data, [cell for cell in cells if cell.name != 'gear_periodic'])
+    groups = _groups(solution)
+    found = []
+    for count, group in enumerate(groups):
+        progress(count / len(groups))
+        found.append(_described(data, selection, catalogue, group))
+    return tuple(sorted(found, key=lambda effect: -effect.size_m))
+
+
+def _groups(solution: Solution) -> list[tuple[Cell, ...]]:
+    """Return the cells grouped to one cause each."""
+    groups: dict[tuple[str, ...], list[Cell]] = {}
+    for cell in solution.cells:
+        key: tuple[str, ...] = (cell.name, cell.driver, cell.form, cell.subject)
+        if cell.name in ('unnamed', 'joint_coupling', 'gear_periodic'):
+            key += (str(cell.joints), cell.variant)
+        groups.setdefault(key, []).append(cell)
+    return [tuple(group) for group in groups.values()]
+
+
+def _described(
+    data: Residuals, selection: Selection, catalogue: Catalogue, group: tuple[Cell, ...]
+) -> FoundEffect:
+    solution = selection.solution
+    first = group[0]
+    wheres = dict(zip(solution.cells, solution.slices(), strict=True))
+    parameters = tuple(
+        Parameter(name, float(value), float(np.sqrt(variance)), cell.unit)
+        for cell in group
+        for name, value, variance in zip(
+            cell.parameters,
+            solution.parameters[wheres[cell]],
+            np.diag(solution.covariance)[wheres[cell]],
+            strict=True,
+        )
+    )
+    rest = tuple(cell for cell in solution.cells if cell not in group)
+    without = solve(data, rest, solution, prior=log_prior(rest, catalogue.cells))
+    gain = np.inf if without is None else solution.log_evidence - without.log_evidence
+    p_values = [step.p_value for step in selection.steps if set(step.cells) & set(group)]
+    if not p_values:
+        # It came in exchange for what had passed.
+        p_values = [max(step.p_value for step in selection.steps)]
+    alike: tuple[LookAlike, ...] = ()
+    if without is not None and len(group) == 1 and first.penalty is None:
+        alike = _look_alikes(data, solution, without, catalogue, first)
+    effect = FoundEffect(
+        name=first.name,
+        joints=_joints(group),
+        place=first.place,
+        driver=first.driver,
+        form=first.form,
+        parameters=parameters,
+        p_value=float(min(p_values)),
+        log_evidence_gain=float(gain),
+        confusable_with=alike,
+        cause=in_words(group),
+        size_m=_size(data, solution, group, wheres),
+        tied=any(not other.same and other.log_evidence_gain > gain - TIED for other in alike),
+    )
+    return effect
+
+
+def _joints(group: Sequence[Cell]) -> tuple[int, ...]:
+    if len(group) == 1:
+        return group[0].joints
+    return tuple(sorted({joint for cell in group for joint in cell.joints}))
+
+
+def _look_alikes(
+    data: Residuals,
+    solution: Solution,
+    without: Solution,
+    catalogue: Catalogue,
+    cell: Cell,
+) -> tuple[LookAlike, ...]:
+    """Return the other causes that explain nearly as much in a cell's place."""
+    score = screen(data, catalogue, replace(without, noise=solution.noise)).score
+    best: dict[tuple[str, tuple[int, ...]], LookAlike] = {}
+    for index in np.argsort(-score)[:SHORTLIST]:
+        other = catalogue.cells[index]
+        if not np.isfinite(score[index]) or (other.name, other.joints) == (cell.name, cell.joints):
+            continue
+        cells = (*without.cells, other)
+        fit = solve(data, cells, solution, prior=log_prior(cells, catalogue.cells))
+        if fit is None or fit.log_evidence < solution.log_evidence - CONFUSABLE:
+            continue
+        gain = fit.log_evidence - without.log_evidence
+        key = (other.name, other.joints)
+        if key in best and best[key].log_evidence_gain >= gain:
+            continue
+        same = _same(data, solution, cell, other)
+        best[key] = LookAlike(
+            other.name, other.joints, float(gain), separate_by(cell, other, same), same
+        )
+    return tuple(sorted(best.values(), key=lambda alike: -alike.log_evidence_gain))
+
+
+def _same(data: Residuals, solution: Solution, cell: Cell, other: Cell) -> bool:
+    """Do two cells displace the marker alike, whatever the data's noise?"""
+    if cell.size != other.size or cell.driver != other.driver:
+        return False
+    source = data.rows.source
+    base = data.base.reshape(3 * len(data), -1)
+    spaces = []
+    for columns in (data.columns([cell]), data.columns([other])):
+        flat = columns[source].reshape(3 * len(data), -1)
+        flat = flat / np.linalg.norm(flat, axis=0)
+        spaces.append(np.linalg.qr(flat - base @ (base.T @ flat))[0])
+    cosines = np.linalg.svd(spaces[0].T @ spaces[1], compute_uv=False)
+    return bool(cosines.min() > SAME)
+
+
+def _size(
+    data: Residuals,
+    solution: Solution,
+    group: tuple[Cell, ...],
+    wheres: dict[Cell, slice],
+) -> float:
+    """Return the RMS of a cause's displacement after absorption by the offsets model, m."""
+    shift = np.zeros((len(data), 3))
+    for cell in group:
+        shift += data.columns([cell])[data.rows.source] @ solution.parameters[wheres[cell]]
+    flat, base = shift.ravel(), data.base.reshape(3 * len(data), -1)
+    left = flat - base @ (base.T @ flat)
+    return float(np.sqrt(np.sum(left**2) / len(data)))
+
+
+def separate_by(cell: Cell, other: Cell, same: bool) -> str:
+    """Say which measurements tell two causes apart."""
+    if same:
+        return (
+            'no pose of this marker can: both displace it alike '
+            '(another name for the same change of the kinematics)'
+        )
+    texts = [
+        EFFECTS[c.name].separate_by.format(driver=c.driver.replace('_', ' '))
+        for c in (cell, other)
+    ]
+    return '; and '.join(dict.fromkeys(texts))
+
+
+def in_words(group: Sequence[Cell]) -> str:
+    """Return the sentence for a technician."""
+    first = group[0]
+    joints = _joints(group)
+    subject = first.subject or _listed(joints if first.name != 'joint_coupling' else joints[:1])
+    other = f'joint {joints[1]}' if len(joints) > 1 else ''
+    place = first.place.replace('_', ' ')
+    if first.joints:
+        place += f' of joint {first.joints[0]}'
+    if first.subject:
+        place += f' of {first.subject}'
+    sentence = EFFECTS[first.name].sentence.format(
+        subject=subject, other=other, driver=first.driver.replace('_', ' '), place=place
+    )
+    return sentence[:1].upper() + sentence[1:]
+
+
+def _listed(joints: Sequence[int]) -> str:
+    names = [str(joint) for joint in joints]
+    if len(names) < 2:
+        return f'joint {"".join(names)}'
+    return f'joints {", ".join(names[:-1])} and {names[-1]}'

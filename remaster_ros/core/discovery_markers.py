@@ -1,0 +1,94 @@
+"""Markers that are not where the session says: judged by how far the fit moved them.
+
+The offsets model fits the markers, so a wrong one leaves no residuals. With I the information of
+the data alone on a marker's position, everything else fitted, and d̂ their estimate, a marker known
+to s per axis gives u = I (d̂ − nominal) ~ N(0, I + s² I²) if the session is right.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from remaster_ros.core.discovery_causes import FoundEffect, Parameter
+from remaster_ros.core.discovery_evidence import Solution
+from remaster_ros.core.discovery_noise import Residuals
+from remaster_ros.core.effects.registry import EFFECTS
+from remaster_ros.core.estimate import Estimate
+from remaster_ros.core.types import FloatArray
+
+# Family-wise error over all markers.
+SIGNIFICANCE = 0.002
+# A direction counts where the data know it this many times better than the session, in variance.
+KNOWN_BETTER = 4.0
+
+
+def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple[FoundEffect, ...]:
+    """Return an effect for every marker that the fit moved further than the session allows."""
+    model, problem = found.model, found.problem
+    x = model.natural(found.mode.z)
+    jacobian = model.natural_jacobian(x, data.rows)
+    columns = data.columns(solution.cells)[data.rows.source]
+    joined = np.concatenate((jacobian, columns), axis=2)
+    white = data.whitened(joined, solution.noise).reshape(3 * len(data), -1)
+    error = data.whitened(data.errors, solution.noise).ravel()
+    std = max(problem.session.marker_std_m, 1e-6)
+    effects = []
+    for index, name in enumerate(problem.marker_names):
+        where = model.marker(index)
+        others = np.delete(white, np.arange(where.start, where.stop), axis=1)
+        own = white[:, where]
+        own = own - _projected(others, own)
+        information = own.T @ own
+        # Estimate of the data alone: the fitted place plus the step without the prior.
+        moved = x[where] - problem.markers[index]
+        pull = own.T @ error + information @ moved
+        values, axes = np.linalg.eigh(information)
+        seen = values * std**2 > KNOWN_BETTER
+        if not seen.any():
+            continue
+        u = axes.T @ pull
+        square = float(np.sum(u[seen] ** 2 / (values[seen] + (values[seen] * std) ** 2)))
+        p_value = float(chi2.sf(square, seen.sum()))
+        if p_value * len(problem.marker_names) > SIGNIFICANCE:
+            continue
+        inverse = axes[:, seen] / values[seen] @ axes[:, seen].T
+        effects.append(_effect(name, inverse @ pull, inverse, p_value, square, int(seen.sum())))
+    return tuple(effects)
+
+
+def _projected(others: FloatArray, own: FloatArray) -> FloatArray:
+    scale = np.linalg.norm(others, axis=0)
+    left, singular, _ = np.linalg.svd(
+        others / np.where(scale > 0.0, scale, 1.0), full_matrices=False
+    )
+    left = left[:, singular > 1e-9 * singular[0]]
+    return left @ (left.T @ own)
+
+
+def _effect(
+    name: str,
+    moved: FloatArray,
+    covariance: FloatArray,
+    p_value: float,
+    square: float,
+    rank: int,
+) -> FoundEffect:
+    effect = EFFECTS['marker_offset']
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return FoundEffect(
+        name=effect.name,
+        joints=(),
+        place=effect.place,
+        driver=effect.driver,
+        form=effect.form,
+        parameters=tuple(
+            Parameter(f'{axis}_{name}', float(v), float(s), effect.unit)
+            for axis, v, s in zip('xyz', moved, std, strict=True)
+        ),
+        p_value=p_value,
+        log_evidence_gain=0.5 * (square - rank),
+        confusable_with=(),
+        cause=effect.sentence.format(subject=name),
+        size_m=float(np.linalg.norm(moved)),
+    )

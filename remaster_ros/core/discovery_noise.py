@@ -1,0 +1,160 @@
+"""What the discovery works on: the residuals of the offsets model, its noise, its absorption.
+
+The noise is that of `posterior`: independent per row with sigma, plus a part common to the rows of
+one sensor at one pose with pose_sigma. What registrations, offsets and markers can absorb is
+projected out with flat priors everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from remaster_ros.core.effects.cell import Cell
+from remaster_ros.core.effects.scene import Scene
+from remaster_ros.core.estimate import Estimate
+from remaster_ros.core.model import Rows
+from remaster_ros.core.types import BoolArray, FloatArray, IntArray
+
+# Directions of the offsets model below this share of the largest are its gauge.
+ROUNDING = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Standard deviations of each sensor, m, (sensors,): per row, and common to a pose."""
+
+    sigma: FloatArray
+    pose_sigma: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """n rows, sorted by sensor and pose, with what the offsets model leaves of them.
+
+    Attributes
+    ----------
+    scene
+        All rows of the session at the solution of the offsets model.
+    rows
+        The rows worked on; ``source`` are their indices in the scene.
+    errors
+        Measured minus modelled, in base coordinates, m, (n, 3).
+    base
+        What the offsets model can absorb, orthonormal columns, (n, 3, p).
+    full_base
+        The same columns for every row of the session, (all rows, 3, p).
+    full_errors
+        Errors of every row of the session, m, (all rows, 3).
+    noise
+        As the offsets model has it.
+    to_parameters
+        What a unit of each base column changes of the model's natural parameters, (size, p).
+    """
+
+    scene: Scene
+    rows: Rows
+    errors: FloatArray
+    base: FloatArray
+    full_base: FloatArray
+    full_errors: FloatArray
+    noise: Noise
+    to_parameters: FloatArray
+
+    @classmethod
+    def of(cls, found: Estimate) -> Residuals:
+        """Take over a fit with offsets: its residuals on the rows it kept."""
+        problem, model = found.problem, found.model
+        x = model.natural(found.mode.z)
+        scene = Scene(
+            problem.chain,
+            problem.measurements,
+            problem.sensor_names,
+            problem.marker_names,
+            model.offsets(x),
+            model.markers(x),
+            model.T_R_N(x),
+        )
+        every = Rows.of(
+            problem.measurements, np.arange(len(problem.measurements)), model.reference
+        )
+        full_errors, full_jacobian = np.empty((len(scene), 3)), None
+        full_errors[every.source] = every.target - model.predict(found.mode.z, every)
+        full_jacobian = np.empty((len(scene), 3, model.size))
+        full_jacobian[every.source] = model.natural_jacobian(x, every)
+
+        rows = Rows.of(problem.measurements, found.kept, model.reference)
+        flat = full_jacobian[rows.source].reshape(-1, model.size)
+        scale = np.linalg.norm(flat, axis=0)
+        scale = np.where(scale > 0.0, scale, 1.0)
+        _, singular, vectors = np.linalg.svd(flat / scale, full_matrices=False)
+        seen = singular > ROUNDING * singular[0]
+        turn = (vectors[seen] / scale).T / singular[seen]
+        full_base = full_jacobian @ turn
+        eta = found.mode.eta
+        sigma, pose_sigma = found.posterior.noise(eta)
+        return cls(
+            scene,
+            rows,
+            full_errors[rows.source],
+            full_base[rows.source],
+            full_base,
+            full_errors,
+            Noise(sigma, pose_sigma),
+            turn,
+        )
+
+    def only(self, source: IntArray, reference: FloatArray) -> Residuals:
+        """Return the same on other rows of the session."""
+        rows = Rows.of(self.scene.measurements, np.sort(source), reference)
+        return replace(
+            self, rows=rows, errors=self.full_errors[rows.source], base=self.full_base[rows.source]
+        )
+
+    def __len__(self) -> int:
+        """Return the number of rows n."""
+        return len(self.rows)
+
+    @property
+    def sensors(self) -> int:
+        """Number of sensors."""
+        return len(self.scene.sensor_names)
+
+    @cached_property
+    def separable(self) -> BoolArray:
+        """Where the pose-common part can be told apart, (sensors,)."""
+        several = self.rows.group_sensor[self.rows.group_size > 1]
+        return np.isin(np.arange(self.sensors), several)
+
+    @cached_property
+    def pose_of_row(self) -> IntArray:
+        """Number of each row's pose, counted from 0 over all sensors, (n,)."""
+        poses = self.scene.measurements.pose[self.rows.source]
+        return np.unique(poses, return_inverse=True)[1]
+
+    @property
+    def poses(self) -> int:
+        """Number of poses."""
+        return int(self.pose_of_row.max()) + 1
+
+    def columns(self, cells: Sequence[Cell]) -> FloatArray:
+        """Return what a unit of each parameter displaces in every row of the session."""
+        parts = [cell.columns(self.scene).displacement(self.scene) for cell in cells]
+        return np.concatenate([np.zeros((len(self.scene), 3, 0)), *parts], axis=2)
+
+    def whitened(self, values: FloatArray, noise: Noise) -> FloatArray:
+        """Return values (n, ...) in units of the noise: independent of variance 1 in all rows."""
+        rows = self.rows
+        sensor = rows.group_sensor
+        size = rows.group_size
+        root = np.sqrt(noise.sigma[sensor] ** 2 + size * noise.pose_sigma[sensor] ** 2)
+        # deviations / sigma + mean / root = values / sigma - mean (1 / sigma - 1 / root)
+        less = (1.0 / noise.sigma[sensor] - 1.0 / root) / size
+        flat = values.reshape(len(values), -1)
+        common = rows.group_sum(flat, axis=0) * less[:, None].astype(flat.dtype)
+        scale = 1.0 / noise.sigma[sensor][rows.group_of_row]
+        white = flat * scale[:, None].astype(flat.dtype) - common[rows.group_of_row]
+        return white.reshape(values.shape)

@@ -1,0 +1,316 @@
+"""Which cells the residuals ask for: forward by the evidence, in physical groups, with second thoughts.
+
+A round screens all cells beside the set found so far and tries the best of them, and every
+physical group as a whole (all joints sag, all links are off), less the members that do not pay.
+The proposal of the highest evidence joins if it passes two tests: its p-value over all cells tried,
+and its gain on poses left out in turn. After each round, members that no longer pay leave, and each
+is exchanged for whatever explains more in its place, since the first step sees a mixture of causes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from remaster_ros.core.discovery_evidence import Solution, solve
+from remaster_ros.core.discovery_noise import Noise, Residuals
+from remaster_ros.core.discovery_screen import Catalogue, Screening, screen
+from remaster_ros.core.effects.cell import Cell
+from remaster_ros.core.types import FloatArray, IntArray
+
+# Family-wise error of one round.
+SIGNIFICANCE = 0.01
+DRAWS = 400
+SHORTLIST = 8
+ROUNDS = 12
+FOLDS = 10
+# What leaves less than this share of the held-out error out is not worth a parameter.
+LEAST_GAIN = 0.004
+# The evidence must rise by this for an exchange: no to and fro between equals.
+HYSTERESIS = 0.5
+MOST_EXCHANGED = 6
+# Physical causes that strike all joints or links of an arm alike.
+FAMILIES: tuple[tuple[str, ...], ...] = (
+    ('joint_compliance',),
+    ('encoder_eccentricity',),
+    ('encoder_scale',),
+    ('backlash',),
+    ('settling',),
+    ('link_length', 'joint_axis_tilt'),
+    ('joint_error_curve',),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One cell set that joined: with what p-value, held-out gain and evidence."""
+
+    cells: tuple[Cell, ...]
+    p_value: float
+    held_out_share: float
+    log_evidence_gain: float
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The outcome: the fit without and with the cells, and how they were found.
+
+    Attributes
+    ----------
+    empty, solution
+        Fit of the offsets model alone, and with the cells.
+    steps
+        What joined, in order.
+    rejected
+        The last proposal, which failed a test; None where none was left.
+    """
+
+    empty: Solution
+    solution: Solution
+    steps: tuple[Step, ...]
+    rejected: Step | None
+
+
+def log_prior(cells: Sequence[Cell], catalogue: Sequence[Cell]) -> float:
+    """Return the log prior probability of a set: cell by cell, or by whole families.
+
+    Cells of a family come together more often than each by its own chance: given the family, each
+    of its members is in or out.
+    """
+    total = 0.0
+    rest = list(cells)
+    for family in FAMILIES:
+        mine = [cell for cell in rest if cell.name in family]
+        if not mine:
+            continue
+        rest = [cell for cell in rest if cell.name not in family]
+        members = len({(cell.name, cell.joints) for cell in catalogue if cell.name in family})
+        alone = -sum(np.log(cell.drawn_from) for cell in mine)
+        total += max(alone, -members * np.log(2.0))
+    return float(total - sum(np.log(cell.drawn_from) for cell in rest))
+
+
+@dataclass(eq=False)
+class Search:
+    """The search on one set of residuals."""
+
+    data: Residuals
+    catalogue: Catalogue
+    rng: np.random.Generator
+    progress: Callable[[float], None]
+
+    def __post_init__(self) -> None:
+        cells = self.catalogue.cells
+        self._cheap = np.array([cell.name != 'gear_periodic' for cell in cells])
+        order = self.rng.permutation(self.data.poses)
+        self._fold_of_pose = order % min(FOLDS, self.data.poses)
+
+    def run(self, given: Solution | None = None) -> Selection:
+        """Search until nothing passes both tests."""
+        empty = self.fit(())
+        assert empty is not None
+        solution, steps, rejected = given or empty, [], None
+        for count in range(ROUNDS):
+            self.progress(count / (count + 2.0))
+            screening = screen(self.data, self.catalogue, solution, rng=self.rng, draws=DRAWS)
+            proposal = self.propose(solution, screening)
+            if proposal is None:
+                break
+            candidate, p_value = proposal
+            share = self.held_out_share(solution, candidate)
+            new = tuple(cell for cell in candidate.cells if cell not in solution.cells)
+            step = Step(new, p_value, share, candidate.log_evidence - solution.log_evidence)
+            if p_value > SIGNIFICANCE or share < LEAST_GAIN:
+                rejected = step
+                break
+            steps.append(step)
+            solution = self.exchange(self.prune(candidate))
+        return Selection(empty, solution, tuple(steps), rejected)
+
+    def fit(self, cells: Sequence[Cell], start: Solution | None = None) -> Solution | None:
+        """Fit a set with its prior probability."""
+        return solve(self.data, cells, start, prior=log_prior(cells, self.catalogue.cells))
+
+    def propose(self, solution: Solution, screening: Screening) -> tuple[Solution, float] | None:
+        """Return the set of the highest evidence one step on, with the p-value of the step."""
+        best: tuple[Solution, float] | None = None
+        for index in np.argsort(-screening.score)[:SHORTLIST]:
+            if not np.isfinite(screening.score[index]):
+                continue
+            candidate = self.fit((*solution.cells, self.catalogue.cells[index]), solution)
+            if candidate is not None and (
+                best is None or candidate.log_evidence > best[0].log_evidence
+            ):
+                best = candidate, screening.p_value(float(screening.score[index]))
+        for family in FAMILIES:
+            candidate = self.grown(solution, family)
+            if candidate is not None and (
+                best is None or candidate.log_evidence > best[0].log_evidence
+            ):
+                gain = candidate.log_evidence - solution.log_evidence
+                best = candidate, screening.p_value(gain)
+        return best
+
+    def grown(self, solution: Solution, family: tuple[str, ...]) -> Solution | None:
+        """Return the set with all of a family that the data can see, less what does not pay."""
+        members = [cell for cell in self.catalogue.cells if cell.name in family]
+        if family == ('encoder_eccentricity',):
+            members = [cell for cell in members if cell.variant == '1+2']
+        if 'joint_axis_tilt' in family:
+            members = [cell for cell in members if len(cell.parameters) == 1]
+        present = {(cell.name, cell.joints, cell.label) for cell in solution.cells}
+        others = [cell for cell in members if (cell.name, cell.joints, cell.label) not in present]
+        new = self.visible(solution.cells, others)
+        if len(new) < 2:
+            return None
+        grown = self.fit((*solution.cells, *new), solution)
+        return None if grown is None else self.prune(grown, set(new))
+
+    def visible(self, given: Sequence[Cell], cells: Sequence[Cell]) -> list[Cell]:
+        """Return the cells that add something to base, given and earlier ones, in order."""
+        if not cells:
+            return []
+        if cells[0].penalty is not None:
+            return list(cells)
+        data = self.data
+        source = data.rows.source
+        fixed = [cell for cell in given if cell.penalty is None]
+        start = np.concatenate((data.base, data.columns(fixed)[source]), axis=2)
+        known, _ = np.linalg.qr(_unit(start.reshape(3 * len(data), -1)))
+        kept = []
+        for cell in cells:
+            block = _unit(data.columns([cell])[source].reshape(3 * len(data), -1))
+            left = block - known @ (known.T @ block)
+            left -= known @ (known.T @ left)
+            if np.linalg.svd(left, compute_uv=False)[-1] < FAMILY_ABSORBED:
+                continue
+            kept.append(cell)
+            known = np.concatenate((known, np.linalg.qr(left)[0]), axis=1)
+        return kept
+
+    def prune(self, solution: Solution, among: set[Cell] | None = None) -> Solution:
+        """Drop, one by one, the cells without which the evidence is higher."""
+        price = np.log(3.0 * len(self.data))
+        while solution.cells:
+            worth = []
+            for cell, where in zip(solution.cells, solution.slices(), strict=True):
+                if among is not None and cell not in among:
+                    worth.append(np.inf)
+                    continue
+                worth.append(_worth(solution, cell, where, price))
+            order = np.argsort(worth)
+            for index in order[:2]:
+                # Wald's estimate of the loss chooses; the evidence itself decides.
+                if worth[index] > 2.0:
+                    return solution
+                rest = (*solution.cells[:index], *solution.cells[index + 1 :])
+                smaller = self.fit(rest, solution)
+                if smaller is not None and smaller.log_evidence > solution.log_evidence:
+                    solution = smaller
+                    break
+            else:
+                return solution
+        return solution
+
+    def exchange(self, solution: Solution) -> Solution:
+        """Replace cells, one at a time, by what explains more in their place."""
+        if len(solution.cells) > MOST_EXCHANGED:
+            return solution
+        for _ in range(MOST_EXCHANGED):
+            better = self._best_exchange(solution)
+            if better is None:
+                return solution
+            solution = self.prune(better)
+        return solution
+
+    def _best_exchange(self, solution: Solution) -> Solution | None:
+        best = None
+        for cell in solution.cells:
+            for candidate in self.replacements(solution, cell, 3):
+                limit = solution if best is None else best
+                if candidate.log_evidence > limit.log_evidence + HYSTERESIS:
+                    best = candidate
+        return best
+
+    def replacements(self, solution: Solution, cell: Cell, count: int) -> list[Solution]:
+        """Return fits with the best other cells in the place of one, best first."""
+        rest = tuple(other for other in solution.cells if other is not cell)
+        without = self.fit(rest, solution)
+        if without is None:
+            return []
+        without = replace(without, noise=solution.noise)
+        chosen = self._cheap & np.array([other is not cell for other in self.catalogue.cells])
+        score = screen(self.data, self.catalogue, without, chosen=chosen).score
+        found = []
+        for index in np.argsort(-score)[:count]:
+            if np.isfinite(score[index]):
+                other = self.fit((*rest, self.catalogue.cells[index]), solution)
+                if other is not None:
+                    found.append(other)
+        return sorted(found, key=lambda fit: -fit.log_evidence)
+
+    def held_out_share(self, smaller: Solution, larger: Solution) -> float:
+        """Return the share of the squared error on poses left out that the larger set saves."""
+        before = held_out_error(self.data, smaller, larger.noise, self._fold_of_pose)
+        after = held_out_error(self.data, larger, larger.noise, self._fold_of_pose)
+        return float(1.0 - after.sum() / before.sum())
+
+
+# A member of a family that the others explain to this share of its size is another name for them.
+FAMILY_ABSORBED = 1e-3
+
+
+def _unit(columns: FloatArray) -> FloatArray:
+    norm = np.linalg.norm(columns, axis=0)
+    return columns / np.where(norm > 0.0, norm, 1.0)
+
+
+def _worth(solution: Solution, cell: Cell, where: slice, price: float) -> float:
+    """Estimate how much log evidence would be lost without a cell."""
+    values, covariance = solution.parameters[where], solution.covariance[where, where]
+    drop = 0.5 * values @ np.linalg.solve(covariance, values)
+    if cell.penalty is None:
+        return float(drop - 0.5 * cell.size * price)
+    return float(drop - 0.5 * cell.size)
+
+
+def held_out_error(
+    data: Residuals, solution: Solution, noise: Noise, fold_of_pose: IntArray
+) -> FloatArray:
+    """Return each pose's squared error, in units of the noise, by the fit to other poses.
+
+    Parameters
+    ----------
+    data
+        The residuals.
+    solution
+        Which cells, with which smoothness.
+    noise
+        The noise to fit and to judge by.
+    fold_of_pose
+        Poses with the same number are left out together, (poses,).
+    """
+    columns = data.columns(solution.cells)[data.rows.source]
+    joined = np.concatenate((data.base, columns, data.errors[:, :, None]), axis=2)
+    white = data.whitened(joined, noise).reshape(3 * len(data), -1)
+    scale = np.linalg.norm(white, axis=0)
+    scale[-1] = 1.0
+    scale[scale == 0.0] = 1.0
+    white /= scale
+    p, size = data.base.shape[2], white.shape[1] - 1
+    prior = np.zeros((size, size))
+    prior[p:, p:] = solution.prior_precision()
+    prior /= np.outer(scale[:-1], scale[:-1])
+    fold = np.repeat(fold_of_pose[data.pose_of_row], 3)
+    total = white.T @ white
+    total[:-1, :-1] += prior + 1e-12 * np.eye(size)
+    errors = np.empty(len(white))
+    for index in np.unique(fold):
+        out = white[fold == index]
+        kept = total - out.T @ out
+        beta = np.linalg.solve(kept[:-1, :-1], kept[:-1, -1])
+        errors[fold == index] = out[:, -1] - out[:, :-1] @ beta
+    square = np.add.reduceat(errors**2, np.arange(0, len(errors), 3))
+    return np.bincount(data.pose_of_row, square)
