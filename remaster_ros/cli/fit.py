@@ -9,8 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from remaster_ros.cli.console import progress_bar, say
-from remaster_ros.cli.options import integer
-from remaster_ros.core.fit import FitResult, fit_session
+from remaster_ros.cli.options import integer, number
+from remaster_ros.core.fit import (
+    COARSEST_PRECISION,
+    FINEST_PRECISION,
+    PRECISION,
+    FitResult,
+    fit_session,
+)
 from remaster_ros.storage.results import prepare_folder, save_fit
 from remaster_ros.storage.session import read_session
 
@@ -32,7 +38,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--draws',
         type=integer(100),
         metavar='N',
-        help='draws of each chain (default 1000); with the paper sampler its steps (200000)',
+        help='draws of each chain (default: what the precision takes); with the paper sampler its '
+        'steps (default 200000)',
+    )
+    parser.add_argument(
+        '--precision',
+        type=number(FINEST_PRECISION, COARSEST_PRECISION),
+        default=PRECISION,
+        metavar='P',
+        help='sample until every mean is known to P standard deviations of its parameter '
+        f'(default {PRECISION}); of no effect with --draws',
     )
 
 
@@ -48,6 +63,7 @@ def run(args: argparse.Namespace) -> int:
             sampler=args.sampler,
             chains=args.chains,
             draws=args.draws,
+            precision=args.precision,
             progress=progress,
             clock=time.perf_counter,
         )

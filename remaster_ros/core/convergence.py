@@ -9,12 +9,12 @@ quantity of its own. A quantity that never moves has nothing to judge: its figur
 
 from __future__ import annotations
 
+from statistics import NormalDist
+
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
-from scipy.stats import norm, rankdata
 
 from remaster_ros.core.errors import InsufficientDataError
-from remaster_ros.core.types import FloatArray
+from remaster_ros.core.types import FloatArray, IntArray
 
 MINIMUM_DRAWS = 8
 
@@ -73,9 +73,26 @@ def _split(draws: FloatArray) -> FloatArray:
 def _rank_normalised(draws: FloatArray) -> FloatArray:
     """Replace values by the normal scores of their ranks over all chains."""
     pooled = draws.reshape(draws.shape[0] * draws.shape[1], -1)
-    ranks = rankdata(pooled, axis=0)
-    # Blom's offsets (1958), as in eq. 14 of Vehtari et al.
-    return norm.ppf((ranks - 0.375) / (len(pooled) + 0.25)).reshape(draws.shape)
+    count = len(pooled)
+    # Ranks are multiples of one half: a table holds the normal quantile of each. Blom's offsets
+    # (1958), as in eq. 14 of Vehtari et al.
+    quantile = NormalDist().inv_cdf
+    scores = np.array(
+        [quantile((half / 2.0 - 0.375) / (count + 0.25)) for half in range(2, 2 * count + 1)]
+    )
+    columns = [scores[_double_ranks(column) - 2] for column in pooled.T]
+    return np.stack(columns, axis=1).reshape(draws.shape)
+
+
+def _double_ranks(values: FloatArray) -> IntArray:
+    """Return twice the ranks of values (n,), equal ones sharing the mean of theirs."""
+    order = np.argsort(values, kind='stable')
+    ordered = values[order]
+    start = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1]))
+    size = np.diff(np.append(start, len(values)))
+    ranks = np.empty(len(values), dtype=np.int64)
+    ranks[order] = np.repeat(2 * start + size + 1, size)
+    return ranks
 
 
 def _split_r_hat(draws: FloatArray) -> FloatArray:
@@ -116,6 +133,6 @@ def _effective_sample_size(draws: FloatArray) -> FloatArray:
 def _autocovariance(draws: FloatArray) -> FloatArray:
     """Return the autocovariance of every chain at every lag, (chains, draws, ...)."""
     length = draws.shape[1]
-    size = next_fast_len(2 * length)
-    spectrum = rfft(draws - draws.mean(axis=1, keepdims=True), size, axis=1)
-    return irfft(np.abs(spectrum) ** 2, size, axis=1)[:, :length] / length
+    size = 2 ** int(np.ceil(np.log2(2 * length)))
+    spectrum = np.fft.rfft(draws - draws.mean(axis=1, keepdims=True), size, axis=1)
+    return np.fft.irfft(np.abs(spectrum) ** 2, size, axis=1)[:, :length] / length

@@ -13,14 +13,16 @@ from remaster_ros.core.estimate import Estimate, Problem, estimate
 from remaster_ros.core.extension import Extension
 from remaster_ros.core.paper_mode import BURN_IN_SHARE, STEPS, fit_paper
 from remaster_ros.core.result import FitResult, Sampled, build_result
-from remaster_ros.core.sampling import Progress, sample_posterior, silent
+from remaster_ros.core.sampling import PRECISION, Length, Progress, sample_posterior, silent
 from remaster_ros.core.types import FloatArray, Session
 
-__all__ = ['FitResult', 'fit_session']
+__all__ = ['PRECISION', 'FitResult', 'fit_session']
 
 Sampler = Literal['fast', 'paper']
 
-FAST_DRAWS = 1000
+# Coarser, and convergence cannot be judged; finer takes more draws than memory holds.
+COARSEST_PRECISION = 0.1
+FINEST_PRECISION = 0.002
 
 
 def fit_session(
@@ -30,6 +32,7 @@ def fit_session(
     sampler: Sampler = 'fast',
     chains: int = 4,
     draws: int | None = None,
+    precision: float = PRECISION,
     progress: Progress | None = None,
     clock: Callable[[], float] | None = None,
     extension: Extension | None = None,
@@ -47,8 +50,11 @@ def fit_session(
     chains
         At least 2, to judge convergence by.
     draws
-        Per chain; 1000 by default. In paper mode the steps in all, 200,000 by default, of which
-        the last eighth is kept.
+        Per chain; None for as many as the precision takes. In paper mode the steps in all, 200,000
+        by default, of which the last eighth is kept.
+    precision
+        Wanted Monte Carlo error of every mean in standard deviations of that parameter; of no
+        meaning in paper mode.
     progress
         Called with the stage and the share of it that is done.
     clock
@@ -67,10 +73,13 @@ def fit_session(
         raise InputError("the paper's model has no further effects; use the fast sampler")
     if chains < 2:
         raise InputError(f'{chains} chain(s) cannot be judged; use at least 2')
-    default = STEPS if sampler == 'paper' else FAST_DRAWS
-    draws = default if draws is None else draws
+    if not FINEST_PRECISION <= precision <= COARSEST_PRECISION:
+        raise InputError(
+            f'a precision of {precision:g} is out of range; use {FINEST_PRECISION} to '
+            f'{COARSEST_PRECISION}; 0.02 for an error of 2 % of each standard deviation'
+        )
     fewest = convergence.MINIMUM_DRAWS / ((1.0 - BURN_IN_SHARE) if sampler == 'paper' else 1.0)
-    if draws < fewest:
+    if draws is not None and draws < fewest:
         raise InputError(f'{draws} draws are too few; use at least {fewest:.0f}')
     report = progress if progress is not None else silent
     started = clock() if clock is not None else np.nan
@@ -79,25 +88,22 @@ def fit_session(
         sampled = fit_paper(
             problem,
             chains=chains,
-            steps=draws,
+            steps=STEPS if draws is None else draws,
             rng=rng,
             progress=lambda share: report('sampling', share),
         )
     else:
-        sampled = _fast(estimate(problem, extension), chains, draws, rng, report)
+        sampled = _fast(
+            estimate(problem, extension), chains, Length(draws, precision), rng, report
+        )
     seconds = clock() - started if clock is not None else np.nan
     return build_result(problem, sampled, seconds, rng)
 
 
 def _fast(
-    found: Estimate, chains: int, draws: int, rng: np.random.Generator, report: Progress
+    found: Estimate, chains: int, length: Length, rng: np.random.Generator, report: Progress
 ) -> Sampled:
     posterior, model = found.posterior, found.model
-    run, name = sample_posterior(found.mode, chains=chains, draws=draws, rng=rng, report=report)
-    sensors = model.sensor_names
-    names = tuple(model.names[index] for index in posterior.free)
-    names += tuple(f'noise.{sensor}.sigma' for sensor in sensors)
-    names += tuple(f'noise.{sensors[index]}.pose_sigma' for index in posterior.separable)
 
     def readable(points: FloatArray) -> FloatArray:
         natural = model.natural(posterior.parameters(points))[..., posterior.free]
@@ -105,7 +111,24 @@ def _fast(
         separate = pose_sigma[..., list(posterior.separable)]
         return np.concatenate((natural, sigma, separate), axis=-1)
 
-    sigma, pose_sigma = posterior.noise(run.draws[..., len(posterior.free) :])
+    run, name = sample_posterior(
+        found.mode,
+        chains=chains,
+        rng=rng,
+        draws=length.draws,
+        precision=length.precision,
+        quantities=readable,
+        report=report,
+    )
+    names = tuple(model.names[index] for index in posterior.free)
+    noises = tuple(
+        '.'.join(filter(None, ('noise', model.sensor_names[c.sensor], c.direction)))
+        for c in posterior.channels
+    )
+    names += tuple(f'{noise}.sigma' for noise in noises)
+    names += tuple(f'{noises[index]}.pose_sigma' for index in posterior.separable)
+
+    sigma, pose_sigma = posterior.sensor_noise(run.draws[..., len(posterior.free) :])
     unfixed = np.isin(np.arange(model.joints), found.gauge.held)
     return Sampled(
         model=model,
@@ -116,9 +139,12 @@ def _fast(
         trace=readable(run.trace),
         draws=readable(run.draws),
         names=names,
-        separable=posterior.separable,
+        separable=tuple({posterior.channels[index].sensor for index in posterior.separable}),
         name=name,
         acceptance_rate=run.acceptance_rate,
+        precision=None if length.draws is not None else length.precision,
+        log_density_error=run.log_density_error,
+        checked=run.checked,
         gauge=found.gauge,
         unfixed=unfixed,
         z_before=found.before.z,

@@ -14,6 +14,7 @@ import numpy as np
 
 from remaster_ros.core.errors import InsufficientDataError
 from remaster_ros.core.metropolis import StudentT, log_student_t
+from remaster_ros.core.model import Rows
 from remaster_ros.core.posterior import RESOLUTION_M, Posterior, prior_rows
 from remaster_ros.core.types import FloatArray
 
@@ -25,26 +26,22 @@ TAIL_FREEDOM = 5.0
 TAIL_WIDENING = 1.3
 
 
+# Draws factorised at a time: more fall out of the processor's cache.
+BLOCK = 256
+
+
 def linearise(posterior: Posterior, z: FloatArray) -> Linearisation:
     """Return the posterior with the predictions replaced by their tangent at z (size,)."""
-    errors = posterior.rows.target - posterior.model.predict(z, posterior.rows)
-    derivative = posterior.model.jacobian(z, posterior.rows)[:, :, posterior.free]
-    # One matrix holds derivative and error: its Gram matrix holds all the products needed.
-    joined = np.concatenate((derivative, errors[:, :, None]), axis=2)
-    sums = posterior.rows.group_sum(joined, axis=0)
-    within, between = [], {}
-    for sensor, span in posterior.rows.spans:
-        flat = joined[span].reshape(-1, joined.shape[2])
-        gram = flat.T @ flat
-        for size in np.unique(posterior.rows.group_size[posterior.rows.group_sensor == sensor]):
-            chosen = (posterior.rows.group_sensor == sensor) & (posterior.rows.group_size == size)
-            part = sums[chosen].reshape(-1, joined.shape[2])
-            between[sensor, int(size)] = (part.T @ part / size, int(chosen.sum()))
-            gram = gram - between[sensor, int(size)][0]
-        within.append(gram)
-    residual, by_z = prior_rows(posterior.model, posterior.priors, z)
-    rows = np.column_stack((-by_z[:, posterior.free], residual))
-    return Linearisation(posterior, z, np.array(within), between, rows.T @ rows)
+    model, free = posterior.model, posterior.free
+
+    def joined(rows: Rows) -> FloatArray:
+        # One matrix holds derivative and error: its Gram matrix holds all the products needed.
+        errors = rows.target - model.predict(z, rows)
+        return np.concatenate((model.jacobian(z, rows)[:, :, free], errors[:, :, None]), axis=2)
+
+    residual, by_z = prior_rows(model, posterior.priors, z)
+    rows = np.column_stack((-by_z[:, free], residual))
+    return Linearisation(posterior, z, posterior.gram(joined, len(free) + 1), rows.T @ rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,29 +54,20 @@ class Linearisation:
         The one it approximates.
     z
         Pinned parameters, (size,).
-    within
-        Gram matrix of [derivative | error] about the group means per sensor, (sensors, f+1, f+1).
-    between
-        Gram matrix of the group means times the size, and their count, by (sensor, group size).
+    cells
+        Gram matrix of [derivative | error] in each of the posterior's cells, (cells, f+1, f+1).
     prior
         Gram matrix of the priors, (f+1, f+1).
     """
 
     posterior: Posterior
     z: FloatArray
-    within: FloatArray
-    between: dict[tuple[int, int], tuple[FloatArray, int]]
+    cells: FloatArray
     prior: FloatArray
 
     def gram(self, eta: FloatArray) -> FloatArray:
         """Return the weighted Gram matrices (..., f+1, f+1) for noise coordinates (..., e)."""
-        sigma, pose_sigma = self.posterior.noise(eta)
-        weights = [1.0 / sigma[..., s] ** 2 for s in range(len(self.within))]
-        matrices = list(self.within)
-        for (sensor, size), (matrix, _) in self.between.items():
-            weights.append(1.0 / (sigma[..., sensor] ** 2 + size * pose_sigma[..., sensor] ** 2))
-            matrices.append(matrix)
-        return np.tensordot(np.stack(weights, axis=-1), np.array(matrices), axes=1) + self.prior
+        return np.tensordot(1.0 / self.posterior.variances(eta), self.cells, axes=1) + self.prior
 
     def conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the Gaussian of the free parameters given the noise, and the noise's density.
@@ -98,33 +86,48 @@ class Linearisation:
         log_marginal
             Log density of the noise coordinates with the parameters integrated out, (...).
         """
+        factor, pull, log_marginal = self.whitened(eta)
+        return self.z[self.posterior.free] + back_substituted(factor, pull), factor, log_marginal
+
+    def whitened(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the same Gaussian as its factor L and the vector L' (mean - z), and the density.
+
+        All follow from one factor of the bordered matrix: its last row holds the vector, its last
+        entry the root of what the parameters leave of the weighted sum of squares.
+        """
         posterior = self.posterior
         gram = self.gram(eta)
         f = len(posterior.free)
         # The scale of the parameters (rad, m) and of their information differs by many powers.
-        information = np.diagonal(gram, axis1=-2, axis2=-1)[..., :f]
-        if not np.all(information > 0.0):
+        information = np.diagonal(gram, axis1=-2, axis2=-1).copy()
+        if not np.all(information[..., :f] > 0.0):
             raise np.linalg.LinAlgError('a parameter without any information')
-        scale = 1.0 / np.sqrt(information)
-        scaled = gram[..., :f, :f] * scale[..., :, None] * scale[..., None, :]
-        factor = np.linalg.cholesky(scaled)
-        pull = np.linalg.solve(factor, (gram[..., :f, f] * scale)[..., None])
-        step = np.linalg.solve(np.swapaxes(factor, -1, -2), pull)[..., 0] * scale
-        quadratic = gram[..., f, f] - np.sum(pull[..., 0] ** 2, axis=-1)
-        log_root = np.sum(np.log(np.diagonal(factor, axis1=-2, axis2=-1)) - np.log(scale), axis=-1)
-        sigma, pose_sigma = posterior.noise(eta)
-        sizes = posterior.rows.group_size
-        sensors = posterior.rows.group_sensor
-        log_scale = np.zeros(quadratic.shape)
-        for sensor in range(len(self.within)):
-            spare = int(np.sum(sizes[sensors == sensor] - 1))
-            log_scale += 3.0 * spare * 2.0 * np.log(sigma[..., sensor])
-        for (sensor, size), (_, count) in self.between.items():
-            total = sigma[..., sensor] ** 2 + size * pose_sigma[..., sensor] ** 2
-            log_scale += 3.0 * count * np.log(total)
-        log_marginal = posterior.log_noise_prior(eta) - 0.5 * (log_scale + quadratic) - log_root
-        mean = self.z[posterior.free] + step
-        return mean, factor / scale[..., :, None], log_marginal
+        # Data without any noise leave nothing, and rounding may leave less than that.
+        gram[..., f, f] += 1e-9 + 1e-12 * information[..., f]
+        information[..., f] = 1.0
+        scale = np.sqrt(information)
+        factor = np.linalg.cholesky(gram / (scale[..., :, None] * scale[..., None, :]))
+        factor *= scale[..., :, None]
+        inner = factor[..., :f, :f]
+        log_scale = np.log(posterior.variances(eta)) @ posterior.freedom
+        log_marginal = (
+            posterior.log_noise_prior(eta)
+            - 0.5 * (log_scale + factor[..., f, f] ** 2)
+            - _log_root(inner)
+        )
+        return inner, factor[..., f, :f], log_marginal
+
+
+def back_substituted(factor: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve L' x = right for lower factors L (..., f, f), right (..., f).
+
+    Column by column for the whole batch at once: many small systems cost little each.
+    """
+    x = right.copy()
+    for column in range(right.shape[-1] - 1, -1, -1):
+        x[..., column] /= factor[..., column, column]
+        x[..., :column] -= factor[..., column, :column] * x[..., column, None]
+    return x
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +154,7 @@ class Mode:
     @property
     def covariance(self) -> FloatArray:
         """Covariance of the free pinned parameters at the mode's noise, (f, f)."""
-        _, factor, _ = self.linearisation.conditional(self.eta)
-        root = np.linalg.inv(factor)
+        root = np.linalg.inv(self.linearisation.whitened(self.eta)[0])
         return root.T @ root
 
 
@@ -195,18 +197,20 @@ def find_mode(posterior: Posterior, eta: FloatArray | None = None) -> Mode:
 
 def _noise_guess(posterior: Posterior) -> FloatArray:
     errors = posterior.rows.target - posterior.model.predict(posterior.reference, posterior.rows)
-    within, mean_square = posterior.sums_of_squares(errors)
-    size, sensor = posterior.rows.group_size, posterior.rows.group_sensor
+    sums = posterior.sums_of_squares(errors)
     sigmas, ratios = [], []
-    for index in range(len(posterior.model.sensor_names)):
-        mine = sensor == index
-        spare = np.sum(size[mine] - 1)
-        common = np.mean(mean_square[mine]) / 3.0
-        variance = np.sum(within[mine]) / (3.0 * spare) if spare > 0 else common
+    for index in range(len(posterior.channels)):
+        mine = [i for i, cell in enumerate(posterior.cells) if cell.channel == index]
+        inner = [i for i in mine if posterior.cells[i].size == 0]
+        outer = [i for i in mine if posterior.cells[i].size > 0]
+        common = sums[outer].sum() / posterior.freedom[outer].sum()
+        variance = sums[inner].sum() / posterior.freedom[inner].sum() if inner else common
         sigma = np.sqrt(variance + RESOLUTION_M**2)
         sigmas.append(np.log(sigma))
         if index in posterior.separable:
-            ratios.append(np.arcsinh(np.sqrt(common) / sigma))
+            sizes = [posterior.cells[i].size for i in outer]
+            share = np.average(sizes, weights=posterior.freedom[outer])
+            ratios.append(np.arcsinh(np.sqrt(max(common - variance, 0.0) / share) / sigma))
     return np.array(sigmas + ratios)
 
 
@@ -222,18 +226,35 @@ def _noise_peak(linearisation: Linearisation, start: FloatArray) -> FloatArray:
         if np.linalg.norm(step) < 1e-4:
             break
         tries = peak + step * 0.5 ** np.arange(8.0)[:, None]
-        heights = linearisation.conditional(tries)[2]
+        heights = linearisation.whitened(tries)[2]
         if np.max(heights) <= value:
             break
         peak = tries[np.argmax(heights)]
-    sensors = len(linearisation.within)
-    return np.concatenate((peak[:sensors], np.abs(peak[sensors:])))
+    count = len(linearisation.posterior.channels)
+    return np.concatenate((peak[:count], np.abs(peak[count:])))
 
 
 def _noise_covariance(linearisation: Linearisation, peak: FloatArray) -> FloatArray:
-    values, vectors = np.linalg.eigh(_noise_curvature(linearisation, peak)[2])
-    # The floor keeps a flat direction (pose_sigma near zero) proper: a std of 1.5 at most.
-    return (vectors / np.maximum(values, 0.45)) @ vectors.T
+    """Return the noise's covariance by its curvature; of a pose_sigma near zero by its spread."""
+    precision = _noise_curvature(linearisation, peak)[2]
+    count = len(linearisation.posterior.channels)
+    std = 1.0 / np.sqrt(np.maximum(np.diag(precision), 0.45))
+    spread = {}
+    for index in range(count, len(peak)):
+        if peak[index] < 2.0 * std[index]:
+            ratio = np.linspace(0.0, 5.0, 51)
+            points = np.repeat(peak[None], len(ratio), axis=0)
+            points[:, index] = ratio
+            log_weight = linearisation.whitened(points)[2]
+            weight = np.exp(log_weight - log_weight.max())
+            spread[index] = float(np.average((ratio - peak[index]) ** 2, weights=weight))
+    values, vectors = np.linalg.eigh(precision)
+    covariance: FloatArray = (vectors / np.maximum(values, 0.45)) @ vectors.T
+    for index, square in spread.items():
+        # At the boundary there is no tangent to correlate by.
+        covariance[index], covariance[:, index] = 0.0, 0.0
+        covariance[index, index] = max(square, 1e-4)
+    return covariance
 
 
 def _noise_curvature(
@@ -245,18 +266,16 @@ def _noise_curvature(
     """
     e, step = len(at), 0.02
     unit = step * np.eye(e)
-    plus, minus = at + unit, at - unit
-    corners = [
-        at + a * unit[i] + b * unit[j]
-        for i in range(e)
-        for j in range(e)
-        for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))
-    ]
-    value = linearisation.conditional(np.array([at, *plus, *minus, *corners]))[2]
-    gradient = (value[1 : e + 1] - value[e + 1 : 2 * e + 1]) / (2.0 * step)
-    four = value[2 * e + 1 :].reshape(e, e, 4)
-    curvature = four @ np.array([1.0, -1.0, -1.0, 1.0]) / (4.0 * step**2)
-    return float(value[0]), gradient, -0.5 * (curvature + curvature.T)
+    first, second = np.triu_indices(e, 1)
+    corners = [at + a * unit[first] + b * unit[second] for a in (1, -1) for b in (1, -1)]
+    points = np.concatenate((at[None], at + unit, at - unit, *corners))
+    value = linearisation.whitened(points)[2]
+    plus, minus = value[1 : e + 1], value[e + 1 : 2 * e + 1]
+    four = value[2 * e + 1 :].reshape(4, -1)
+    curvature = np.diag((plus + minus - 2.0 * value[0]) / step**2)
+    mixed = (four[0] - four[1] - four[2] + four[3]) / (4.0 * step**2)
+    curvature[first, second] = curvature[second, first] = mixed
+    return float(value[0]), (plus - minus) / (2.0 * step), -curvature
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,23 +293,37 @@ class LaplaceProposal:
         # The folded coordinates have a mirrored half: |x| has the density of x and of -x together.
         eta, _ = self._noise.sample(count, rng)
         eta = self._fold(eta)
-        mean, factor, _ = self.mode.linearisation.conditional(eta)
-        normal = rng.standard_normal(mean.shape)
+        f = len(self.mode.linearisation.posterior.free)
+        normal = rng.standard_normal((count, f))
         tail = rng.random(count) < TAIL_SHARE
         mixing = np.sqrt(rng.chisquare(TAIL_FREEDOM, count) / TAIL_FREEDOM)
         whitened = normal * np.where(tail, TAIL_WIDENING / mixing, 1.0)[:, None]
-        step = np.linalg.solve(np.swapaxes(factor, -1, -2), whitened[..., None])[..., 0]
-        density = self._noise_density(eta) + self._conditional_density(whitened, factor)
-        return np.concatenate((mean + step, eta), axis=1), density
+        points, log_root = np.empty((count, f)), np.empty(count)
+        for start in range(0, count, BLOCK):
+            chosen = slice(start, start + BLOCK)
+            points[chosen], log_root[chosen] = self._coloured(eta[chosen], whitened[chosen])
+        density = self._noise_density(eta) + _conditional_density(whitened, log_root)
+        return np.concatenate((points, eta), axis=1), density
 
     def log_density(self, points: FloatArray) -> FloatArray:
         """Return the normalised log density of points (n, d), (n,)."""
         f = len(self.mode.linearisation.posterior.free)
         eta = points[:, f:]
+        whitened, log_root = self._whitened(eta, points[:, :f])
+        return self._noise_density(eta) + _conditional_density(whitened, log_root)
+
+    def _coloured(self, eta: FloatArray, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return parameters of standard normal vectors (n, f), and log of the precision's root."""
+        linearisation = self.mode.linearisation
+        factor, pull, _ = linearisation.whitened(eta)
+        middle = linearisation.z[linearisation.posterior.free]
+        return middle + back_substituted(factor, pull + whitened), _log_root(factor)
+
+    def _whitened(self, eta: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the opposite: the standard normal vectors of parameters (n, f)."""
         mean, factor, _ = self.mode.linearisation.conditional(eta)
-        step = (points[:, :f] - mean)[..., None]
-        whitened = (np.swapaxes(factor, -1, -2) @ step)[..., 0]
-        return self._noise_density(eta) + self._conditional_density(whitened, factor)
+        step = (parameters - mean)[..., None]
+        return (np.swapaxes(factor, -1, -2) @ step)[..., 0], _log_root(factor)
 
     def dispersed(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Return starts for chains: spread twice as far as the posterior, (count, d)."""
@@ -303,14 +336,14 @@ class LaplaceProposal:
         return starts
 
     def _fold(self, eta: FloatArray) -> FloatArray:
-        sensors = len(self.mode.linearisation.within)
-        return np.concatenate((eta[:, :sensors], np.abs(eta[:, sensors:])), axis=1)
+        count = len(self.mode.linearisation.posterior.channels)
+        return np.concatenate((eta[:, :count], np.abs(eta[:, count:])), axis=1)
 
     def _noise_density(self, eta: FloatArray) -> FloatArray:
-        sensors = len(self.mode.linearisation.within)
-        folded = eta.shape[1] - sensors
+        count = len(self.mode.linearisation.posterior.channels)
+        folded = eta.shape[1] - count
         signs = itertools.product((1.0, -1.0), repeat=folded)
-        mirrored = [eta * np.array((*(1.0,) * sensors, *sign)) for sign in signs]
+        mirrored = [eta * np.array((*(1.0,) * count, *sign)) for sign in signs]
         return np.logaddexp.reduce([self._noise.log_density(image) for image in mirrored])
 
     @property
@@ -318,14 +351,115 @@ class LaplaceProposal:
         factor: FloatArray = np.asarray(np.linalg.cholesky(self.mode.eta_covariance))
         return StudentT(self.mode.eta, factor, NOISE_FREEDOM)
 
-    def _conditional_density(self, whitened: FloatArray, factor: FloatArray) -> FloatArray:
-        f = whitened.shape[-1]
-        square = np.sum(whitened**2, axis=-1)
-        centre = np.log1p(-TAIL_SHARE) - 0.5 * square - 0.5 * f * np.log(2.0 * np.pi)
-        tail = (
-            np.log(TAIL_SHARE)
-            + log_student_t(square / TAIL_WIDENING**2, f, TAIL_FREEDOM)
-            - f * np.log(TAIL_WIDENING)
-        )
-        log_root = np.sum(np.log(np.diagonal(factor, axis1=-2, axis2=-1)), axis=-1)
-        return np.logaddexp(centre, tail) + log_root
+
+@dataclass(frozen=True, eq=False)
+class InterpolatedProposal(LaplaceProposal):
+    """The same for hundreds of parameters, where factorising their precision for each draw costs.
+
+    Along each principal direction of the noise the mean is quadratic, and so is the logarithm of
+    the diagonal of the covariance's factor; the rest of that factor is linear. What this leaves
+    out the sampler corrects.
+
+    Attributes
+    ----------
+    basis
+        Principal directions of the noise, one standard deviation long, (e, e).
+    factor
+        Lower factor of the precision at the mode, (f, f).
+    mean
+        Slope and curvature of the mean along each direction, (e, 2, f).
+    log_diagonal
+        The same of the logarithm of the diagonal, (e, 2, f).
+    lower
+        Slope of what is below the diagonal, (e, f, f).
+    """
+
+    basis: FloatArray
+    factor: FloatArray
+    mean: FloatArray
+    log_diagonal: FloatArray
+    lower: FloatArray
+
+    @classmethod
+    def of(cls, mode: Mode) -> InterpolatedProposal:
+        """Factorise at the mode and a standard deviation of the noise to either side of it."""
+        linearisation = mode.linearisation
+        centre, factor, _ = linearisation.conditional(mode.eta)
+        basis: FloatArray = np.asarray(np.linalg.cholesky(mode.eta_covariance)).T
+        count = len(linearisation.posterior.channels)
+        means, diagonals, lowers = [], [], []
+        for direction in basis:
+            # Behind the boundary of the folded coordinates the density is mirrored, not smooth.
+            behind = mode.eta - direction
+            behind[count:] = np.maximum(behind[count:], 0.0)
+            reach = float(np.linalg.norm(mode.eta - behind) / np.linalg.norm(direction))
+            sides = []
+            for eta in (mode.eta + direction, behind):
+                mean, moved, _ = linearisation.conditional(eta)
+                # Lower too: the covariance's factor relative to the one at the mode.
+                ratio = np.linalg.solve(moved, factor)
+                sides.append((mean - centre, np.log(np.diag(ratio)), np.tril(ratio, -1)))
+            (m1, d1, l1), (m2, d2, l2) = sides
+            means.append(_parabola(m1, m2, reach))
+            diagonals.append(_parabola(d1, d2, reach))
+            lowers.append((l1 - l2) / (1.0 + reach))
+        return cls(mode, basis, factor, np.array(means), np.array(diagonals), np.array(lowers))
+
+    def _coloured(self, eta: FloatArray, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
+        u = self._along(eta)
+        mean, log_diagonal = self._interpolated(u)
+        right = np.exp(log_diagonal) * whitened
+        for share, lower in zip(u.T, self.lower, strict=True):
+            right += share[:, None] * (whitened @ lower)
+        step = np.linalg.solve(self.factor.T, right.T).T
+        return mean + step, _log_root(self.factor) - log_diagonal.sum(axis=1)
+
+    def _whitened(self, eta: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        u = self._along(eta)
+        mean, log_diagonal = self._interpolated(u)
+        right = (parameters - mean) @ self.factor
+        ratio = np.tensordot(u, self.lower, axes=1)
+        diagonal = np.arange(len(self.factor))
+        ratio[:, diagonal, diagonal] = np.exp(log_diagonal)
+        whitened: FloatArray = np.linalg.solve(np.swapaxes(ratio, -1, -2), right[..., None])[
+            ..., 0
+        ]
+        log_root: FloatArray = _log_root(self.factor) - log_diagonal.sum(axis=1)
+        return whitened, log_root
+
+    def _along(self, eta: FloatArray) -> FloatArray:
+        u: FloatArray = np.linalg.solve(self.basis.T, (eta - self.mode.eta).T).T.astype(float)
+        return u
+
+    def _interpolated(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        middle = self.mode.linearisation
+        centre = middle.z[middle.posterior.free]
+        mean = centre + u @ self.mean[:, 0] + u**2 @ self.mean[:, 1]
+        # So far out the parabola may turn: there a bound keeps the proposal wide enough.
+        return mean, np.clip(u @ self.log_diagonal[:, 0] + u**2 @ self.log_diagonal[:, 1], -2, 2)
+
+
+def _parabola(plus: FloatArray, minus: FloatArray, reach: float) -> FloatArray:
+    """Return slope and curvature (2, f) through 0 at 0, ``plus`` at 1, ``minus`` at -reach."""
+    if reach < 0.1:
+        return np.array([plus, np.zeros_like(plus)])
+    curvature = (minus + reach * plus) / (reach * (1.0 + reach))
+    return np.array([plus - curvature, curvature])
+
+
+def _log_root(factor: FloatArray) -> FloatArray:
+    """Return the log determinant of triangular factors (..., f, f), (...)."""
+    return np.sum(np.log(np.diagonal(factor, axis1=-2, axis2=-1)), axis=-1)
+
+
+def _conditional_density(whitened: FloatArray, log_root: FloatArray) -> FloatArray:
+    """Return the log density of parameters given the noise, (n,): normal, with some t tails."""
+    f = whitened.shape[-1]
+    square = np.sum(whitened**2, axis=-1)
+    centre = np.log1p(-TAIL_SHARE) - 0.5 * square - 0.5 * f * np.log(2.0 * np.pi)
+    tail = (
+        np.log(TAIL_SHARE)
+        + log_student_t(square / TAIL_WIDENING**2, f, TAIL_FREEDOM)
+        - f * np.log(TAIL_WIDENING)
+    )
+    return np.logaddexp(centre, tail) + log_root

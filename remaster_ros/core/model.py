@@ -25,8 +25,10 @@ an extension turn with joint 1 like the arm they belong to, so this holds with a
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -251,6 +253,20 @@ class Model:
         """Return the derivative of the prediction by the natural parameters, (n, 3, size)."""
         return self._derivative(self.offsets(x), x, rows)
 
+    def inner_pose(self, z: FloatArray, rows: Rows) -> Pose:
+        """Return where the arm stands in each row before registration, joints 1 and k at 0."""
+        turns, shifts = self._extended(z, rows)
+        offsets = self._inner_offsets(z) + turns
+        markers = self.markers(z)[rows.marker]
+        frames = self.chain.frames(rows.q, offsets)
+        tool = frames[..., -1, :, :] @ self.chain.T_fixed[-1]
+        return Pose(
+            tool,
+            apply(tool, markers) + shifts,
+            self.chain.axes_in_base(frames),
+            self.chain.position_jacobian(rows.q, markers, offsets),
+        )
+
     def _inner_offsets(self, z: FloatArray) -> FloatArray:
         offsets = self.offsets(z).copy()
         offsets[..., [0, self.joints - 1]] = 0.0
@@ -298,6 +314,27 @@ class Model:
             if by_theta is not None:
                 derivative[span, :, self.core :] = turn @ by_theta[span]
         return derivative
+
+
+class Pose(NamedTuple):
+    """Where an arm stands in n rows, in its base R.
+
+    Attributes
+    ----------
+    tool
+        T_R_T, (n, 4, 4).
+    points
+        Markers, displaced by an extension, m, (n, 3).
+    axes
+        Directions of the joints, (n, k, 3).
+    by_joints
+        Derivative of the points by the joint angles, m/rad, (n, 3, k).
+    """
+
+    tool: FloatArray
+    points: FloatArray
+    axes: FloatArray
+    by_joints: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,6 +398,32 @@ class Rows:
     def group_sum(self, values: FloatArray, axis: int) -> FloatArray:
         """Sum over the rows of each group; `axis` (the rows) becomes the groups."""
         return np.add.reduceat(values, self.group_start, axis=axis)
+
+    def blocks(self, rows: int) -> list[tuple[int, int]]:
+        """Cut the groups into runs (first, behind the last) of about so many rows each."""
+        number = self.group_start // max(1, rows)
+        edges = np.flatnonzero(np.diff(number)) + 1
+        cuts = [0, *edges.tolist(), len(self.group_start)]
+        return list(itertools.pairwise(cuts))
+
+    def of_groups(self, first: int, last: int) -> Rows:
+        """Return the rows of the groups from ``first`` to before ``last``."""
+        start = int(self.group_start[first])
+        stop = int(self.group_start[last - 1] + self.group_size[last - 1])
+        spans = (
+            (sensor, slice(max(span.start, start) - start, min(span.stop, stop) - start))
+            for sensor, span in self.spans
+        )
+        return Rows(
+            source=self.source[start:stop],
+            q=self.q[start:stop],
+            marker=self.marker[start:stop],
+            target=self.target[start:stop],
+            spans=tuple((sensor, span) for sensor, span in spans if span.start < span.stop),
+            group_start=self.group_start[first:last] - start,
+            group_size=self.group_size[first:last],
+            group_sensor=self.group_sensor[first:last],
+        )
 
     @property
     def group_of_row(self) -> IntArray:

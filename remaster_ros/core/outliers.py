@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi
 
 from remaster_ros.core.errors import InsufficientDataError
 from remaster_ros.core.model import Rows
@@ -24,6 +23,8 @@ LIMIT = 6.0
 # More than this share is no accident: the model or the session is wrong.
 LARGEST_SHARE = 0.1
 _QUANTILES = (0.5, 0.8)
+# The same quantiles of the length of a standard normal vector in three dimensions.
+_EXPECTED = np.array([1.5381722545, 2.1544437046])
 # The 80 % quantile may say this many times the median's standard deviation; more than a fifth of
 # gross errors shows in it.
 TAIL_LIMIT = 4.0
@@ -159,18 +160,16 @@ def robust_noise(rows: Rows, errors: FloatArray, good: BoolArray) -> tuple[Float
 
 def _robust_scale(lengths: FloatArray) -> float:
     """Return the standard deviation per axis of three-dimensional errors of these lengths."""
-    expected = chi.ppf(_QUANTILES, 3)
-    return float(np.max(np.quantile(lengths, _QUANTILES) / expected)) + RESOLUTION_M
+    return float(np.max(np.quantile(lengths, _QUANTILES) / _EXPECTED)) + RESOLUTION_M
 
 
 def _require_majority(rows: Rows, errors: FloatArray, sensor_names: Sequence[str]) -> None:
     """Refuse data in which gross errors are so many that the others cannot be told."""
-    expected = chi.ppf(_QUANTILES, 3)
     for sensor, span in rows.spans:
         if span.stop - span.start < FEWEST_TO_JUDGE:
             continue
         half, most = np.quantile(np.linalg.norm(errors[span], axis=1), _QUANTILES)
-        if most / expected[1] > TAIL_LIMIT * (half / expected[0] + RESOLUTION_M):
+        if most / _EXPECTED[1] > TAIL_LIMIT * (half / _EXPECTED[0] + RESOLUTION_M):
             raise InsufficientDataError(
                 f"sensor '{sensor_names[sensor]}': half of the observations agree within "
                 f'{_mm(half)} mm, but a fifth is off by more than {_mm(most)} mm: too many gross '

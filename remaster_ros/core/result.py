@@ -14,12 +14,12 @@ from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.estimate import Problem
 from remaster_ros.core.gauge import Gauge, GaugeDirection
 from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.sampling import R_HAT_LIMIT
 from remaster_ros.core.theoretical import Predictive
 from remaster_ros.core.transforms import apply, inverse, matrix_to_rotation_vector
 from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Session
 
-# The usual limit of R-hat, and effective draws enough for two digits of a 95 % interval.
-R_HAT_LIMIT = 1.01
+# Effective draws enough for two digits of a 95 % interval.
 ESS_LIMIT = 400.0
 # Of an angle that nothing is known of: uniform over the turn.
 UNKNOWN_STD = np.pi / np.sqrt(3.0)
@@ -52,10 +52,17 @@ class SamplerInfo:
         Share of proposals taken.
     r_hat, ess_bulk, ess_tail
         Per parameter of `FitResult.parameter_names`, (p,).
+    precision, precision_wanted
+        Largest Monte Carlo error of a mean over its parameter's standard deviation, reached and
+        asked for; None where a number of draws was asked for instead.
+    log_density_error, checked
+        Largest difference of the density that was sampled from the exact one, on so many of the
+        draws; NaN and 0 where the exact one was sampled.
     seconds
         By the clock passed in; NaN without one.
     converged
-        Every R-hat at most 1.01 and every effective sample size at least 400.
+        Every R-hat at most 1.01 and every effective sample size at least what the precision
+        takes, 400 where none was asked for.
     message
         The verdict in words.
     """
@@ -67,6 +74,10 @@ class SamplerInfo:
     r_hat: FloatArray
     ess_bulk: FloatArray
     ess_tail: FloatArray
+    precision: float
+    precision_wanted: float | None
+    log_density_error: float
+    checked: int
     seconds: float
     converged: bool
     message: str
@@ -180,6 +191,10 @@ class Sampled:
         Sensor indices with a pose_sigma of their own.
     name, acceptance_rate
         Of the sampler.
+    precision
+        That was asked for; None where a number of draws was.
+    log_density_error, checked
+        See `SamplerInfo`.
     gauge
         What the data cannot see.
     unfixed
@@ -205,6 +220,9 @@ class Sampled:
     unfixed: BoolArray
     z_before: FloatArray
     left_out: tuple[tuple[int, str], ...]
+    precision: float | None = None
+    log_density_error: float = float('nan')
+    checked: int = 0
 
 
 def build_result(
@@ -298,11 +316,20 @@ def _sampler_info(sampled: Sampled, seconds: float) -> SamplerInfo:
     r_hat = convergence.r_hat(sampled.draws)
     bulk, tail = convergence.ess_bulk(sampled.draws), convergence.ess_tail(sampled.draws)
     worst, least = float(np.max(r_hat)), float(np.min(np.minimum(bulk, tail)))
-    converged = worst <= R_HAT_LIMIT and least >= ESS_LIMIT
+    wanted = sampled.precision
+    enough = ESS_LIMIT if wanted is None else wanted**-2
+    converged = worst <= R_HAT_LIMIT and least >= enough
+    precision = 1.0 / np.sqrt(least)
     figures = (
         f'R-hat up to {worst:.3f} ({sampled.names[int(np.argmax(r_hat))]}), '
-        f'at least {least:.0f} effective draws'
+        f'at least {least:.0f} effective draws, every mean within {100 * precision:.1f} % of its '
+        'standard deviation'
     )
+    if wanted is not None:
+        figures += f' ({100 * wanted:g} % wanted)'
+    verdict = 'converged' if converged else 'NOT converged'
+    if not converged and wanted is not None:
+        verdict += f' within {sampled.draws.shape[1]} draws a chain'
     return SamplerInfo(
         name=sampled.name,
         chains=sampled.draws.shape[0],
@@ -311,9 +338,13 @@ def _sampler_info(sampled: Sampled, seconds: float) -> SamplerInfo:
         r_hat=r_hat,
         ess_bulk=bulk,
         ess_tail=tail,
+        precision=float(precision),
+        precision_wanted=wanted,
+        log_density_error=sampled.log_density_error,
+        checked=sampled.checked,
         seconds=seconds,
         converged=converged,
-        message=f'converged: {figures}' if converged else f'NOT converged: {figures}',
+        message=f'{verdict}: {figures}',
     )
 
 

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.types import FloatArray
+
+# SciPy has rotations too; importing them takes longer than a fit.
 
 
 def transform(rotation: ArrayLike, translation: ArrayLike) -> FloatArray:
@@ -55,38 +56,72 @@ def apply(T: ArrayLike, points: ArrayLike) -> FloatArray:
 def rotation_vector_to_matrix(rotation_vector: ArrayLike) -> FloatArray:
     """Turn rotation vectors (axis times angle, rad), (..., 3), into matrices (..., 3, 3)."""
     vectors = np.asarray(rotation_vector, dtype=float)
-    matrices = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
-    return matrices.reshape(*vectors.shape[:-1], 3, 3)
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    # Rodrigues: I + sin(a) / a K + (1 - cos(a)) / a² K², K the vector's cross-product matrix.
+    K = np.zeros((*vectors.shape[:-1], 3, 3))
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -z, y, -x
+    K -= np.swapaxes(K, -1, -2)
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    return np.eye(3) + first * K + second * (K @ K)
 
 
 def matrix_to_rotation_vector(rotation: ArrayLike) -> FloatArray:
     """Turn rotation matrices (..., 3, 3) into rotation vectors (..., 3) of angle 0 to pi, rad."""
-    matrices = np.asarray(rotation, dtype=float)
-    vectors = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_rotvec()
-    return vectors.reshape(*matrices.shape[:-2], 3)
+    quaternion = quaternion_xyzw(rotation)
+    sine = np.linalg.norm(quaternion[..., :3], axis=-1, keepdims=True)
+    half = np.arctan2(sine, quaternion[..., 3:])
+    # Without any turn 2 sin(half) = angle.
+    safe = np.where(sine > 0.0, sine, 1.0)
+    return quaternion[..., :3] * np.where(sine > 0.0, 2.0 * half / safe, 2.0)
 
 
 def quaternion_xyzw(rotation: ArrayLike) -> FloatArray:
     """Turn rotation matrices (..., 3, 3) into unit quaternions x, y, z, w (..., 4) with w >= 0."""
-    matrices = np.asarray(rotation, dtype=float)
-    quaternions = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat()
+    R = np.asarray(rotation, dtype=float)
+    trace = np.trace(R, axis1=-2, axis2=-1)
+    diagonal = np.diagonal(R, axis1=-2, axis2=-1)
+    # The outer product of the quaternion with itself, times 4: any of its rows will do, the one
+    # of the largest component loses nothing.
+    product = np.empty((*R.shape[:-2], 4, 4))
+    product[..., :3, :3] = R + np.swapaxes(R, -1, -2)
+    product[..., range(3), range(3)] = 1.0 + 2.0 * diagonal - trace[..., None]
+    product[..., 3, 3] = 1.0 + trace
+    for i, j, k in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):
+        product[..., i, 3] = product[..., 3, i] = R[..., j, k] - R[..., k, j]
+    largest = np.argmax(np.diagonal(product, axis1=-2, axis2=-1), axis=-1)
+    quaternion = np.take_along_axis(product, largest[..., None, None], axis=-2)[..., 0, :]
     # q and -q are the same rotation; one sign makes files and messages comparable.
-    quaternions *= np.where(quaternions[:, 3:] < 0.0, -1.0, 1.0)
-    return quaternions.reshape(*matrices.shape[:-2], 4)
+    sign = np.where(quaternion[..., 3:] < 0.0, -1.0, 1.0)
+    length = np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    return np.asarray(sign * quaternion / length, dtype=float)
 
 
 def matrix_from_quaternion_xyzw(quaternion: ArrayLike) -> FloatArray:
     """Turn quaternions x, y, z, w (..., 4) of any length but zero into matrices (..., 3, 3)."""
     quaternions = np.asarray(quaternion, dtype=float)
-    matrices = Rotation.from_quat(quaternions.reshape(-1, 4)).as_matrix()
-    return matrices.reshape(*quaternions.shape[:-1], 3, 3)
+    length = np.linalg.norm(quaternions, axis=-1, keepdims=True)
+    if not np.all(length > 0.0):
+        raise ValueError('a quaternion of length zero is no rotation')
+    x, y, z, w = np.moveaxis(quaternions / length, -1, 0)
+    return np.stack(
+        (
+            np.stack((1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)), axis=-1),
+            np.stack((2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)), axis=-1),
+            np.stack((2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)), axis=-1),
+        ),
+        axis=-2,
+    )
 
 
 def matrix_from_rpy(rpy: ArrayLike) -> FloatArray:
     """Turn roll, pitch, yaw (..., 3) in rad, URDF's Rz(yaw) Ry(pitch) Rx(roll), into matrices."""
     angles = np.asarray(rpy, dtype=float)
-    matrices = Rotation.from_euler('xyz', angles.reshape(-1, 3)).as_matrix()
-    return matrices.reshape(*angles.shape[:-1], 3, 3)
+    roll, pitch, yaw = (
+        rotation_vector_to_matrix(angles[..., axis, None] * np.eye(3)[axis]) for axis in range(3)
+    )
+    return yaw @ pitch @ roll
 
 
 def looking_at(position: ArrayLike, target: ArrayLike, roll_rad: float = 0.0) -> FloatArray:

@@ -185,6 +185,10 @@ def fit_to_dict(result: FitResult) -> dict[str, Any]:
             'acceptance_rate': _finite(sampler.acceptance_rate),
             'converged': bool(sampler.converged),
             'message': sampler.message,
+            'precision': _finite(sampler.precision),
+            'precision_wanted': sampler.precision_wanted,
+            'log_density_error_max': _finite(sampler.log_density_error),
+            'log_density_checked_draws': int(sampler.checked),
         },
         'parameters': [
             {
