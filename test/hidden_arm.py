@@ -6,41 +6,16 @@ indexed from 0.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pinocchio as pin
 
 from remaster_ros.core.types import FloatArray
+from remaster_ros.fakes.stage import ArmState
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
-@dataclass(frozen=True, eq=False)
-class ArmState:
-    """The arm at n configurations, everything in the base frame R.
-
-    Attributes
-    ----------
-    origin
-        Origin of every joint, m, (n, k, 3).
-    before, after
-        Rotation of each joint's frame before and after its own turn, (n, k, 3, 3).
-    axis
-        Unit axis of each joint, (n, k, 3).
-    tool_origin, tool
-        Of the tool frame, m, (n, 3) and (n, 3, 3).
-    """
-
-    origin: FloatArray
-    before: FloatArray
-    after: FloatArray
-    axis: FloatArray
-    tool_origin: FloatArray
-    tool: FloatArray
-
-
-class Arm:
+class PinocchioArm:
     """A serial arm read from its URDF by pinocchio.
 
     Parameters

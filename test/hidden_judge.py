@@ -16,12 +16,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from hidden_effects import UNNAMED, HiddenEffect
 from hidden_oracle import Oracle
 from hidden_world import HiddenTruth, HiddenWorld
 from scipy.interpolate import BSpline
 
 from remaster_ros.core.types import FloatArray
+from remaster_ros.fakes.effects import UNNAMED, HiddenEffect
 
 INDISTINGUISHABLE = 4.0
 SIZE_STD = 3.0
@@ -261,10 +261,8 @@ def expected(world: HiddenWorld, effect: HiddenEffect) -> dict[str, float]:
             return {f'radial_{sensor}': values[0]}
         case 'marker_offset':
             return {
-                f'{axis}_{name}': float(
-                    world.true_markers[name][i] + effect.values[i] - nominal[i]
-                )
-                for name, nominal in world.markers.items()
+                f'{axis}_{name}': float(world.markers[name][i] + effect.values[i] - nominal[i])
+                for name, nominal in world.nominal_markers.items()
                 for i, axis in enumerate('xyz')
             }
         case 'foreign_torque':

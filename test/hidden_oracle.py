@@ -7,13 +7,13 @@ true response. What registration, offsets and marker can take up it must not cou
 from __future__ import annotations
 
 import numpy as np
-from hidden_effects import HiddenEffect
 from hidden_world import MARKER_STD_M, HiddenTruth, HiddenWorld
 from scipy.linalg import solve_triangular
 from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
 
 from remaster_ros.core.types import FloatArray
+from remaster_ros.fakes.effects import HiddenEffect
 
 
 class Oracle:

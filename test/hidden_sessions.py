@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from hidden_draws import draw_effect
 from hidden_oracle import Oracle
 from hidden_tours import world
 from hidden_world import HiddenTruth, HiddenWorld, Noise
 
 from remaster_ros.core.types import Session
+from remaster_ros.fakes.hiding import draw_effect
 
 NOISES = {
     'independent': Noise(0.15e-3),

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from hidden_arm import six_joint_arm
-from hidden_world import HiddenSensor, HiddenWorld, Visits
+from hidden_world import HiddenWorld, Visits
 
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.collision import ArmCapsules
@@ -19,6 +19,7 @@ from remaster_ros.core.inverse import InverseKinematics
 from remaster_ros.core.planning import LineOfSight, PoseRanges, candidate_poses, plan_poses
 from remaster_ros.core.tour import Tour
 from remaster_ros.core.types import FloatArray
+from remaster_ros.fakes.stage import StagedSensor
 
 ROBOTS = Path(__file__).parent.parent / 'config/robots'
 MARKERS = {'sir': np.array([0.1, 0.0, 0.02]), 'smr': np.array([-0.1, 0.0, 0.02])}
@@ -117,7 +118,7 @@ def world(
     for sensor in sensors:
         marker, place, _ = PLACES[sensor]
         origin = place + 0.05 * rng.standard_normal(3)
-        placed[sensor] = HiddenSensor(_facing(origin, rng.uniform(-0.2, 0.2)), origin, marker)
+        placed[sensor] = StagedSensor(_facing(origin, rng.uniform(-0.2, 0.2)), origin, marker)
     markers = {PLACES[sensor][0]: MARKERS[PLACES[sensor][0]] for sensor in sensors}
     return HiddenWorld(robot(name), tour, placed, markers, rng)
 

@@ -7,20 +7,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hidden_arm import Arm
-from hidden_draws import DRAWS, draw_effect
-from hidden_effects import ARC_MINUTE, NAMED, UNNAMED, Deviation, HiddenEffect
+from hidden_arm import PinocchioArm
 from hidden_oracle import Oracle
 from hidden_tours import robot, visits, world
 from hidden_world import HiddenWorld, Noise
 from scipy.stats import chi2
 
 from remaster_ros.core.chain import SerialChain
+from remaster_ros.fakes.effects import ARC_MINUTE, NAMED, UNNAMED, Deviation, HiddenEffect
+from remaster_ros.fakes.hiding import DRAWS, draw_effect
 
 
 @pytest.mark.parametrize('name', ['lwr4plus', 'iiwa7', 'iiwa14', 'six'])
 def test_pinocchio_and_the_package_agree_on_kinematics_and_gravity(name: str) -> None:
-    arm, chain = Arm(robot(name)), SerialChain.from_urdf(robot(name), 'base_link', 'tool')
+    arm, chain = PinocchioArm(robot(name)), SerialChain.from_urdf(robot(name), 'base_link', 'tool')
     q = np.random.default_rng(1).uniform(chain.lower, chain.upper, (200, len(chain)))
     state = arm.state(q)
     T = chain.forward(q)
@@ -53,7 +53,7 @@ def test_nuisance_is_the_derivative(name: str) -> None:
         np.testing.assert_allclose(
             (above - below) / (2 * step), hidden.nuisance[:, :, j], rtol=0, atol=1e-7
         )
-    for i, marker in enumerate(hidden.true_markers.values()):
+    for i, marker in enumerate(hidden.markers.values()):
         before = hidden.seen()
         for axis in range(3):
             marker[axis] += step

@@ -1,7 +1,7 @@
-"""Draws effects of the hidden world: which joint, which way, which sign.
+"""Draws effects to hide: which joint, which way, which sign.
 
 Signs are drawn too, but for what can only give way to a load or grow when it warms. Every draw is
-of about the largest size that is plausible; `HiddenWorld.of_size` makes it smaller.
+of about the largest size that is plausible; `Stage.of_size` makes it smaller.
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from hidden_effects import ARC_MINUTE, Circumstances, HiddenEffect
-from hidden_world import HiddenWorld
 
+from remaster_ros.core.errors import InputError
 from remaster_ros.core.types import FloatArray
+from remaster_ros.fakes.effects import ARC_MINUTE, Circumstances, HiddenEffect
+from remaster_ros.fakes.stage import Stage
 
 Draw = Callable[[np.random.Generator, int, Circumstances, tuple[str, ...]], HiddenEffect]
 """(rng, number of joints, circumstances, names of the sensors) -> an effect."""
@@ -153,8 +154,8 @@ def _at_some_time(draw: Draw) -> Draw:
         rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
     ) -> HiddenEffect:
         effect = draw(rng, k, c, sensors)
-        share = float(rng.uniform(0.15, 0.4))
-        return replace(effect, detail={**effect.detail, 'share_of_time': share})
+        moment = float(rng.uniform(0.15, 0.4) * c.time_s[-1])
+        return replace(effect, detail={**effect.detail, 'moment_s': moment})
 
     return timed
 
@@ -186,22 +187,20 @@ DRAWS: dict[str, Draw] = {
 }
 
 
-def draw_effect(
-    world: HiddenWorld, kind: str, rng: np.random.Generator, size_m: float
-) -> HiddenEffect:
-    """Draw an effect of that kind of which so much is left (see `HiddenWorld.size_m`).
+def draw_effect(stage: Stage, kind: str, rng: np.random.Generator, size_m: float) -> HiddenEffect:
+    """Draw an effect of that kind of which so much is left (see `Stage.size_m`).
 
     Drawn again as long as it would have to be larger than is plausible: a joint that hardly moves
     shows no eccentricity. Where no draw gets there, the most visible of them is taken.
     """
     best, best_size = None, 0.0
     for _ in range(30):
-        effect = DRAWS[kind](rng, world.arm.joints, world.circumstances, tuple(world.sensors))
-        largest = world.size_m(effect)
+        effect = DRAWS[kind](rng, stage.arm.joints, stage.circumstances, tuple(stage.sensors))
+        largest = stage.size_m(effect)
         if largest > best_size:
             best, best_size = effect, largest
         if largest >= size_m:
             break
     if best is None or best_size < 1e-6:
-        raise ValueError(f'{kind} cannot be seen on these visits')
-    return world.of_size(best, size_m)
+        raise InputError(f'{kind} cannot be seen on these visits, whatever its size')
+    return stage.of_size(best, size_m)

@@ -1,14 +1,15 @@
-"""What the hidden world can hide: every effect written from its equation, on its own.
+"""What a hidden world can hide: every effect written from its equation, on its own.
 
-An effect is linear in its values: `HiddenEffect.values` times what its rule adds to a `Deviation`.
-A rule reads the `Circumstances` of every configuration and knows nothing of how an estimate would
-describe the same thing. `NAMED` are the named effects, `UNNAMED` are cells without a name.
+Nothing here is shared with the code that estimates (`core.effects`). An effect is linear in its
+values: `HiddenEffect.values` times what its rule adds to a `Deviation`. A rule reads the
+`Circumstances` of every configuration. `NAMED` are the effects with a name, `UNNAMED` are cells
+without one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,8 @@ class Deviation:
 
     Attributes
     ----------
+    sensors
+        Names of the sensors.
     angle
         Added to the true joint angles, rad, (n, k).
     shift
@@ -70,27 +73,44 @@ class Deviation:
         Turns the base about its origin, axes of R, rad, (n, 3).
     marker
         Added to the marker in the tool frame, m, (n, 3).
-    sensors
-        For each sensor what is added to a point it measures: (points in N, m, (n, 3)) -> same.
+    beside, scale, radial
+        What each sensor (s of them) adds to a point p that it measures, in its frame N: beside,
+        m, (n, s, 3), scale p, (n, s, 3), and radial r² (x, y, 0), 1/m², (n, s, 1).
     """
 
+    sensors: tuple[str, ...]
     angle: FloatArray
     shift: FloatArray
     tilt: FloatArray
     base: FloatArray
     marker: FloatArray
-    sensors: dict[str, list[Callable[[FloatArray], FloatArray]]] = field(default_factory=dict)
+    beside: FloatArray
+    scale: FloatArray
+    radial: FloatArray
 
     @classmethod
-    def none(cls, n: int, k: int) -> Deviation:
-        """Return an arm as drawn."""
-        return cls(
-            np.zeros((n, k)),
-            np.zeros((n, k + 1, 3)),
-            np.zeros((n, k, 3)),
-            np.zeros((n, 3)),
-            np.zeros((n, 3)),
-        )
+    def none(cls, n: int, k: int, sensors: tuple[str, ...] = ()) -> Deviation:
+        """Return an arm and sensors as drawn."""
+        shapes = ((k,), (k + 1, 3), (k, 3), (3,), (3,))
+        per_sensor = ((len(sensors), 3), (len(sensors), 3), (len(sensors), 1))
+        return cls(sensors, *(np.zeros((n, *shape)) for shape in (*shapes, *per_sensor)))
+
+    def map(self, change: Callable[..., FloatArray], *others: Deviation) -> Deviation:
+        """Apply a function to every array of this and other deviations."""
+        names = [spec.name for spec in fields(self) if spec.name != 'sensors']
+        changed: dict[str, Any] = {
+            name: change(getattr(self, name), *(getattr(other, name) for other in others))
+            for name in names
+        }
+        return replace(self, **changed)
+
+    def measured(self, sensor: str, points: FloatArray) -> FloatArray:
+        """Return what a sensor makes of points p in its frame N, m, (n, 3)."""
+        s = self.sensors.index(sensor)
+        across = points * (1.0, 1.0, 0.0)
+        square = np.sum(across**2, axis=1, keepdims=True)
+        added = self.scale[:, s] * points + self.radial[:, s] * square * across
+        return points + self.beside[:, s] + added
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +141,25 @@ class HiddenEffect:
     def add_to(self, deviation: Deviation, c: Circumstances) -> None:
         """Deviate as the rule says."""
         (NAMED | UNNAMED)[self.kind].rule(self, deviation, c)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists and numbers, for a file."""
+        detail = {
+            key: value.tolist() if isinstance(value, np.ndarray) else value
+            for key, value in self.detail.items()
+        }
+        return {
+            'kind': self.kind,
+            'joints': list(self.joints),
+            'values': self.values.tolist(),
+            'detail': detail,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> HiddenEffect:
+        """Undo `to_dict`."""
+        joints = tuple(data['joints'])
+        return cls(data['kind'], joints, np.array(data['values']), data['detail'])
 
     def __str__(self) -> str:
         shown = {key: value for key, value in self.detail.items() if np.ndim(value) < 1}
@@ -211,25 +250,18 @@ def _base(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 def _drift(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """What the sensor measures wanders with this velocity, m/s, in its own frame."""
-    wander = c.time_s[:, None] * e.values
-    d.sensors.setdefault(e.detail['sensor'], []).append(lambda points: wander)
+    d.beside[:, d.sensors.index(e.detail['sensor'])] += c.time_s[:, None] * e.values
 
 
 def _sensor_scale(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """δp = s p, or only in depth (z of N)."""
     along = np.array([0.0, 0.0, 1.0]) if e.detail['form'] == 'depth' else np.ones(3)
-    scale = e.values[0] * along
-    d.sensors.setdefault(e.detail['sensor'], []).append(lambda points: scale * points)
+    d.scale[:, d.sensors.index(e.detail['sensor'])] += e.values[0] * along
 
 
 def _distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """δp = k r² (x, y, 0), r the distance from the optical axis z, 1/m²."""
-
-    def radial(points: FloatArray) -> FloatArray:
-        across = points * (1.0, 1.0, 0.0)
-        return e.values[0] * np.sum(across**2, axis=1, keepdims=True) * across
-
-    d.sensors.setdefault(e.detail['sensor'], []).append(radial)
+    d.radial[:, d.sensors.index(e.detail['sensor'])] += e.values[0]
 
 
 def _foreign_torque(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
@@ -265,12 +297,11 @@ def _sagging_tool(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 def _bumped_sensor(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """From some moment on the sensor measures everything beside where it did, m."""
-    beside = _after(e, c)[:, None] * e.values
-    d.sensors.setdefault(e.detail['sensor'], []).append(lambda points: beside)
+    d.beside[:, d.sensors.index(e.detail['sensor'])] += _after(e, c)[:, None] * e.values
 
 
 def _after(e: HiddenEffect, c: Circumstances) -> FloatArray:
-    return (c.time_s > e.detail['share_of_time'] * c.time_s[-1]).astype(float)
+    return (c.time_s > e.detail['moment_s']).astype(float)
 
 
 @dataclass(frozen=True)

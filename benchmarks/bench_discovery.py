@@ -1,0 +1,195 @@
+"""Does `remaster discover` name what is hidden, and nothing where nothing is?
+
+Sessions come from a world of its own (test/hidden_world.py: pinocchio, no code shared with the
+package but the plain records and the planning). Each is one line of the results file, so that the
+benchmark can be stopped and goes on where it was; figures are printed as they come.
+
+    python benchmarks/bench_discovery.py                      all of it, on all cores
+    python benchmarks/bench_discovery.py --only null --count 40
+    python benchmarks/bench_discovery.py --report             only print what is known so far
+    python benchmarks/bench_discovery.py --session single-backlash-3    one again, in full
+
+Single effects are drawn with sizes between half and eight times the one at which the best possible
+test, which knows what to look for and the noise, finds them in 90 % of sessions at 2 % false
+alarms. Judged by test/hidden_judge.py: right is who names exactly what was hidden.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+import time
+import warnings
+import zlib
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / 'test'))
+
+from discovery_tables import report  # noqa: E402
+from hidden_judge import judge  # noqa: E402
+from hidden_sessions import NOISES, Recipe, held_out_noise_m, hidden_session  # noqa: E402
+
+from remaster_ros.core.discovery import discover_session  # noqa: E402
+from remaster_ros.fakes.effects import NAMED, UNNAMED  # noqa: E402
+
+ROBOTS = ('iiwa7', 'six')
+SENSORS = (('mocap',), ('mocap', 'tracker'))
+GROUPS = {'single': 24, 'pair': 60, 'unnamed': 12, 'null': 300}
+"""Group -> sessions (of each kind, for single and unnamed)."""
+
+
+def recipes(group: str, count: int) -> Iterator[tuple[str, Recipe]]:
+    """Give every session of a group with its name; the first n stay the same for any count."""
+    kinds = {'single': tuple(NAMED), 'unnamed': tuple(UNNAMED)}.get(group, ('',))
+    for i in range(count):
+        for kind in kinds:
+            name = '-'.join(part for part in (group, kind, str(i)) if part)
+            seed = zlib.crc32(name.encode())
+            rng = np.random.default_rng(seed)
+            hidden: tuple[str, ...] = (kind,) if kind else ()
+            if group == 'pair':
+                hidden = tuple(rng.choice(tuple(NAMED), 2, replace=False).tolist())
+            # Half, a quarter … of the sessions have each: all combinations occur.
+            yield (
+                name,
+                Recipe(
+                    seed=seed,
+                    kinds=hidden,
+                    multiple=float(2.0 ** rng.uniform(2.0 if group == 'pair' else -1.0, 3.0)),
+                    robot=ROBOTS[i % 2],
+                    sensors=SENSORS[(i // 2) % 2],
+                    noise=tuple(NOISES)[(i // 4) % 4],
+                    outliers=bool(rng.random() < 0.5),
+                    held_out_outliers=group == 'null',
+                ),
+            )
+
+
+def run(name: str, recipe: Recipe, talk: bool = False) -> dict[str, Any]:
+    """Make one session, discover, judge; return a line of the results file."""
+    hidden = hidden_session(recipe)
+    started = time.process_time()
+    line: dict[str, Any] = {
+        'name': name,
+        'robot': recipe.robot,
+        'sensors': len(recipe.sensors),
+        'noise': recipe.noise,
+        'outliers': recipe.outliers,
+        'rows': int(np.sum(~hidden.session.measurements.is_validation)),
+        'kinds': list(recipe.kinds),
+        'truth': [str(effect) for effect in hidden.truth.effects],
+        'multiple': recipe.multiple,
+        'size_mm': [1e3 * size for size in hidden.truth.size_m],
+        'best_mm': [1e3 * size for size in hidden.best_size_m],
+        'floor_mm': 1e3 * held_out_noise_m(hidden),
+    }
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter('error')
+            found = discover_session(hidden.session, rng=np.random.default_rng(recipe.seed))
+    except Exception as error:  # a benchmark goes on, and counts it
+        return {**line, 'error': f'{type(error).__name__}: {error}'}
+    line['seconds'] = time.process_time() - started
+    verdict = judge(hidden.world, hidden.truth, found)
+    line |= {
+        'verdict': found.verdict,
+        'hidden': [_cause(cause) for cause in verdict.hidden],
+        'named': [_cause(cause) for cause in verdict.named],
+        'named_right': verdict.named_right,
+        'forgiven': verdict.forgiven,
+        'first_right': verdict.first_right,
+        'size_right': verdict.size_right,
+        'deviations': {key: round(z, 3) for key, z in verdict.deviations.items()},
+        'listed': [
+            [f'{other.name} {list(other.joints)}' for other in effect.confusable_with]
+            for effect in found.effects
+        ],
+        'p_values': [effect.p_value for effect in found.effects],
+        'before_mm': 1e3 * found.gain.held_out_rms_before_m,
+        'after_mm': 1e3 * found.gain.held_out_rms_after_m,
+    }
+    if talk:
+        for effect in found.effects:
+            print(effect)
+    return line
+
+
+def _cause(cause: tuple[str, tuple[int, ...], str]) -> str:
+    name, joints, rest = cause
+    return ' '.join(part for part in (name, ','.join(map(str, joints)), rest) if part)
+
+
+def known(path: Path) -> dict[str, dict[str, Any]]:
+    """Read the results so far; a line torn by an interruption is left out."""
+    lines = {}
+    if path.exists():
+        for text in path.read_text(encoding='utf-8').splitlines():
+            try:
+                line = json.loads(text)
+            except json.JSONDecodeError:
+                continue
+            lines[line['name']] = line
+    return lines
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or '').partition('\n')[0])
+    parser.add_argument('--results', type=Path, default=Path('bench_discovery.jsonl'))
+    parser.add_argument('--only', nargs='+', choices=GROUPS, default=list(GROUPS))
+    parser.add_argument('--kind', nargs='+', help='only sessions with these effects')
+    parser.add_argument('--count', type=int, help='sessions (of each kind) instead of all')
+    parser.add_argument('--jobs', type=int, default=os.cpu_count())
+    parser.add_argument('--report', action='store_true', help='print what is known, run nothing')
+    parser.add_argument('--session', metavar='NAME', help='run one again and print all of it')
+    args = parser.parse_args()
+    # One thread per process, as the processes fill the cores; they start with what stands here.
+    for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
+        os.environ[name] = '1'
+    wanted = {
+        name: recipe
+        for group in args.only
+        for name, recipe in recipes(group, args.count or GROUPS[group])
+        if not args.kind or set(args.kind) & set(recipe.kinds)
+    }
+    if args.session:
+        everything = {n: r for g in GROUPS for n, r in recipes(g, 1000)}
+        line = run(args.session, everything[args.session], talk=True)
+        print(json.dumps(line, indent=1))
+        return
+    done = known(args.results)
+    todo = {name: recipe for name, recipe in wanted.items() if name not in done}
+    if args.report:
+        todo = {}
+    print(f'{len(wanted) - len(todo)} sessions known, {len(todo)} to run', flush=True)
+    fresh = multiprocessing.get_context('spawn')
+    with (
+        ProcessPoolExecutor(args.jobs, fresh) as pool,
+        args.results.open('a', encoding='utf-8') as file,
+    ):
+        futures = [pool.submit(run, name, recipe) for name, recipe in todo.items()]
+        for number, future in enumerate(as_completed(futures), 1):
+            line = future.result()
+            done[line['name']] = line
+            file.write(json.dumps(line) + '\n')
+            file.flush()
+            outcome = line.get('error') or (
+                ('right' if line['named_right'] else 'WRONG')
+                + f' x{line["multiple"]:.1f} {line["seconds"]:.1f} s: '
+                + ('; '.join(line['named']) or 'nothing')
+            )
+            print(f'{number}/{len(todo)} {line["name"]}: {outcome}', flush=True)
+    print()
+    report(line for name, line in done.items() if name in wanted)
+
+
+if __name__ == '__main__':
+    main()
