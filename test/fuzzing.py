@@ -325,7 +325,7 @@ def decode_as_any_version(rng: random.Random) -> Target:
 
     def target(data: bytes) -> None:
         with contextlib.suppress(natnet.ProtocolError):
-            natnet.decode_message(data, rng.choice(VERSIONS))
+            natnet.decode_message(data, rng.choice(VERSIONS), markers_only=rng.random() < 0.5)
         with contextlib.suppress(natnet.ProtocolError):
             natnet.decode_request(data)
 
@@ -395,6 +395,7 @@ class NatNetClientTarget:
     def _receive(self, data: bytes, source: _DatagramSource, address: str = SERVER) -> None:
         source.waiting.append((data, (address, 1510)))
         self.client._receive(source)  # type: ignore[arg-type]
+        self.client._digest_backlog()
 
     def _check(self) -> None:
         status = self.client.status()

@@ -11,6 +11,7 @@ import contextlib
 import selectors
 import socket
 import time
+from collections import deque
 from collections.abc import Callable
 
 from remaster_ros.core.errors import DeviceError
@@ -44,8 +45,12 @@ __all__ = [
 RETRY_S = 0.5
 KEEPALIVE_S = 1.0
 POLL_S = 0.1
-DATAGRAMS_PER_TURN = 64
+DATAGRAMS_PER_TURN = 1024
 """Then the thread looks at its timers again, however fast the datagrams come."""
+DIGESTED_PER_TURN = 16
+"""A few milliseconds of decoding; then the sockets are emptied again."""
+MAX_BACKLOG_BYTES = 1 << 26
+"""What may wait to be decoded: twenty seconds of 1 kHz frames with 50 markers."""
 MALFORMED_IN_A_ROW = 3
 """Then the version has probably changed, and the server is asked."""
 NEGOTIATION_TRIES = 4
@@ -84,6 +89,9 @@ class NatNetClient(MarkerFollower):
         self._negotiation_tries = 0
         self._malformed_in_a_row = 0
         self._bitstream_changed = False
+        # Received and not yet decoded: datagram, arrival, whether it came to the data socket.
+        self._backlog: deque[tuple[bytes, float, bool]] = deque()
+        self._backlog_bytes = 0
         self._due = dict.fromkeys(('connect', 'model', 'keepalive', 'bitstream'), 0.0)
 
     def _open(self) -> None:
@@ -107,6 +115,8 @@ class NatNetClient(MarkerFollower):
             if opened is not None:
                 opened.close()
         self._command = self._data = None
+        self._backlog.clear()
+        self._backlog_bytes = 0
 
     def _run(self) -> None:
         with selectors.DefaultSelector() as selector:
@@ -115,8 +125,9 @@ class NatNetClient(MarkerFollower):
                     selector.register(opened, selectors.EVENT_READ)
             while not self._stopping.is_set():
                 self._keep_in_touch(time.monotonic())
-                for key, _ in selector.select(POLL_S):
+                for key, _ in selector.select(0.0 if self._backlog else POLL_S):
                     self._receive(key.fileobj)  # type: ignore[arg-type]
+                self._digest_backlog()
 
     def _keep_in_touch(self, now: float) -> None:
         """Send the requests that are due."""
@@ -164,6 +175,11 @@ class NatNetClient(MarkerFollower):
             self._send_error = error.strerror or str(error)
 
     def _receive(self, source: socket.socket) -> None:
+        """Empty a socket into the backlog.
+
+        The buffer of a socket is small; a thread that waited long for a processor must not lose
+        more while it decodes what has come.
+        """
         for _ in range(DATAGRAMS_PER_TURN):
             try:
                 datagram, (address, _port) = source.recvfrom(MAX_DATAGRAM_BYTES)
@@ -174,8 +190,19 @@ class NatNetClient(MarkerFollower):
                 self._stopping.wait(POLL_S)
                 return
             received_s = self._clock()
-            if not self._is_foreign(address):
-                self._digest(datagram, received_s, from_data_socket=source is self._data)
+            if self._is_foreign(address):
+                continue
+            if self._backlog_bytes + len(datagram) > MAX_BACKLOG_BYTES:
+                self._gate.drop(Dropped.OVERRUN)
+                continue
+            self._backlog_bytes += len(datagram)
+            self._backlog.append((datagram, received_s, source is self._data))
+
+    def _digest_backlog(self) -> None:
+        for _ in range(min(len(self._backlog), DIGESTED_PER_TURN)):
+            datagram, received_s, from_data_socket = self._backlog.popleft()
+            self._backlog_bytes -= len(datagram)
+            self._digest(datagram, received_s, from_data_socket=from_data_socket)
 
     def _digest(self, datagram: bytes, received_s: float, *, from_data_socket: bool) -> None:
         """Decode one datagram and act on it."""
@@ -187,7 +214,7 @@ class NatNetClient(MarkerFollower):
             if self._version is None and (is_frame or message_id == MessageId.MODELDEF):
                 self._gate.drop(Dropped.UNRESOLVED)
                 return
-            message = natnet.decode_message(datagram, self._version)
+            message = natnet.decode_message(datagram, self._version, markers_only=True)
         except ProtocolError as error:
             self._note_malformed(error)
             self._malformed_in_a_row += 1

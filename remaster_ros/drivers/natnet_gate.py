@@ -37,6 +37,8 @@ class Dropped(StrEnum):
 
     FOREIGN = 'foreign'
     """It came from an address that is not the configured server."""
+    OVERRUN = 'overrun'
+    """This computer cannot keep up: too much waits to be decoded."""
     MALFORMED = 'malformed'
     UNRESOLVED = 'unresolved'
     """The bitstream version or the marker's id is not known (yet)."""

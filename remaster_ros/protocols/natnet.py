@@ -2,8 +2,8 @@
 
 A client decodes with `decode_message` and encodes with the ``encode_…_request`` functions; a
 server decodes with `decode_request` and encodes with `encode_message` and its kin. The layout of
-frames is in `natnet_frames`, that of model definitions in `natnet_models`. One exception comes
-out of bad bytes: `ProtocolError`.
+frames is in `natnet_frames` and `natnet_frame_writer`, that of model definitions in
+`natnet_models`. One exception comes out of bad bytes: `ProtocolError`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from enum import IntEnum
 from struct import Struct
 
 from remaster_ros.protocols import natnet_wire as wire
-from remaster_ros.protocols.natnet_frames import Frame, decode_frame, encode_frame
+from remaster_ros.protocols.natnet_frame_writer import encode_frame
+from remaster_ros.protocols.natnet_frames import Frame, decode_frame
 from remaster_ros.protocols.natnet_models import (
     ModelDefinition,
     decode_model_definition,
@@ -189,7 +190,9 @@ def join_datagram(message_id: int, payload: bytes = b'') -> bytes:
     return _HEADER.pack(message_id, len(payload)) + payload
 
 
-def decode_message(datagram: bytes, version: Version | None) -> Message:
+def decode_message(
+    datagram: bytes, version: Version | None, *, markers_only: bool = False
+) -> Message:
     """Decode what a server sent.
 
     Parameters
@@ -199,6 +202,8 @@ def decode_message(datagram: bytes, version: Version | None) -> Message:
     version
         The server's bitstream version; None while it is unknown, when frames and model
         definitions cannot be read.
+    markers_only
+        As for `decode_frame`.
 
     Raises
     ------
@@ -207,7 +212,7 @@ def decode_message(datagram: bytes, version: Version | None) -> Message:
     """
     message_id, payload = split_datagram(datagram)
     if message_id == MessageId.FRAMEOFDATA:
-        return decode_frame(payload, _known(version))
+        return decode_frame(payload, _known(version), markers_only=markers_only)
     if message_id == MessageId.SERVERINFO:
         return _decode_server_info(payload)
     if message_id == MessageId.MODELDEF:

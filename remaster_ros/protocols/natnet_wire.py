@@ -115,11 +115,22 @@ class Reader:
     def text(self) -> str:
         """Read UTF-8 text up to its NUL; bytes that are no UTF-8 become U+FFFD."""
         start = self.offset
+        self.skip_text()
+        return self._data[start : self.offset - 1].decode('utf-8', 'replace')
+
+    def skip_text(self) -> None:
+        """Step over text and its NUL."""
+        start = self.offset
         stop = self._data.find(0, start, min(self.end, start + MAX_TEXT_BYTES))
         if stop < 0:
             raise ProtocolError(f'text at byte {start} has no end')
         self.offset = stop + 1
-        return self._data[start:stop].decode('utf-8', 'replace')
+
+    def skip(self, size: int) -> None:
+        """Step over `size` bytes."""
+        if not 0 <= size <= self.left:
+            raise ProtocolError(f'{size} bytes to skip at byte {self.offset}, {self.left} left')
+        self.offset += size
 
     def items(self, read: Callable[[Reader], Item], item_bytes: int) -> tuple[Item, ...]:
         """Read a count and that many items with `read`."""
@@ -141,6 +152,19 @@ class Reader:
         items = tuple(read(self) for _ in range(count))
         self.offset, self.end = self.end, with_tail
         return items
+
+    def skip_section(
+        self, version: Version, skip_item: Callable[[Reader], object], item_bytes: int
+    ) -> None:
+        """Step over a section of a frame: at once where it has a byte size (4.1+)."""
+        if version < (4, 1):
+            for _ in range(self.count(item_bytes)):
+                skip_item(self)
+            return
+        count, size = self.unpack(TWO_I32)
+        if count < 0 or not count * item_bytes <= size:
+            raise ProtocolError(f'a section of {count} items in {size} bytes, {self.left} left')
+        self.skip(size)
 
     def row_section(self, version: Version, layout: Struct) -> list[tuple[Any, ...]]:
         """Read a section of items of one size: count, byte size (4.1+), structs."""

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from remaster_ros.protocols.natnet_frame_writer import encode_frame
 from remaster_ros.protocols.natnet_frames import (
     MEASURED,
     OCCLUDED,
@@ -24,7 +25,6 @@ from remaster_ros.protocols.natnet_frames import (
     RigidBody,
     Skeleton,
     decode_frame,
-    encode_frame,
 )
 from remaster_ros.protocols.natnet_wire import ProtocolError
 
@@ -126,11 +126,23 @@ def test_what_is_encoded_is_decoded(version, data):
 
 
 @pytest.mark.parametrize('version', VERSIONS)
-def test_every_truncation_is_refused(version):
+@settings(deadline=None, max_examples=25)
+@given(data=st.data())
+def test_markers_only_leaves_out_the_rest_and_nothing_else(version, data):
+    frame = data.draw(frames(version))
+    decoded = decode_frame(encode_frame(frame, version), version, markers_only=True)
+    left_out = ('rigid_bodies', 'marker_sets', 'other_markers', 'skeletons', 'assets')
+    left_out += ('force_plates', 'devices')
+    assert decoded == dataclasses.replace(frame, **dict.fromkeys(left_out, ()))
+
+
+@pytest.mark.parametrize('markers_only', [False, True])
+@pytest.mark.parametrize('version', VERSIONS)
+def test_every_truncation_is_refused(version, markers_only):
     payload = encode_frame(full_frame(version), version)
     for length in range(len(payload)):
         with pytest.raises(ProtocolError):
-            decode_frame(payload[:length], version)
+            decode_frame(payload[:length], version, markers_only=markers_only)
 
 
 @pytest.mark.parametrize('version', VERSIONS)
@@ -143,8 +155,9 @@ def test_bytes_after_the_end_tag_are_refused(version):
 @settings(deadline=None, max_examples=200)
 @given(payload=st.binary(max_size=400), version=st.sampled_from(VERSIONS))
 def test_random_bytes_give_a_protocol_error_or_a_frame(payload, version):
-    with contextlib.suppress(ProtocolError):
-        decode_frame(payload, version)
+    for markers_only in (False, True):
+        with contextlib.suppress(ProtocolError):
+            decode_frame(payload, version, markers_only=markers_only)
 
 
 @settings(deadline=None, max_examples=200)
@@ -171,8 +184,9 @@ def test_absurd_counts_are_refused_at_every_place(version, count):
     payload = encode_frame(full_frame(version), version)
     for where in range(4, len(payload) - 3):
         damaged = payload[:where] + struct.pack('<i', count) + payload[where + 4 :]
-        with contextlib.suppress(ProtocolError):
-            decode_frame(damaged, version)
+        for markers_only in (False, True):
+            with contextlib.suppress(ProtocolError):
+                decode_frame(damaged, version, markers_only=markers_only)
 
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf])
