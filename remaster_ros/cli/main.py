@@ -22,6 +22,7 @@ VERBS = {
     'simulate': 'Make a session from a known truth, which is written beside it.',
     'fit': 'Fit the zero-offsets of a session: fit.json, figures and report.html.',
     'accuracy': 'Judge the zero-offsets of a fit on any session: the three metrics.',
+    'recover': 'Finish the files of a session whose recorder was killed; say what was lost.',
     'replay': 'Publish a recorded session again (as `ros2 bag play` does).',
 }
 TRACEBACK = 'REMASTER_TRACEBACK'

@@ -1,0 +1,31 @@
+"""Bring a session that a crash has left to rest; say what was lost."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from remaster_ros.cli.console import say
+from remaster_ros.storage.recovery import recover_session
+
+LOST = 3
+"""Exit status of a recovery that had to drop something."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``remaster recover``."""
+    parser.add_argument('session', metavar='SESSION', type=Path, help='folder of the session')
+    parser.epilog = (
+        f'Exit status: 0 nothing was lost, {LOST} what was being written was lost (and what), '
+        '2 no such session, one that is being written, or a damaged one.'
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Recover the session; returns the exit status."""
+    recovery = recover_session(args.session)
+    for line in recovery.lost:
+        print(f'lost: {line}')
+    done = 'recovered' if recovery.finished else 'at rest, nothing to recover'
+    say(args.quiet, f'{args.session}: {done}')
+    return LOST if recovery.lost else 0

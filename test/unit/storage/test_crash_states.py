@@ -1,0 +1,52 @@
+"""A thousand simulated power cuts in the life of a session (more: bench_crash_states.py).
+
+What a crash may leave is in test/crash_states.py, what must hold then in test/session_crashes.py.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import shutil
+import tempfile
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from session_crashes import check, live, yaml_read_once
+
+STATES = 1000
+SHARED_MEMORY = Path('/dev/shm')
+
+
+@pytest.fixture
+def quick_folder(tmp_path):
+    """Return a folder in memory where there is one: syncing is not what is tested here."""
+    if not SHARED_MEMORY.is_dir():
+        yield tmp_path
+        return
+    with tempfile.TemporaryDirectory(dir=SHARED_MEMORY) as folder:
+        yield Path(folder)
+
+
+def test_no_crash_loses_what_was_acknowledged(quick_folder, caplog):
+    caplog.set_level(logging.CRITICAL, 'remaster_ros')
+    found: Counter[str] = Counter()
+    seed = 0
+    with yaml_read_once():
+        while found.total() < STATES:
+            (quick_folder / f'life_{seed}').mkdir()
+            life = live(quick_folder / f'life_{seed}', seed)
+            # Every boundary of an operation, twice, with other fates of what was not synced.
+            for cut in [*range(len(life.operations) + 1)] * 2:
+                folder = quick_folder / 'crash'
+                folder.mkdir()
+                chooser = random.Random(f'{seed} {cut} {found.total()}')
+                print(f'seed {seed}, cut {cut}, state {found.total()}')
+                found[check(life, cut, chooser, folder)] += 1
+                shutil.rmtree(folder)
+            seed += 1
+    # The states are worth something: sessions not yet there, torn lines, and most just whole.
+    assert found['nothing'] > 50
+    assert found['dropped'] > 10
+    assert found['whole'] > 500
