@@ -55,6 +55,9 @@ def build_parser(chosen: str | None) -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     argv = sys.argv[1:] if argv is None else list(argv)
+    # Products of small matrices in several threads take many times as long as in one: the threads
+    # wait for each other at full speed. NumPy looks at this when it is first imported.
+    os.environ.setdefault('OMP_NUM_THREADS', '1')
     try:
         args = build_parser(next(iter(argv), None)).parse_args(argv)
         logging.basicConfig(

@@ -26,7 +26,7 @@ TAIL_FREEDOM = 5.0
 TAIL_WIDENING = 1.3
 
 
-# Draws factorised at a time: more fall out of the processor's cache.
+# Draws at a time: more fall out of the processor's cache.
 BLOCK = 256
 
 
@@ -87,7 +87,8 @@ class Linearisation:
             Log density of the noise coordinates with the parameters integrated out, (...).
         """
         factor, pull, log_marginal = self.whitened(eta)
-        return self.z[self.posterior.free] + back_substituted(factor, pull), factor, log_marginal
+        step = np.linalg.solve(np.swapaxes(factor, -1, -2), pull[..., None])[..., 0]
+        return self.z[self.posterior.free] + step, factor, log_marginal
 
     def whitened(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the same Gaussian as its factor L and the vector L' (mean - z), and the density.
@@ -116,18 +117,6 @@ class Linearisation:
             - _log_root(inner)
         )
         return inner, factor[..., f, :f], log_marginal
-
-
-def back_substituted(factor: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve L' x = right for lower factors L (..., f, f), right (..., f).
-
-    Column by column for the whole batch at once: many small systems cost little each.
-    """
-    x = right.copy()
-    for column in range(right.shape[-1] - 1, -1, -1):
-        x[..., column] /= factor[..., column, column]
-        x[..., :column] -= factor[..., column, :column] * x[..., column, None]
-    return x
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,105 +272,36 @@ class LaplaceProposal:
     """Noise from a Student t; parameters given the noise from their Gaussian, with t tails.
 
     Together a heavy-tailed, skewed relative of the multivariate t: the width of the parameters
-    goes with the noise drawn.
-    """
-
-    mode: Mode
-
-    def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Return points (count, d) of the posterior and their log density (count,)."""
-        # The folded coordinates have a mirrored half: |x| has the density of x and of -x together.
-        eta, _ = self._noise.sample(count, rng)
-        eta = self._fold(eta)
-        f = len(self.mode.linearisation.posterior.free)
-        normal = rng.standard_normal((count, f))
-        tail = rng.random(count) < TAIL_SHARE
-        mixing = np.sqrt(rng.chisquare(TAIL_FREEDOM, count) / TAIL_FREEDOM)
-        whitened = normal * np.where(tail, TAIL_WIDENING / mixing, 1.0)[:, None]
-        points, log_root = np.empty((count, f)), np.empty(count)
-        for start in range(0, count, BLOCK):
-            chosen = slice(start, start + BLOCK)
-            points[chosen], log_root[chosen] = self._coloured(eta[chosen], whitened[chosen])
-        density = self._noise_density(eta) + _conditional_density(whitened, log_root)
-        return np.concatenate((points, eta), axis=1), density
-
-    def log_density(self, points: FloatArray) -> FloatArray:
-        """Return the normalised log density of points (n, d), (n,)."""
-        f = len(self.mode.linearisation.posterior.free)
-        eta = points[:, f:]
-        whitened, log_root = self._whitened(eta, points[:, :f])
-        return self._noise_density(eta) + _conditional_density(whitened, log_root)
-
-    def _coloured(self, eta: FloatArray, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return parameters of standard normal vectors (n, f), and log of the precision's root."""
-        linearisation = self.mode.linearisation
-        factor, pull, _ = linearisation.whitened(eta)
-        middle = linearisation.z[linearisation.posterior.free]
-        return middle + back_substituted(factor, pull + whitened), _log_root(factor)
-
-    def _whitened(self, eta: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the opposite: the standard normal vectors of parameters (n, f)."""
-        mean, factor, _ = self.mode.linearisation.conditional(eta)
-        step = (parameters - mean)[..., None]
-        return (np.swapaxes(factor, -1, -2) @ step)[..., 0], _log_root(factor)
-
-    def dispersed(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Return starts for chains: spread twice as far as the posterior, (count, d)."""
-        mode = self.mode
-        points, _ = self.sample(count, rng)
-        centre = np.concatenate((mode.z[mode.linearisation.posterior.free], mode.eta))
-        starts = centre + 2.0 * (points - centre)
-        f = len(mode.linearisation.posterior.free)
-        starts[:, f:] = self._fold(starts[:, f:])
-        return starts
-
-    def _fold(self, eta: FloatArray) -> FloatArray:
-        count = len(self.mode.linearisation.posterior.channels)
-        return np.concatenate((eta[:, :count], np.abs(eta[:, count:])), axis=1)
-
-    def _noise_density(self, eta: FloatArray) -> FloatArray:
-        count = len(self.mode.linearisation.posterior.channels)
-        folded = eta.shape[1] - count
-        signs = itertools.product((1.0, -1.0), repeat=folded)
-        mirrored = [eta * np.array((*(1.0,) * count, *sign)) for sign in signs]
-        return np.logaddexp.reduce([self._noise.log_density(image) for image in mirrored])
-
-    @property
-    def _noise(self) -> StudentT:
-        factor: FloatArray = np.asarray(np.linalg.cholesky(self.mode.eta_covariance))
-        return StudentT(self.mode.eta, factor, NOISE_FREEDOM)
-
-
-@dataclass(frozen=True, eq=False)
-class InterpolatedProposal(LaplaceProposal):
-    """The same for hundreds of parameters, where factorising their precision for each draw costs.
-
-    Along each principal direction of the noise the mean is quadratic, and so is the logarithm of
-    the diagonal of the covariance's factor; the rest of that factor is linear. What this leaves
-    out the sampler corrects.
+    goes with the noise drawn. To factorise their precision for every draw would cost more than all
+    the rest, so the Gaussian is interpolated along each principal direction of the noise: its mean
+    is quadratic, and so is the logarithm of the diagonal of its factor; the rest of the factor is
+    linear. What this leaves out the sampler corrects.
 
     Attributes
     ----------
+    mode
+        About which it proposes.
     basis
         Principal directions of the noise, one standard deviation long, (e, e).
-    factor
-        Lower factor of the precision at the mode, (f, f).
+    root
+        Inverse of the lower factor of the precision at the mode, (f, f).
     mean
         Slope and curvature of the mean along each direction, (e, 2, f).
     log_diagonal
-        The same of the logarithm of the diagonal, (e, 2, f).
+        The same of the logarithm of the diagonal of the covariance's factor, (e, 2, f).
     lower
-        Slope of what is below the diagonal, (e, f, f).
+        Slope of what is below that diagonal, (e, f, f).
     """
 
+    mode: Mode
     basis: FloatArray
-    factor: FloatArray
+    root: FloatArray
     mean: FloatArray
     log_diagonal: FloatArray
     lower: FloatArray
 
     @classmethod
-    def of(cls, mode: Mode) -> InterpolatedProposal:
+    def of(cls, mode: Mode) -> LaplaceProposal:
         """Factorise at the mode and a standard deviation of the noise to either side of it."""
         linearisation = mode.linearisation
         centre, factor, _ = linearisation.conditional(mode.eta)
@@ -403,40 +323,86 @@ class InterpolatedProposal(LaplaceProposal):
             means.append(_parabola(m1, m2, reach))
             diagonals.append(_parabola(d1, d2, reach))
             lowers.append((l1 - l2) / (1.0 + reach))
-        return cls(mode, basis, factor, np.array(means), np.array(diagonals), np.array(lowers))
+        root: FloatArray = np.asarray(np.linalg.inv(factor))
+        return cls(mode, basis, root, np.array(means), np.array(diagonals), np.array(lowers))
 
-    def _coloured(self, eta: FloatArray, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
-        u = self._along(eta)
-        mean, log_diagonal = self._interpolated(u)
-        right = np.exp(log_diagonal) * whitened
-        for share, lower in zip(u.T, self.lower, strict=True):
-            right += share[:, None] * (whitened @ lower)
-        step = np.linalg.solve(self.factor.T, right.T).T
-        return mean + step, _log_root(self.factor) - log_diagonal.sum(axis=1)
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Return points (count, d) of the posterior and their log density (count,)."""
+        # The folded coordinates have a mirrored half: |x| has the density of x and of -x together.
+        eta, _ = self._noise.sample(count, rng)
+        eta = self._fold(eta)
+        whitened = rng.standard_normal((count, len(self.root)))
+        tail = rng.random(count) < TAIL_SHARE
+        mixing = np.sqrt(rng.chisquare(TAIL_FREEDOM, count) / TAIL_FREEDOM)
+        whitened *= np.where(tail, TAIL_WIDENING / mixing, 1.0)[:, None]
+        points = np.empty((count, len(self.root)))
+        density = self._noise_density(eta)
+        for start in range(0, count, BLOCK):
+            chosen = slice(start, start + BLOCK)
+            mean, log_diagonal, u = self._conditional(eta[chosen])
+            right = np.exp(log_diagonal) * whitened[chosen]
+            for share, lower in zip(u.T, self.lower, strict=True):
+                right += share[:, None] * (whitened[chosen] @ lower)
+            points[chosen] = mean + right @ self.root
+            density[chosen] += self._conditional_density(whitened[chosen], log_diagonal)
+        return np.concatenate((points, eta), axis=1), density
 
-    def _whitened(self, eta: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-        u = self._along(eta)
-        mean, log_diagonal = self._interpolated(u)
-        right = (parameters - mean) @ self.factor
+    def log_density(self, points: FloatArray) -> FloatArray:
+        """Return the normalised log density of points (n, d), (n,)."""
+        f = len(self.root)
+        eta = points[:, f:]
+        mean, log_diagonal, u = self._conditional(eta)
         ratio = np.tensordot(u, self.lower, axes=1)
-        diagonal = np.arange(len(self.factor))
-        ratio[:, diagonal, diagonal] = np.exp(log_diagonal)
-        whitened: FloatArray = np.linalg.solve(np.swapaxes(ratio, -1, -2), right[..., None])[
-            ..., 0
-        ]
-        log_root: FloatArray = _log_root(self.factor) - log_diagonal.sum(axis=1)
-        return whitened, log_root
+        ratio[:, np.arange(f), np.arange(f)] = np.exp(log_diagonal)
+        right = np.linalg.solve(self.root.T, (points[:, :f] - mean).T).T
+        whitened = np.linalg.solve(np.swapaxes(ratio, -1, -2), right[..., None])[..., 0]
+        return self._noise_density(eta) + self._conditional_density(whitened, log_diagonal)
 
-    def _along(self, eta: FloatArray) -> FloatArray:
-        u: FloatArray = np.linalg.solve(self.basis.T, (eta - self.mode.eta).T).T.astype(float)
-        return u
+    def dispersed(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """Return starts for chains: spread twice as far as the posterior, (count, d)."""
+        mode = self.mode
+        points, _ = self.sample(count, rng)
+        centre = np.concatenate((mode.z[mode.linearisation.posterior.free], mode.eta))
+        starts = centre + 2.0 * (points - centre)
+        f = len(self.root)
+        starts[:, f:] = self._fold(starts[:, f:])
+        return starts
 
-    def _interpolated(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        middle = self.mode.linearisation
-        centre = middle.z[middle.posterior.free]
+    def _conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return mean and log diagonal of the factor (n, f), and eta by principal direction."""
+        u = (eta - self.mode.eta) @ np.linalg.inv(self.basis)
+        centre = self.mode.z[self.mode.linearisation.posterior.free]
         mean = centre + u @ self.mean[:, 0] + u**2 @ self.mean[:, 1]
-        # So far out the parabola may turn: there a bound keeps the proposal wide enough.
-        return mean, np.clip(u @ self.log_diagonal[:, 0] + u**2 @ self.log_diagonal[:, 1], -2, 2)
+        log_diagonal = u @ self.log_diagonal[:, 0] + u**2 @ self.log_diagonal[:, 1]
+        # Far out the parabola may turn: a bound keeps the proposal from collapsing.
+        return mean, np.clip(log_diagonal, -2.0, 2.0), u
+
+    def _conditional_density(self, whitened: FloatArray, log_diagonal: FloatArray) -> FloatArray:
+        """Return the log density of parameters given the noise, (n,): normal with t tails."""
+        f = len(self.root)
+        square = np.sum(whitened**2, axis=-1)
+        centre = np.log1p(-TAIL_SHARE) - 0.5 * square - 0.5 * f * np.log(2.0 * np.pi)
+        tail = (
+            np.log(TAIL_SHARE)
+            + log_student_t(square / TAIL_WIDENING**2, f, TAIL_FREEDOM)
+            - f * np.log(TAIL_WIDENING)
+        )
+        return np.logaddexp(centre, tail) - _log_root(self.root) - log_diagonal.sum(axis=-1)
+
+    def _fold(self, eta: FloatArray) -> FloatArray:
+        count = len(self.mode.linearisation.posterior.channels)
+        return np.concatenate((eta[:, :count], np.abs(eta[:, count:])), axis=1)
+
+    def _noise_density(self, eta: FloatArray) -> FloatArray:
+        count = len(self.mode.linearisation.posterior.channels)
+        folded = eta.shape[1] - count
+        signs = itertools.product((1.0, -1.0), repeat=folded)
+        mirrored = [eta * np.array((*(1.0,) * count, *sign)) for sign in signs]
+        return np.logaddexp.reduce([self._noise.log_density(image) for image in mirrored])
+
+    @property
+    def _noise(self) -> StudentT:
+        return StudentT(self.mode.eta, self.basis.T, NOISE_FREEDOM)
 
 
 def _parabola(plus: FloatArray, minus: FloatArray, reach: float) -> FloatArray:
@@ -450,16 +416,3 @@ def _parabola(plus: FloatArray, minus: FloatArray, reach: float) -> FloatArray:
 def _log_root(factor: FloatArray) -> FloatArray:
     """Return the log determinant of triangular factors (..., f, f), (...)."""
     return np.sum(np.log(np.diagonal(factor, axis1=-2, axis2=-1)), axis=-1)
-
-
-def _conditional_density(whitened: FloatArray, log_root: FloatArray) -> FloatArray:
-    """Return the log density of parameters given the noise, (n,): normal, with some t tails."""
-    f = whitened.shape[-1]
-    square = np.sum(whitened**2, axis=-1)
-    centre = np.log1p(-TAIL_SHARE) - 0.5 * square - 0.5 * f * np.log(2.0 * np.pi)
-    tail = (
-        np.log(TAIL_SHARE)
-        + log_student_t(square / TAIL_WIDENING**2, f, TAIL_FREEDOM)
-        - f * np.log(TAIL_WIDENING)
-    )
-    return np.logaddexp(centre, tail) + log_root

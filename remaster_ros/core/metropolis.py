@@ -137,21 +137,28 @@ def independence_sampler(
     points = points.reshape(chains, length, -1)
     log_weight = (log_target - log_proposal).reshape(chains, length)
     log_uniform = np.log(rng.random((chains, length)))
-
-    index = np.empty((chains, length), dtype=np.int64)
-    accepted = np.zeros((chains, length), dtype=bool)
+    current = log_density(start) - proposal.log_density(start)
+    walks = [_walk(*chain) for chain in zip(log_weight, log_uniform, current, strict=True)]
+    index = np.array(walks)
+    accepted = np.diff(index, axis=1, prepend=-1) != 0
     everyone = np.arange(chains)
-    current = np.full(chains, -1)
-    current_weight = log_density(start) - proposal.log_density(start)
-    for step in range(length):
-        weight = log_weight[:, step]
-        take = log_uniform[:, step] < weight - current_weight
-        current = np.where(take, step, current)
-        current_weight = np.where(take, weight, current_weight)
-        accepted[:, step] = take
-        index[:, step] = current
     path = np.where((index >= 0)[..., None], points[everyone[:, None], index], start[:, None])
     return Chains(path[:, warm_up:], float(accepted[:, warm_up:].mean()), path)
+
+
+def _walk(log_weight: FloatArray, log_uniform: FloatArray, current: float) -> list[int]:
+    """Return which proposal the chain is at after each step; -1 is the start.
+
+    Plain numbers in a plain loop: nothing here is worth an array.
+    """
+    here, path = -1, []
+    for step, (weight, uniform) in enumerate(
+        zip(log_weight.tolist(), log_uniform.tolist(), strict=True)
+    ):
+        if uniform < weight - current:
+            here, current = step, weight
+        path.append(here)
+    return path
 
 
 def random_walk_sampler(

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from remaster_ros.core import convergence
-from remaster_ros.core.laplace import InterpolatedProposal, LaplaceProposal, Mode
+from remaster_ros.core.laplace import LaplaceProposal, Mode
 from remaster_ros.core.metropolis import (
     Chains,
     LogDensity,
@@ -44,8 +44,6 @@ WALK_STEPS_PER_DRAW = 20
 DENSITY_ERROR_LIMIT = 0.05
 CHECKED_DRAWS = 200
 CHECKED_ROWS = 5_000_000
-# With more parameters the proposals given the noise are interpolated.
-MANY_PARAMETERS = 60
 
 
 class Sampling(NamedTuple):
@@ -134,8 +132,7 @@ def sample_posterior(
     """
     posterior = mode.linearisation.posterior
     length = Length(draws, precision)
-    many = len(posterior.free) > MANY_PARAMETERS
-    laplace = InterpolatedProposal.of(mode) if many else LaplaceProposal(mode)
+    laplace = LaplaceProposal.of(mode)
     starts = laplace.dispersed(chains, rng)
 
     def independent(target: LogDensity, proposal: Proposal, start: FloatArray) -> Chains:

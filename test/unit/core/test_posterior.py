@@ -29,7 +29,7 @@ def test_density_is_that_of_correlated_normal_errors(found) -> None:
     """The whole covariance matrix of every sensor's errors, written out."""
     posterior, model = found.posterior, found.model
     rng = np.random.default_rng(1)
-    points, _ = LaplaceProposal(found.mode).sample(6, rng)
+    points, _ = LaplaceProposal.of(found.mode).sample(6, rng)
     expected = []
     for point in points:
         sigma, pose_sigma = posterior.noise(point[len(posterior.free) :])
@@ -58,14 +58,14 @@ def test_density_is_that_of_correlated_normal_errors(found) -> None:
 
 
 def test_negative_ratios_have_no_density(found) -> None:
-    point, _ = LaplaceProposal(found.mode).sample(1, np.random.default_rng(1))
+    point, _ = LaplaceProposal.of(found.mode).sample(1, np.random.default_rng(1))
     point[0, -1] *= -1.0
     assert found.posterior.log_density(point)[0] == -np.inf
 
 
 def test_linearised_posterior_is_nearly_the_exact_one(found) -> None:
     """Conditional times marginal equals the density but for a constant, near the mode."""
-    proposal = LaplaceProposal(found.mode)
+    proposal = LaplaceProposal.of(found.mode)
     points, _ = proposal.sample(200, np.random.default_rng(2))
     f = len(found.posterior.free)
     mean, factor, marginal = found.mode.linearisation.conditional(points[:, f:])
@@ -77,7 +77,7 @@ def test_linearised_posterior_is_nearly_the_exact_one(found) -> None:
 
 
 def test_proposal_reports_the_density_it_samples_from(found) -> None:
-    proposal = LaplaceProposal(found.mode)
+    proposal = LaplaceProposal.of(found.mode)
     points, density = proposal.sample(50, np.random.default_rng(3))
     np.testing.assert_allclose(proposal.log_density(points), density)
     assert np.all(points[:, -2:] >= 0.0)
