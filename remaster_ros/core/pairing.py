@@ -6,6 +6,7 @@ bag replayed at any speed gives the same observations.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,7 +77,8 @@ class Rejection:
     Attributes
     ----------
     reason
-        A word to count by: ``moving``, ``stale``, ``too_few``, ``unsteady`` or ``device``.
+        A word to count by: ``moving``, ``unseen``, ``clock``, ``stale``, ``too_few``,
+        ``unsteady``, ``frozen``, ``swapped``, ``device``, ``absent`` or ``not_waited``.
     detail
         One line with the numbers.
     """
@@ -84,6 +86,13 @@ class Rejection:
     sensor: str
     reason: str
     detail: str
+
+
+LONGEST_GAP_S = 5.0
+"""Without a report of the joints for so long nobody knows that the arm stood still, s."""
+
+CLOCK_BACK_S = 0.1
+"""A report that is older than the last one by more than this comes from a clock set back, s."""
 
 
 class Pairing:
@@ -99,6 +108,9 @@ class Pairing:
         The rules, one per sensor.
     motion_tolerance
         A report further than this from `q_settled` on any joint means the arm moved, rad.
+    require
+        Whom the arm waits for: ``all`` sensors, ``any`` of them, or one by its name. A sensor
+        that is not required and has no reading by then is left out.
     """
 
     def __init__(
@@ -107,18 +119,27 @@ class Pairing:
         q_settled: FloatArray,
         sensors: tuple[SensorRules, ...],
         motion_tolerance: float = 5e-4,
+        require: str = 'all',
     ) -> None:
         self.settled_stamp_s = settled_stamp_s
         self.q_settled = np.asarray(q_settled, float)
         self.rules = {rules.sensor: rules for rules in sensors}
         self.motion_tolerance = motion_tolerance
+        self.require = require
         self.decided: dict[str, PairedReading | Rejection] = {}
+        self._decided_s: dict[str, float] = {}
+        self._now_s = self._looked_s = settled_stamp_s
+        self._excused_s = dict.fromkeys(self.rules, 0.0)
         self._joints: list[tuple[float, FloatArray]] = []
         self._readings: dict[str, list[MarkerReading]] = {name: [] for name in self.rules}
 
     def add_joint_state(self, stamp_s: float, q: FloatArray) -> None:
-        """Take a report of the joint positions, rad, (k,)."""
-        if stamp_s > self.settled_stamp_s:
+        """Take a report of the joint positions, rad, (k,), in the order of their arrival."""
+        if self._joints and stamp_s < self._now_s - CLOCK_BACK_S:
+            detail = f'the clock of joint_states went back by {self._now_s - stamp_s:.1f} s'
+            self._reject_rest('clock', detail)
+        elif stamp_s > self._now_s:
+            self._now_s = stamp_s
             self._joints.append((stamp_s, np.asarray(q, float)))
             self._decide(stamp_s)
 
@@ -130,19 +151,68 @@ class Pairing:
 
     def fail(self, sensor: str, detail: str) -> None:
         """Note that the device itself said that there is no measurement."""
-        self.decided.setdefault(sensor, Rejection(sensor, 'device', detail))
+        self._set(Rejection(sensor, 'device', detail))
 
-    def give_up(self, now_s: float) -> None:
-        """Reject every sensor whose time is over at `now_s`."""
-        for name, rules in self.rules.items():
-            allowed = rules.timeout_s + (0.0 if rules.single_shot else rules.dwell_s)
-            if name not in self.decided and now_s > self.settled_stamp_s + allowed:
-                self.decided[name] = self._late(rules, allowed)
+    def give_up(self, now_s: float, absent: Collection[str] = ()) -> None:
+        """Reject every sensor whose time is over at `now_s`.
+
+        Parameters
+        ----------
+        now_s
+            Stamp of the latest joint state, s.
+        absent
+            Sensors that are not there at all now: a required one is waited for, and the time is
+            not counted; another one is left out.
+        """
+        passed = max(now_s - self._looked_s, 0.0)
+        self._looked_s = now_s
+        for name in absent:
+            if name in self.rules and self.is_required(name):
+                self._excused_s[name] += passed
+            elif name in self.rules:
+                self._set(Rejection(name, 'absent', 'it is not there, and not required'))
+        for rules in self.rules.values():
+            allowed = self._allowed_s(rules)
+            if now_s > self.settled_stamp_s + allowed:
+                self._set(self._late(rules, allowed))
+
+    def is_required(self, sensor: str) -> bool:
+        """Whether the arm waits for this sensor."""
+        return self.require in ('all', 'any', sensor)
 
     @property
     def complete(self) -> bool:
-        """Whether every sensor has been decided on."""
-        return len(self.decided) == len(self.rules)
+        """Whether the arm need not wait any longer."""
+        if len(self.decided) == len(self.rules):
+            return True
+        if self.require == 'any':
+            return any(isinstance(item, PairedReading) for item in self.decided.values())
+        return self.require in self.decided
+
+    def finish(self) -> None:
+        """Leave out the sensors that the arm did not wait for."""
+        self._reject_rest('not_waited', f'the arm waits for {self.require}')
+
+    def waited_s(self) -> dict[str, float]:
+        """How long the arm stood for whom, s: from one sensor's decision to the next one's."""
+        waited, since = dict.fromkeys(self.rules, 0.0), self.settled_stamp_s
+        for name, at in sorted(self._decided_s.items(), key=lambda item: item[1]):
+            waited[name], since = at - since, at
+        return waited
+
+    def _set(self, item: PairedReading | Rejection) -> None:
+        if item.sensor not in self.decided:
+            self.decided[item.sensor] = item
+            self._decided_s[item.sensor] = self._now_s
+
+    def _reject_rest(self, reason: str, detail: str) -> None:
+        for name in self.rules:
+            self._set(Rejection(name, reason, detail))
+
+    def _allowed_s(self, rules: SensorRules) -> float:
+        """How long after the settling a sensor may stay out, s."""
+        dwell_s = 0.0 if rules.single_shot else rules.dwell_s
+        return dwell_s + rules.timeout_s + self._excused_s[rules.sensor]
 
     def _late(self, rules: SensorRules, allowed: float) -> Rejection:
         count = len(self._readings[rules.sensor])
@@ -172,7 +242,7 @@ class Pairing:
             # Without a later joint state nobody knows that the arm stood still to the end.
             if not self._joints or self._joints[-1][0] < end:
                 continue
-            self.decided[name] = self._judge(rules, used, end)
+            self._set(self._judge(rules, used, end))
 
     def _dwell(
         self, rules: SensorRules, readings: list[MarkerReading]
@@ -188,7 +258,7 @@ class Pairing:
                 return None
             used = readings[: rules.min_samples]
             end = used[-1].stamp_s
-            if end > self.settled_stamp_s + rules.dwell_s + rules.timeout_s:
+            if end > self.settled_stamp_s + self._allowed_s(rules):
                 return None
         return end, used
 
@@ -203,6 +273,10 @@ class Pairing:
         if not moved <= self.motion_tolerance:
             detail = f'a joint moved {moved:.2e} rad (allowed {self.motion_tolerance:.1e})'
             return Rejection(rules.sensor, 'moving', detail)
+        gap = float(np.max(np.diff(stamps[:until], prepend=self.settled_stamp_s)))
+        if gap > LONGEST_GAP_S:
+            detail = f'no report of the joints for {gap:.1f} s (or their clock jumped)'
+            return Rejection(rules.sensor, 'unseen', detail)
         inside = q[stamps <= end]
         q_mean = inside.mean(axis=0) if len(inside) else q[0]
         positions = np.array([reading.position for reading in used]).reshape(-1, 3)
@@ -213,6 +287,9 @@ class Pairing:
             if not np.all(std <= rules.max_std_m):
                 detail = f'std {1e3 * std.max():.3f} mm (allowed {1e3 * rules.max_std_m:.3f} mm)'
                 return Rejection(rules.sensor, 'unsteady', detail)
+            if len(used) > 1 and not np.any(np.ptp(positions, axis=0)):
+                detail = f'{len(used)} readings are the same to the last bit'
+                return Rejection(rules.sensor, 'frozen', detail)
         return PairedReading(
             rules.sensor, rules.marker, end, q_mean, positions.mean(axis=0), std, len(used)
         )

@@ -18,6 +18,12 @@ from remaster_ros.core.types import FloatArray
 
 LONGEST_STEP_S = 0.5
 """Robot time that passes at most between two reports, s."""
+PROBE = -1
+"""The number of the move before the first one."""
+PROBE_RAD = 1e-6
+"""How far it goes, rad: less than the arm repeats, more than the last bit."""
+PROBE_WAIT_S = 0.5
+"""After its end a robot that copies commands has copied this one, s."""
 STANDING_S = 0.2
 """An arm that has not moved for so long stands; it must before it is sent anywhere, s."""
 OLD_REPORT_S = 0.2
@@ -145,6 +151,13 @@ class Visitor:
         Nothing outside them is ever commanded.
     rules
         See `VisitRules`.
+
+    Attributes
+    ----------
+    halted
+        Why the arm stays where it is until somebody starts the collection again; ''.
+    trouble
+        What is wrong with the reports of the joints; ''.
     """
 
     def __init__(self, limits: MotionLimits, rules: VisitRules) -> None:
@@ -153,12 +166,13 @@ class Visitor:
         self._heard = dict.fromkeys(('planner', 'recorder', 'robot'), -np.inf)
         self._planner_state = 'unknown'
         self._waiting_for = ''
-        self._trouble = ''
+        self.trouble = ''
         self._emergency = False
         self._solutions: FloatArray | None = None
         self._next, self._attempt = 0, 1
         self._visit: _Visit | None = None
         self._failures = 0
+        self._probed = False
         # What the reports say.
         self._q: FloatArray | None = None
         self._velocity = np.zeros(len(limits.lower))
@@ -204,7 +218,7 @@ class Visitor:
     def unreadable(self, why: str, wall_s: float) -> list[Action]:
         """Take a report that says nothing about the joints."""
         self._heard['robot'] = wall_s
-        self._trouble = why
+        self.trouble = why
         return self.tick(wall_s)
 
     def emergency(self, stopped: bool, wall_s: float) -> list[Action]:
@@ -217,12 +231,14 @@ class Visitor:
         if not np.all(np.isfinite(q)):
             return self.unreadable('joint_states are not finite', wall_s)
         self._heard['robot'] = wall_s
-        self._trouble = ''
+        self.trouble = ''
         self._follow(stamp_s, q, wall_s)
         visit = self._visit
         actions: list[Action] = []
         if visit is not None and not visit.settled:
             actions = self._judge(visit, stamp_s, q, wall_s)
+        elif visit is not None and self._waiting_for:
+            visit.deadline = self._time + self.rules.answer_timeout_s
         elif visit is not None and self._time > visit.deadline:
             self._leave(visit)
             actions = [Failed(visit.solution, 'the recorder did not say what became of it')]
@@ -242,6 +258,10 @@ class Visitor:
         """Whether a configuration is under way."""
         return self._visit is not None
 
+    def report_age_s(self, wall_s: float) -> float:
+        """Time since the robot was heard, s; infinite if it never was."""
+        return wall_s - self._heard['robot']
+
     def blocked(self, wall_s: float) -> str:
         """Why the arm must not move; '' if it may."""
         limit = self.rules.heartbeat_s
@@ -254,7 +274,7 @@ class Visitor:
             return f'planner is {self._planner_state}'
         if self._waiting_for:
             return f'waiting for {self._waiting_for}'
-        return self._trouble
+        return self.trouble
 
     # Inside
 
@@ -262,8 +282,9 @@ class Visitor:
         """Keep robot time, velocity and standstill."""
         passed = stamp_s - self._stamp
         seen_all_along = 0.0 < passed <= LONGEST_STEP_S
-        known = self._q is not None and seen_all_along
-        self._velocity = (q - self._q) / passed if known else np.zeros_like(q)
+        self._velocity = np.zeros_like(q)
+        if self._q is not None and seen_all_along:
+            self._velocity = (q - self._q) / passed
         self._time += min(max(passed, 0.0), LONGEST_STEP_S)
         still = np.all(np.abs(q - self._stands_at) <= self.rules.settle.still_tolerance)
         if not (still and seen_all_along):
@@ -277,17 +298,26 @@ class Visitor:
             stands = self._time - self._stands_since >= STANDING_S
             if not stands or self._next >= len(self._solutions):
                 break
+            if not self._probed:
+                return [self._probe(self._q, wall_s)]
             target = self._solutions[self._next]
             outside = self.limits.outside(target)
             if outside:
                 actions.append(Failed(self._next, outside))
                 self._next += 1
             else:
-                actions.append(self._drive(self.limits.move(self._q, target), wall_s))
+                move = self.limits.move(self._q, target)
+                actions.append(self._drive(self._next, move, wall_s))
         return actions
 
-    def _drive(self, move: Move, wall_s: float) -> Drive:
-        rules, solution = self.rules, self._next
+    def _probe(self, q: FloatArray, wall_s: float) -> Drive:
+        """Command where the arm stands, but for a micrometre: it must not come back to the bit."""
+        low, high = np.clip((self.limits.lower, self.limits.upper), -1e3, 1e3)
+        inward = np.where(2 * q > low + high, -PROBE_RAD, PROBE_RAD)
+        return self._drive(PROBE, self.limits.move(q, q + inward), wall_s)
+
+    def _drive(self, solution: int, move: Move, wall_s: float) -> Drive:
+        rules = self.rules
         deadline = self._time + move.duration_s + rules.settle.settle_s + rules.arrive_timeout_s
         detector = SettleDetector(move.end, rules.settle)
         self._visit = _Visit(solution, move, detector, self._time, self._stamp, wall_s, deadline)
@@ -300,7 +330,16 @@ class Visitor:
     def _judge(self, visit: _Visit, stamp_s: float, q: FloatArray, wall_s: float) -> list[Action]:
         """Say what becomes of the configuration that the arm is on its way to."""
         detector, rules = visit.detector, self.rules
-        if detector.update(stamp_s, q) == 'settled':
+        arrived = self._time - visit.sent > visit.move.duration_s + PROBE_WAIT_S
+        settled = detector.update(stamp_s, q) == 'settled'
+        if (arrived or settled) and np.array_equal(q, visit.move.end):
+            why = 'joint_states repeat what was commanded to the last bit: no measurement'
+            return self._halt(f'{why}; switch the driver to measured positions', wall_s)
+        if visit.solution == PROBE:
+            if arrived:
+                self._visit, self._probed = None, True
+            return []
+        if settled:
             assert detector.still_since is not None
             visit.settled, self._failures = True, 0
             visit.deadline = self._time + rules.answer_timeout_s

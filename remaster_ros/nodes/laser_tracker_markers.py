@@ -288,7 +288,10 @@ class LaserTrackerMarkers(RemasterNode):
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
         level = 'ok' if not self._trouble else 'warn' if self._state == 'ready' else 'error'
         values: dict[str, Any] = {
+            'sensor': self.p.sensor,
+            'ready': 'yes' if self._state == 'ready' and self.tracker.connected else 'no',
             'state': self._state,
+            'trouble': self._trouble,
             'lock': self.tracker.status.value,
             **self.tracker.counts,
         }

@@ -124,7 +124,13 @@ class OptiTrackMarkers(RemasterNode):
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
         status = self.client.status()
         diagnosis = self.client.diagnosis()
+        # A hidden marker is no reason to stop the arm: moving on shows it again.
+        ready = diagnosis.fault in ('none', 'marker')
         values = {
+            'sensor': self.p.sensor,
+            'ready': 'yes' if ready else 'no',
+            'fault': diagnosis.fault,
+            'trouble': diagnosis.message,
             'frames': status.frames,
             'published': self.published,
             'lost': status.lost,

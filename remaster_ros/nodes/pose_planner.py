@@ -25,6 +25,7 @@ from remaster_ros.core.inverse import InverseKinematics
 from remaster_ros.core.planning import Plan, candidate_poses, plan_poses
 from remaster_ros.core.tour import REGISTRATION, Stop, Tour, registration_tour
 from remaster_ros.core.types import FloatArray
+from remaster_ros.nodes.clearance import Clearance
 from remaster_ros.nodes.messages import JointOrder, duration_of, stamp_key, transform_array
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
@@ -86,7 +87,8 @@ class PosePlanner(RemasterNode):
         for name in ('collect', 'pause', 'stop'):
             self.create_service(Trigger, f'/remaster/{name}', getattr(self, f'_on_{name}'))
         self.status = Status(self, self._summary)
-        listen(self, self._on_event)
+        self._clearance, self._cleared = Clearance(self, self.cell), False
+        listen(self, self._on_event, self._clearance.on_summary)
         self.create_timer(0.05, self._step, clock=self.status.steady)
 
     # Services
@@ -172,6 +174,8 @@ class PosePlanner(RemasterNode):
         """Publish the next pose once every solution of the last one has its outcome."""
         if self.state != 'running' or self._open or self._q is None or not self._heard():
             return
+        if not self._is_cleared():
+            return
         try:
             stop = self._next_stop(self._q)
         except RemasterError as error:
@@ -195,6 +199,14 @@ class PosePlanner(RemasterNode):
             self._why = 'waiting for robot_bridge and recorder'
         return False
 
+    def _is_cleared(self) -> bool:
+        """Whether the preflight has been passed, once, before the first motion."""
+        if not self._cleared:
+            findings = self._clearance.findings(seen_before=bool(self.T_R_N))
+            self._cleared = not findings
+            self._why = f'preflight: {"; ".join(findings)}' if findings else ''
+        return self._cleared
+
     def _next_stop(self, q: FloatArray) -> Stop | None:
         if self.phase == REGISTRATION:
             return self._next_registration(q)
@@ -207,8 +219,8 @@ class PosePlanner(RemasterNode):
 
     def _next_registration(self, q: FloatArray) -> Stop | None:
         """Visit poses until the recorder has registered every sensor."""
-        missing = [name for name in self.cell.sensors if name not in self.T_R_N]
-        if not missing:
+        missing = [name for name in self._clearance.required() if name not in self.T_R_N]
+        if not missing or (self.T_R_N and self._clearance.any_sensor):
             self._tour, self.phase, self._why = None, 'collection', ''
             return self._next_stop(q)
         if self._registered:
@@ -237,7 +249,9 @@ class PosePlanner(RemasterNode):
 
     def _plan_collection(self) -> Tour:
         sensors = {name: T[:3, 3] for name, T in self.T_R_N.items()}
-        aim = sensors[self.cell.aim_at]
+        # A sensor that is not required may have no registration.
+        rough = np.array(self.cell.sensors[self.cell.aim_at].rough_position_m)
+        aim = sensors.get(self.cell.aim_at, rough)
         plans = {'optimization': self._plan(self.p.optimization_candidates, aim, sensors)}
         if self.p.validation_candidates:
             plans['validation'] = self._plan(self.p.validation_candidates, aim, sensors)

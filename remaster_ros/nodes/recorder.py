@@ -6,8 +6,9 @@ are on disk; the bridge moves on only then.
 
 from __future__ import annotations
 
+import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,7 +23,9 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.core.errors import InputError
-from remaster_ros.core.pairing import PairedReading, Pairing, SensorRules
+from remaster_ros.core.pairing import PairedReading, Pairing, Rejection, SensorRules
+from remaster_ros.core.plausibility import Plausibility
+from remaster_ros.core.presence import Presence
 from remaster_ros.core.tour import nearest_solution
 from remaster_ros.core.types import FloatArray, MarkerReading, Measurements, Observation, Session
 from remaster_ros.nodes.bagging import BagRecorder
@@ -30,6 +33,7 @@ from remaster_ros.nodes.messages import JointOrder, seconds, stamp_key
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.registering import Registrar
 from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.shots import Shots
 from remaster_ros.nodes.status import TOPIC as STATUS
 from remaster_ros.nodes.status import Event, Status, receiver
 from remaster_ros.storage.cell import Cell, read_cell
@@ -62,6 +66,19 @@ class Parameters:
     )
     settle_s: float = parameter(
         3.0, 'settle time of the bridge, noted in the session', unit='s', low=0.1, high=60.0
+    )
+    require: str = parameter(
+        'all', "whom the arm waits for at each configuration: all, any, or a sensor's name"
+    )
+    heartbeat_s: float = parameter(
+        3.0, 'longest silence of a sensor node, wall time', unit='s', low=0.5, high=60.0
+    )
+    max_deviation_m: float = parameter(
+        0.05,
+        'a reading further than this from where the robot has the marker is of another one',
+        unit='m',
+        low=1e-3,
+        high=5.0,
     )
 
 
@@ -110,6 +127,13 @@ class Recorder(RemasterNode):
         self.cell = read_cell(self.p.cell)
         self.chain = self.cell.chain()
         self.rules = sensor_rules(self.cell, self.p)
+        if self.p.require not in ('all', 'any', *self.cell.sensors):
+            raise InputError(
+                f'recorder: parameter require is {self.p.require!r}; it must be all, any or one '
+                f'of {", ".join(self.cell.sensors)}'
+            )
+        self._presence = Presence(self.cell.sensors, self.p.heartbeat_s)
+        self._waited_s = dict.fromkeys(self.cell.sensors, 0.0)
         self._order = JointOrder(self.chain.joint_names)
         folder = Path(self.p.session)
         header = Session(
@@ -138,12 +162,15 @@ class Recorder(RemasterNode):
         self._configuration = 0
         self._observation = 0
         self._closed = ''
+        self._was_waiting = False
         self.registrar = Registrar(self, self.cell, self.chain)
+        markers = {name: np.array(position) for name, position in self.cell.markers.items()}
+        self._plausibility = Plausibility(self.chain, markers, self.p.max_deviation_m)
         self._bag = BagRecorder(self, folder / 'bag' if self.p.bag else None)
         self._subscribe()
         self.create_service(Trigger, '/remaster/register', self._on_register)
         self.status = Status(self, self._summary)
-        self.create_timer(0.05, self._give_up, clock=self.status.steady)
+        self.create_timer(0.05, self._look, clock=self.status.steady)
 
     def _subscribe(self) -> None:
         """Take each topic once, raw: into the bag as it came, then decoded."""
@@ -152,11 +179,12 @@ class Recorder(RemasterNode):
         bag.subscribe(JointState, '/remaster/settled', self._on_settled)
         bag.subscribe(JointTrajectory, '/remaster/joint_solutions', self._on_solutions)
         bag.subscribe(JointTrajectory, '/joint_trajectory_controller/joint_trajectory')
-        self._measure = {}
+        clients = {}
         for name, sensor in self.cell.sensors.items():
             bag.subscribe(PointStamped, sensor.topic, self._on_point(name))
             if sensor.single_shot and sensor.measure_service and self.p.call_measure:
-                self._measure[name] = self.create_client(Trigger, sensor.measure_service)
+                clients[name] = self.create_client(Trigger, sensor.measure_service)
+        self._shots = Shots(clients)
         bag.subscribe(DiagnosticArray, STATUS, receiver(self._on_event, self._on_summary))
         bag.subscribe_rest()
 
@@ -169,6 +197,7 @@ class Recorder(RemasterNode):
             if not np.all(np.isfinite(position)):
                 self.counts[f'{sensor}_not_finite'] += 1
                 return
+            self._presence.reads(sensor, time.monotonic())
             reading = MarkerReading(seconds(message.header.stamp), position)
             self._recent_readings.append((sensor, reading))
             if self._taking is not None:
@@ -202,6 +231,9 @@ class Recorder(RemasterNode):
             self._from_q = None
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
+        if 'sensor' in values:
+            ready = values.get('ready') == 'yes'
+            self._presence.says(values['sensor'], ready, message, time.monotonic())
         if node == 'pose_planner' and self._taking is None:
             if values.get('state') == 'complete':
                 self._close('complete')
@@ -245,7 +277,7 @@ class Recorder(RemasterNode):
         pose: _Pose,
         future: Future | None = None,
     ) -> None:
-        pairing = Pairing(settled_s, q, self.rules, self.p.motion_tolerance)
+        pairing = Pairing(settled_s, q, self.rules, self.p.motion_tolerance, self.p.require)
         # Now, not when the reading is done: a stop may come in between.
         self._taking = _Taking(pairing, stamp, solution, pose, self._from_q, future)
         self._from_q = q
@@ -253,32 +285,39 @@ class Recorder(RemasterNode):
             pairing.add_joint_state(stamp_s, recent)
         for sensor, reading in self._recent_readings:
             pairing.add_reading(sensor, reading)
-        for name, client in self._measure.items():
-            if not client.service_is_ready():
-                pairing.fail(name, f'the service {client.srv_name} is not there')
-                continue
-            client.call_async(Trigger.Request()).add_done_callback(self._measured(pairing, name))
+        self._shots.look(pairing, self._presence.absent(time.monotonic()))
 
-    def _measured(self, pairing: Pairing, sensor: str) -> Callable[[Future], None]:
-        def receive(future: Future) -> None:
-            response = future.result()
-            if response is not None and not response.success:
-                pairing.fail(sensor, response.message)
-                self._finish_if_complete()
-
-        return receive
-
-    def _give_up(self) -> None:
+    def _look(self) -> None:
+        """Ask, give up, and say at once when a required sensor goes or comes back."""
+        absent = self._presence.absent(time.monotonic())
         if self._taking is not None:
-            self._taking.pairing.give_up(self._now)
+            self._shots.look(self._taking.pairing, absent)
+            self._taking.pairing.give_up(self._now, absent)
             self._finish_if_complete()
+        waiting_for = self._waiting_for(absent)
+        if bool(waiting_for) != self._was_waiting:
+            self._was_waiting = bool(waiting_for)
+            self.status.publish()
+
+    def _waiting_for(self, absent: Mapping[str, str]) -> str:
+        """Name the required sensors that are not there, and why; '' if the arm may go on."""
+        sensors = self.cell.sensors
+        wanted = [name for name in sensors if self.p.require in ('all', 'any', name)]
+        gone = [name for name in wanted if name in absent]
+        if not gone or (self.p.require == 'any' and len(gone) < len(wanted)):
+            return ''
+        return '; '.join(f'{name}: {absent[name]}' for name in gone)
 
     def _finish_if_complete(self) -> None:
         taking = self._taking
         if taking is None or not taking.pairing.complete:
             return
         self._taking = None
-        decided = taking.pairing.decided.values()
+        taking.pairing.finish()
+        decided = [self._judged(item) for item in taking.pairing.decided.values()]
+        waited_s = taking.pairing.waited_s()
+        for name, seconds_waited in waited_s.items():
+            self._waited_s[name] += seconds_waited
         good = [item for item in decided if isinstance(item, PairedReading)]
         bad = [item for item in decided if not isinstance(item, PairedReading)]
         for rejection in bad:
@@ -294,7 +333,8 @@ class Recorder(RemasterNode):
         if taking.future is not None:
             taking.future.set_result((good, why))
             return
-        result = 'recorded' if not bad else 'partial' if good else 'rejected'
+        missed = [item for item in bad if item.reason not in ('not_waited', 'absent')]
+        result = 'rejected' if not good else 'partial' if missed else 'recorded'
         last = max((reading.stamp_s for reading in good), default=self._now)
         self._report(
             taking.stamp,
@@ -303,7 +343,13 @@ class Recorder(RemasterNode):
             why,
             registered='yes' if self.registrar.complete else 'no',
             measuring_s=f'{last - taking.pairing.settled_stamp_s:.6f}',
+            **{f'waited_s_{name}': f'{waited:.3f}' for name, waited in waited_s.items()},
         )
+
+    def _judged(self, item: PairedReading | Rejection) -> PairedReading | Rejection:
+        if isinstance(item, Rejection):
+            return item
+        return self._plausibility.judge(item, self.registrar.T_R_N.get(item.sensor))
 
     def _write(self, good: list[PairedReading], taking: _Taking) -> None:
         """Write the observations of one configuration; on disk when this returns."""
@@ -363,14 +409,21 @@ class Recorder(RemasterNode):
 
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
         state = 'closed' if self._closed else 'measuring' if self._taking else 'waiting'
+        now, sensors = time.monotonic(), self.cell.sensors
+        waiting_for = self._waiting_for(self._presence.absent(now))
+        trouble = self._trouble or (f'waiting for {waiting_for}' if waiting_for else '')
         values = {
             'state': state,
             'exit_status': self._closed,
             'session': self.p.session,
             'observations': self._observation,
+            'require': self.p.require,
+            'waiting_for': waiting_for,
+            **{f'waited_s_{name}': f'{s:.1f}' for name, s in self._waited_s.items()},
+            **{f'read_age_s_{n}': f'{self._presence.read_age_s(n, now):.1f}' for n in sensors},
             **dict(sorted(self.counts.items())),
         }
-        return ('warn' if self._trouble else 'ok'), self._trouble or state, values
+        return ('warn' if trouble else 'ok'), trouble or state, values
 
     def _close(self, exit_status: ExitStatus) -> None:
         if not self._closed:

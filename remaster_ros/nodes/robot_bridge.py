@@ -23,6 +23,7 @@ from remaster_ros.core.motion import MotionLimits, Waypoint
 from remaster_ros.core.settling import SettleRules
 from remaster_ros.core.types import FloatArray
 from remaster_ros.core.visiting import (
+    PROBE,
     Action,
     Drive,
     Failed,
@@ -201,6 +202,8 @@ class RobotBridge(RemasterNode):
 
     def _drive(self, drive: Drive) -> None:
         self._send(drive.waypoints)
+        if drive.solution == PROBE:
+            return
         self.counts['commanded'] += 1
         self._event(
             'commanded',
@@ -249,7 +252,12 @@ class RobotBridge(RemasterNode):
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
         blocked = self._visitor.blocked(time.monotonic())
         text = 'moving or measuring' if self._visitor.busy else 'waiting for a pose'
-        values = {**self.counts, 'halted': self._visitor.halted}
+        values = {
+            **self.counts,
+            'halted': self._visitor.halted,
+            'joints_age_s': f'{self._visitor.report_age_s(time.monotonic()):.1f}',
+            'joints_trouble': self._visitor.trouble,
+        }
         return ('warn' if blocked else 'ok'), blocked or text, values
 
     def close(self) -> None:

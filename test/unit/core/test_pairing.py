@@ -67,7 +67,7 @@ def test_a_marker_hidden_for_a_moment_prolongs_the_dwell():
     """Three samples in the dwell, then a gap: the fifth ends it, and no later one counts."""
     pairing = Pairing(10.0, Q, (STREAM,))
     for stamp in (10.1, 10.2, 10.3, 10.9, 11.0, 11.1):
-        pairing.add_reading('mocap', MarkerReading(stamp, np.zeros(3)))
+        pairing.add_reading('mocap', MarkerReading(stamp, np.array([stamp, 0, 0]) * 1e-6))
     run(pairing, skip_stream=True, until=1.5)
     reading = pairing.decided['mocap']
     assert (reading.samples, reading.stamp_s) == (5, 11.0)
@@ -125,3 +125,129 @@ def test_a_device_error_does_not_undo_an_accepted_reading():
     pairing = run(Pairing(10.0, Q, (STREAM,)))
     pairing.fail('mocap', 'too late')
     assert isinstance(pairing.decided['mocap'], PairedReading)
+
+
+# What a fault looks like
+
+
+def test_a_frozen_stream_is_no_reading():
+    """To the last bit the same, reading after reading: no measurement is like that."""
+    pairing = Pairing(10.0, Q, (STREAM,))
+    for stamp in np.arange(10.01, 10.7, 0.01):
+        pairing.add_reading('mocap', MarkerReading(stamp, np.array([1.0, 2.0, 3.0])))
+    run(pairing, skip_stream=True)
+    rejection = pairing.decided['mocap']
+    assert rejection.reason == 'frozen'
+    assert rejection.detail == '50 readings are the same to the last bit'
+
+
+def test_one_bit_of_noise_is_a_measurement():
+    pairing = Pairing(10.0, Q, (STREAM,))
+    for i, stamp in enumerate(np.arange(10.01, 10.7, 0.01)):
+        x = np.nextafter(1.0, 2.0) if i % 7 == 0 else 1.0
+        pairing.add_reading('mocap', MarkerReading(stamp, np.array([x, 2.0, 3.0])))
+    assert isinstance(run(pairing, skip_stream=True).decided['mocap'], PairedReading)
+
+
+def test_a_clock_that_is_set_back_rejects_what_is_open():
+    pairing = run(Pairing(10.0, Q, (STREAM, SHOT)))
+    assert set(pairing.decided) == {'mocap'}
+    pairing.add_joint_state(9.0, Q)
+    assert isinstance(pairing.decided['mocap'], PairedReading), 'it was decided before'
+    assert pairing.decided['tracker'].reason == 'clock'
+    assert pairing.decided['tracker'].detail == 'the clock of joint_states went back by 2.0 s'
+    assert pairing.complete
+
+
+def test_reports_a_little_out_of_order_do_no_harm():
+    pairing = run(Pairing(10.0, Q, (STREAM,)), until=0.3)
+    pairing.add_joint_state(10.25, Q + 1.0)
+    assert not pairing.decided
+    assert isinstance(run(pairing, start=10.3, until=0.5).decided['mocap'], PairedReading)
+
+
+@pytest.mark.parametrize(('gap', 'reason'), [(4.5, None), (5.5, 'unseen'), (3600.0, 'unseen')])
+def test_nobody_vouches_for_an_arm_that_was_not_seen(gap, reason):
+    """Joint states pause, or their clock jumps ahead, between settling and reading."""
+    pairing = Pairing(10.0, Q, (SHOT,))
+    pairing.add_joint_state(10.1, Q)
+    pairing.add_reading('tracker', MarkerReading(10.1 + gap - 0.01, np.ones(3)))
+    pairing.add_joint_state(10.1 + gap, Q)
+    decided = pairing.decided['tracker']
+    assert getattr(decided, 'reason', None) == reason
+
+
+# Two sensors, each at its own pace
+
+
+@pytest.mark.parametrize(
+    ('require', 'complete'), [('all', False), ('any', True), ('mocap', True), ('tracker', False)]
+)
+def test_the_arm_waits_for_what_is_required(require, complete):
+    pairing = run(Pairing(10.0, Q, (STREAM, SHOT), require=require))
+    assert isinstance(pairing.decided['mocap'], PairedReading)
+    assert pairing.complete == complete
+    assert pairing.is_required('tracker') == (require != 'mocap')
+    pairing.finish()
+    assert pairing.complete
+    if complete:
+        assert pairing.decided['tracker'].reason == 'not_waited'
+        assert pairing.decided['tracker'].detail == f'the arm waits for {require}'
+    assert isinstance(pairing.decided['mocap'], PairedReading)
+
+
+@pytest.mark.parametrize(
+    ('require', 'complete'), [('all', False), ('any', False), ('mocap', True)]
+)
+def test_a_rejection_is_no_reading(require, complete):
+    """With `any` the next sensor is waited for; a required one has had its chance."""
+    pairing = Pairing(10.0, Q, (STREAM, SHOT), require=require)
+    pairing.fail('mocap', 'gone')
+    assert pairing.complete == complete
+    pairing.fail('tracker', 'gone too')
+    assert pairing.complete
+
+
+def test_the_time_that_a_required_sensor_is_absent_is_not_counted():
+    """Thirty seconds without it, then a reading: accepted; the arm stood all the while."""
+    pairing = Pairing(10.0, Q, (STREAM,))
+    for stamp in np.arange(10.0, 40.0, 0.1):
+        pairing.add_joint_state(stamp, Q)
+        pairing.give_up(stamp, {'mocap'})
+    assert not pairing.decided
+    for stamp in np.arange(40.0, 40.3, 0.02):
+        pairing.add_joint_state(stamp, Q)
+        pairing.add_reading('mocap', MarkerReading(stamp, np.array([stamp, 0, 0]) * 1e-6))
+        pairing.give_up(stamp)
+    assert isinstance(pairing.decided['mocap'], PairedReading)
+    assert pairing.waited_s()['mocap'] == pytest.approx(30.1, abs=0.11)
+
+
+def test_back_again_and_silent_it_has_its_time_out_as_ever():
+    pairing = Pairing(10.0, Q, (STREAM,))
+    for stamp in np.arange(10.0, 40.0, 0.1):
+        pairing.give_up(stamp, {'mocap'} if stamp < 30 else set())
+    assert pairing.decided['mocap'].reason == 'stale'
+    pairing = Pairing(10.0, Q, (STREAM,))
+    pairing.give_up(30.0, {'mocap'})
+    pairing.give_up(32.4)
+    assert not pairing.decided
+    pairing.give_up(32.6)
+    assert pairing.decided['mocap'].reason == 'stale'
+
+
+def test_an_absent_sensor_that_is_not_required_is_left_out_at_once():
+    pairing = Pairing(10.0, Q, (STREAM, SHOT), require='mocap')
+    pairing.give_up(10.1, {'tracker', 'another'})
+    assert pairing.decided['tracker'].reason == 'absent'
+    assert set(pairing.decided) == {'tracker'}
+
+
+def test_who_was_waited_for():
+    """The bar takes its dwell; the tracker the rest; the sum is what the arm stood."""
+    pairing = run(Pairing(10.0, Q, (STREAM, SHOT)), until=4.0)
+    pairing.add_reading('tracker', MarkerReading(13.9, np.ones(3)))
+    pairing.add_joint_state(14.0, Q)
+    waited = pairing.waited_s()
+    assert waited['mocap'] == pytest.approx(0.5, abs=0.05)
+    assert sum(waited.values()) == pytest.approx(4.0, abs=0.05)

@@ -1,0 +1,112 @@
+"""Judge the tests of the code that limits motion: coverage of lines and branches, and mutants.
+
+Copies the modules and their tests into a temporary folder, where coverage.py counts what the tests
+reach and mutmut changes the code in every way it knows, one change at a time: the tests must fail
+for each. Ends with status 1 where a line or branch is not reached or a mutant survives.
+
+    python benchmarks/check_motion_code.py            (pip install coverage mutmut)
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+MODULES = ('motion', 'visiting', 'settling')
+TESTS = [f'test/unit/core/test_{name}.py' for name in MODULES]
+CONFIG = """\
+[mutmut]
+source_paths=remaster_ros
+only_mutate=
+    {modules}
+pytest_add_cli_args_test_selection=
+    {tests}
+also_copy=
+    config
+    pytest.ini
+"""
+
+
+def main() -> int:
+    """Print the figures; return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n', 1)[0])
+    parser.add_argument('--children', type=int, default=os.cpu_count() or 1)
+    parser.add_argument('--keep', type=Path, help='work in this folder and leave it')
+    args = parser.parse_args()
+    folder = args.keep or Path(tempfile.mkdtemp(prefix='motion_code_'))
+    try:
+        prepare(folder)
+        missed = coverage(folder)
+        survivors = mutants(folder, args.children)
+    finally:
+        if args.keep is None:
+            shutil.rmtree(folder, ignore_errors=True)
+    return 1 if missed or survivors else 0
+
+
+def prepare(folder: Path) -> None:
+    """Copy what the tests need."""
+    folder.mkdir(exist_ok=True)
+    for name in ('remaster_ros', 'config', 'test/unit/core'):
+        shutil.copytree(
+            ROOT / name, folder / name, ignore=shutil.ignore_patterns('__pycache__', 'mutants')
+        )
+    shutil.copy(ROOT / 'pytest.ini', folder)
+    modules = '\n    '.join(f'remaster_ros/core/{name}.py' for name in MODULES)
+    (folder / 'setup.cfg').write_text(
+        CONFIG.format(modules=modules, tests='\n    '.join(TESTS)), encoding='utf-8'
+    )
+
+
+def coverage(folder: Path) -> bool:
+    """Run the tests under coverage.py; return whether anything is not reached."""
+    include = ','.join(f'remaster_ros/core/{name}.py' for name in MODULES)
+    python = [sys.executable, '-m']
+    run(folder, *python, 'coverage', 'run', '--branch', f'--include={include}', '-m', 'pytest',
+        '-q', *TESTS)  # fmt: skip
+    report = run(
+        folder, *python, 'coverage', 'report', '--show-missing', '--fail-under=100', check=False
+    )
+    print(report.stdout)
+    return report.returncode != 0
+
+
+def mutants(folder: Path, children: int) -> int:
+    """Run mutmut; return how many mutants the tests did not notice."""
+    mutmut = [sys.executable, '-m', 'mutmut']
+    began = time.monotonic()
+    done = run(folder, *mutmut, 'run', '--max-children', str(children), check=False)
+    results = run(folder, *mutmut, 'results', '--all', 'true').stdout
+    fates = [line.rsplit(': ', 1) for line in results.splitlines() if ': ' in line]
+    counts = Counter(fate for _, fate in fates)
+    if not counts:
+        sys.exit(f'mutmut made no mutants:\n{done.stdout[-2000:]}{done.stderr[-2000:]}')
+    print(f'{sum(counts.values())} mutants in {time.monotonic() - began:.0f} s: {dict(counts)}')
+    unnoticed = [name for name, fate in fates if fate not in ('killed', 'timeout')]
+    for name in unnoticed:
+        print(run(folder, *mutmut, 'show', name.strip(), check=False).stdout)
+    return len(unnoticed)
+
+
+def run(folder: Path, *command: str, check: bool = True) -> subprocess.CompletedProcess[str]:
+    """Run a command in the folder, quietly unless it fails."""
+    environment = {**os.environ, 'OMP_NUM_THREADS': '1', 'PYTEST_DISABLE_PLUGIN_AUTOLOAD': '1'}
+    environment['PYTEST_ADDOPTS'] = '-p pytest_timeout -p no:cacheprovider'
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    if check and done.returncode:
+        sys.exit(f'{" ".join(command)} failed:\n{done.stdout[-3000:]}{done.stderr[-3000:]}')
+    return done
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -1,0 +1,87 @@
+"""May the arm move for the first time? What topics, sensors and nodes have to show; no clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+FRESH_S = 3.0
+"""Nothing older counts as a sign of life (wall time), s."""
+
+
+@dataclass(frozen=True)
+class SensorFacts:
+    """What is known of a sensor now. Ages are wall time, s; infinite for what never came.
+
+    Attributes
+    ----------
+    name
+        As in the cell.
+    said_age_s
+        Since its node's last word.
+    ready
+        Whether the node says that its device can measure.
+    message
+        The node's own diagnosis.
+    read_age_s
+        Since the recorder's last reading of it.
+    """
+
+    name: str
+    said_age_s: float
+    ready: bool
+    message: str
+    read_age_s: float
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is known before the first motion.
+
+    Attributes
+    ----------
+    joints_age_s
+        Since the last joint_states that name every joint, s.
+    joints_message
+        What is wrong with them; ''.
+    bridge_age_s, recorder_age_s
+        Since the last word of the bridge and of the recorder, s.
+    sensors
+        Those that the arm waits for.
+    any_sensor
+        Whether one of them is enough.
+    """
+
+    joints_age_s: float
+    joints_message: str
+    bridge_age_s: float
+    recorder_age_s: float
+    sensors: Sequence[SensorFacts]
+    any_sensor: bool = False
+
+
+def preflight(facts: Facts) -> tuple[str, ...]:
+    """Return what is in the way of the first motion, a line each; nothing if it may begin."""
+    findings = []
+    if facts.joints_message:
+        findings.append(facts.joints_message)
+    elif not facts.joints_age_s <= FRESH_S:
+        findings.append('no joint_states: is the robot running?')
+    for node, age_s in (('robot_bridge', facts.bridge_age_s), ('recorder', facts.recorder_age_s)):
+        if not age_s <= FRESH_S:
+            findings.append(f'no sign of {node}: is it running in this ROS domain?')
+    troubles = [trouble for sensor in facts.sensors if (trouble := _trouble(sensor))]
+    if troubles and not (facts.any_sensor and len(troubles) < len(facts.sensors)):
+        findings.extend(troubles)
+    return tuple(findings)
+
+
+def _trouble(sensor: SensorFacts) -> str:
+    if not sensor.said_age_s <= FRESH_S:
+        return f'{sensor.name}: no sign of its node: is it running in this ROS domain?'
+    if not sensor.ready:
+        return f'{sensor.name}: {sensor.message or "not ready"}'
+    if not sensor.read_age_s <= FRESH_S:
+        seen = sensor.message or 'turn the tool until the sensor sees its marker'
+        return f'{sensor.name}: the recorder has no reading of its marker: {seen}'
+    return ''

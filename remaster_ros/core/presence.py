@@ -1,0 +1,57 @@
+"""Which sensors are there: heard from lately, and ready by their own word; times are arguments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class Presence:
+    """Follow the signs of life of sensors.
+
+    Parameters
+    ----------
+    sensors
+        Their names.
+    heartbeat_s
+        A sensor that was heard and then is silent for longer is absent, s.
+
+    Attributes
+    ----------
+    readings
+        Readings received, per sensor.
+    """
+
+    def __init__(self, sensors: Iterable[str], heartbeat_s: float) -> None:
+        self._heartbeat_s = heartbeat_s
+        self._heard: dict[str, float] = {}
+        self._trouble: dict[str, str] = {}
+        self._read: dict[str, float] = {}
+        self.readings = dict.fromkeys(sensors, 0)
+
+    def says(self, sensor: str, ready: bool, message: str, now_s: float) -> None:
+        """Take the word of a sensor's node; `message` says what is wrong if it is not ready."""
+        if sensor in self.readings:
+            self._heard[sensor] = now_s
+            self._trouble[sensor] = '' if ready else message or 'not ready'
+
+    def reads(self, sensor: str, now_s: float) -> None:
+        """Take note of a reading."""
+        self.readings[sensor] += 1
+        self._read[sensor] = now_s
+
+    def read_age_s(self, sensor: str, now_s: float) -> float:
+        """Time since the last reading, s; infinite if there was none."""
+        return now_s - self._read.get(sensor, float('-inf'))
+
+    def absent(self, now_s: float) -> dict[str, str]:
+        """Return why, for each sensor that is not there.
+
+        A sensor that never said anything is none of them: a bag may hold readings alone.
+        """
+        why = {}
+        for name, heard in self._heard.items():
+            if now_s - heard > self._heartbeat_s:
+                why[name] = f'its node has been silent for {self._heartbeat_s:g} s'
+            elif self._trouble[name]:
+                why[name] = self._trouble[name]
+        return why

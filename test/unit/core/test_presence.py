@@ -1,0 +1,29 @@
+"""Presence of sensors: silent, not ready, back again."""
+
+import math
+
+from remaster_ros.core.presence import Presence
+
+
+def test_silent_or_not_ready_is_absent_and_says_why():
+    presence = Presence(['mocap', 'tracker'], 3.0)
+    assert presence.absent(100.0) == {}, 'a bag without status has no absent sensor'
+    presence.says('mocap', True, '', 10.0)
+    presence.says('tracker', False, 'warming up', 10.0)
+    presence.says('stranger', False, 'whatever', 10.0)
+    assert presence.absent(13.0) == {'tracker': 'warming up'}
+    silent = 'its node has been silent for 3 s'
+    assert presence.absent(13.1) == {'mocap': silent, 'tracker': silent}
+    presence.says('tracker', True, 'an old trouble', 14.0)
+    assert presence.absent(14.0) == {'mocap': silent}
+    presence.says('tracker', False, '', 14.0)
+    assert presence.absent(14.0)['tracker'] == 'not ready'
+
+
+def test_readings_are_counted_and_dated():
+    presence = Presence(['mocap'], 3.0)
+    assert presence.read_age_s('mocap', 5.0) == math.inf
+    presence.reads('mocap', 5.0)
+    presence.reads('mocap', 6.0)
+    assert presence.readings == {'mocap': 2}
+    assert presence.read_age_s('mocap', 6.5) == 0.5
