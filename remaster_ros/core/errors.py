@@ -1,8 +1,21 @@
 """The exceptions a caller may expect; each carries what is wrong and the remedy."""
 
+_LONGEST = 1000
+"""Characters of a message; what a stranger's file holds must not flood the terminal."""
+
 
 class RemasterError(Exception):
-    """Base of every error this package raises on purpose; ``str()`` is one line for a user."""
+    """Base of every error this package raises on purpose; ``str()`` is one line for a user.
+
+    A line that quotes too much is shortened in its middle: the place stands at its beginning, the
+    remedy at its end.
+    """
+
+    def __str__(self) -> str:
+        """Return the line."""
+        line = ' '.join(super().__str__().split())
+        half = _LONGEST // 2
+        return line if len(line) <= _LONGEST else f'{line[:half]} … {line[-half:]}'
 
 
 class InputError(RemasterError):

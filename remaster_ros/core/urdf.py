@@ -6,8 +6,9 @@ names the joint or link; nothing is guessed.
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,7 +86,8 @@ def parse_urdf(text: str) -> UrdfModel:
         raise InputError('URDF: it declares a DOCTYPE or entities; remove the declaration')
     try:
         robot = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
+    # A ValueError where the text holds what no encoding can write.
+    except (ElementTree.ParseError, ValueError) as error:
         raise InputError(f'URDF: not well-formed XML ({error})') from None
     if robot.tag != 'robot':
         raise InputError(f'URDF: the outermost element is <{robot.tag}>, not <robot>')
@@ -120,19 +122,21 @@ def parse_urdf(text: str) -> UrdfModel:
     if len(roots) != 1:
         found = ', '.join(roots) if roots else 'none, the links form a loop'
         raise InputError(f'URDF: a robot is a tree with one root link; found {found}')
-    for name in links:
-        _path_to_root(name, links[roots[0]].name, parent_joint)
+    _refuse_loops(links, roots[0], parent_joint)
     return UrdfModel(robot.get('name', ''), roots[0], links, parent_joint)
 
 
-def _path_to_root(link: str, root: str, parent_joint: Mapping[str, UrdfJoint]) -> None:
-    """Refuse a link whose ancestors form a loop apart from the root."""
-    here, seen = link, {link}
-    while here != root:
-        here = parent_joint[here].parent
-        if here in seen:
-            raise InputError(f"URDF: link '{link}' is part of a loop; a robot is a tree")
-        seen.add(here)
+def _refuse_loops(links: Iterable[str], root: str, parent_joint: Mapping[str, UrdfJoint]) -> None:
+    """Refuse links whose ancestors form a loop apart from the root."""
+    hanging = {root}
+    for link in links:
+        here, path = link, {link}
+        while here not in hanging:
+            here = parent_joint[here].parent
+            if here in path:
+                raise InputError(f"URDF: link '{link}' is part of a loop; a robot is a tree")
+            path.add(here)
+        hanging |= path
 
 
 def _link(element: ElementTree.Element) -> UrdfLink:
@@ -163,9 +167,9 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
     axis = np.array([1.0, 0.0, 0.0])
     if axis_element is not None:
         axis = _triple(_attribute(axis_element, 'xyz', where), f'the axis of {where}')
-    length = np.linalg.norm(axis)
-    if length == 0.0:
-        raise InputError(f'URDF: the axis of {where} has length zero')
+    length = math.hypot(*axis)
+    if not 1e-6 < length < 1e6:
+        raise InputError(f'URDF: the axis of {where} has length {length:g}; give a unit vector')
     limit = element.find('limit')
     limits: dict[str, float | None] = {}
     for key in ('lower', 'upper', 'velocity'):

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Mapping
-from math import radians
+from math import isfinite, radians
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
-import yaml
 
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.planning import LineOfSight, PoseRanges
 from remaster_ros.core.types import FloatArray
+from remaster_ros.storage.files import decode_text, read_limited
+from remaster_ros.storage.safe_yaml import YamlError, load_yaml
+
+YAML_LIMIT = 256 * 1024
+URDF_LIMIT = 16 * 1024**2
 
 
 class CellRobot(msgspec.Struct, forbid_unknown_fields=True):
@@ -141,26 +146,21 @@ def read_cell(path: str | Path) -> Cell:
     if not path.suffix and not path.exists():
         path = config_path(f'cells/{path}.yaml')
     try:
-        data = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except OSError as error:
-        raise InputError(f'{path}: cannot read the cell file ({error.strerror})') from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f'{path}: no valid YAML: {" ".join(str(error).split())}') from error
-    try:
+        data = load_yaml(decode_text(read_limited(path, YAML_LIMIT, 'name a cell file'), path))
         cell = msgspec.convert(data, Cell)
-    except msgspec.ValidationError as error:
-        raise InputError(f'{path}: {error}') from error
+    except (YamlError, msgspec.ValidationError) as error:
+        raise InputError(f'{path}: {error}') from None
     urdf = path.parent / cell.robot.urdf
-    try:
-        cell.urdf_text = urdf.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f'{path}: robot.urdf: cannot read {urdf} ({error})') from error
+    cell.urdf_text = decode_text(
+        read_limited(urdf, URDF_LIMIT, f'robot.urdf in {path} names it'), urdf
+    )
     _check(path, cell)
     return cell
 
 
 def _check(path: Path, cell: Cell) -> None:
     """Refuse names that point nowhere and values that cannot be."""
+    _require_finite(path, '', msgspec.to_builtins(cell))
     names = cell.chain().joint_names
     if cell.held_joint and cell.held_joint not in names:
         raise InputError(f'{path}: held_joint {cell.held_joint!r} is none of {", ".join(names)}')
@@ -180,3 +180,15 @@ def _check(path: Path, cell: Cell) -> None:
         )
     if not (cell.marker_std_m > 0 and cell.link_radius_m > 0):
         raise InputError(f'{path}: marker_std_m and link_radius_m must be positive')
+
+
+def _require_finite(path: Path, key: str, value: Any) -> None:
+    """Refuse a number that is none, wherever it stands."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            _require_finite(path, f'{key}.{name}'.lstrip('.'), inner)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            _require_finite(path, key, inner)
+    elif isinstance(value, float) and not isfinite(value):
+        raise InputError(f'{path}: {key}: {value} is not a finite number; correct it')

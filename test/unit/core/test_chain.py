@@ -164,7 +164,7 @@ BAD = {
         arm(limit='<limit lower="-1" upper="1" velocity="-1"/>'),
         "velocity limit of joint 'joint_1' is negative",
     ),
-    'zero axis': (arm(joint='<axis xyz="0 0 0"/>'), "axis of joint 'joint_1' has length zero"),
+    'zero axis': (arm(joint='<axis xyz="0 0 0"/>'), "axis of joint 'joint_1' has length 0"),
     'two numbers': (arm(joint='<axis xyz="0 0"/>'), "axis of joint 'joint_1' is '0 0'"),
     'no number': (arm(joint='<origin xyz="0 0 a"/>'), "xyz of joint 'joint_1' is 'a'"),
     'nan': (arm(joint='<origin rpy="0 0 nan"/>'), "rpy of joint 'joint_1' is 'nan'"),
