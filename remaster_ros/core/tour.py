@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.errors import InsufficientDataError
-from remaster_ros.core.planning import Plan, PlannedPose, order_solutions
+from remaster_ros.core.planning import Plan, order_solutions
 from remaster_ros.core.types import FloatArray
 
 REGISTRATION = 'registration'
@@ -31,12 +31,23 @@ class Stop:
         The tool's pose in the robot base, (4, 4).
     solutions
         Joint solutions, nearest first, rad, (m, k).
+    index
+        Which of the poses planned for its split.
+    ids
+        Which of that pose's planned solutions each of `solutions` is.
     """
 
     pose: int
     split: str
     T_R_T: FloatArray
     solutions: FloatArray
+    index: int
+    ids: tuple[int, ...]
+
+    def only(self, ids: Collection[int]) -> Stop:
+        """Return the stop with only these solutions, in the same order."""
+        kept = [i for i, number in enumerate(self.ids) if number in ids]
+        return replace(self, solutions=self.solutions[kept], ids=tuple(self.ids[i] for i in kept))
 
 
 class Tour:
@@ -63,8 +74,9 @@ class Tour:
         one_solution: bool = False,
     ) -> None:
         self._chain = chain
-        self._in_order, self._one_solution = in_order, one_solution
-        self._left: dict[str, list[PlannedPose]] = {s: list(p.poses) for s, p in plans.items()}
+        self.in_order, self.one_solution = in_order, one_solution
+        self.plans = dict(plans)
+        self._left = {split: list(range(len(plan.poses))) for split, plan in plans.items()}
         self.poses = {split: len(plan.poses) for split, plan in plans.items()}
         self.configurations = {
             split: sum(1 if one_solution else len(pose.solutions) for pose in plan.poses)
@@ -77,19 +89,29 @@ class Tour:
 
     def next(self, q: FloatArray) -> Stop | None:
         """Return the next stop for an arm at joint positions `q` (rad, (k,)); None at the end."""
-        for split, poses in self._left.items():
-            if not poses:
+        for split, left in self._left.items():
+            if not left:
                 continue
+            poses = self.plans[split].poses
             here = self._chain.forward(q)[:3, 3]
-            distances = [np.linalg.norm(pose.T_R_T[:3, 3] - here) for pose in poses]
-            pose = poses.pop(0 if self._in_order else int(np.argmin(distances)))
-            order = order_solutions(pose.solutions, q, self._chain.velocity_limits)
-            if self._one_solution:
+            distances = [np.linalg.norm(poses[i].T_R_T[:3, 3] - here) for i in left]
+            index = left[0 if self.in_order else int(np.argmin(distances))]
+            order = order_solutions(poses[index].solutions, q, self._chain.velocity_limits)
+            if self.one_solution:
                 order = order[:1]
-            number = self.visited if split != REGISTRATION else -1 - self.visited
-            self.visited += 1
-            return Stop(number, split, pose.T_R_T, pose.solutions[order])
+            return self.go_to(split, index, [int(number) for number in order])
         return None
+
+    def go_to(self, split: str, index: int, ids: Sequence[int]) -> Stop:
+        """Return the stop at one planned pose with these of its solutions, and count it visited.
+
+        This is how a tour that was begun before takes up where it was: the stops so far, in order.
+        """
+        self._left[split].remove(index)
+        pose = self.plans[split].poses[index]
+        number = self.visited if split != REGISTRATION else -1 - self.visited
+        self.visited += 1
+        return Stop(number, split, pose.T_R_T, pose.solutions[list(ids)], index, tuple(ids))
 
     def describe(self) -> str:
         """Return what was planned and dropped, in a line."""

@@ -138,7 +138,9 @@ class SessionWriter:
         return self._journal.records
 
     def _begin(self, urdf: str) -> None:
-        make_new_folder(self.folder)
+        # The planner may have been there first.
+        if not (self.folder.is_dir() and os.listdir(self.folder) == [PLAN]):
+            make_new_folder(self.folder)
         try:
             sync_folder(self.folder.parent)
         except OSError as error:
@@ -150,7 +152,7 @@ class SessionWriter:
 
     def _remove_beginnings(self) -> None:
         """Remove what a writer has left that was killed before the folder was a session."""
-        names = {path.name for path in self.folder.iterdir() if path.suffix != '.tmp'}
+        names = {path.name for path in self.folder.iterdir() if path.suffix != '.tmp'} - {PLAN}
         if HEADER in names or names - {URDF, ROWS}:
             return
         if ROWS in names and self._read_rows() != self._header_line.encode():

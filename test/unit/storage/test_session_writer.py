@@ -169,3 +169,113 @@ def test_a_killed_writer_loses_nothing_it_acknowledged(session, tmp_path):
     read = read_session(tmp_path / 's')
     assert read.exit_status == 'aborted'
     assert set(acknowledged) <= set(read.measurements.observation.tolist())
+
+
+def resumed(session, folder):
+    return SessionWriter(folder, session, resume=True)
+
+
+def test_a_killed_session_is_gone_on_with(session, tmp_path):
+    """Numbers go on, the journal is there again, and the rows are those of one run."""
+    rows = list(observations(session))
+    writer = resumed(session, tmp_path / 's')
+    assert not writer.resumed
+    writer.record({'kind': 'configuration', 'pose': 0}, rows[:2])
+    writer.record({'kind': 'note', 'text': 'größer'})
+    writer._release()
+    writer = resumed(session, tmp_path / 's')
+    assert writer.resumed
+    assert (writer.observations, writer.configurations) == (2, 1)
+    assert writer.last_stamp_s == rows[1].stamp_s
+    assert [record['kind'] for record in writer.records] == ['configuration', 'note']
+    assert writer.records[1]['text'] == 'größer'
+    with pytest.raises(InputError, match='already on line 2'):
+        writer.append(rows[0])
+    writer.close('stopped')
+    assert read_session(tmp_path / 's').exit_status == 'stopped'
+    writer = resumed(session, tmp_path / 's')
+    assert read_session(tmp_path / 's').exit_status == 'aborted'
+    for row in rows[2:]:
+        writer.append(row)
+    writer.close()
+    with SessionWriter(tmp_path / 'whole', session) as whole:
+        for row in rows:
+            whole.append(row)
+    for name in ('observations.csv', 'session.yaml'):
+        assert (tmp_path / 's' / name).read_bytes() == (tmp_path / 'whole' / name).read_bytes()
+    with pytest.raises(InputError, match='is complete'):
+        resumed(session, tmp_path / 's')
+
+
+def test_a_session_is_written_by_one_process(session, tmp_path):
+    with (
+        resumed(session, tmp_path / 's'),
+        pytest.raises(InputError, match='another process is writing'),
+    ):
+        resumed(session, tmp_path / 's')
+
+
+@pytest.mark.parametrize(
+    ('change', 'problem'),
+    [
+        ({'settle_s': 1.0}, 'another settle_s'),
+        ({'sensors': {'mocap': 'sir', 'tracker': 'sir'}}, 'another sensors'),
+        ({'markers': {'sir': np.zeros(3), 'smr': np.zeros(3)}}, 'another markers'),
+    ],
+)
+def test_another_session_is_not_gone_on_with(session, tmp_path, change, problem):
+    writer = SessionWriter(tmp_path / 's', session)
+    writer.append(next(observations(session)))
+    writer._release()
+    before = {p.name: p.read_bytes() for p in (tmp_path / 's').iterdir()}
+    with pytest.raises(InputError, match=problem):
+        resumed(replace(session, **change), tmp_path / 's')
+    with pytest.raises(InputError, match='another URDF'):
+        resumed(replace(session, urdf=session.urdf + '<!-- -->'), tmp_path / 's')
+    assert {p.name: p.read_bytes() for p in (tmp_path / 's').iterdir()} == before
+
+
+def test_a_session_of_another_program_is_not_gone_on_with(session, tmp_path):
+    write_session(tmp_path / 's', replace(session, exit_status='stopped'))
+    with pytest.raises(InputError, match=r'without journal\.jsonl'):
+        resumed(
+            replace(session, base_prior=read_session(tmp_path / 's').base_prior), tmp_path / 's'
+        )
+
+
+def test_rows_that_were_changed_by_hand_are_not_gone_on_with(session, tmp_path):
+    writer = SessionWriter(tmp_path / 's', session)
+    for observation in observations(session):
+        writer.append(observation)
+    writer._release()
+    path = tmp_path / 's' / 'observations.csv'
+    lines = path.read_text().split('\n')
+    lines[3] = lines[3].replace('sir', 'smr')
+    path.write_text('\n'.join(lines))
+    with pytest.raises(InputError, match='line 4: not as'):
+        resumed(session, tmp_path / 's')
+
+
+@pytest.mark.parametrize('name', ['observations.csv', 'session.yaml', 'robot.urdf'])
+def test_a_closed_file_that_changed_is_named_and_not_used(session, tmp_path, name):
+    with SessionWriter(tmp_path / 's', session) as writer:
+        for observation in observations(session):
+            writer.append(observation)
+    check = subprocess.run(
+        ['sha256sum', '--check', '--strict', 'SHA256SUMS'],
+        cwd=tmp_path / 's', capture_output=True, text=True,
+    )  # fmt: skip
+    assert check.returncode == 0, check.stdout
+    path = tmp_path / 's' / name
+    whole = path.read_bytes()
+    seed = 4
+    print('seed', seed)
+    rng = np.random.default_rng(seed)
+    for _ in range(50):
+        data = bytearray(whole)
+        data[rng.integers(len(data))] ^= 1 << rng.integers(8)
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=f'{name}: not as it was closed'):
+            read_session(tmp_path / 's')
+    path.write_bytes(whole)
+    read_session(tmp_path / 's')

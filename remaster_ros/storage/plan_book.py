@@ -1,0 +1,218 @@
+"""The planner's memory: what is planned, which pose is open, what became of each configuration.
+
+``plan.jsonl`` in the session folder is a journal (see `journal`). The plan is in it before the
+arm first moves, each pose before the arm is sent there; a planner that is started again takes up
+the tour where it was.
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.planning import Plan, PlannedPose
+from remaster_ros.core.tour import REGISTRATION, Stop, Tour
+from remaster_ros.storage.files import make_folder, reason
+from remaster_ros.storage.journal import Journal, Record
+from remaster_ros.storage.session_writer import PLAN
+
+ALIVE_S = 1.0
+"""How often a running planner touches the file, s."""
+
+
+class PlanBook:
+    """Keep what a planner must not forget; what a method returned from is on the disk.
+
+    Parameters
+    ----------
+    folder
+        The session's; the file is made when there is something to remember.
+    settings
+        What the plan depends on, plain data by name.
+
+    Attributes
+    ----------
+    id
+        Tells this plan from others; '' before there is one.
+    tour
+        The tour under way, at the stop where it was; None where there is none.
+    stop
+        The last stop with the solutions that still have no outcome; None before the first.
+    outcomes
+        How many configurations of the collection came to which end.
+    state
+        What the planner last said it does, '' before.
+    silent_s
+        For how long no planner has been running, s.
+    lost
+        What a crash has cut off, in words; '' where nothing was.
+
+    Raises
+    ------
+    InputError
+        Another planner is running there, the plan was made with other settings, or the file is
+        damaged.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any], chain: SerialChain) -> None:
+        self.path = folder / PLAN
+        self._settings, self._chain = dict(settings), chain
+        self._journal: Journal | None = None
+        self.id = self.state = self.lost = ''
+        self.tour: Tour | None = None
+        self.stop: Stop | None = None
+        self.outcomes: Counter[str] = Counter()
+        self.silent_s = 0.0
+        self._touched = 0.0
+        if self.path.exists():
+            self._open()
+
+    def _open(self) -> Journal:
+        new = not self.path.exists()
+        if not new:
+            self.silent_s = self._age_s()
+        self._journal = Journal(self.path)
+        self.lost = self._journal.lost
+        if not self._journal.records:
+            self.id = uuid.uuid4().hex[:12]
+            self._journal.append({'kind': 'plan', 'id': self.id, 'settings': self._settings})
+            return self._journal
+        try:
+            self._check(self._journal.records[0])
+            for record in self._journal.records[1:]:
+                self._replay(record)
+        except BaseException as error:
+            self._journal.close()
+            if isinstance(error, (KeyError, IndexError, TypeError, ValueError)):
+                raise InputError(
+                    f'{self.path}: no plan of this version ({type(error).__name__}: {error}); '
+                    'name a new session folder'
+                ) from None
+            raise
+        return self._journal
+
+    def _age_s(self) -> float:
+        try:
+            return time.time() - self.path.stat().st_mtime
+        except OSError as error:
+            raise InputError(f'{self.path}: cannot be read ({reason(error)})') from None
+
+    def _check(self, record: Record) -> None:
+        self.id = record['id']
+        made = record['settings']
+        other = [name for name, value in self._settings.items() if made.get(name) != value]
+        if other:
+            name = other[0]
+            was = '' if name == 'cell' else f' ({made.get(name)}, now {self._settings[name]})'
+            raise InputError(
+                f'{self.path}: the plan of this session was made with another {name}{was}; start '
+                'with the same to go on, or name a new session folder'
+            )
+
+    def _replay(self, record: Record) -> None:
+        kind = record['kind']
+        if kind == 'tour':
+            plans = {split: _plan(content) for split, content in record['plans'].items()}
+            self.tour = Tour(
+                self._chain,
+                plans,
+                in_order=record['in_order'],
+                one_solution=record['one_solution'],
+            )
+            self.stop = None
+        elif kind == 'stop' and self.tour is not None:
+            self.stop = self.tour.go_to(record['split'], record['index'], record['ids'])
+        elif kind == 'outcome':
+            self._close_solution(record['id'], record['result'])
+        elif kind == 'state':
+            self.state = record['state']
+
+    def _close_solution(self, solution: int, result: str) -> None:
+        assert self.stop is not None
+        if self.stop.split != REGISTRATION:
+            self.outcomes[result] += 1
+        self.stop = self.stop.only([number for number in self.stop.ids if number != solution])
+
+    def _append(self, record: Record) -> None:
+        if self._journal is None:
+            make_folder(self.path.parent)
+            self._journal = self._open()
+        self._journal.append(record)
+
+    def begin(self, tour: Tour) -> None:
+        """Remember a new tour."""
+        self._append(
+            {
+                'kind': 'tour',
+                'plans': {split: _content(plan) for split, plan in tour.plans.items()},
+                'in_order': tour.in_order,
+                'one_solution': tour.one_solution,
+            }
+        )
+        self.tour, self.stop = tour, None
+
+    def open_stop(self, stop: Stop) -> None:
+        """Remember the next stop, before the arm is sent there."""
+        self._append(
+            {'kind': 'stop', 'split': stop.split, 'index': stop.index, 'ids': list(stop.ids)}
+        )
+        self.stop = stop
+
+    def outcome(self, solution: int, result: str) -> None:
+        """Remember what became of a solution of the open stop; one that has its outcome keeps it.
+
+        Parameters
+        ----------
+        solution
+            One of the stop's `ids`.
+        result
+            ``recorded``, ``partial``, ``rejected`` or ``failed``.
+        """
+        if self.stop is None or solution not in self.stop.ids:
+            return
+        self._append({'kind': 'outcome', 'id': solution, 'result': result})
+        self._close_solution(solution, result)
+
+    def say_state(self, state: str) -> None:
+        """Remember what the planner does, once there is a plan."""
+        if self._journal is not None and state != self.state:
+            self._append({'kind': 'state', 'state': state})
+        self.state = state
+
+    def stay_alive(self) -> None:
+        """Leave a sign of life, by which a planner started again knows how long nobody ran."""
+        now = time.monotonic()
+        if self._journal is not None and now - self._touched > ALIVE_S:
+            self._touched = now
+            self._journal.touch()
+
+    def close(self) -> None:
+        """Let others go on with the plan."""
+        if self._journal is not None:
+            self._journal.close()
+
+
+def _content(plan: Plan) -> dict[str, Any]:
+    return {
+        'poses': [
+            {'T_R_T': pose.T_R_T.tolist(), 'solutions': pose.solutions.tolist()}
+            for pose in plan.poses
+        ],
+        'dropped': dict(plan.dropped),
+    }
+
+
+def _plan(content: Mapping[str, Any]) -> Plan:
+    poses = tuple(
+        PlannedPose(np.array(pose['T_R_T'], float), np.array(pose['solutions'], float))
+        for pose in content['poses']
+    )
+    return Plan(poses, content['dropped'])

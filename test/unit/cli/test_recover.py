@@ -1,0 +1,86 @@
+"""`remaster recover`: 0 where nothing was lost, 3 where something was (and what), else 2."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from session_crashes import live, make_observations, session_header
+
+from remaster_ros.cli.main import main
+from remaster_ros.storage.session import read_session
+from remaster_ros.storage.session_writer import SessionWriter
+
+
+@pytest.fixture
+def killed(tmp_path):
+    """Return the folder of a session whose recorder was killed."""
+    writer = SessionWriter(tmp_path / 's', session_header())
+    for number, group in enumerate(make_observations(1, 4)):
+        writer.record({'kind': 'configuration', 'number': number}, group)
+    writer._release()
+    return tmp_path / 's'
+
+
+def run(capsys, *args):
+    status = main(['recover', *map(str, args)])
+    printed = capsys.readouterr()
+    return status, printed.out, printed.err
+
+
+def test_nothing_was_lost(killed, capsys):
+    before = len(read_session(killed).measurements)
+    assert run(capsys, killed) == (0, f'{killed}: recovered\n', '')
+    assert run(capsys, killed) == (0, f'{killed}: at rest, nothing to recover\n', '')
+    assert run(capsys, '--quiet', killed) == (0, '', '')
+    session = read_session(killed)
+    assert len(session.measurements) == before
+    assert session.exit_status == 'aborted'
+
+
+@pytest.mark.parametrize('tail', [b'{"kind":"configur', b'{"name":"gr\xc3', bytes(700)])
+def test_a_line_being_written_was_lost(killed, capsys, tail):
+    with (killed / 'journal.jsonl').open('ab') as file:
+        file.write(tail)
+    before = len(read_session(killed).measurements)
+    status, out, _ = run(capsys, killed)
+    assert status == 3
+    assert f'journal.jsonl, line 5: {len(tail)} bytes of a line' in out
+    assert run(capsys, killed)[0] == 0
+    assert len(read_session(killed).measurements) == before
+
+
+@pytest.mark.parametrize('zeros', [0, 40])
+def test_observations_that_only_the_journal_has_come_back(killed, capsys, zeros):
+    path = killed / 'observations.csv'
+    whole = path.read_bytes()
+    last = whole.rstrip(b'\n').rfind(b'\n') + 1
+    path.write_bytes(whole[: random.Random(2).randint(last + 1, len(whole) - 41)] + bytes(zeros))
+    assert run(capsys, killed)[0] == 0
+    assert path.read_bytes() == whole
+
+
+def test_what_is_no_session_or_damaged_or_in_use(killed, tmp_path, capsys):
+    status, _, err = run(capsys, tmp_path / 'none')
+    assert status == 2
+    assert 'none' in err
+    writer = SessionWriter(killed, session_header(), resume=True)
+    status, _, err = run(capsys, killed)
+    assert status == 2
+    assert 'another process is writing' in err
+    writer.close('stopped')
+    data = bytearray((killed / 'journal.jsonl').read_bytes())
+    data[40] ^= 1
+    (killed / 'journal.jsonl').write_bytes(data)
+    status, _, err = run(capsys, killed)
+    assert status == 2
+    assert 'journal.jsonl: not as it was closed' in err
+    (killed / 'SHA256SUMS').unlink()
+    status, _, err = run(capsys, killed)
+    assert status == 2
+    assert 'journal.jsonl, line 1: damaged' in err
+
+
+def test_a_life_without_a_crash_needs_no_recovery(tmp_path, capsys):
+    live(tmp_path, seed=5)
+    assert run(capsys, tmp_path / 'new' / 'session')[0] == 0

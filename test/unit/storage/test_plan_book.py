@@ -1,0 +1,143 @@
+"""A planner that is started again takes up its tour where it was, and refuses another plan."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.planning import Plan, PlannedPose
+from remaster_ros.core.tour import REGISTRATION, Tour, registration_tour
+from remaster_ros.storage.cell import read_cell
+from remaster_ros.storage.plan_book import PlanBook
+
+SETTINGS = {'cell': 'abc', 'seed': 3}
+
+
+@pytest.fixture(scope='module')
+def chain():
+    return read_cell('demo').chain()
+
+
+def plan_of(chain: SerialChain, seed: int, poses: int, solutions: int) -> Plan:
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(-1.5, 1.5, (poses, solutions, len(chain)))
+    return Plan(tuple(PlannedPose(chain.forward(own[0]), own) for own in q), {'out of reach': 4})
+
+
+def visit(tour, book, q, rng, outcomes):
+    """Go to the next stop and give some of its solutions an outcome; returns it."""
+    stop = tour.next(q)
+    if stop is None:
+        return None
+    book.open_stop(stop)
+    for number in stop.ids[: rng.integers(0, len(stop.ids) + 1)]:
+        result = str(rng.choice(['recorded', 'rejected']))
+        book.outcome(number, result)
+        outcomes[result] = outcomes.get(result, 0) + 1
+    return stop
+
+
+def test_any_number_of_restarts_visits_what_one_run_visits(chain, tmp_path):
+    seed = 17
+    print('seed', seed)
+    rng = np.random.default_rng(seed)
+    plans = {'optimization': plan_of(chain, 1, 7, 4), 'validation': plan_of(chain, 2, 5, 3)}
+    one_run = Tour(chain, plans)
+    book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+    assert not book.path.exists()
+    book.begin(Tour(chain, plans))
+    plan_id, outcomes, q = book.id, {}, np.zeros(len(chain))
+    while (wanted := one_run.next(q)) is not None:
+        stop = visit(book.tour, book, q, rng, outcomes)
+        assert (stop.pose, stop.split, stop.ids) == (wanted.pose, wanted.split, wanted.ids)
+        open_ids = book.stop.ids
+        book.close()
+        book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+        assert book.id == plan_id
+        assert book.stop.ids == open_ids
+        assert book.stop.pose == stop.pose
+        for number, solution in zip(book.stop.ids, book.stop.solutions):
+            np.testing.assert_array_equal(solution, stop.solutions[stop.ids.index(number)])
+        assert dict(book.outcomes) == outcomes
+        q = rng.uniform(-1, 1, len(chain))
+    assert book.tour.next(q) is None
+    assert book.tour.describe() == one_run.describe()
+    book.close()
+
+
+def test_a_registration_tour_keeps_its_order_and_its_numbers(chain, tmp_path):
+    tour = registration_tour(chain, plan_of(chain, 3, 6, 2), [np.array([0.1, 0.0, 0.02])])
+    book = PlanBook(tmp_path, SETTINGS, chain)
+    book.begin(tour)
+    q = np.zeros(len(chain))
+    numbers = []
+    for _ in range(6):
+        stop = book.tour.next(q)
+        book.open_stop(stop)
+        book.outcome(stop.ids[0], 'recorded')
+        numbers.append(stop.pose)
+        assert stop.split == REGISTRATION
+        assert len(stop.ids) == 1
+        book.close()
+        book = PlanBook(tmp_path, SETTINGS, chain)
+    assert numbers == [-1, -2, -3, -4, -5, -6]
+    assert not book.outcomes
+    book.close()
+
+
+def test_the_state_and_the_time_of_silence_are_known(chain, tmp_path):
+    book = PlanBook(tmp_path, SETTINGS, chain)
+    book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
+    book.say_state('running')
+    with pytest.raises(InputError, match='another process'):
+        PlanBook(tmp_path, SETTINGS, chain)
+    book.close()
+    then = os.stat(book.path).st_mtime - 50.0
+    os.utime(book.path, (then, then))
+    book = PlanBook(tmp_path, SETTINGS, chain)
+    assert book.state == 'running'
+    assert 49.0 < book.silent_s < 200.0
+    book.stay_alive()
+    book.close()
+    book = PlanBook(tmp_path, SETTINGS, chain)
+    assert book.silent_s < 30.0
+    book.close()
+
+
+@pytest.mark.parametrize(
+    ('settings', 'problem'),
+    [
+        ({'cell': 'other', 'seed': 3}, 'another cell;'),
+        ({'cell': 'abc', 'seed': 4}, r'another seed \(3, now 4\)'),
+    ],
+)
+def test_another_plan_is_refused(chain, tmp_path, settings, problem):
+    book = PlanBook(tmp_path, SETTINGS, chain)
+    book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
+    book.close()
+    with pytest.raises(InputError, match=problem):
+        PlanBook(tmp_path, settings, chain)
+    # And it is not held any longer.
+    PlanBook(tmp_path, SETTINGS, chain).close()
+
+
+def test_a_torn_line_is_dropped_and_a_damaged_one_refused(chain, tmp_path):
+    book = PlanBook(tmp_path, SETTINGS, chain)
+    book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
+    stop = book.tour.next(np.zeros(len(chain)))
+    book.open_stop(stop)
+    book.outcome(stop.ids[0], 'recorded')
+    book.close()
+    whole = book.path.read_bytes()
+    book.path.write_bytes(whole[:-5])
+    book = PlanBook(tmp_path, SETTINGS, chain)
+    assert 'cut off' in book.lost
+    assert book.stop.ids == stop.ids
+    book.close()
+    book.path.write_bytes(whole.replace(b'"stop"', b'"step"', 1))
+    with pytest.raises(InputError, match='line 3: damaged'):
+        PlanBook(tmp_path, SETTINGS, chain)
