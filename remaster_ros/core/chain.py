@@ -225,7 +225,11 @@ class SerialChain:
         """
         frames = self.frames(q, joint_offsets)
         tip = frames[..., -1, :, :] @ self.T_fixed[-1]
-        arms = apply(tip, points)[..., None, :] - frames[..., :3, 3]
+        return self.velocities(frames, apply(tip, points))
+
+    def velocities(self, frames: FloatArray, points: FloatArray) -> FloatArray:
+        """Return the same, (..., 3, k), for points in R (..., 3) and `frames` (..., k, 4, 4)."""
+        arms = points[..., None, :] - frames[..., :3, 3]
         return np.swapaxes(np.cross(self.axes_in_base(frames), arms), -1, -2)
 
     def gravity_torque(

@@ -255,17 +255,18 @@ class Model:
 
     def inner_pose(self, z: FloatArray, rows: Rows) -> Pose:
         """Return where the arm stands in each row before registration, joints 1 and k at 0."""
-        turns, shifts = self._extended(z, rows)
-        offsets = self._inner_offsets(z) + turns
-        markers = self.markers(z)[rows.marker]
-        frames = self.chain.frames(rows.q, offsets)
+        return self._pose(self._inner_offsets(z), z, rows)
+
+    def _pose(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> Pose:
+        turns, shifts = self._extended(x, rows)
+        shifts = shifts @ _rotation_about(*self.base_axis, offsets[0])[:3, :3].T
+        frames = self.chain.frames(rows.q, offsets + turns)
         tool = frames[..., -1, :, :] @ self.chain.T_fixed[-1]
-        return Pose(
-            tool,
-            apply(tool, markers) + shifts,
-            self.chain.axes_in_base(frames),
-            self.chain.position_jacobian(rows.q, markers, offsets),
-        )
+        points = apply(tool, self.markers(x)[rows.marker])
+        by_joints = self.chain.velocities(frames, points)
+        # Joint 1 carries the displacements along.
+        by_joints[..., 0] += np.cross(self.base_axis[1], shifts)
+        return Pose(tool, points + shifts, self.chain.axes_in_base(frames), by_joints)
 
     def _inner_offsets(self, z: FloatArray) -> FloatArray:
         offsets = self.offsets(z).copy()
@@ -282,19 +283,16 @@ class Model:
         return turns[..., rows.source, :], shifts[..., rows.source, :]
 
     def _derivative(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> FloatArray:
-        markers = self.markers(x)[rows.marker]
         derivative = np.zeros((len(rows.q), 3, self.size))
-        turns, shifts = self._extended(x, rows)
-        base = _rotation_about(*self.base_axis, offsets[0])[:3, :3]
-        shifts = shifts @ base.T
-        tool = self.chain.forward(rows.q, offsets + turns)
-        points = apply(tool, markers) + shifts
-        by_joints = self.chain.position_jacobian(rows.q, markers, offsets + turns)
+        tool, points, _, by_joints = self._pose(offsets, x, rows)
         by_theta = None
         if self.extension is not None:
-            by_theta = by_joints @ self.extension.joint[rows.source]
+            base = _rotation_about(*self.base_axis, offsets[0])[:3, :3]
+            # The joints themselves turn under the displacements.
+            turned = by_joints.copy()
+            turned[..., 0] -= np.cross(self.base_axis[1], self._extended(x, rows)[1] @ base.T)
+            by_theta = turned @ self.extension.joint[rows.source]
             by_theta += base @ self.extension.displacement[rows.source]
-            by_joints[..., 0] += np.cross(self.base_axis[1], shifts)
         correction = self.corrections(x)
         for sensor, span in rows.spans:
             turn = correction[sensor, :3, :3]

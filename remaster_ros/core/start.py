@@ -25,6 +25,8 @@ CAUCHY_WIDTH = 2.5
 # What the linear start expects of a robot out of the box, against which it weighs the nominal
 # marker positions.
 UNCALIBRATED_ERROR_M = 5e-3
+# Rows of a sensor that the start looks at.
+LARGEST_START = 5000
 # A model that leaves more of the points' extent than this describes another robot, or none.
 LARGEST_RELATIVE_ERROR = 0.1
 
@@ -63,6 +65,7 @@ def robust_start(
         When the points of a sensor do not fix a registration, or are not those of this robot.
     """
     chain = model.chain
+    everything, rows = rows, _some_rows(measurements, rows)
     tool = chain.forward(measurements.q[rows])
     sensor, marker = measurements.sensor[rows], measurements.marker[rows]
     measured = measurements.position[rows]
@@ -86,8 +89,18 @@ def robust_start(
     _, start, z = min(candidates, key=lambda candidate: candidate[0])
     sorted_rows = Rows.of(measurements, rows, start.reference)
     _require_likeness(start, sorted_rows, sorted_rows.target - start.predict(z, sorted_rows))
-    moved = referenced(model, measurements, rows, start.T_R_N(z))
+    moved = referenced(model, measurements, everything, start.T_R_N(z))
     return moved, moved.vector(start.offsets(z), start.markers(z))
+
+
+def _some_rows(measurements: Measurements, rows: IntArray) -> IntArray:
+    """Return all rows, or evenly spread ones of a sensor that has more than a start needs."""
+    chosen = []
+    for sensor in np.unique(measurements.sensor[rows]):
+        mine = rows[measurements.sensor[rows] == sensor]
+        count = min(len(mine), LARGEST_START)
+        chosen.append(mine[np.linspace(0, len(mine) - 1, count).astype(np.int64)])
+    return np.sort(np.concatenate(chosen))
 
 
 def register(points_R: FloatArray, points_N: FloatArray, sensor: str) -> FloatArray:
