@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -73,8 +73,10 @@ class Discovery:
         How the cells were found.
     residuals
         What the search worked on.
-    before, after
-        The fit with offsets only, and with the effects (the same where there are none).
+    offsets_before
+        Zero-offsets without the effects, and their stds (NaN where the gauge holds them), rad.
+    fit
+        The sampled fit, with the effects where there are any.
     """
 
     verdict: Verdict
@@ -84,10 +86,10 @@ class Discovery:
     noise_by_range: Mapping[str, Mapping[str, float]]
     outliers: tuple[tuple[int, str], ...]
     untestable: Mapping[str, str]
+    offsets_before: tuple[FloatArray, FloatArray]
     selection: Selection
     residuals: Residuals
-    before: FitResult
-    after: FitResult
+    fit: FitResult
 
 
 def discover_session(
@@ -118,7 +120,48 @@ def discover_session(
         Data that do not allow an answer.
     """
     report = progress if progress is not None else silent
-    report('offsets', 0.0)
+    findings = find_causes(session, rng=rng, progress=report)
+    residuals, solution = findings.residuals, findings.selection.solution
+    fit = fit_session(
+        session,
+        rng=rng,
+        clock=clock,
+        extension=extension_of(residuals, solution) if solution.cells else None,
+        progress=lambda _, share: report('sampling the extended model', share),
+    )
+    effects = tuple(effect.sampled(fit) for effect in findings.effects)
+    verdict: Verdict = 'effects' if effects else 'none'
+    if any(effect.tied for effect in effects):
+        verdict = 'undetermined'
+    return Discovery(
+        verdict=verdict,
+        effects=effects,
+        gain=_gain(residuals, solution, fit),
+        pose_common_fraction=_pose_common_fraction(solution),
+        noise_by_range=_noise_by_range(residuals, solution),
+        outliers=fit.left_out,
+        untestable=findings.untestable,
+        offsets_before=_offsets(findings.estimate),
+        selection=findings.selection,
+        residuals=residuals,
+        fit=fit,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What is found before anything is sampled; fields as in `Discovery`."""
+
+    estimate: Estimate
+    residuals: Residuals
+    selection: Selection
+    effects: tuple[FoundEffect, ...]
+    untestable: Mapping[str, str]
+
+
+def find_causes(session: Session, *, rng: np.random.Generator, progress: Progress) -> Findings:
+    """Search a session for causes; see `discover_session`."""
+    progress('offsets', 0.0)
     problem = Problem.of(session)
     found = estimate(problem)
     residuals = Residuals.of(found)
@@ -131,39 +174,22 @@ def discover_session(
         if name not in untestable and name != 'marker_offset'
         for cell in effect.cells(residuals.scene)
     ]
-    residuals, selection = _searched(found, residuals, cells, rng, report)
-    solution = selection.solution
+    residuals, selection = _searched(found, residuals, cells, rng, progress)
     effects = describe(
-        residuals, selection, cells, rng, lambda share: report('look-alikes', share)
+        residuals, selection, cells, lambda share: progress('comparing look-alikes', share)
     )
-    effects += moved_markers(found, residuals, solution)
-    before = fit_session(session, rng=rng, clock=clock, progress=lambda _, s: report('offsets', s))
-    after = before
-    if solution.cells:
-        after = fit_session(
-            session,
-            rng=rng,
-            clock=clock,
-            extension=extension_of(residuals, solution),
-            progress=lambda _, share: report('extended model', share),
-        )
-        effects = tuple(effect.sampled(after) for effect in effects)
-    verdict: Verdict = 'effects' if effects else 'none'
-    if any(effect.tied for effect in effects):
-        verdict = 'undetermined'
-    return Discovery(
-        verdict=verdict,
-        effects=effects,
-        gain=_gain(residuals, solution, before, after),
-        pose_common_fraction=_pose_common_fraction(solution),
-        noise_by_range=_noise_by_range(residuals, solution),
-        outliers=after.left_out,
-        untestable=untestable,
-        selection=selection,
-        residuals=residuals,
-        before=before,
-        after=after,
-    )
+    effects += moved_markers(found, residuals, selection.solution)
+    return Findings(found, residuals, selection, effects, untestable)
+
+
+def _offsets(found: Estimate) -> tuple[FloatArray, FloatArray]:
+    """Return the zero-offsets of the fit without effects and their stds, rad, (k,) each."""
+    joints = found.model.joints
+    std = np.full(joints, np.nan)
+    free = found.posterior.free
+    angles = free < joints
+    std[free[angles]] = np.sqrt(np.diag(found.mode.covariance)[: len(free)][angles])
+    return found.model.offsets(found.mode.z), std
 
 
 def _searched(
@@ -205,7 +231,7 @@ def _kept(found: Estimate, residuals: Residuals, solution: Solution) -> FloatArr
     return np.sort(every.rows.source[~judgement.gross])
 
 
-def _gain(residuals: Residuals, solution: Solution, before: FitResult, after: FitResult) -> Gain:
+def _gain(residuals: Residuals, solution: Solution, fit: FitResult) -> Gain:
     measurements = residuals.scene.measurements
     held_out = measurements.is_validation
     noise = solution.noise
@@ -218,7 +244,7 @@ def _gain(residuals: Residuals, solution: Solution, before: FitResult, after: Fi
     def rms(errors: FloatArray) -> float:
         return float(np.sqrt(np.mean(np.sum(errors[held_out] ** 2, axis=1))))
 
-    return Gain(rms(before.residuals_after), rms(after.residuals_after), floor)
+    return Gain(rms(residuals.full_errors), rms(fit.residuals_after), floor)
 
 
 def _pose_common_fraction(solution: Solution) -> float:
@@ -251,18 +277,3 @@ def _noise_by_range(residuals: Residuals, solution: Solution) -> dict[str, dict[
             'p_value': float(p_value) if np.isfinite(p_value) else 1.0,
         }
     return found
-
-
-def joint_offsets_change(discovery: Discovery) -> list[dict[str, Any]]:
-    """Return how far each zero-offset moved when the effects joined, deg, with both stds."""
-    before, after = discovery.before, discovery.after
-    return [
-        {
-            'joint': name,
-            'before_deg': float(np.degrees(before.joint_offsets[i])),
-            'before_std_deg': float(np.degrees(before.joint_offsets_std[i])),
-            'after_deg': float(np.degrees(after.joint_offsets[i])),
-            'after_std_deg': float(np.degrees(after.joint_offsets_std[i])),
-        }
-        for i, name in enumerate(before.joint_names)
-    ]

@@ -101,7 +101,6 @@ def describe(
     data: Residuals,
     selection: Selection,
     cells: Sequence[Cell],
-    rng: np.random.Generator,
     progress: Callable[[float], None],
 ) -> tuple[FoundEffect, ...]:
     """Return the chosen cells as causes, the largest first."""

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve
+from scipy.linalg.lapack import dpotri
 from scipy.optimize import minimize
 
 from remaster_ros.core.discovery_noise import Noise, Residuals
@@ -205,6 +206,8 @@ class _System:
         self.order = np.concatenate((np.flatnonzero(free), np.flatnonzero(~free)))
         self.unpenalised = int(free.sum())
         self.separable = np.flatnonzero(self.data.separable)
+        # Each stratum's matrix as one row: sums and traces over strata are then products.
+        self.flat = self.strata.grams.reshape(len(self.strata.grams), -1)
 
     def visible(self) -> bool:
         """Do unpenalised columns say something that the others, and the base, do not?"""
@@ -228,12 +231,12 @@ class _System:
         noise = self.noise(eta)
         weights = self.strata.weights(noise)
         factors = np.exp(eta[len(eta) - len(self.penalised) :])
-        H, root, beta = self._solve(weights, factors)
-        inverse = cho_solve((root, True), np.eye(self.size))
-        grams = self.strata.grams
-        error = np.append(-beta, 1.0)
-        rss = np.einsum('i,sij,j->s', error, grams, error)
-        trace = np.einsum('ij,sji->s', inverse, grams[:, :-1, :-1])
+        _, root, beta = self._solve(weights, factors)
+        inverse = self._inverse(root)
+        rss = self._squares(beta)
+        padded = np.zeros((self.size + 1, self.size + 1))
+        padded[:-1, :-1] = inverse
+        trace = self.flat @ padded.ravel()
         n = self.strata.count
         value = 0.5 * n @ np.log(weights) - np.sum(np.log(np.diag(root))) - 0.5 * weights @ rss
         by_log_weight = 0.5 * (n - weights * trace - weights * rss)
@@ -262,13 +265,23 @@ class _System:
         self, weights: FloatArray, factors: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return H, its lower Cholesky factor (natural order) and the estimate."""
-        total = np.tensordot(weights, self.strata.grams, axes=1)
+        total = (weights @ self.flat).reshape(self.size + 1, self.size + 1)
         H = total[:-1, :-1].copy()
         for index, penalty, factor in zip(self.penalised, self.penalties, factors, strict=True):
             where = self.where[index]
             H[where, where] += factor * penalty
         root = np.linalg.cholesky(H)
-        return H, root, cho_solve((root, True), total[:-1, -1])
+        return H, root, cho_solve((root, True), total[:-1, -1], check_finite=False)
+
+    def _inverse(self, root: FloatArray) -> FloatArray:
+        """Return the inverse of the matrix with this lower Cholesky factor."""
+        lower, _ = dpotri(root, lower=1)
+        return np.tril(lower) + np.tril(lower, -1).T
+
+    def _squares(self, beta: FloatArray) -> FloatArray:
+        """Return the sum of squared errors in each stratum, m², (strata,)."""
+        error = np.append(-beta, 1.0)
+        return self.flat @ np.outer(error, error).ravel()
 
     def solution(self, start: Solution | None, prior: float) -> Solution:
         eta, bounds = self._start(start)
@@ -278,7 +291,7 @@ class _System:
             jac=True,
             method='L-BFGS-B',
             bounds=bounds,
-            options={'maxiter': STEPS, 'ftol': 1e-9, 'gtol': 1e-3},
+            options={'maxiter': STEPS, 'ftol': 1e-8, 'gtol': 1e-2},
         )
         eta = best.x
         noise = self.noise(eta)
@@ -286,7 +299,7 @@ class _System:
         factors = np.exp(eta[len(eta) - len(self.penalised) :])
         H, root, beta = self._solve(weights, factors)
         evidence = self._evidence(H, weights, factors, beta)
-        covariance = cho_solve((root, True), np.eye(self.size)) / np.outer(self.unit, self.unit)
+        covariance = self._inverse(root) / np.outer(self.unit, self.unit)
         beta = beta / self.unit
         smoothness = np.full(len(self.cells), np.nan)
         smoothness[self.penalised] = factors
@@ -307,8 +320,7 @@ class _System:
         """Return L with ½ log N for each unpenalised parameter in place of its determinant."""
         ordered = np.linalg.cholesky(H[np.ix_(self.order, self.order)])
         logs = np.log(np.diag(ordered))
-        error = np.append(-beta, 1.0)
-        rss = np.einsum('i,sij,j->s', error, self.strata.grams, error)
+        rss = self._squares(beta)
         n = self.strata.count
         value = 0.5 * n @ np.log(weights) - 0.5 * weights @ rss - logs[: self.p].sum()
         value -= 0.5 * (self.unpenalised - self.p) * np.log(n.sum() - self.p)

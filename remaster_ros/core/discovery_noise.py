@@ -17,6 +17,7 @@ from remaster_ros.core.effects.cell import Cell
 from remaster_ros.core.effects.scene import Scene
 from remaster_ros.core.estimate import Estimate
 from remaster_ros.core.model import Rows
+from remaster_ros.core.outliers import robust_noise
 from remaster_ros.core.types import BoolArray, FloatArray, IntArray
 
 # Directions of the offsets model below this share of the largest are its gauge.
@@ -94,8 +95,7 @@ class Residuals:
         seen = singular > ROUNDING * singular[0]
         turn = (vectors[seen] / scale).T / singular[seen]
         full_base = full_jacobian @ turn
-        eta = found.mode.eta
-        sigma, pose_sigma = found.posterior.noise(eta)
+        sigma, pose_sigma = robust_noise(rows, full_errors[rows.source], np.ones(len(rows), bool))
         return cls(
             scene,
             rows,

@@ -115,8 +115,10 @@ class Search:
         for count in range(ROUNDS):
             self.progress(count / (count + 2.0))
             screening = screen(self.data, self.catalogue, solution, rng=self.rng, draws=DRAWS)
+            if screening.score.max() <= 0.0:
+                break
             proposal = self.propose(solution, screening)
-            if proposal is None:
+            if proposal is None or proposal[0].log_evidence <= solution.log_evidence:
                 break
             candidate, p_value = proposal
             share = self.held_out_share(solution, candidate)
@@ -145,6 +147,8 @@ class Search:
             ):
                 best = candidate, screening.p_value(float(screening.score[index]))
         for family in FAMILIES:
+            if not self._promising(family, screening):
+                continue
             candidate = self.grown(solution, family)
             if candidate is not None and (
                 best is None or candidate.log_evidence > best[0].log_evidence
@@ -152,6 +156,11 @@ class Search:
                 gain = candidate.log_evidence - solution.log_evidence
                 best = candidate, screening.p_value(gain)
         return best
+
+    def _promising(self, family: tuple[str, ...], screening: Screening) -> bool:
+        """Does at least one member of a family raise the evidence by itself?"""
+        mine = [cell.name in family for cell in self.catalogue.cells]
+        return bool(np.any(screening.score[mine] > 0.0))
 
     def grown(self, solution: Solution, family: tuple[str, ...]) -> Solution | None:
         """Return the set with all of a family that the data can see, less what does not pay."""
