@@ -12,6 +12,7 @@ from remaster_ros.core.errors import InputError
 from remaster_ros.core.estimate import Estimate, Problem, estimate
 from remaster_ros.core.extension import Extension
 from remaster_ros.core.paper_mode import BURN_IN_SHARE, STEPS, fit_paper
+from remaster_ros.core.posterior import Posterior
 from remaster_ros.core.result import FitResult, Sampled, build_result
 from remaster_ros.core.sampling import PRECISION, Length, Progress, sample_posterior, silent
 from remaster_ros.core.types import FloatArray, Session
@@ -136,6 +137,7 @@ def _fast(
         z_mean=posterior.parameters(run.draws.reshape(-1, posterior.size).mean(axis=0)),
         sigma=sigma,
         pose_sigma=pose_sigma,
+        by_direction=_by_direction(posterior, run.draws[..., len(posterior.free) :]),
         trace=readable(run.trace),
         draws=readable(run.draws),
         names=names,
@@ -150,3 +152,15 @@ def _fast(
         z_before=found.before.z,
         left_out=found.left_out,
     )
+
+
+def _by_direction(
+    posterior: Posterior, eta: FloatArray
+) -> dict[tuple[int, str], tuple[FloatArray, FloatArray]]:
+    """Return sigma and pose_sigma, m, (chains, draws) each, along and across lines of sight."""
+    sigma, pose_sigma = posterior.noise(eta)
+    return {
+        (channel.sensor, channel.direction): (sigma[..., index], pose_sigma[..., index])
+        for index, channel in enumerate(posterior.channels)
+        if channel.direction
+    }

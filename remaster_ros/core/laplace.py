@@ -141,6 +141,12 @@ class Mode:
     linearisation: Linearisation
 
     @property
+    def log_evidence(self) -> float:
+        """Log likelihood of the noise at the mode, the parameters integrated out."""
+        marginal = self.linearisation.whitened(self.eta)[2]
+        return float(marginal - self.linearisation.posterior.log_noise_prior(self.eta))
+
+    @property
     def covariance(self) -> FloatArray:
         """Covariance of the free pinned parameters at the mode's noise, (f, f)."""
         root = np.linalg.inv(self.linearisation.whitened(self.eta)[0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -29,13 +29,16 @@ UNKNOWN_STD = np.pi / np.sqrt(3.0)
 class NoiseEstimate:
     """The noise of one sensor per axis, m: posterior means, and the std of ``sigma_m``.
 
-    ``pose_sigma_m`` is None where no pose has two rows: ``sigma_m`` then holds both parts.
+    ``pose_sigma_m`` is None where no pose has two rows: ``sigma_m`` then holds both parts. Where
+    the noise along the line of sight differs, these are root mean squares over the three axes, and
+    ``directions`` has the noise 'along' and 'across'; otherwise it is empty.
     """
 
     sigma_m: float
     std_m: float
     pose_sigma_m: float | None
     pose_sigma_std_m: float | None
+    directions: Mapping[str, NoiseEstimate] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +194,9 @@ class Sampled:
         Sensor indices with a pose_sigma of their own.
     name, acceptance_rate
         Of the sampler.
+    by_direction
+        sigma and pose_sigma, m, (chains, draws) each, by sensor and 'along' or 'across'; only of
+        the sensors whose noise differs between the two.
     precision
         That was asked for; None where a number of draws was.
     log_density_error, checked
@@ -220,6 +226,9 @@ class Sampled:
     unfixed: BoolArray
     z_before: FloatArray
     left_out: tuple[tuple[int, str], ...]
+    by_direction: Mapping[tuple[int, str], tuple[FloatArray, FloatArray]] = field(
+        default_factory=dict
+    )
     precision: float | None = None
     log_density_error: float = float('nan')
     checked: int = 0
@@ -301,15 +310,25 @@ def predicted_rows(problem: Problem, model: Model, z: FloatArray) -> FloatArray:
 def _noise(sampled: Sampled, sensors: tuple[str, ...]) -> dict[str, NoiseEstimate]:
     noise = {}
     for index, name in enumerate(sensors):
-        sigma, pose = sampled.sigma[..., index], sampled.pose_sigma[..., index]
         known = index in sampled.separable
-        noise[name] = NoiseEstimate(
-            sigma_m=float(sigma.mean()),
-            std_m=float(sigma.std(ddof=1)),
-            pose_sigma_m=float(pose.mean()) if known else None,
-            pose_sigma_std_m=float(pose.std(ddof=1)) if known else None,
+        noise[name] = replace(
+            _noise_estimate(sampled.sigma[..., index], sampled.pose_sigma[..., index], known),
+            directions={
+                direction: _noise_estimate(*draws, known)
+                for (sensor, direction), draws in sampled.by_direction.items()
+                if sensor == index
+            },
         )
     return noise
+
+
+def _noise_estimate(sigma: FloatArray, pose: FloatArray, known: bool) -> NoiseEstimate:
+    return NoiseEstimate(
+        sigma_m=float(sigma.mean()),
+        std_m=float(sigma.std(ddof=1)),
+        pose_sigma_m=float(pose.mean()) if known else None,
+        pose_sigma_std_m=float(pose.std(ddof=1)) if known else None,
+    )
 
 
 def _sampler_info(sampled: Sampled, seconds: float) -> SamplerInfo:

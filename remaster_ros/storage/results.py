@@ -172,6 +172,16 @@ def fit_to_dict(result: FitResult) -> dict[str, Any]:
                 'std_m': noise.std_m,
                 'pose_sigma_m': noise.pose_sigma_m,
                 'pose_std_m': noise.pose_sigma_std_m,
+                **{
+                    f'{direction}_{key}': value
+                    for direction, part in noise.directions.items()
+                    for key, value in (
+                        ('sigma_m', part.sigma_m),
+                        ('std_m', part.std_m),
+                        ('pose_sigma_m', part.pose_sigma_m),
+                        ('pose_std_m', part.pose_sigma_std_m),
+                    )
+                },
             }
             for sensor, noise in result.noise.items()
         },
