@@ -17,6 +17,7 @@ from remaster_ros.core.fit import (
     FitResult,
     fit_session,
 )
+from remaster_ros.storage.priors import read_priors
 from remaster_ros.storage.results import prepare_folder, save_fit
 from remaster_ros.storage.session import read_session
 
@@ -49,11 +50,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='sample until every mean is known to P standard deviations of its parameter '
         f'(default {PRECISION}); of no effect with --draws',
     )
+    parser.add_argument(
+        '--prior',
+        type=Path,
+        metavar='FILE',
+        help='YAML file of what is known before: offsets, markers, base frames',
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Fit, write, and say in a few lines what came out."""
     session = read_session(args.session)
+    priors = read_priors(args.prior) if args.prior is not None else None
     # An hour's chain must not end at a folder that cannot be written.
     prepare_folder(args.out)
     with progress_bar(args.quiet) as progress:
@@ -66,6 +74,7 @@ def run(args: argparse.Namespace) -> int:
             precision=args.precision,
             progress=progress,
             clock=time.perf_counter,
+            priors=priors,
         )
         progress('writing', 0.0)
         report = save_fit(result, args.out, figures=not args.no_figures)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,9 +14,17 @@ from remaster_ros.core.gauge import Gauge, find_gauge
 from remaster_ros.core.laplace import Mode, find_mode
 from remaster_ros.core.model import Model, Rows
 from remaster_ros.core.outliers import Judgement, find_outliers
-from remaster_ros.core.posterior import Posterior, Prior, base_prior, marker_prior
+from remaster_ros.core.posterior import Posterior, Prior, base_prior, marker_prior, offset_prior
 from remaster_ros.core.start import robust_start
-from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Measurements, Session
+from remaster_ros.core.types import (
+    BasePrior,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Measurements,
+    Priors,
+    Session,
+)
 
 # Fewer rows of a sensor leave nothing to estimate its noise from.
 FEWEST_ROWS = 4
@@ -40,10 +48,14 @@ class Problem:
         Those with at least one row.
     measurements
         All rows in file order, ``sensor`` and ``marker`` being indices into these names.
-    markers
-        Nominal positions, m, (markers, 3).
+    markers, marker_std_m
+        Nominal positions and how well they are known, m, (markers, 3) and (markers,).
     fitted
         Indices of the optimization rows.
+    known_offsets
+        (joint index, mean, standard deviation), rad, of the offsets known beforehand.
+    known_base
+        Sensor name -> registration known beforehand.
     """
 
     session: Session
@@ -52,16 +64,19 @@ class Problem:
     marker_names: tuple[str, ...]
     measurements: Measurements
     markers: FloatArray
+    marker_std_m: FloatArray
     fitted: IntArray
+    known_offsets: tuple[tuple[int, float, float], ...]
+    known_base: Mapping[str, BasePrior]
 
     @classmethod
-    def of(cls, session: Session) -> Problem:
-        """Reduce and check a session.
+    def of(cls, session: Session, priors: Priors | None = None) -> Problem:
+        """Reduce and check a session; priors replace what it says of the same markers and sensors.
 
         Raises
         ------
         InputError
-            A robot that does not fit the session.
+            A robot that does not fit the session, or priors on what the session has not.
         InsufficientDataError
             Too few observations, of one sensor or of all.
         """
@@ -98,30 +113,47 @@ class Problem:
                     f"sensor '{name}' has {count} optimization rows; at least {FEWEST_ROWS} are "
                     'needed to register it and to know its noise'
                 )
+        priors = Priors() if priors is None else priors
+        _require_known('joint', priors.joint_offsets, chain.joint_names)
+        _require_known('marker', priors.markers, session.marker_names)
+        _require_known('sensor', priors.base, session.sensor_names)
+        places = [
+            priors.markers.get(name, (session.markers[name], session.marker_std_m))
+            for name in marker_names
+        ]
         return cls(
             session,
             chain,
             sensor_names,
             marker_names,
             replace(given, sensor=sensor.astype(np.int64), marker=marker.astype(np.int64)),
-            np.array([session.markers[name] for name in marker_names], dtype=float),
+            np.array([place for place, _ in places], dtype=float),
+            np.array([std for _, std in places], dtype=float),
             fitted,
+            tuple(
+                (chain.joint_names.index(name), mean, std)
+                for name, (mean, std) in priors.joint_offsets.items()
+            ),
+            {**session.base_prior, **priors.base},
         )
 
     def marker_priors(self, model: Model) -> tuple[Prior, ...]:
         """Return the priors on the markers."""
         return tuple(
-            marker_prior(model, index, nominal, self.session.marker_std_m)
-            for index, nominal in enumerate(self.markers)
+            marker_prior(model, index, nominal, float(std))
+            for index, (nominal, std) in enumerate(
+                zip(self.markers, self.marker_std_m, strict=True)
+            )
         )
 
-    def base_priors(self, model: Model) -> tuple[Prior, ...]:
-        """Return the priors on the registrations that the session knows beforehand."""
-        return tuple(
-            base_prior(model, index, self.session.base_prior[name])
+    def other_priors(self, model: Model) -> tuple[Prior, ...]:
+        """Return the priors on registrations and offsets that are known beforehand."""
+        base = tuple(
+            base_prior(model, index, self.known_base[name])
             for index, name in enumerate(self.sensor_names)
-            if name in self.session.base_prior
+            if name in self.known_base
         )
+        return base + tuple(offset_prior(model, *known) for known in self.known_offsets)
 
     def empty_model(self, extension: Extension | None = None) -> Model:
         """Return a model with registrations still unknown."""
@@ -183,10 +215,10 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
         measurements,
         problem.fitted,
         problem.markers,
-        problem.session.marker_std_m,
+        float(np.max(problem.marker_std_m)),
         problem.marker_priors(empty),
     )
-    priors = problem.marker_priors(model) + problem.base_priors(model)
+    priors = problem.marker_priors(model) + problem.other_priors(model)
     rows = Rows.of(measurements, problem.fitted, model.reference)
     gauge = find_gauge(model, model.natural(z), rows, priors)
     free = np.setdiff1d(np.arange(model.size), gauge.held)
@@ -267,6 +299,15 @@ def hold_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
         reference=posterior.model.pinned(natural),
     )
     return find_mode(held)
+
+
+def _require_known(kind: str, given: Mapping[str, object], names: Sequence[str]) -> None:
+    for name in given:
+        if name not in names:
+            raise InputError(
+                f"there is a prior on {kind} '{name}', but the session has {', '.join(names)}; "
+                'correct the name or leave it out'
+            )
 
 
 def _require_information(rows: Rows, free: IntArray, model: Model) -> None:

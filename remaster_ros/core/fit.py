@@ -15,7 +15,7 @@ from remaster_ros.core.paper_mode import BURN_IN_SHARE, STEPS, fit_paper
 from remaster_ros.core.posterior import Posterior
 from remaster_ros.core.result import FitResult, Sampled, build_result
 from remaster_ros.core.sampling import PRECISION, Length, Progress, sample_posterior, silent
-from remaster_ros.core.types import FloatArray, Session
+from remaster_ros.core.types import FloatArray, Priors, Session
 
 __all__ = ['PRECISION', 'FitResult', 'fit_session']
 
@@ -37,6 +37,7 @@ def fit_session(
     progress: Progress | None = None,
     clock: Callable[[], float] | None = None,
     extension: Extension | None = None,
+    priors: Priors | None = None,
 ) -> FitResult:
     """Fit a session's optimization rows.
 
@@ -62,6 +63,8 @@ def fit_session(
         Returns seconds, to time the sampler; core has no clock of its own.
     extension
         Further physical effects to fit; the paper's model has none.
+    priors
+        What is known beforehand, instead of what the session says; the paper's model has none.
 
     Raises
     ------
@@ -72,6 +75,8 @@ def fit_session(
     """
     if extension is not None and sampler == 'paper':
         raise InputError("the paper's model has no further effects; use the fast sampler")
+    if priors is not None and sampler == 'paper':
+        raise InputError("the paper's model has no priors on its parameters; use the fast sampler")
     if chains < 2:
         raise InputError(f'{chains} chain(s) cannot be judged; use at least 2')
     if not FINEST_PRECISION <= precision <= COARSEST_PRECISION:
@@ -84,7 +89,7 @@ def fit_session(
         raise InputError(f'{draws} draws are too few; use at least {fewest:.0f}')
     report = progress if progress is not None else silent
     started = clock() if clock is not None else np.nan
-    problem = Problem.of(session)
+    problem = Problem.of(session, priors)
     if sampler == 'paper':
         sampled = fit_paper(
             problem,

@@ -66,6 +66,15 @@ def marker_prior(model: Model, marker: int, nominal: FloatArray, std_m: float) -
     )
 
 
+def offset_prior(model: Model, joint: int, mean: float, std: float) -> Prior:
+    """Return what is known of a joint's offset before, rad."""
+    width = max(std, TIGHTEST_PRIOR)
+    return Prior(
+        f'the prior on {model.chain.joint_names[joint]}, {np.degrees(std):g} deg',
+        lambda x: (x[..., joint : joint + 1] - mean) / width,
+    )
+
+
 def base_prior(model: Model, sensor: int, prior: BasePrior) -> Prior:
     """Return what is known of a sensor's registration T_R_N before."""
     known = matrix_from_quaternion_xyzw(prior.rotation_xyzw)

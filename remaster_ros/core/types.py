@@ -103,6 +103,25 @@ class BasePrior:
 
 
 @dataclass(frozen=True)
+class Priors:
+    """What a user knows before a fit, beyond what the session says, and instead of it.
+
+    Attributes
+    ----------
+    joint_offsets
+        Joint name -> mean and standard deviation, rad.
+    markers
+        Marker name -> position in the tool frame T, m, (3,), and standard deviation per axis, m.
+    base
+        Sensor name -> registration.
+    """
+
+    joint_offsets: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    markers: Mapping[str, tuple[FloatArray, float]] = field(default_factory=dict)
+    base: Mapping[str, BasePrior] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Measurements:
     """The observations of a session as columns; row i of every array is one observation.
 

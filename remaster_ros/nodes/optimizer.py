@@ -18,6 +18,7 @@ from remaster_ros.core.fit import FitResult, fit_session
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import LATCHED, Status
+from remaster_ros.storage.priors import read_priors
 from remaster_ros.storage.results import prepare_folder, save_fit
 from remaster_ros.storage.session import read_session
 
@@ -30,6 +31,7 @@ class Parameters:
     out: str = parameter('fit', 'folder for fit.json, figures and report')
     sampler: str = parameter('fast', 'which sampler', choices=('fast', 'paper'))
     chains: int = parameter(4, 'number of chains', low=2, high=64)
+    prior: str = parameter('', 'YAML file of what is known before a fit; empty for nothing')
     seed: int = parameter(0, 'seed of the sampler', low=0)
     figures: bool = parameter(True, 'write figures and the report')
 
@@ -76,6 +78,7 @@ class Optimizer(RemasterNode):
             chains=self.p.chains,
             progress=self._progress,
             clock=time.perf_counter,
+            priors=read_priors(self.p.prior) if self.p.prior else None,
         )
         return result, save_fit(result, out, figures=self.p.figures)
 
