@@ -27,6 +27,8 @@ INDISTINGUISHABLE = 4.0
 SIZE_STD = 3.0
 # A free curve has no single size: it must agree with the true one to this share of its RMS.
 CURVE_SHARE = 0.4
+# A component of which less than this share is left cannot be asked for.
+UNSEEN_SHARE = 0.02
 
 Cause = tuple[str, tuple[int, ...], str]
 """Name, joints, and for a cell without a name its place and driver; for a sensor its name."""
@@ -109,7 +111,8 @@ def _claimed(effect: Any) -> list[Cause]:
     joints = tuple(effect.joints)
     if effect.name == 'unnamed':
         return [('unnamed', joints, f'{effect.place} {effect.driver}')]
-    if effect.name == 'joint_compliance':
+    if effect.name != 'joint_coupling' and len(joints) > 1:
+        # One entry for several joints that err in the same way.
         return [(effect.name, (joint,), '') for joint in joints]
     sensor = ''
     if effect.place == 'sensor_frame':
@@ -138,26 +141,26 @@ def _forgiven(
 
 
 def _parts(claim: Any) -> list[HiddenEffect]:
-    """Return the named effect as this world would hide it, a unit of each of its parameters."""
+    """Return the named effect as this world would hide it, each of its parameters alone."""
     return [
-        part
+        part.scaled(parameter.value)
         for parameter in claim.parameters
-        if (part := _part(parameter.name, tuple(claim.joints))) is not None
+        if (part := _part(parameter.name)) is not None
     ]
 
 
 # What the estimate calls a parameter -> the same thing in the terms of the hidden world.
 _PATTERNS = {
     r'compliance_(?P<j>\d+)': 'joint_compliance',
-    r'sin(?P<order>\d+)_\d+': 'encoder_eccentricity',
-    r'cos(?P<order>\d+)_\d+': 'encoder_eccentricity',
+    r'sin(?P<order>\d+)_(?P<j>\d+)': 'encoder_eccentricity',
+    r'cos(?P<order>\d+)_(?P<j>\d+)': 'encoder_eccentricity',
     r'scale_(?P<j>\d+)': 'encoder_scale',
-    r'half_backlash_\d+': 'backlash',
-    r'settling_\d+': 'settling',
-    r'coupling_\d+_by_(?P<by>\d+)': 'joint_coupling',
-    r'length_\d+': 'link_length',
-    r'offset_(?P<axis>[xyz])_\d+': 'link_length',
-    r'tilt_(?P<axis>[xyz])_\d+': 'joint_axis_tilt',
+    r'half_backlash_(?P<j>\d+)': 'backlash',
+    r'settling_(?P<j>\d+)': 'settling',
+    r'coupling_(?P<j>\d+)_by_(?P<by>\d+)': 'joint_coupling',
+    r'length_(?P<j>\d+)': 'link_length',
+    r'offset_(?P<axis>[xyz])_(?P<j>\d+)': 'link_length',
+    r'tilt_(?P<axis>[xyz])_(?P<j>\d+)': 'joint_axis_tilt',
     r'growth': 'thermal_growth',
     r'base_compliance': 'base_compliance',
     r'drift_(?P<axis>[xyz])_(?P<sensor>\w+)': 'registration_drift',
@@ -167,21 +170,19 @@ _PATTERNS = {
 }
 
 
-def _part(name: str, joints: tuple[int, ...]) -> HiddenEffect | None:
+def _part(name: str) -> HiddenEffect | None:
     for pattern, kind in _PATTERNS.items():
         match = re.fullmatch(pattern, name)
         if match is None:
             continue
         detail: dict[str, Any] = match.groupdict()
         values = np.ones(1)
-        if kind == 'joint_compliance':
-            joints = (int(detail['j']),)
-        elif kind == 'encoder_eccentricity':
+        joints = (int(detail['j']),) if 'j' in detail else ()
+        if kind == 'encoder_eccentricity':
             detail = {'orders': (int(detail['order']),)}
             values = np.array([1.0, 0.0] if name.startswith('sin') else [0.0, 1.0])
         elif kind == 'joint_coupling':
             detail = {'by': int(detail['by']), 'form': 'linear'}
-            joints = joints[:1]
         elif kind in ('joint_axis_tilt', 'registration_drift'):
             values = np.eye(3)['xyz'.index(detail['axis'])]
         elif kind == 'sensor_scale':
@@ -211,11 +212,25 @@ def _deviations(
         if effect.kind == 'joint_error_curve':
             deviations['curve'] = _curve_deviation(world, effect, estimates)
             continue
+        if effect.kind == 'marker_offset':
+            deviations |= _marker_deviations(world, effect, estimates)
+            continue
         spread = max(std for _, std in estimates.values())
         for name, true in expected(world, effect).items():
+            if name not in estimates and _unseen(world, effect, name):
+                continue
             value, std = estimates.get(name, (0.0, spread))
             deviations[name] = (value - true) / std
     return deviations
+
+
+def _unseen(world: HiddenWorld, effect: HiddenEffect, name: str) -> bool:
+    """Whether this component of the effect is taken up by offsets, registration or marker."""
+    part = _part(name)
+    if part is None:
+        return False
+    size = np.linalg.norm(effect.values) / np.linalg.norm(part.values)
+    return world.size_m(part.scaled(size)) < UNSEEN_SHARE * world.size_m(effect)
 
 
 def expected(world: HiddenWorld, effect: HiddenEffect) -> dict[str, float]:
@@ -259,12 +274,6 @@ def expected(world: HiddenWorld, effect: HiddenEffect) -> dict[str, float]:
             return {f'{prefix}_{sensor}': values[0]}
         case 'sensor_distortion':
             return {f'radial_{sensor}': values[0]}
-        case 'marker_offset':
-            return {
-                f'{axis}_{name}': float(world.markers[name][i] + effect.values[i] - nominal[i])
-                for name, nominal in world.nominal_markers.items()
-                for i, axis in enumerate('xyz')
-            }
         case 'foreign_torque':
             return {f'joint_{j}_by_gravity_torque_of_joint_{by}': values[0]}
         case 'creeping_joint' | 'slipped_joint':
@@ -273,6 +282,27 @@ def expected(world: HiddenWorld, effect: HiddenEffect) -> dict[str, float]:
             return {f'joint_{j}_by_temperature': values[0]}
         case _:
             return {}
+
+
+def _marker_deviations(
+    world: HiddenWorld, effect: HiddenEffect, estimates: dict[str, tuple[float, float]]
+) -> dict[str, float]:
+    """Compare height and distance from the last joint's axis, the z axis of the tool here.
+
+    Where the marker is round that axis trades with the last zero-offset: nobody can tell.
+    """
+    deviations = {}
+    for name, nominal in world.nominal_markers.items():
+        if f'x_{name}' not in estimates:
+            continue
+        true = world.markers[name] + effect.values
+        value, std = np.transpose([estimates[f'{axis}_{name}'] for axis in 'xyz'])
+        found = nominal + value
+        radius = np.hypot(found[0], found[1])
+        radial_std = np.hypot(found[0] * std[0], found[1] * std[1]) / radius
+        deviations[f'radius_{name}'] = float((radius - np.hypot(true[0], true[1])) / radial_std)
+        deviations[f'z_{name}'] = float((found[2] - true[2]) / std[2])
+    return deviations
 
 
 def _curve_deviation(

@@ -73,7 +73,7 @@ def _draw_compliance(
     loaded = 1 + np.flatnonzero(np.ptp(c.torque, axis=0) > 0.5)
     count = min(int(rng.choice((1, 1, 2))), len(loaded))
     joints = np.sort(rng.choice(loaded, count, replace=False))
-    values = 4e-4 * rng.uniform(0.3, 1.0, count)
+    values = 4e-4 * rng.uniform(0.5, 1.0, count)
     return HiddenEffect('joint_compliance', tuple(int(j) for j in joints), values)
 
 
@@ -196,6 +196,8 @@ def draw_effect(stage: Stage, kind: str, rng: np.random.Generator, size_m: float
     best, best_size = None, 0.0
     for _ in range(30):
         effect = DRAWS[kind](rng, stage.arm.joints, stage.circumstances, tuple(stage.sensors))
+        if len(effect.joints) > 1:
+            effect = _balanced(stage, effect)
         largest = stage.size_m(effect)
         if largest > best_size:
             best, best_size = effect, largest
@@ -204,3 +206,16 @@ def draw_effect(stage: Stage, kind: str, rng: np.random.Generator, size_m: float
     if best is None or best_size < 1e-6:
         raise InputError(f'{kind} cannot be seen on these visits, whatever its size')
     return stage.of_size(best, size_m)
+
+
+def _balanced(stage: Stage, effect: HiddenEffect) -> HiddenEffect:
+    """Let every joint that shares in an effect leave as much as the drawn values are large.
+
+    Else one of two joints that give way could be there in name only.
+    """
+    alone = [
+        stage.size_m(replace(effect, joints=(joint,), values=np.ones(1)))
+        for joint in effect.joints
+    ]
+    values = effect.values / np.maximum(alone, 1e-12)
+    return replace(effect, values=values * np.max(effect.values) / np.max(values))
