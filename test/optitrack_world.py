@@ -33,6 +33,9 @@ class MarkerWorld:
     def line_of_sight(self, sensor: str, t: float) -> bool:
         return self.visible
 
+    def faults(self, device: str) -> dict[str, float]:
+        return {}
+
     def is_moving(self, t: float) -> bool:
         return True
 

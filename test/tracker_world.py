@@ -38,6 +38,9 @@ class ReflectorWorld:
     def line_of_sight(self, sensor: str, t: float) -> bool:
         return self.visible
 
+    def faults(self, device: str) -> dict[str, float]:
+        return {}
+
 
 def across_and_along(error: np.ndarray, position: np.ndarray) -> tuple[float, float]:
     """Split an error into its lengths across the ray to `position` and along it."""

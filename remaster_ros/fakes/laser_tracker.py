@@ -14,6 +14,7 @@ import numpy as np
 
 from remaster_ros.core.errors import DeviceError
 from remaster_ros.core.types import FloatArray
+from remaster_ros.fakes.faults import Numbers
 from remaster_ros.fakes.laser_tracker_instrument import TrackerInstrument
 from remaster_ros.fakes.laser_tracker_settings import TrackerBehaviour
 from remaster_ros.protocols.laser_tracker import (
@@ -69,7 +70,10 @@ class FakeLaserTracker:
         aim: FloatArray | None = None,
     ) -> None:
         self._world = world
-        self._instrument = TrackerInstrument(world, sensor, rng, world.now(), behaviour, aim)
+        self._sensor, self._rng = sensor, rng
+        self._behaviour, self._restarted, self._lost_s = behaviour, False, 0.0
+        self._looked_at = world.now()
+        self._instrument = TrackerInstrument(world, sensor, rng, self._looked_at, behaviour, aim)
         self._wanted = (host, port)
         self._lock = threading.Lock()
         self._closing = threading.Event()
@@ -152,13 +156,40 @@ class FakeLaserTracker:
         while not self._closing.is_set():
             ready = [key.fileobj for key, _ in self._selector.select(_POLL_WALL_S)]
             with self._lock:
-                self._send(self._instrument.step(self._world.now()))
+                faults = self._world.faults(self._sensor)
+                self._suffer(faults)
+                if 'stuck' not in faults:
+                    self._send(self._instrument.step(self._instrument_time(faults)))
                 # The client first: one that has left makes room for one that knocks.
-                if self._client in ready:
+                if self._client in ready and 'stuck' not in faults:
                     self._receive()
                 if self._listener in ready:
                     self._accept()
         self._drop_client()
+
+    def _instrument_time(self, faults: Numbers) -> float:
+        """World time, which passes slowly for an instrument that is slow."""
+        now = self._world.now()
+        passed, self._looked_at = now - self._looked_at, now
+        self._lost_s += passed * (1.0 - 1.0 / faults.get('slow', 1.0))
+        return now - self._lost_s
+
+    def _suffer(self, faults: Numbers) -> None:
+        """Break what the faults say is broken."""
+        if 'off' in faults:
+            self._drop_client()
+        if 'renumbered' in faults and not self._restarted:
+            self._drop_client()
+            time_s = self._world.now() - self._lost_s
+            self._instrument = TrackerInstrument(
+                self._world, self._sensor, self._rng, time_s, self._behaviour
+            )
+        self._restarted = 'renumbered' in faults
+        if 'cut' in faults:
+            self._cut_after = int(faults['cut'])
+        if 'garbage' in faults and self._client is not None:
+            with contextlib.suppress(OSError):
+                self._client.sendall(self._rng.bytes(64))
 
     def _accept(self) -> None:
         assert self._listener is not None
@@ -166,6 +197,9 @@ class FakeLaserTracker:
             client, _ = self._listener.accept()
         except OSError:
             # The client has gone again before it was welcomed.
+            return
+        if 'off' in self._world.faults(self._sensor):
+            client.close()
             return
         if self._client is not None:
             refusal = ErrorReport(Command.UNKNOWN, Status.MULTI_CONNECTIONS_NOT_ALLOWED)

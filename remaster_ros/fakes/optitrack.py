@@ -18,6 +18,7 @@ import numpy as np
 from remaster_ros.core.errors import InputError
 from remaster_ros.drivers.natnet_diagnosis import require_group
 from remaster_ros.drivers.natnet_sockets import open_socket
+from remaster_ros.fakes.optitrack_faults import FrameFaults
 from remaster_ros.fakes.optitrack_scene import CLOCK_HZ, OptiTrackBehaviour, OptiTrackScene
 from remaster_ros.protocols import natnet
 from remaster_ros.protocols.natnet import ClientRequest, Message, MessageId, ProtocolError, Version
@@ -117,6 +118,7 @@ class FakeOptiTrackServer:
         self._group = (multicast_group, data_port)
         self._unicast_port = unicast_port
         self._client_timeout_s = client_timeout_s
+        self._sensor, self._spoiler = sensor, FrameFaults(rng)
         self._scene = OptiTrackScene(world, sensor, rng, behaviour or OptiTrackBehaviour())
         self._command: socket.socket | None = None
         self._data: socket.socket | None = None
@@ -197,10 +199,11 @@ class FakeOptiTrackServer:
             self._world.sleep(max(0.0, start_s + number / self._rate_hz - self._world.now()))
             frame = self._scene.frame(number, self._version)
             self._latest = frame
-            self._distribute(frame)
+            for message in self._spoiler.spoil(frame, self._world.faults(self._sensor)):
+                self._distribute(message)
             self.frames_sent += 1
 
-    def _distribute(self, frame: Frame) -> None:
+    def _distribute(self, frame: Frame | bytes) -> None:
         if self._data is not None:
             self._send(frame, self._group, self._version, self._data)
             return
@@ -218,6 +221,8 @@ class FakeOptiTrackServer:
                 datagram, address = self._command.recvfrom(1 << 16)
                 request = natnet.decode_request(datagram)
             except (OSError, ProtocolError):
+                continue
+            if 'off' in self._world.faults(self._sensor):
                 continue
             with self._lock:
                 if address in self._clients:
@@ -305,7 +310,7 @@ class FakeOptiTrackServer:
 
     def _send(
         self,
-        message: Message,
+        message: Message | bytes,
         address: Address,
         version: Version,
         through: socket.socket | None = None,
@@ -313,5 +318,6 @@ class FakeOptiTrackServer:
         # A network that is down loses datagrams, as everywhere; the server goes on.
         sender = through or self._command
         assert sender is not None
+        raw = message if isinstance(message, bytes) else natnet.encode_message(message, version)
         with contextlib.suppress(OSError):
-            sender.sendto(natnet.encode_message(message, version), address)
+            sender.sendto(raw, address)

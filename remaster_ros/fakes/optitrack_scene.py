@@ -215,7 +215,9 @@ class OptiTrackScene:
         if t >= end:
             self._plan_occlusion(end)
             start, end = self._occlusion
-        if tracked and not start <= t < end:
+        if 'filled' in self._world.faults(self._sensor):
+            self._hidden_params = MODEL_FILLED | HAS_MODEL
+        elif tracked and not start <= t < end:
             self._hidden_params = None
         elif self._hidden_params is None:
             self._hidden_params = int(self._rng.choice(_HIDDEN))

@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from remaster_ros.core.types import FloatArray
+from remaster_ros.fakes.faults import Numbers, is_out
 from remaster_ros.fakes.motion import Waypoint
 from remaster_ros.fakes.world import World
 
@@ -43,6 +44,8 @@ class FakeArm:
         self._rng = rng
         # joint_state_broadcaster reports in an order of its own; everyone must permute by name.
         self._order = rng.permutation(len(self.names))
+        self._commanded: tuple[float, FloatArray] | None = None
+        self._braked = False
 
     def command(
         self, names: Sequence[str], points: Sequence[TrajectoryPoint], start_s: float = 0.0
@@ -62,7 +65,8 @@ class FakeArm:
             Why the trajectory was dropped, for the log; None when it is followed.
         """
         now = self.world.now()
-        reason = self._refuse(names, points, start_s, now)
+        faults = self.world.faults('robot')
+        reason = _fault_reason(faults, now) or self._refuse(names, points, start_s, now)
         if reason is not None:
             return reason
         columns = [list(names).index(name) for name in self.names]
@@ -73,7 +77,10 @@ class FakeArm:
             q = np.asarray(point.positions, float)[columns] + stray
             velocity = np.asarray(point.velocities, float)[columns] if point.velocities else None
             waypoints.append(Waypoint(point.time_from_start_s, q, velocity))
-        self.world.begin_motion(max(start_s, now), waypoints)
+        waypoints = _spoil(waypoints, faults)
+        begin = max(start_s, now)
+        self._commanded = begin + waypoints[-1].time_s, np.asarray(points[-1].positions)[columns]
+        self.world.begin_motion(begin, waypoints)
         return None
 
     def _refuse(
@@ -101,10 +108,55 @@ class FakeArm:
             return 'the trajectory ends in the past'
         return None
 
-    def joint_state(self) -> tuple[float, list[str], FloatArray, FloatArray]:
-        """Report now: time (s), names, positions (rad), velocities (rad/s), in its own order."""
-        now = self.world.now()
+    def joint_state(self) -> tuple[float, list[str], FloatArray, FloatArray] | None:
+        """Report now: time (s), names, positions (rad), velocities (rad/s), in its own order.
+
+        None for a robot that is off.
+        """
+        now, faults = self.world.now(), self.world.faults('robot')
+        if 'estop' not in faults:
+            self._braked = False
+        elif not self._braked:
+            self._brake(now)
+        if 'off' in faults or is_out(faults.get('intermittent'), now):
+            return None
+        now -= faults.get('late', 0.0)
         q, velocity = self.world.reported(now)
         q = q + self._rng.normal(0.0, self.world.truth.encoder_rad, len(q))
+        if 'copy' in faults and self._commanded is not None and now >= self._commanded[0]:
+            q = self._commanded[1]
+        if 'drift' in faults:
+            q = q + faults['drift'] * np.arcsin(np.sin(now))
+        if 'nan' in faults:
+            q = np.where(np.arange(len(q)) == 2, np.nan, q)
+        if 'reordered' in faults:
+            self._order = self._rng.permutation(len(q))
         order = self._order
-        return now, [self.names[i] for i in order], q[order], velocity[order]
+        prefix = 'other_' if 'renamed' in faults else ''
+        names = [prefix + self.names[i] for i in order]
+        return now + faults.get('clock', 0.0), names, q[order], velocity[order]
+
+    def _brake(self, now: float) -> None:
+        """Stand still at once, as an emergency stop does."""
+        self._braked = True
+        q, velocity = self.world.reported(now)
+        braking_s = 0.15
+        end = q + 0.5 * braking_s * velocity
+        self.world.begin_motion(now, [Waypoint(braking_s, end, np.zeros_like(end))])
+
+
+def _fault_reason(faults: Numbers, now: float) -> str:
+    """Why a faulty robot takes no command; '' if it does."""
+    for name in ('off', 'dropped', 'estop'):
+        if name in faults:
+            return f'fault injected: {name}'
+    return 'fault injected: intermittent' if is_out(faults.get('intermittent'), now) else ''
+
+
+def _spoil(waypoints: Sequence[Waypoint], faults: Numbers) -> list[Waypoint]:
+    """Go beside the target, or slowly."""
+    slow, beside = faults.get('slow', 1.0), faults.get('elsewhere', 0.0)
+    return [
+        Waypoint(p.time_s * slow, p.q + beside, None if p.velocity is None else p.velocity / slow)
+        for p in waypoints
+    ]

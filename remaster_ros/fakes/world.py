@@ -28,6 +28,7 @@ from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.collision import ArmCapsules
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.types import FloatArray
+from remaster_ros.fakes.faults import Faults, Numbers, is_out
 from remaster_ros.fakes.motion import Motion, Waypoint
 
 START_S = 100.0
@@ -54,6 +55,9 @@ class WorldView(Protocol):
 
     def line_of_sight(self, sensor: str, t: float) -> bool:
         """Whether the sensor sees its marker at time t."""
+
+    def faults(self, device: str) -> Numbers:
+        """Faults of the device now, see `remaster_ros.fakes.faults`."""
 
 
 @dataclass(frozen=True)
@@ -183,6 +187,7 @@ class World:
         self._capsules = ArmCapsules(self.chain, data['link_radius_m'])
         self.start_q = np.array(data['start_q_rad'], float)
         self._motion = Motion(START_S, self.start_q)
+        self._faults = Faults(folder)
         self._lines: TextIO | None = None
         self._torn = ''
         self._position = 0
@@ -296,6 +301,10 @@ class World:
         """Whether any joint moves faster than 0.1 mrad/s at time t."""
         return self.joint_speed(t) > 1e-4
 
+    def faults(self, device: str) -> Numbers:
+        """Faults of the device now, see `remaster_ros.fakes.faults`."""
+        return self._faults.of(device)
+
     # What sensors see
 
     def marker_in_sensor(self, sensor: str, t: float) -> FloatArray:
@@ -303,11 +312,15 @@ class World:
         truth = self._sensor(sensor)
         q = self.reported(t)[0]
         marker_R = self.chain.positions(q, truth.marker, self.truth.joint_offsets)
-        return transforms.apply(transforms.inverse(truth.T_R_N), marker_R)
+        marker_N = transforms.apply(transforms.inverse(truth.T_R_N), marker_R)
+        marker_N[0] += self.faults(sensor).get('swapped', 0.0)
+        return marker_N
 
     def line_of_sight(self, sensor: str, t: float) -> bool:
         """Whether the sensor sees its marker at time t: turned to it, and no link between."""
-        truth = self._sensor(sensor)
+        truth, faults = self._sensor(sensor), self.faults(sensor)
+        if 'occluded' in faults or is_out(faults.get('intermittent'), t):
+            return False
         q = self.reported(t)[0] + self.truth.joint_offsets
         T_R_T = self.chain.forward(q)
         marker_R = transforms.apply(T_R_T, truth.marker)

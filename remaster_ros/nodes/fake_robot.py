@@ -89,7 +89,10 @@ class FakeRobotNode(RemasterNode):
         self._clock_publisher.publish(ClockMessage(clock=stamp_of(self.world.now())))
 
     def _publish_state(self) -> None:
-        now, names, q, velocity = self.arm.joint_state()
+        state = self.arm.joint_state()
+        if state is None:
+            return
+        now, names, q, velocity = state
         message = JointState(name=names, position=q.tolist(), velocity=velocity.tolist())
         message.header.stamp = stamp_of(now)
         self._states.publish(message)

@@ -1,0 +1,104 @@
+"""Faults that are injected into the fakes: a file in the hidden World that a test writes.
+
+``faults.json`` maps a device (``robot`` or a sensor's name) to its faults, and each fault to its
+number: ``{"robot": {"slow": 3.0}, "mocap": {"frozen": 1}}``. The fakes look at it all the time, so
+a fault begins and ends with the file.
+
+The robot:
+
+=================  =====================================================
+``off``            reports nothing and takes no command
+``dropped``        takes no command
+``estop``          stands still at once and takes no command
+``elsewhere``      goes so many rad beside its target, at every joint
+``slow``           needs so many times as long
+``late``           reports what was so many seconds ago
+``intermittent``   is off every other period of so many seconds
+``nan``            reports a joint that is not a number
+``renamed``        reports joints of other names
+``reordered``      reports the joints in another order each time
+``drift``          creeps to and fro by so many rad
+``copy``           reports what was commanded
+``clock``          has a clock that is off by so many seconds
+=================  =====================================================
+
+An OptiTrack server:
+
+=================  =====================================================
+``off``            neither streams nor answers
+``stopped``        answers, but does not stream
+``frozen``         streams new frames with old positions
+``swapped``        labels a stray as the marker
+``jumping``        shows the marker half a metre off in every fourth frame
+``occluded``       does not see the marker
+``filled``         guesses where the marker is
+``slow``           streams every n-th frame
+``late``           streams frames so many seconds late
+``intermittent``   does not see the marker every other period of so many seconds
+``garbage``        streams random bytes
+``duplicate``      sends every frame twice
+``reordered``      sends every second frame before the first
+``renumbered``     begins the frame numbers and the time anew, once
+=================  =====================================================
+
+A laser tracker:
+
+=================  =====================================================
+``off``            refuses connections and drops its client
+``stuck``          answers nothing
+``swapped``        measures another reflector, so many metres beside
+``slow``           needs so many times as long for everything
+``garbage``        sends random bytes
+``cut``            breaks off each packet after so many bytes
+``intermittent``   loses the beam every other period of so many seconds
+``search_fails``   finds no reflector
+``renumbered``     has been switched off and on, once
+=================  =====================================================
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+Numbers = Mapping[str, float]
+FILE = 'faults.json'
+
+
+def inject(folder: Path, faults: Mapping[str, Numbers]) -> None:
+    """Replace the faults of the World in `folder`; with none, all end."""
+    temporary = folder / f'{FILE}.new'
+    temporary.write_text(json.dumps(faults))
+    os.replace(temporary, folder / FILE)
+
+
+class Faults:
+    """The faults of a World, as they are now.
+
+    Parameters
+    ----------
+    folder
+        The World's.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / FILE
+        self._read_at: int | None = None
+        self._faults: Mapping[str, Numbers] = {}
+
+    def of(self, device: str) -> Numbers:
+        """Return the faults of a device."""
+        try:
+            changed = self._path.stat().st_mtime_ns
+        except OSError:
+            return {}
+        if changed != self._read_at:
+            self._faults, self._read_at = json.loads(self._path.read_text()), changed
+        return self._faults.get(device, {})
+
+
+def is_out(period_s: float | None, t: float) -> bool:
+    """Whether something that fails every other period fails at time t; None never fails."""
+    return bool(period_s) and int(t / period_s) % 2 == 1  # type: ignore[operator]
