@@ -332,7 +332,7 @@ def decode_as_any_version(rng: random.Random) -> Target:
     return target
 
 
-class _DatagramSource:
+class DatagramSource:
     """A socket that has received what the fuzzer made."""
 
     def __init__(self) -> None:
@@ -362,8 +362,8 @@ class NatNetClientTarget:
         )
         self.client._server_ip = self.SERVER
         self.client._command = None
-        self.client._data = self._data = _DatagramSource()  # type: ignore[assignment]
-        self._answers = _DatagramSource()
+        self.client._data = self._data = DatagramSource()  # type: ignore[assignment]
+        self._answers = DatagramSource()
         self.samples = self.strangers = self._number = self._fed = 0
         self._wrong: object = None
 
@@ -392,10 +392,11 @@ class NatNetClientTarget:
         if self._fed % 100 == 0:
             self._check()
 
-    def _receive(self, data: bytes, source: _DatagramSource, address: str = SERVER) -> None:
+    def _receive(self, data: bytes, source: DatagramSource, address: str = SERVER) -> None:
         source.waiting.append((data, (address, 1510)))
         self.client._receive(source)  # type: ignore[arg-type]
-        self.client._digest_backlog()
+        while self.client._backlog:
+            self.client._digest_backlog()
 
     def _check(self) -> None:
         status = self.client.status()
@@ -406,6 +407,8 @@ class NatNetClientTarget:
             raise FuzzError(f'{status.accepted} accepted, {self.samples} handed on')
         if status.dropped[Dropped.FOREIGN] != self.strangers:
             raise FuzzError(f'{self.strangers} foreign datagrams, counted: {status.dropped}')
+        if self.client._backlog_bytes:
+            raise FuzzError(f'{self.client._backlog_bytes} bytes of an empty backlog')
         if len(diagnosis.message) > 5000:
             raise FuzzError(f'a diagnosis of {len(diagnosis.message)} characters')
 

@@ -47,8 +47,8 @@ KEEPALIVE_S = 1.0
 POLL_S = 0.1
 DATAGRAMS_PER_TURN = 1024
 """Then the thread looks at its timers again, however fast the datagrams come."""
-DIGESTED_PER_TURN = 16
-"""A few milliseconds of decoding; then the sockets are emptied again."""
+DIGEST_S = 0.005
+"""So long a turn decodes and hands on; then the sockets are emptied again."""
 MAX_BACKLOG_BYTES = 1 << 26
 """What may wait to be decoded: twenty seconds of 1 kHz frames with 50 markers."""
 MALFORMED_IN_A_ROW = 3
@@ -199,10 +199,13 @@ class NatNetClient(MarkerFollower):
             self._backlog.append((datagram, received_s, source is self._data))
 
     def _digest_backlog(self) -> None:
-        for _ in range(min(len(self._backlog), DIGESTED_PER_TURN)):
+        until = time.monotonic() + DIGEST_S
+        while self._backlog:
             datagram, received_s, from_data_socket = self._backlog.popleft()
             self._backlog_bytes -= len(datagram)
             self._digest(datagram, received_s, from_data_socket=from_data_socket)
+            if time.monotonic() >= until:
+                return
 
     def _digest(self, datagram: bytes, received_s: float, *, from_data_socket: bool) -> None:
         """Decode one datagram and act on it."""

@@ -6,12 +6,15 @@ import contextlib
 import socket
 import struct
 import threading
+import time
 
 import numpy as np
 import pytest
+from fuzzing import DatagramSource, full_frame
 from optitrack_world import RATE, SENSOR, MarkerWorld, eventually, free_port, open_descriptors
 
 from remaster_ros.core.errors import DeviceError
+from remaster_ros.drivers import natnet as natnet_driver
 from remaster_ros.drivers.natnet import NatNetClient, NatNetSettings
 from remaster_ros.drivers.natnet_gate import Dropped, MarkerChoice
 from remaster_ros.fakes.optitrack import FakeOptiTrackServer
@@ -360,6 +363,45 @@ def test_another_address_is_counted_and_never_believed(peer_and_client):
     assert len(client.samples) == 1
     assert eventually(lambda: client.diagnosis().fault == 'address')
     assert '127.0.0.2' in client.diagnosis().message
+
+
+def received(frames, on_sample):
+    """Return a client without sockets that has received frames and digested none."""
+    client = NatNetClient(NatNetSettings(marker=MarkerChoice(marker_id=1 << 16 | 1)), on_sample)
+    client._server_ip, client._version = LOCAL, (3, 1)
+    client._data = source = DatagramSource()
+    for number in range(1, frames + 1):
+        datagram = natnet.encode_message(full_frame((3, 1), number), (3, 1))
+        source.waiting.append((datagram, (LOCAL, 1511)))
+    while source.waiting:
+        client._receive(source)
+    return client
+
+
+def test_a_slow_listener_keeps_no_datagram_in_the_socket():
+    """The socket is emptied between any two hand-overs that take long; nothing is lost."""
+    numbers = []
+
+    def listen(sample):
+        numbers.append(sample.frame_number)
+        time.sleep(0.006)
+
+    client = received(2000, listen)
+    client._digest_backlog()
+    assert numbers == [1], 'one turn takes no longer than its time'
+    client._on_sample = lambda sample: numbers.append(sample.frame_number)
+    while client._backlog:
+        client._digest_backlog()
+    assert numbers == list(range(1, 2001))
+    assert client.status().lost == 0
+
+
+def test_what_waits_is_bounded_and_the_rest_counted(monkeypatch):
+    one = len(natnet.encode_message(full_frame((3, 1)), (3, 1)))
+    monkeypatch.setattr(natnet_driver, 'MAX_BACKLOG_BYTES', 100 * one)
+    client = received(130, print)
+    assert len(client._backlog) == 100
+    assert client.status().dropped[Dropped.OVERRUN] == 30
 
 
 def test_a_changed_model_list_is_asked_for(peer_and_client):
