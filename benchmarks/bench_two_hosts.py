@@ -110,7 +110,9 @@ def become_root_of_a_namespace() -> None:
 
 
 @contextmanager
-def nodes(hosts: Hosts, out: Path, world: Path, args: argparse.Namespace) -> Iterator[None]:
+def nodes(
+    hosts: Hosts, out: Path, world: Path, args: argparse.Namespace
+) -> Iterator[dict[str, subprocess.Popen[bytes]]]:
     """Run every node on its host; end them all."""
     own: dict[str, dict[str, Any]] = {
         **{name: {'world': str(world)} for name in (*SENSORS[:2], 'fake_robot')},
@@ -121,7 +123,7 @@ def nodes(hosts: Hosts, out: Path, world: Path, args: argparse.Namespace) -> Ite
         },
         'recorder': {'session': str(out / 'session')},
     }
-    running = []
+    running: dict[str, subprocess.Popen[bytes]] = {}
     try:
         for host, names in zip(hosts.names, (SENSORS, REST)):
             for name in names:
@@ -131,14 +133,14 @@ def nodes(hosts: Hosts, out: Path, world: Path, args: argparse.Namespace) -> Ite
                 for key, value in own.get(name, {}).items():
                     command += ['-p', f'{name}:{key}:={json.dumps(value)}']
                 with (out / f'{name}.log').open('wb') as log:
-                    running.append(
-                        subprocess.Popen(command, stdout=log, stderr=log, env=environment())
+                    running[name] = subprocess.Popen(
+                        command, stdout=log, stderr=log, env=environment()
                     )
-        yield
+        yield running
     finally:
-        for process in running:
+        for process in running.values():
             process.send_signal(signal.SIGINT)
-        for process in running:
+        for process in running.values():
             try:
                 process.wait(10.0)
             except subprocess.TimeoutExpired:
@@ -192,8 +194,14 @@ def conduct() -> None:
 class Watch:
     """Follows the nodes through the conductor, and the arm through the hidden World."""
 
-    def __init__(self, conductor: subprocess.Popen[str], world: World) -> None:
+    def __init__(
+        self,
+        conductor: subprocess.Popen[str],
+        running: dict[str, subprocess.Popen[bytes]],
+        world: World,
+    ) -> None:
         self._lines = conductor.stdout
+        self._running = running
         self._world = world
         self.said: dict[str, dict[str, str]] = {}
         os.set_blocking(self._lines.fileno(), False)  # type: ignore[union-attr]
@@ -210,6 +218,9 @@ class Watch:
         deadline, told = time.monotonic() + PATIENCE_S, 0.0
         while not done():
             self.look()
+            ended = [name for name, process in self._running.items() if process.poll() is not None]
+            if ended:
+                raise SystemExit(f'{", ".join(ended)} ended while we waited for {what}')
             if time.monotonic() > deadline:
                 raise SystemExit(f'waited {PATIENCE_S:g} s in vain for {what}: {self.said}')
             if time.monotonic() - told > 10.0:
@@ -284,18 +295,20 @@ def main() -> int:
         print(f'no network namespaces here: {reason}', file=sys.stderr)
         return 3
     become_root_of_a_namespace()
+    # A termination cleans up too: namespaces outlive the processes in them.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit('terminated'))
     with tempfile.TemporaryDirectory(prefix='two_hosts_') as temporary:
         out = args.out or Path(temporary)
         out.mkdir(parents=True, exist_ok=True)
         folder = Path(temporary) / 'world'
         world = make_world(folder, read_cell('demo'), args.seed, args.rate)
-        with Hosts() as hosts, nodes(hosts, out, folder, args):
+        with Hosts() as hosts, nodes(hosts, out, folder, args) as running:
             command = ['ip', 'netns', 'exec', hosts.names[1], sys.executable, __file__]
             with subprocess.Popen(
                 [*command, '--conduct'], stdout=subprocess.PIPE, text=True, env=environment()
             ) as conductor:
                 try:
-                    watch = Watch(conductor, world)
+                    watch = Watch(conductor, running, world)
                     watch.until(lambda: watch.share() >= 0.5, 'half of the configurations')
                     hosts.cable('down')
                     before = watch.share()
