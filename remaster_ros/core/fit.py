@@ -154,6 +154,7 @@ def _fast(
         checked=run.checked,
         gauge=found.gauge,
         unfixed=unfixed,
+        taken_as_known=np.zeros(model.joints),
         z_before=found.before.z,
         left_out=found.left_out,
     )

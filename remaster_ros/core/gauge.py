@@ -73,8 +73,6 @@ def find_gauge(
     x: FloatArray,
     rows: Rows,
     priors: Sequence[Prior],
-    *,
-    fitted: IntArray | None = None,
 ) -> Gauge:
     """Find the null space at a solution, name it, and fix what no prior does.
 
@@ -84,16 +82,13 @@ def find_gauge(
         What is fitted, to which rows, and what is known beforehand.
     x
         Natural parameters, (size,).
-    fitted
-        Indices of the parameters that are fitted at all; None for all of them.
 
     Raises
     ------
     InsufficientDataError
         Where a registration or a marker itself cannot be told: holding a joint does not help.
     """
-    fitted = np.arange(model.size) if fitted is None else fitted
-    scale, null, pivots = _null_space(model, x, rows, fitted)
+    scale, null, pivots = _null_space(model, x, rows)
     _, by_x = prior_rows(model, priors, x, natural=True)
     held = _unresolved(by_x @ null, pivots, model, scale)
 
@@ -119,38 +114,34 @@ def find_gauge(
 
 
 def _null_space(
-    model: Model, x: FloatArray, rows: Rows, fitted: IntArray
+    model: Model, x: FloatArray, rows: Rows
 ) -> tuple[FloatArray, FloatArray, list[int]]:
     """Return the scale of each parameter, a basis of the null space, (size, d), and its pivots."""
     derivative = model.natural_jacobian(x, rows)
     errors = rows.target - model.predict(model.pinned(x), rows)
     for spread, (_, span) in zip(robust_spread(errors, rows), rows.spans, strict=True):
         derivative[span] /= spread
-    flat = derivative.reshape(-1, model.size)[:, fitted]
-    norm = np.linalg.norm(flat, axis=0)
-    norm = np.where(norm > ROUNDING * norm.max(), norm, norm.max())
-    triangle: FloatArray = np.asarray(np.linalg.qr(flat / norm, mode='r'))
+    flat = derivative.reshape(-1, model.size)
+    scale = np.linalg.norm(flat, axis=0)
+    scale = np.where(scale > ROUNDING * scale.max(), scale, scale.max())
+    triangle: FloatArray = np.asarray(np.linalg.qr(flat / scale, mode='r'))
     _, singular, vectors = np.linalg.svd(triangle, full_matrices=True)
     singular = np.append(singular, np.zeros(len(vectors) - len(singular)))
     unseen = singular < ROUNDING * singular[0]
 
-    scale = np.ones(model.size)
-    scale[fitted] = norm
-    basis = np.zeros((model.size, int(unseen.sum())))
-    basis[fitted] = (vectors[unseen] / norm).T
-    basis, pivots = _reduce(basis, scale, _kinds(model))
+    basis, pivots = _reduce((vectors[unseen] / scale).T, scale, _kinds(model))
     # A prior on effects counts as data for what is nearly unseen: it is what keeps them apart.
     root = np.zeros((len(rooted := extension_root(model)), model.size))
     root[:, model.core :] = rooted
-    triangle = np.asarray(np.linalg.qr(np.concatenate((triangle, root[:, fitted] / norm)), 'r'))
-    for direction, pivot in _nearly_null(triangle, fitted, norm, pivots, model):
+    triangle = np.asarray(np.linalg.qr(np.concatenate((triangle, root / scale)), 'r'))
+    for direction, pivot in _nearly_null(triangle, scale, pivots, model):
         basis = np.column_stack((basis, direction))
         pivots.append(pivot)
     return scale, basis, pivots
 
 
 def _nearly_null(
-    triangle: FloatArray, fitted: IntArray, norm: FloatArray, pivots: list[int], model: Model
+    triangle: FloatArray, scale: FloatArray, pivots: list[int], model: Model
 ) -> list[tuple[FloatArray, int]]:
     """Return the directions along which an angle is seen, but no better than `UNKNOWN_ANGLE`.
 
@@ -158,20 +149,20 @@ def _nearly_null(
     angle is how everything moves with that angle. Then that one is held too.
     """
     found = []
-    active = ~np.isin(fitted, pivots)
-    angles = np.array([_is_angle(model, index) for index in fitted])
+    active = ~np.isin(np.arange(model.size), pivots)
+    angles = np.array([_is_angle(model, index) for index in range(model.size)])
     while np.any(active & angles):
         root = np.linalg.inv(np.linalg.qr(triangle[:, active], mode='r'))
-        covariance = (root @ root.T) / np.outer(norm[active], norm[active])
+        covariance = (root @ root.T) / np.outer(scale[active], scale[active])
         std = np.where(angles[active], np.sqrt(np.diag(covariance)), 0.0)
         worst = int(np.argmax(std))
         if std[worst] < UNKNOWN_ANGLE:
             break
         direction = np.zeros(model.size)
-        direction[fitted[active]] = covariance[worst] / covariance[worst, worst]
-        pivot = int(fitted[active][worst])
+        direction[active] = covariance[worst] / covariance[worst, worst]
+        pivot = int(np.flatnonzero(active)[worst])
         found.append((direction, pivot))
-        active[np.flatnonzero(active)[worst]] = False
+        active[pivot] = False
     return found
 
 

@@ -1,10 +1,14 @@
-"""Gross errors: which rows no noise of the size of the others' can explain.
+"""Gross errors: rows that are far more likely to be mistakes than noise, named one by one.
 
-A row is judged against what the other rows of its pose say (the pose-common error), a whole pose
-against the other poses, with robust standard deviations. The limit of `LIMIT` standard deviations
-in three dimensions calls one good Gaussian row in 10 million gross. The standard deviations are
-the larger of what the median and what the 80 % quantile of the errors say, so that errors with
-more than Gaussian tails, which real robots have, are not eaten.
+A mixture: most rows have the noise of the others, a small share has an error many times as wide;
+share and width are found by expectation maximisation (Dempster, Laird and Rubin 1977). A row is
+judged against what the other rows of its pose say (the pose-common error), a whole pose against
+the other poses. What is gross with a probability of `CERTAIN` is left out.
+
+The standard deviations are robust, the larger of what the median and what the 80 % quantile of the
+errors say, so that errors with more than Gaussian tails, which real robots have, are not eaten.
+The mixture's limit then comes to lie between 6 and 7 of them: of Gaussian errors of known size it
+calls fewer than one in 5 million gross.
 """
 
 from __future__ import annotations
@@ -19,7 +23,13 @@ from remaster_ros.core.model import Rows
 from remaster_ros.core.posterior import RESOLUTION_M
 from remaster_ros.core.types import BoolArray, FloatArray
 
-LIMIT = 6.0
+# A row is left out from this probability on.
+CERTAIN = 0.99
+# What is known of gross errors before: their share as if so many of a hundred rows had been seen,
+# and that they are at least so many standard deviations wide.
+PRIOR_GROSS = 0.1
+PRIOR_ROWS = 100.0
+NARROWEST = 20.0
 # More than this share is no accident: the model or the session is wrong.
 LARGEST_SHARE = 0.1
 _QUANTILES = (0.5, 0.8)
@@ -106,13 +116,16 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
     deviation = np.linalg.norm(errors - share[:, None] * mean, axis=1)
     sigmas = deviation / spread
 
-    new = sigmas > LIMIT
+    probability = np.zeros(len(rows))
+    for _, span in rows.spans:
+        probability[span] = gross_probability(sigmas[span])
+    new = probability > CERTAIN
     worst = np.zeros(len(count))
     np.maximum.at(worst, group, np.where(gross, 0.0, sigmas))
     gross_now = new & (gross | (sigmas == worst[group]))
     why = [
-        f'residual {_mm(d)} mm, {s:.0f} sigma' if g else ''
-        for d, s, g in zip(deviation, sigmas, gross_now, strict=True)
+        f'residual {_mm(d)} mm, {s:.0f} sigma; gross with probability {_percent(p)}' if g else ''
+        for d, s, p, g in zip(deviation, sigmas, probability, gross_now, strict=True)
     ]
 
     # A pose whose rows agree with each other, and with no other pose.
@@ -121,15 +134,52 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
         pose_sigma[rows.group_sensor] ** 2 + sigma[rows.group_sensor] ** 2 / np.maximum(count, 1.0)
     )
     pose_sigmas = np.linalg.norm(pose_mean, axis=1) / pose_spread
-    for index in np.flatnonzero((pose_sigmas > LIMIT) & (count > 1)):
-        start = rows.group_start[index]
+    off = np.zeros(len(count))
+    for index, _ in rows.spans:
+        mine = (rows.group_sensor == index) & (count > 1)
+        off[mine] = gross_probability(pose_sigmas[mine])
+    for index in np.flatnonzero(off > CERTAIN).tolist():
+        start = int(rows.group_start[index])
         for row in range(start, start + rows.group_size[index]):
             gross_now[row] = True
             why[row] = (
-                f'residual {_mm(float(np.linalg.norm(errors[row])))} mm: '
-                f'the whole pose is off by {pose_sigmas[index]:.0f} sigma'
+                f'residual {_mm(float(np.linalg.norm(errors[row])))} mm: the whole pose is off by '
+                f'{pose_sigmas[index]:.0f} sigma; gross with probability {_percent(off[index])}'
             )
     return Judgement(gross_now, tuple(why))
+
+
+def gross_probability(sigmas: FloatArray) -> FloatArray:
+    """Return how probable it is that each of three-dimensional errors is gross.
+
+    Parameters
+    ----------
+    sigmas
+        Lengths of the errors in standard deviations of good ones, (n,).
+
+    Returns
+    -------
+    ndarray
+        (n,), under a mixture of two Gaussians whose share and width fit these errors.
+    """
+    square = sigmas**2
+    share, excess = PRIOR_GROSS / PRIOR_ROWS, NARROWEST**2
+    probability = np.zeros(len(square))
+    for _ in range(100):
+        before = probability
+        log_odds = (
+            np.log(share / (1.0 - share))
+            - 1.5 * np.log1p(excess)
+            + 0.5 * square * excess / (1.0 + excess)
+        )
+        probability = 1.0 / (1.0 + np.exp(-np.clip(log_odds, -500.0, 500.0)))
+        if np.max(np.abs(probability - before), initial=0.0) < 1e-6:
+            break
+        total = float(probability.sum())
+        share = (total + PRIOR_GROSS) / (len(square) + PRIOR_ROWS)
+        excess = float(probability @ (square / 3.0 - 1.0) + NARROWEST**2) / (total + 1.0)
+        excess = max(excess, NARROWEST**2)
+    return probability
 
 
 def robust_noise(rows: Rows, errors: FloatArray, good: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -182,11 +232,15 @@ def _guard(rows: Rows, gross: BoolArray, sensor_names: Sequence[str]) -> None:
         out, of = int(gross[span].sum()), span.stop - span.start
         if out > max(1.0, LARGEST_SHARE * of):
             raise InsufficientDataError(
-                f"sensor '{sensor_names[sensor]}': {out} of {of} observations are beyond "
-                f'{LIMIT:g} sigma, too many to leave out; look for mixed-up markers or a sensor '
-                'that was moved'
+                f"sensor '{sensor_names[sensor]}': {out} of {of} observations are gross errors, "
+                'too many to leave out; look for mixed-up markers or a sensor that was moved'
             )
 
 
 def _mm(length: float) -> str:
     return f'{length * 1e3:.1f}'
+
+
+def _percent(probability: float) -> str:
+    """Return a probability in words that never say certain."""
+    return f'{100.0 * probability:.1f} %' if probability < 0.999 else 'above 99.9 %'

@@ -20,7 +20,7 @@ from remaster_ros.core.gauge import Gauge, find_gauge
 from remaster_ros.core.laplace import find_mode
 from remaster_ros.core.metropolis import Chains, random_walk_sampler
 from remaster_ros.core.model import Model, Rows
-from remaster_ros.core.posterior import Posterior
+from remaster_ros.core.posterior import TIGHTEST_PRIOR, Posterior
 from remaster_ros.core.result import Sampled
 from remaster_ros.core.start import referenced, register
 from remaster_ros.core.transforms import inverse, transform
@@ -183,7 +183,9 @@ def fit_paper(
     trace, trace_sigma = _paper_natural(target, model, run.trace)
     fitted = np.arange(model.joints + 6 * len(model.sensor_names))
     at_mean = model.vector(model.offsets(mean), problem.markers)
-    gauge = _paper_gauge(find_gauge(model, at_mean, rows, (), fitted=fitted), model)
+    # Over the markers too: that the paper takes their places as exact tells nothing about them.
+    found = find_gauge(model, at_mean, rows, problem.marker_priors(model))
+    gauge = _paper_gauge(found, model)
     unseen = np.zeros(model.joints, dtype=bool)
     unseen[gauge.held] = True
     z = model.pinned(x)
@@ -212,6 +214,7 @@ def fit_paper(
         acceptance_rate=run.acceptance_rate,
         gauge=gauge,
         unfixed=unseen,
+        taken_as_known=_taken_as_known(found, model, problem.marker_std_m),
         z_before=find_mode(flat).z,
         left_out=(),
     )
@@ -230,22 +233,43 @@ def _paper_natural(
 
 def _paper_gauge(gauge: Gauge, model: Model) -> Gauge:
     """Say of every direction that the paper's flat prior leaves it open."""
-    held = [model.names[index] for index in gauge.held]
+    held = {f'{model.names[index]} = 0' for index in gauge.held}
 
-    def reworded(text: str) -> str:
-        for name in held:
-            text = text.replace(
-                f'{name} = 0',
-                'nothing: its prior is flat and the chain wanders along it '
-                f'(registrations and markers are given for {name} = 0)',
+    def reworded(fixed_by: str) -> str:
+        if fixed_by in held:
+            return (
+                'nothing: its prior is flat and the chain wanders along it (registrations and '
+                f'markers are given for {fixed_by})'
             )
-        return text
+        return f'taking the marker as known exactly, where there is no more than {fixed_by}'
 
+    words = {d.fixed_by: reworded(d.fixed_by) for d in gauge.directions}
+    why = []
+    for text in gauge.why:
+        for old, new in words.items():
+            text = text.replace(f'fixed by {old}', f'fixed by {new}')
+        why.append(text)
     return Gauge(
-        tuple(replace(d, fixed_by=reworded(d.fixed_by)) for d in gauge.directions),
+        tuple(replace(d, fixed_by=words[d.fixed_by]) for d in gauge.directions),
         gauge.held,
-        tuple(reworded(text) for text in gauge.why),
+        tuple(why),
     )
+
+
+def _taken_as_known(gauge: Gauge, model: Model, marker_std_m: FloatArray) -> FloatArray:
+    """Return the std that markers as well as they are known leave each offset, rad, (k,)."""
+    variance = np.zeros(model.joints)
+    for direction in gauge.directions:
+        entries = direction.combination
+        pull = 0.0
+        for index, std in enumerate(marker_std_m):
+            moved = [entries.get(name, 0.0) for name in model.names[model.marker(index)]]
+            pull += float(np.sum(np.square(moved))) / max(float(std), TIGHTEST_PRIOR) ** 2
+        for joint, name in enumerate(model.chain.joint_names):
+            if pull > 0.0:
+                variance[joint] += entries.get(name, 0.0) ** 2 / pull
+    variance[gauge.held] = 0.0
+    return np.sqrt(variance)
 
 
 def _three_points(points: FloatArray, sensor: str, rng: np.random.Generator) -> IntArray:

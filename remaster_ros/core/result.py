@@ -21,6 +21,8 @@ from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Session
 
 # Effective draws enough for two digits of a 95 % interval.
 ESS_LIMIT = 400.0
+# An offset that a prior tells counts as known up to so many times what the data leave the others.
+AS_GOOD_AS_SEEN = 2.0
 # Of an angle that nothing is known of: uniform over the turn.
 UNKNOWN_STD = np.pi / np.sqrt(3.0)
 
@@ -110,9 +112,10 @@ class FitResult:
         Posterior mean and std, rad, (k,), and 95 % interval, rad, (k, 2). A joint that neither
         data nor prior tell has mean 0, the std of a uniform turn, and the whole turn.
     identifiable
-        False where the data alone cannot tell a joint's offset, (k,).
+        False where the data cannot tell a joint's offset, (k,); true all the same where a prior
+        tells it nearly as well as the data tell the others.
     why
-        What they cannot tell it from; '' where they can, k strings.
+        What the data alone cannot tell it from; '' where they can, k strings.
     gauge
         Every combination of parameters that the data cannot see.
     T_R_N, T_R_N_std_m, T_R_N_std_rad
@@ -205,6 +208,9 @@ class Sampled:
         What the data cannot see.
     unfixed
         True for joints that neither the data nor a prior tell, (k,).
+    taken_as_known
+        Standard deviation, rad, of what the sampler took as known exactly and the session does
+        not, in each joint's offset, (k,); it is added to that of the draws.
     z_before
         Pinned parameters of the fit with offsets at zero, (size,).
     left_out
@@ -224,6 +230,7 @@ class Sampled:
     acceptance_rate: float
     gauge: Gauge
     unfixed: BoolArray
+    taken_as_known: FloatArray
     z_before: FloatArray
     left_out: tuple[tuple[int, str], ...]
     by_direction: Mapping[tuple[int, str], tuple[FloatArray, FloatArray]] = field(
@@ -252,6 +259,11 @@ def build_result(
     pooled = flat[:, :joints]
     mean, std = pooled.mean(axis=0), pooled.std(axis=0, ddof=1)
     interval = np.quantile(pooled, (0.025, 0.975), axis=0).T
+    more = sampled.taken_as_known
+    std = np.hypot(std, more)
+    # 1.96 standard deviations to either side hold 95 %.
+    half = np.hypot(interval - mean[:, None], 1.96 * more[:, None])
+    interval = mean[:, None] + half * (-1.0, 1.0)
     mean = np.where(sampled.unfixed, 0.0, mean)
     std = np.where(sampled.unfixed, UNKNOWN_STD, std)
     interval = np.where(sampled.unfixed[:, None], (-np.pi, np.pi), interval)
@@ -274,7 +286,7 @@ def build_result(
         joint_offsets=mean,
         joint_offsets_std=std,
         joint_offsets_interval95=interval,
-        identifiable=np.array([not why for why in sampled.gauge.why]),
+        identifiable=_identifiable(sampled.gauge.why, std),
         why=sampled.gauge.why,
         gauge=sampled.gauge.directions,
         T_R_N=dict(zip(sensors, T_R_N, strict=True)),
@@ -296,6 +308,15 @@ def build_result(
         theta_std=model.theta(flat).std(axis=0, ddof=1),
         theta_draws=model.theta(sampled.z),
     )
+
+
+def _identifiable(why: tuple[str, ...], std: FloatArray) -> BoolArray:
+    """Tell which offsets (k,) the data tell, or a prior nearly as well as they tell the others."""
+    seen = np.array([not text for text in why])
+    if not seen.any():
+        return seen
+    known: BoolArray = std <= AS_GOOD_AS_SEEN * np.median(std[seen])
+    return seen | known
 
 
 def predicted_rows(problem: Problem, model: Model, z: FloatArray) -> FloatArray:

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi
 
 from remaster_ros.core.errors import InsufficientDataError
 from remaster_ros.core.model import Rows
-from remaster_ros.core.outliers import find_outliers, judge, robust_noise
+from remaster_ros.core.outliers import (
+    CERTAIN,
+    find_outliers,
+    gross_probability,
+    judge,
+    robust_noise,
+)
 
 SIGMA, POSE_SIGMA = 0.2e-3, 0.8e-3
 
@@ -45,7 +52,7 @@ def test_one_bad_row_is_named_and_its_neighbours_are_not() -> None:
     assert np.flatnonzero(found.gross).tolist() == [17]
     text = found.why[17]
     assert text.startswith('residual 1')
-    assert text.endswith(' sigma')
+    assert text.endswith(' sigma; gross with probability above 99.9 %')
     assert not any(why for row, why in enumerate(found.why) if row != 17)
 
 
@@ -70,7 +77,7 @@ def test_a_pose_that_is_off_as_a_whole() -> None:
 
 
 def test_good_rows_are_left_alone() -> None:
-    """100 sets of 200 Gaussian rows: expected false alarms 100 x 200 / 1.3e7, so none."""
+    """100 sets of 200 Gaussian rows, one in 5 million called gross: 1 in 250 seeds fails."""
     rows = rows_of(40, 5)
     assert not any(find(rows, errors_of(rows, seed)).gross.any() for seed in range(100))
 
@@ -110,7 +117,9 @@ def test_single_rows_are_judged_by_the_total() -> None:
     assert robust_noise(rows, errors, ~found.gross)[1][0] == 0.0
 
 
-@pytest.mark.parametrize(('share', 'message'), [(0.15, '6 sigma'), (0.4, 'half of the')])
+@pytest.mark.parametrize(
+    ('share', 'message'), [(0.15, 'gross errors, too many'), (0.4, 'half of the')]
+)
 def test_too_many_gross_errors_are_an_error(share: float, message: str) -> None:
     rows = rows_of(200, 1)
     errors = errors_of(rows, 9)
@@ -118,3 +127,37 @@ def test_too_many_gross_errors_are_an_error(share: float, message: str) -> None:
     errors[bad] += [0.05, 0.0, 0.0]
     with pytest.raises(InsufficientDataError, match=message):
         find(rows, errors)
+
+
+def test_the_limit_of_good_rows_is_where_it_is_said_to_be() -> None:
+    """Of good errors with one more at x: the x from which on it is gross, by chi's quantiles."""
+    for count in (30, 200, 5000):
+        good = chi.ppf((np.arange(count) + 0.5) / count, 3)
+        lengths = np.linspace(5.0, 8.0, 301)
+        called = [gross_probability(np.append(good, x))[-1] > CERTAIN for x in lengths]
+        limit = lengths[np.argmax(called)]
+        assert called == [x >= limit for x in lengths]
+        assert chi.sf(limit, 3) < 2e-7
+        assert limit < 7.0
+
+
+def test_the_mixture_finds_share_and_kind_of_each_row() -> None:
+    """5 % of 2,000 errors 30 times as wide: nearly all are told, in proportion to their length."""
+    rng = np.random.default_rng(11)
+    lengths = np.linalg.norm(rng.standard_normal((2000, 3)), axis=1)
+    bad = np.arange(2000) < 100
+    lengths[bad] *= 30.0
+    probability = gross_probability(lengths)
+    assert not np.any(probability[~bad] > CERTAIN)
+    # An error 30 times as wide is shorter than 6.5 in fewer than 1 of 100 cases.
+    assert np.sum(probability[bad] > CERTAIN) >= 94
+    assert np.all(np.diff(probability[np.argsort(lengths)]) >= 0.0)
+
+
+def test_two_thirds_of_a_pose_masked_by_each_other() -> None:
+    """Two rows of a pose of three, both off the same way: the pose is named, none is missed."""
+    rows = rows_of(40, 3)
+    errors = errors_of(rows, 12)
+    errors[[30, 31]] += [0.02, 0.0, 0.0]
+    found = np.flatnonzero(find(rows, errors).gross)
+    assert {30, 31} <= set(found.tolist()) <= {30, 31, 32}

@@ -111,9 +111,15 @@ def test_a_short_run_says_that_it_did_not_converge() -> None:
     assert not result.sampler.converged
     assert shares[-1] == pytest.approx(1.0)
     # The gauge of joint 1 is said, and carries no tight interval; markers stay at nominal.
-    assert result.identifiable.tolist() == [False, True, True, True, True, True, True]
+    assert result.identifiable.tolist() == [False, True, True, True, True, True, False]
     assert 'the chain wanders' in result.gauge[0].fixed_by
     np.testing.assert_allclose(np.degrees(result.joint_offsets_interval95[0]), [-180.0, 180.0])
+    # Nor does that of joint 7, which is the marker's place: 0.5 mm at 100 mm.
+    assert 'taking the marker as known exactly' in result.gauge[1].fixed_by
+    assert 'the prior on marker sir, 0.5 mm per axis' in result.why[6]
+    assert result.joint_offsets_std[6] > 0.95 * 0.5 / 100.0
+    low, high = result.joint_offsets_interval95[6]
+    assert high - low > 0.95 * 2 * 1.96 * 0.5 / 100.0
     np.testing.assert_allclose(result.marker_positions['sir'], session.markers['sir'], atol=1e-12)
     assert result.noise['mocap'].pose_sigma_m is None
     assert result.left_out == ()
