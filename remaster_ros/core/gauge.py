@@ -2,7 +2,8 @@
 
 The null space of the data's Jacobian (priors left out) over every parameter group, found
 numerically for the data at hand. A direction that a proper prior resolves is left to the prior;
-any other is fixed by holding one joint at zero, and said so.
+any other is fixed by holding one joint at zero, and said so. Directions that the data see, but
+hardly, are named as well.
 """
 
 from __future__ import annotations
@@ -16,13 +17,18 @@ from remaster_ros.core.errors import InsufficientDataError
 from remaster_ros.core.model import Model, Rows
 from remaster_ros.core.posterior import Prior, extension_root, prior_rows
 from remaster_ros.core.start import robust_spread
-from remaster_ros.core.types import FloatArray, IntArray
+from remaster_ros.core.types import BoolArray, FloatArray, IntArray
 
 # Singular values (of unit columns, relative to the largest) that are rounding errors.
 ROUNDING = 1e-9
 # An angle known no better than this counts as unknown: neither the data's nor a prior's linear
 # picture holds over such a range.
 UNKNOWN_ANGLE = np.radians(5.0)
+# An offset that the data tell no better than this, and this many times worse than the median one,
+# is named as hardly seen; of its direction the parts that matter at this share.
+WEAK_ANGLE = np.radians(0.2)
+WEAK_FACTOR = 5.0
+WEAK_SHARE = 0.1
 # Entries of a direction below this share of its largest are rounding errors.
 NEGLIGIBLE = 1e-5
 
@@ -88,7 +94,7 @@ def find_gauge(
     InsufficientDataError
         Where a registration or a marker itself cannot be told: holding a joint does not help.
     """
-    scale, null, pivots = _null_space(model, x, rows)
+    scale, null, pivots, weak = _null_space(model, x, rows)
     _, by_x = prior_rows(model, priors, x, natural=True)
     held = _unresolved(by_x @ null, pivots, model, scale)
 
@@ -101,22 +107,44 @@ def find_gauge(
             fixed_by = f'{model.names[pivot]} = {at:g}'
         else:
             fixed_by = _resolving_priors(priors, x, null[:, column], model)
-        entries = {
-            name: round(float(value), 9)
-            for name, value in zip(model.names, combination, strict=True)
-            if value != 0.0
-        }
-        directions.append(GaugeDirection(entries, words, fixed_by))
+        directions.append(GaugeDirection(_entries(model, combination), words, fixed_by))
         for joint in np.flatnonzero(combination[: model.joints]):
             text = f'the data cannot see it: {words}; fixed by {fixed_by}'
             why[joint] = f'{why[joint]}; {text}' if why[joint] else text
+    directions += [_hardly_seen(model, *found, scale) for found in weak]
     return Gauge(tuple(directions), np.array(sorted(held), dtype=np.int64), tuple(why))
+
+
+def _entries(model: Model, combination: FloatArray) -> dict[str, float]:
+    return {
+        name: round(float(value), 9)
+        for name, value in zip(model.names, combination, strict=True)
+        if value != 0.0
+    }
+
+
+def _hardly_seen(
+    model: Model, direction: FloatArray, joint: int, std: float, scale: FloatArray
+) -> GaugeDirection:
+    """Name a direction along which the data tell a joint's offset only to ``std``, rad."""
+    size = np.abs(direction * scale)
+    main = np.where(size > WEAK_SHARE * size.max(), direction, 0.0)
+    combination = _about_origin(model, main, scale)
+    words = (
+        f'{_together(model, combination)} hardly change the observations; poses that are spread '
+        f'further and turn the tool, or a prior on {model.names[joint]}, would tell them apart'
+    )
+    known = f'the data, though {model.names[joint]} only to {np.degrees(std):.2f} deg'
+    return GaugeDirection(_entries(model, combination), words, known)
 
 
 def _null_space(
     model: Model, x: FloatArray, rows: Rows
-) -> tuple[FloatArray, FloatArray, list[int]]:
-    """Return the scale of each parameter, a basis of the null space, (size, d), and its pivots."""
+) -> tuple[FloatArray, FloatArray, list[int], list[tuple[FloatArray, int, float]]]:
+    """Return the scale of each parameter, a basis of the null space, (size, d), and its pivots.
+
+    Last come the joints that are hardly seen: direction, index and standard deviation, rad.
+    """
     derivative = model.natural_jacobian(x, rows)
     errors = rows.target - model.predict(model.pinned(x), rows)
     for spread, (_, span) in zip(robust_spread(errors, rows), rows.spans, strict=True):
@@ -134,34 +162,42 @@ def _null_space(
     root = np.zeros((len(rooted := extension_root(model)), model.size))
     root[:, model.core :] = rooted
     triangle = np.asarray(np.linalg.qr(np.concatenate((triangle, root / scale)), 'r'))
-    for direction, pivot in _nearly_null(triangle, scale, pivots, model):
+    angles = np.array([_is_angle(model, index) for index in range(model.size)])
+    for direction, pivot, _ in _nearly_null(triangle, scale, pivots, angles, UNKNOWN_ANGLE):
         basis = np.column_stack((basis, direction))
         pivots.append(pivot)
-    return scale, basis, pivots
+    joints = np.arange(model.size) < model.joints
+    weak = _nearly_null(triangle, scale, pivots, joints, WEAK_ANGLE, WEAK_FACTOR)
+    return scale, basis, pivots, weak
 
 
 def _nearly_null(
-    triangle: FloatArray, scale: FloatArray, pivots: list[int], model: Model
-) -> list[tuple[FloatArray, int]]:
-    """Return the directions along which an angle is seen, but no better than `UNKNOWN_ANGLE`.
+    triangle: FloatArray,
+    scale: FloatArray,
+    pivots: list[int],
+    angles: BoolArray,
+    limit: float,
+    factor: float = 0.0,
+) -> list[tuple[FloatArray, int, float]]:
+    """Return the directions along which some of the angles are seen no better than a limit, rad.
 
-    With the pivots of the null space held the rest has a covariance; its column of the worst
-    angle is how everything moves with that angle. Then that one is held too.
+    Nor better than a factor times their median. With the pivots of the null space held the rest
+    has a covariance; its column of the worst angle is how everything moves with that angle. Then
+    that one is held too.
     """
     found = []
-    active = ~np.isin(np.arange(model.size), pivots)
-    angles = np.array([_is_angle(model, index) for index in range(model.size)])
+    active = ~np.isin(np.arange(len(scale)), pivots)
     while np.any(active & angles):
         root = np.linalg.inv(np.linalg.qr(triangle[:, active], mode='r'))
         covariance = (root @ root.T) / np.outer(scale[active], scale[active])
         std = np.where(angles[active], np.sqrt(np.diag(covariance)), 0.0)
         worst = int(np.argmax(std))
-        if std[worst] < UNKNOWN_ANGLE:
+        if std[worst] < max(limit, factor * float(np.median(std[angles[active]]))):
             break
-        direction = np.zeros(model.size)
+        direction = np.zeros(len(scale))
         direction[active] = covariance[worst] / covariance[worst, worst]
         pivot = int(np.flatnonzero(active)[worst])
-        found.append((direction, pivot))
+        found.append((direction, pivot, float(std[worst])))
         active[pivot] = False
     return found
 
@@ -304,12 +340,19 @@ def _in_words(model: Model, direction: FloatArray) -> str:
                 for m in markers
             ]
             return f'{joint} offset = {_listed(moved)}; a measured marker would tell them apart'
+    return (
+        f'{_together(model, direction)} change no observation; poses that are spread further and '
+        'turn the tool, or a prior on one of them, would tell them apart'
+    )
+
+
+def _together(model: Model, direction: FloatArray) -> str:
     moved = [
         f'{name} ({value:+.3g})'
         for name, value in zip(model.names, direction, strict=True)
         if value != 0.0
     ]
-    return f'{_listed(moved)} together change no observation'
+    return f'{_listed(moved)} together'
 
 
 def _per_degree(shift: FloatArray) -> str:

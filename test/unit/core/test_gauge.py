@@ -111,3 +111,28 @@ def test_registrations_that_nothing_fixes_are_an_error() -> None:
     )
     with pytest.raises(InsufficientDataError, match=r'do not determine .*registration'):
         find_gauge(model, model.natural(found.mode.z), one_point, ())
+
+
+def test_a_joint_that_is_hardly_seen_is_named() -> None:
+    """Joint 4 within 0.02 degrees, the others everywhere: it moves like the parts next to it."""
+    session, _ = scene(28, poses=15)
+    rng = np.random.default_rng(1)
+    measured = session.measurements
+    q = 0.5 * rng.uniform(CHAIN.lower, CHAIN.upper, measured.q.shape)
+    # An arm that is nearly straight: joints 3 and 5 turn about nearly one axis.
+    q[:, 3] = 5e-3 + 1e-3 * rng.standard_normal(len(q))
+    points = CHAIN.positions(q, session.markers['sir'], np.full(7, 0.001))
+    points += 1e-4 * rng.standard_normal(points.shape)
+    session = replace(session, measurements=replace(measured, q=q, position=points))
+    gauge = gauge_of(session)
+    weak = [d for d in gauge.directions if d.fixed_by.startswith('the data, though')]
+    assert len(weak) == 1
+    assert abs(weak[0].combination['joint_3']) > 0.5
+    assert weak[0].combination['joint_5'] == pytest.approx(
+        -weak[0].combination['joint_3'], rel=0.2
+    )
+    assert 'hardly change the observations' in weak[0].why
+    assert 'would tell them apart' in weak[0].why
+    # It is seen all the same, if badly: no reason why it could not be.
+    assert gauge.held.tolist() == [0]
+    assert [bool(why) for why in gauge.why] == [True, *[False] * 5, True]
