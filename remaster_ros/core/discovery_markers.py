@@ -15,7 +15,7 @@ from remaster_ros.core.discovery_evidence import Solution
 from remaster_ros.core.discovery_noise import Residuals
 from remaster_ros.core.effects.registry import EFFECTS
 from remaster_ros.core.estimate import Estimate
-from remaster_ros.core.types import FloatArray
+from remaster_ros.core.types import BoolArray, FloatArray
 
 # Family-wise error over all markers.
 SIGNIFICANCE = 0.002
@@ -53,8 +53,28 @@ def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple
         if p_value * len(problem.marker_names) > SIGNIFICANCE:
             continue
         inverse = axes[:, seen] / values[seen] @ axes[:, seen].T
-        effects.append(_effect(name, inverse @ pull, inverse, p_value, square, int(seen.sum())))
+        by_data = inverse @ pull
+        covariance = inverse + _unseen(by_data, problem.markers[index], axes, seen)
+        effects.append(_effect(name, by_data, covariance, p_value, square, int(seen.sum())))
     return tuple(effects)
+
+
+def _unseen(
+    moved: FloatArray, place: FloatArray, axes: FloatArray, seen: BoolArray
+) -> FloatArray:
+    """Return the covariance due to directions that the data cannot see, m², (3, 3).
+
+    A marker moves about as far in them as in the others. Around the last joint's axis it moves on
+    a circle, which changes its radius at second order.
+    """
+    typical = np.sum(moved**2) / max(1, int(seen.sum()))
+    hidden = axes[:, ~seen]
+    covariance = typical * hidden @ hidden.T
+    radius = np.linalg.norm(place[:2])
+    if hidden.shape[1] and radius > 0.0:
+        inward = np.append(place[:2] / radius, 0.0)
+        covariance += 0.5 * (typical / radius) ** 2 * np.outer(inward, inward)
+    return covariance
 
 
 def _projected(others: FloatArray, own: FloatArray) -> FloatArray:

@@ -9,6 +9,7 @@ is exchanged for whatever explains more in its place, since the first step sees 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -31,6 +32,7 @@ LEAST_GAIN = 0.004
 # The evidence must rise by this for an exchange: no to and fro between equals.
 HYSTERESIS = 0.5
 MOST_EXCHANGED = 6
+MOST_MERGED = 4
 # Physical causes that strike all joints or links of an arm alike.
 FAMILIES: tuple[tuple[str, ...], ...] = (
     ('joint_compliance',),
@@ -235,22 +237,26 @@ class Search:
         return solution
 
     def _best_exchange(self, solution: Solution) -> Solution | None:
+        """Return the best fit with one cell, or two, replaced by one other; None if none gains."""
         best = None
-        for cell in solution.cells:
-            for candidate in self.replacements(solution, cell, 3):
+        removed = [{cell} for cell in solution.cells]
+        if len(solution.cells) <= MOST_MERGED:
+            removed += [set(pair) for pair in itertools.combinations(solution.cells, 2)]
+        for cells in removed:
+            for candidate in self.replacements(solution, cells, 3):
                 limit = solution if best is None else best
                 if candidate.log_evidence > limit.log_evidence + HYSTERESIS:
                     best = candidate
         return best
 
-    def replacements(self, solution: Solution, cell: Cell, count: int) -> list[Solution]:
-        """Return fits with the best other cells in the place of one, best first."""
-        rest = tuple(other for other in solution.cells if other is not cell)
+    def replacements(self, solution: Solution, cells: set[Cell], count: int) -> list[Solution]:
+        """Return fits with the best other cells in the place of these, best first."""
+        rest = tuple(other for other in solution.cells if other not in cells)
         without = self.fit(rest, solution)
         if without is None:
             return []
         without = replace(without, noise=solution.noise)
-        chosen = self._cheap & np.array([other is not cell for other in self.catalogue.cells])
+        chosen = self._cheap & np.array([other not in cells for other in self.catalogue.cells])
         score = screen(self.data, self.catalogue, without, chosen=chosen).score
         found = []
         for index in np.argsort(-score)[:count]:

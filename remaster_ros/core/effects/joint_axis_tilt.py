@@ -11,6 +11,11 @@ from remaster_ros.core.effects.scene import Scene
 from remaster_ros.core.types import FloatArray
 
 
+# A tilt along the axis before is, with that joint's zero-offset, another name for a shift of the
+# link: of the two the shift is the simpler.
+RARITY = 3
+
+
 def cells(scene: Scene) -> Iterator[Cell]:
     """Each joint after the first, about the axes of its frame that are not its own axis."""
     for joint in range(2, scene.joints + 1):
@@ -36,7 +41,7 @@ def cells(scene: Scene) -> Iterator[Cell]:
                 parameters=tuple(f'tilt_{axis}_{joint}' for axis in axes),
                 unit=EFFECT.unit,
                 columns=columns,
-                drawn_from=(scene.joints - 1) * (1 if len(axes) > 1 else len(directions)),
+                drawn_from=(scene.joints - 1) * (1 if len(axes) > 1 else RARITY * len(directions)),
                 variant=axes,
             )
 
