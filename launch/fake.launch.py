@@ -41,6 +41,8 @@ def generate_launch_description():
                     name=name,
                     parameters=[params],
                     output='screen',
+                    respawn=True,
+                    respawn_delay=1.0,
                 )
                 for name in (*FAKES, *NODES)
             ),

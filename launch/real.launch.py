@@ -59,6 +59,8 @@ def generate_launch_description():
                     parameters=[params],
                     remappings=remappings,
                     output='screen',
+                    respawn=True,
+                    respawn_delay=1.0,
                 )
                 for name in NODES
             ),

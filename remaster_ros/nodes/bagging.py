@@ -6,14 +6,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 
-from remaster_ros.nodes.status import LATCHED, RELIABLE
+from remaster_ros.core.errors import InputError
+from remaster_ros.nodes.status import LATCHED, RELIABLE, TOPIC
 from remaster_ros.storage.bag_writer import BagWriter
+
+STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
+BEGAN = 'began'
+"""The event by which a bag says that its recorder was started (again)."""
 
 
 class BagRecorder:
@@ -24,12 +30,39 @@ class BagRecorder:
     node
         The node that subscribes.
     folder
-        The bag's folder; None records nothing and only hands messages on.
+        The bag's folder, gone on with where there is one; None records nothing and only hands
+        messages on.
+
+    Attributes
+    ----------
+    notes
+        What a user should know of the bag as it was found.
     """
 
     def __init__(self, node: Node, folder: Path | None) -> None:
-        self._node = node
-        self._writer = BagWriter(folder) if folder is not None else None
+        self._node, self._folder = node, folder
+        self._writer: BagWriter | None = None
+        self.notes: list[str] = []
+        self.reopen()
+
+    def reopen(self) -> None:
+        """Go on with the bag after it was closed."""
+        if self._folder is None:
+            return
+        try:
+            self._writer = BagWriter(self._folder, resume=True)
+        except InputError as error:
+            # The bag is never the only copy of an observation: its damage stops nothing.
+            self._folder = _free(self._folder)
+            self.notes.append(f'{error}; recording into {self._folder}')
+            self._writer = BagWriter(self._folder)
+        # First in each file, so that a replay forgets the reading that was under way before it.
+        status = DiagnosticStatus(name=f'{self._node.get_name()}: {BEGAN}', message=BEGAN)
+        self._write(TOPIC, STATUS_TYPE, serialize_message(DiagnosticArray(status=[status])))
+
+    def _write(self, topic: str, type_name: str, data: bytes) -> None:
+        if self._writer is not None:
+            self._writer.write(topic, type_name, data, self._node.get_clock().now().nanoseconds)
 
     def subscribe(
         self,
@@ -44,9 +77,7 @@ class BagRecorder:
 
         def take(data: bytes) -> None:
             # Raw, because serialising again can leave uninitialised bytes behind the message.
-            if self._writer is not None:
-                stamp_ns = self._node.get_clock().now().nanoseconds
-                self._writer.write(topic, type_name, data, stamp_ns)
+            self._write(topic, type_name, data)
             if receive is not None:
                 receive(deserialize_message(data, kind))
 
@@ -54,7 +85,7 @@ class BagRecorder:
 
     def subscribe_rest(self) -> None:
         """Record the topics that the recorder itself has no use for."""
-        if self._writer is None:
+        if self._folder is None:
             return
         self.subscribe(PoseStamped, '/remaster/target_pose')
         self.subscribe(TransformStamped, '/remaster/registration', qos=LATCHED)
@@ -66,3 +97,11 @@ class BagRecorder:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
+
+
+def _free(folder: Path) -> Path:
+    """Return the first of bag_1, bag_2, … that is not there."""
+    number = 1
+    while (free := folder.with_name(f'{folder.name}_{number}')).exists():
+        number += 1
+    return free

@@ -36,7 +36,9 @@ from remaster_ros.nodes.processes import NodeProcesses
 from remaster_ros.nodes.running import report
 from remaster_ros.nodes.status import Event, listen
 from remaster_ros.storage.cell import config_path, read_cell
+from remaster_ros.storage.logbook import is_complete
 from remaster_ros.storage.results import read_fit
+from remaster_ros.storage.session_writer import JOURNAL
 
 FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
 NODES = (
@@ -53,7 +55,9 @@ NODES = (
 class Parameters:
     """Parameters of the demo."""
 
-    out: str = parameter('', 'folder of everything the demo writes; must be new or empty')
+    out: str = parameter(
+        '', 'folder of everything the demo writes: new, empty, or of a demo to go on with'
+    )
     seed: int = parameter(0, 'seed of the hidden World and of all randomness', low=0)
     candidates: int = parameter(
         14, 'candidate poses for optimization and for validation, each', low=1, high=1000
@@ -107,12 +111,12 @@ class Demo:
     def __init__(self, node: Conductor, stopping: list[int]) -> None:
         self.node, self.p, self._stopping = node, node.p, stopping
         self.console = Console(quiet=self.p.quiet)
-        self.out = new_folder(Path(self.p.out))
+        self.out = output_folder(Path(self.p.out))
         self.session, self.fit = self.out / 'session', self.out / 'fit'
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self.hidden = Path(tempfile.mkdtemp(prefix='remaster_world_'))
-        (self.out / 'log').mkdir()
+        (self.out / 'log').mkdir(exist_ok=True)
         self.processes = NodeProcesses(
             self.out / 'log', {'PYTHONUNBUFFERED': '1', **_domain_environment()}
         )
@@ -126,10 +130,10 @@ class Demo:
         self.console.print(f'hidden world drawn with seed {self.p.seed}; starting the nodes')
         self._start()
         self._wait(self._ready, 60.0, 'the nodes to come up')
-        self._trigger('/remaster/collect')
+        self._trigger('/remaster/collect', 'pose_planner')
         self._collect()
         self.console.print('fitting')
-        self._trigger('/remaster/fit', timeout_s=300.0)
+        self._trigger('/remaster/fit', 'optimizer', timeout_s=300.0)
         result = read_fit(self.fit / 'fit.json')
         self.processes.stop()
         print_times(self.console, self.node.times)
@@ -151,6 +155,7 @@ class Demo:
             **{name: {'world': str(self.hidden)} for name in FAKES},
             'pose_planner': {
                 'seed': self.p.seed,
+                'session': str(self.session),
                 'optimization_candidates': size,
                 'validation_candidates': size,
             },
@@ -173,7 +178,10 @@ class Demo:
         self._executor.spin_once(timeout_sec=0.1)
         if self._stopping:
             raise KeyboardInterrupt
-        self.processes.check()
+        for name in self.processes.check():
+            # What it said last is no longer so.
+            self.node.summaries.pop(name, None)
+            self.console.print(f'{name} was killed, and is started again')
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
         deadline = time.monotonic() + timeout_s
@@ -193,12 +201,16 @@ class Demo:
             and said['optitrack_markers']['published'] != '0'
         )
 
-    def _trigger(self, service: str, timeout_s: float = 30.0) -> None:
-        future = None
+    def _trigger(self, service: str, server: str, timeout_s: float = 30.0) -> None:
+        """Call a service until it answers; its node may be killed meanwhile."""
+        future, process = None, self.processes.pid(server)
 
         def done() -> bool:
-            nonlocal future
-            if future is None:
+            nonlocal future, process
+            if self.processes.pid(server) != process:
+                future, process = None, self.processes.pid(server)
+            # A dead node's service seems to be there for a while; its summary does not.
+            if future is None and server in self.node.summaries:
                 future = self.node.call(service)
             return future is not None and future.done()
 
@@ -240,8 +252,8 @@ class Demo:
         shutil.rmtree(self.hidden, ignore_errors=True)
 
 
-def new_folder(path: Path) -> Path:
-    """Make a new folder, or use an empty one.
+def output_folder(path: Path) -> Path:
+    """Make a new folder, use an empty one, or that of a demo which was interrupted.
 
     Raises
     ------
@@ -250,8 +262,13 @@ def new_folder(path: Path) -> Path:
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
+        session = path / 'session'
+        if (session / JOURNAL).exists() and not is_complete(session):
+            return path
         if any(path.iterdir()):
-            raise InputError(f'{path} is not empty; give --out a new folder')
+            raise InputError(
+                f'{path} is not empty, and holds no unfinished session; give --out a new folder'
+            )
         (path / 'log').mkdir()
         (path / 'log').rmdir()
     except OSError as error:

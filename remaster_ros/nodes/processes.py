@@ -1,4 +1,4 @@
-"""Start nodes as processes of their own, watch them, and end them all in time."""
+"""Start nodes as processes of their own, start again what was killed, end them all in time."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,11 @@ from typing import Any
 from remaster_ros.core.errors import DeviceError
 
 _PR_SET_PDEATHSIG = 1
+
+SHORT_LIFE_S = 2.0
+"""A process that ends this soon has hardly begun, s."""
+SHORT_LIVES = 5
+"""How many of these in a row are borne."""
 
 
 def _die_with_parent() -> None:
@@ -38,6 +44,9 @@ class NodeProcesses:
         self._log_folder = log_folder
         self._environment = {**os.environ, **environment}
         self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._commands: dict[str, list[str]] = {}
+        self._begun: dict[str, float] = {}
+        self._short_lives: Counter[str] = Counter()
 
     def start(self, name: str, parameters_file: Path, parameters: Mapping[str, Any]) -> None:
         """Start node `name` with a parameter file and values that override it."""
@@ -47,9 +56,14 @@ class NodeProcesses:
             # With the node's name: a bare one gives way to what the file says of that node.
             # JSON is YAML; text in double quotes stays text whatever it looks like.
             command += ['-p', f'{name}:{key}:={json.dumps(value)}']
-        with (self._log_folder / f'{name}.log').open('wb') as log:
+        self._commands[name] = command
+        self._spawn(name)
+
+    def _spawn(self, name: str) -> None:
+        self._begun[name] = time.monotonic()
+        with (self._log_folder / f'{name}.log').open('ab') as log:
             self._running[name] = subprocess.Popen(
-                command,
+                self._commands[name],
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
@@ -58,13 +72,34 @@ class NodeProcesses:
                 preexec_fn=_die_with_parent,
             )
 
-    def check(self) -> None:
-        """Raise DeviceError with the last line of its log if a process has ended by itself."""
-        for name, process in self._running.items():
-            if process.poll() is not None:
+    def check(self) -> list[str]:
+        """Start again whoever was killed, as a supervisor does; return their names.
+
+        Raises
+        ------
+        DeviceError
+            With the last line of its log, if a process has ended by itself, or is killed again
+            and again as soon as it is there.
+        """
+        killed = []
+        for name, process in list(self._running.items()):
+            status = process.poll()
+            if status is None:
+                continue
+            lived_s = time.monotonic() - self._begun[name]
+            self._short_lives[name] = self._short_lives[name] + 1 if lived_s < SHORT_LIFE_S else 0
+            if status < 0 and self._short_lives[name] <= SHORT_LIVES:
+                self._spawn(name)
+                killed.append(name)
+            else:
                 lines = (self._log_folder / f'{name}.log').read_text(errors='replace').split('\n')
                 last = next((line for line in reversed(lines) if line.strip()), 'it said nothing')
-                raise DeviceError(f'{name} ended with status {process.returncode}: {last.strip()}')
+                raise DeviceError(f'{name} ended with status {status}: {last.strip()}')
+        return killed
+
+    def pid(self, name: str) -> int:
+        """Return the process that runs a node now."""
+        return self._running[name].pid
 
     def stop(self, grace_s: float = 3.5) -> list[str]:
         """End every process within about `grace_s` seconds; return those that were killed."""

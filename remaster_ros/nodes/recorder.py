@@ -18,7 +18,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from rclpy.task import Future
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
@@ -26,10 +26,11 @@ from remaster_ros.core.errors import InputError
 from remaster_ros.core.pairing import PairedReading, Pairing, Rejection, SensorRules
 from remaster_ros.core.plausibility import Plausibility
 from remaster_ros.core.presence import Presence
-from remaster_ros.core.tour import nearest_solution
-from remaster_ros.core.types import FloatArray, MarkerReading, Measurements, Observation, Session
-from remaster_ros.nodes.bagging import BagRecorder
-from remaster_ros.nodes.messages import JointOrder, seconds, stamp_key
+from remaster_ros.core.tour import REGISTRATION
+from remaster_ros.core.types import FloatArray, MarkerReading, Measurements, Session
+from remaster_ros.nodes.announcements import Announced, Announcements
+from remaster_ros.nodes.bagging import BEGAN, BagRecorder
+from remaster_ros.nodes.messages import JointOrder, seconds, temperature_topic
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.registering import Registrar
 from remaster_ros.nodes.running import RemasterNode, run
@@ -37,7 +38,13 @@ from remaster_ros.nodes.shots import Shots
 from remaster_ros.nodes.status import TOPIC as STATUS
 from remaster_ros.nodes.status import Event, Status, receiver
 from remaster_ros.storage.cell import Cell, read_cell
-from remaster_ros.storage.session_writer import ExitStatus, SessionWriter
+from remaster_ros.storage.logbook import Logbook
+from remaster_ros.storage.session_writer import ExitStatus
+
+TEMPERATURE_S = 600.0
+"""A temperature older than this says nothing of a reading, s."""
+BY_HAND = -1_000_000
+"""The number of poses that a user drove to for a registration: no planner's."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +52,9 @@ class Parameters:
     """Parameters of the recorder."""
 
     cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
-    session: str = parameter('session', 'folder of the new session; must not exist or be empty')
+    session: str = parameter(
+        'session', 'folder of the session: new, empty, or of an unfinished one, which goes on'
+    )
     bag: bool = parameter(True, 'record a rosbag2 (MCAP) of the raw topics into session/bag')
     call_measure: bool = parameter(
         True, 'call the measure service of single-shot sensors; false when a bag is replayed'
@@ -82,22 +91,13 @@ class Parameters:
     )
 
 
-@dataclass(frozen=True)
-class _Pose:
-    """What the planner announced."""
-
-    pose: int
-    split: str
-
-
 @dataclass
 class _Taking:
     """A reading under way: of a configuration, or (`future`) asked for by /remaster/register."""
 
     pairing: Pairing
-    stamp: str
     solution: int
-    pose: _Pose
+    pose: Announced
     from_q: FloatArray | None
     future: Future | None = None
 
@@ -147,11 +147,10 @@ class Recorder(RemasterNode):
             settle_s=self.p.settle_s,
             created=datetime.now(UTC).isoformat(timespec='seconds'),
         )
-        self.writer = SessionWriter(folder, header)
+        self.logbook = Logbook(folder, header)
         self.counts: Counter[str] = Counter()
         self._trouble = ''
-        self._poses: dict[str, _Pose] = {}
-        self._solutions: JointTrajectory | None = None
+        self._announcements = Announcements(self.chain.joint_names)
         self._taking: _Taking | None = None
         # Topics come in no common order: what belongs to a dwell may be here before /settled is.
         self._recent_joints: deque[tuple[float, FloatArray]] = deque(maxlen=500)
@@ -159,17 +158,19 @@ class Recorder(RemasterNode):
         self._q: FloatArray | None = None
         self._now = 0.0
         self._from_q: FloatArray | None = None
-        self._configuration = 0
-        self._observation = 0
-        self._closed = ''
+        self._temperatures: deque[tuple[float, float]] = deque(maxlen=500)
         self._was_waiting = False
         self.registrar = Registrar(self, self.cell, self.chain)
         markers = {name: np.array(position) for name, position in self.cell.markers.items()}
         self._plausibility = Plausibility(self.chain, markers, self.p.max_deviation_m)
-        self._bag = BagRecorder(self, folder / 'bag' if self.p.bag else None)
+        recording = self.p.bag and not self.logbook.closed
+        self._bag = BagRecorder(self, folder / 'bag' if recording else None)
         self._subscribe()
         self.create_service(Trigger, '/remaster/register', self._on_register)
         self.status = Status(self, self._summary)
+        for note in (*self.logbook.notes, *self._bag.notes):
+            self.get_logger().warning(note)
+        self.registrar.add(self.logbook.registration)
         self.create_timer(0.05, self._look, clock=self.status.steady)
 
     def _subscribe(self) -> None:
@@ -177,11 +178,13 @@ class Recorder(RemasterNode):
         bag = self._bag
         bag.subscribe(JointState, '/joint_states', self._on_joint_state)
         bag.subscribe(JointState, '/remaster/settled', self._on_settled)
-        bag.subscribe(JointTrajectory, '/remaster/joint_solutions', self._on_solutions)
+        announcements = self._announcements
+        bag.subscribe(JointTrajectory, '/remaster/joint_solutions', announcements.hear_solutions)
         bag.subscribe(JointTrajectory, '/joint_trajectory_controller/joint_trajectory')
         clients = {}
         for name, sensor in self.cell.sensors.items():
             bag.subscribe(PointStamped, sensor.topic, self._on_point(name))
+            bag.subscribe(Temperature, temperature_topic(sensor.topic), self._on_temperature)
             if sensor.single_shot and sensor.measure_service and self.p.call_measure:
                 clients[name] = self.create_client(Trigger, sensor.measure_service)
         self._shots = Shots(clients)
@@ -218,14 +221,21 @@ class Recorder(RemasterNode):
             self._taking.pairing.add_joint_state(self._now, self._q)
             self._finish_if_complete()
 
-    def _on_solutions(self, message: JointTrajectory) -> None:
-        self._solutions = message if message.points else None
+    def _on_temperature(self, message: Temperature) -> None:
+        if np.isfinite(message.temperature):
+            self._temperatures.append((seconds(message.header.stamp), message.temperature))
+
+    def _temperature_c(self, stamp_s: float) -> float | None:
+        """Return the last temperature measured before a time, if that is not long ago."""
+        known = [item for item in self._temperatures if 0.0 <= stamp_s - item[0] < TEMPERATURE_S]
+        return max(known)[1] if known else None
 
     def _on_event(self, event: Event) -> None:
         if (event.node, event.event) == ('pose_planner', 'pose'):
-            self._poses[event.values['stamp']] = _Pose(
-                int(event.values['pose']), event.values['split']
-            )
+            self._announcements.hear_pose(event.values)
+        elif (event.node, event.event) == ('recorder', BEGAN):
+            # From a bag: that recorder was started anew here, and knew of no reading under way.
+            self._taking = None
         elif (event.node, event.event) == ('robot_bridge', 'stopped'):
             # On its way: nobody knows what it will come from next.
             self._from_q = None
@@ -235,10 +245,14 @@ class Recorder(RemasterNode):
             ready = values.get('ready') == 'yes'
             self._presence.says(values['sensor'], ready, message, time.monotonic())
         if node == 'pose_planner' and self._taking is None:
-            if values.get('state') == 'complete':
+            state = values.get('state')
+            if state == 'complete':
                 self._close('complete')
-            elif values.get('state') == 'stopped' and self._observation:
+            elif state == 'stopped' and self.logbook.observations:
                 self._close('stopped')
+            elif state == 'running' and self.logbook.closed == 'stopped':
+                self.logbook.reopen()
+                self._bag.reopen()
 
     # A configuration
 
@@ -248,38 +262,37 @@ class Recorder(RemasterNode):
         except InputError as error:
             self._trouble = str(error)
             return
-        solution = self._which_solution(q)
-        if solution is None or self._solutions is None:
+        pose, solution = self._announcements.now, self._announcements.which(q)
+        if pose is None or solution is None:
+            # The planner sees by the summary what is not known here, and announces it again.
             self.counts['settled_unknown'] += 1
-            self._trouble = 'settled at no joint solution of the announced pose'
+            self._trouble = 'settled at no joint solution of an announced pose'
             return
-        stamp = stamp_key(self._solutions.header.stamp)
-        pose = self._poses.get(stamp)
-        if pose is None:
-            self.counts['settled_without_pose'] += 1
-            self._report(stamp, solution, 'rejected', 'the planner announced no such pose')
+        if self.logbook.closed or not self.logbook.follow(pose.plan):
+            self._trouble = 'settled, but the session is closed, or was begun with another plan'
             return
-        self._take(q, seconds(message.header.stamp), stamp, solution, pose)
+        known = self.logbook.result(pose.pose, pose.ids[solution])
+        if known:
+            self._report(
+                pose.stamp, solution, known, 'recorded before', registered=self._registered()
+            )
+            return
+        self._take(q, seconds(message.header.stamp), solution, pose)
 
-    def _which_solution(self, q: FloatArray) -> int | None:
-        if self._solutions is None:
-            return None
-        columns = [list(self._solutions.joint_names).index(n) for n in self.chain.joint_names]
-        targets = np.array([point.positions for point in self._solutions.points])[:, columns]
-        return nearest_solution(targets, q)
+    def _registered(self) -> str:
+        return 'yes' if self.registrar.complete else 'no'
 
     def _take(
         self,
         q: FloatArray,
         settled_s: float,
-        stamp: str,
         solution: int,
-        pose: _Pose,
+        pose: Announced,
         future: Future | None = None,
     ) -> None:
         pairing = Pairing(settled_s, q, self.rules, self.p.motion_tolerance, self.p.require)
         # Now, not when the reading is done: a stop may come in between.
-        self._taking = _Taking(pairing, stamp, solution, pose, self._from_q, future)
+        self._taking = _Taking(pairing, solution, pose, self._from_q, future)
         self._from_q = q
         for stamp_s, recent in self._recent_joints:
             pairing.add_joint_state(stamp_s, recent)
@@ -325,23 +338,21 @@ class Recorder(RemasterNode):
         for reading in good:
             self.counts[f'{reading.sensor}_accepted'] += 1
         why = '; '.join(f'{r.sensor}: {r.reason}: {r.detail}' for r in bad)
-        registration = taking.pose.split == 'registration'
-        if registration:
+        missed = [item for item in bad if item.reason not in ('not_waited', 'absent')]
+        result = 'rejected' if not good else 'partial' if missed else 'recorded'
+        self._write(good, taking, result, why)
+        if taking.pose.split == REGISTRATION:
             self.registrar.add(good)
-        else:
-            self._write(good, taking)
         if taking.future is not None:
             taking.future.set_result((good, why))
             return
-        missed = [item for item in bad if item.reason not in ('not_waited', 'absent')]
-        result = 'rejected' if not good else 'partial' if missed else 'recorded'
         last = max((reading.stamp_s for reading in good), default=self._now)
         self._report(
-            taking.stamp,
+            taking.pose.stamp,
             taking.solution,
             result,
             why,
-            registered='yes' if self.registrar.complete else 'no',
+            registered=self._registered(),
             measuring_s=f'{last - taking.pairing.settled_stamp_s:.6f}',
             **{f'waited_s_{name}': f'{waited:.3f}' for name, waited in waited_s.items()},
         )
@@ -351,28 +362,18 @@ class Recorder(RemasterNode):
             return item
         return self._plausibility.judge(item, self.registrar.T_R_N.get(item.sensor))
 
-    def _write(self, good: list[PairedReading], taking: _Taking) -> None:
-        """Write the observations of one configuration; on disk when this returns."""
-        for reading in sorted(good, key=lambda item: item.stamp_s):
-            self.writer.append(
-                Observation(
-                    observation=self._observation,
-                    pose=taking.pose.pose,
-                    configuration=self._configuration,
-                    split='validation' if taking.pose.split == 'validation' else 'optimization',
-                    stamp_s=reading.stamp_s,
-                    sensor=reading.sensor,
-                    marker=reading.marker,
-                    q=reading.q,
-                    position=reading.position,
-                    from_q=taking.from_q,
-                    std=reading.std,
-                    samples=reading.samples,
-                )
-            )
-            self._observation += 1
-        if good:
-            self._configuration += 1
+    def _write(self, good: list[PairedReading], taking: _Taking, result: str, reason: str) -> None:
+        """Write what became of one configuration; on disk when this returns."""
+        self.logbook.write(
+            pose=taking.pose.pose,
+            solution=taking.pose.ids[taking.solution],
+            split=taking.pose.split,
+            result=result,
+            reason=reason,
+            readings=good,
+            from_q=taking.from_q,
+            temperatures_c=[self._temperature_c(reading.stamp_s) for reading in good],
+        )
 
     def _report(self, stamp: str, solution: int, result: str, why: str, **values: str) -> None:
         self.counts[f'configurations_{result}'] += 1
@@ -397,9 +398,12 @@ class Recorder(RemasterNode):
         if self._q is None:
             response.message = 'no joint_states yet: is the robot running?'
             return response
+        if self.logbook.closed:
+            response.message = f'the session is closed ({self.logbook.closed})'
+            return response
         future: Future = Future()
-        pose = _Pose(-1, 'registration')
-        self._take(self._q, self._now, '', 0, pose, future)
+        pose = Announced(BY_HAND, REGISTRATION, (0,), '')
+        self._take(self._q, self._now, 0, pose, future)
         good, why = await future
         response.success = bool(good)
         response.message = why or self.registrar.describe()
@@ -408,15 +412,20 @@ class Recorder(RemasterNode):
     # State
 
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
-        state = 'closed' if self._closed else 'measuring' if self._taking else 'waiting'
+        state = 'closed' if self.logbook.closed else 'measuring' if self._taking else 'waiting'
         now, sensors = time.monotonic(), self.cell.sensors
         waiting_for = self._waiting_for(self._presence.absent(now))
         trouble = self._trouble or (f'waiting for {waiting_for}' if waiting_for else '')
+        pose = self._announcements.now
         values = {
             'state': state,
-            'exit_status': self._closed,
+            'exit_status': self.logbook.closed,
             'session': self.p.session,
-            'observations': self._observation,
+            'observations': self.logbook.observations,
+            # By these the planner, or one that was started again, takes up where this one is.
+            'pose': '' if pose is None else pose.stamp,
+            'plan': self.logbook.plan_id,
+            'decided': self.logbook.decided(),
             'require': self.p.require,
             'waiting_for': waiting_for,
             **{f'waited_s_{name}': f'{s:.1f}' for name, s in self._waited_s.items()},
@@ -426,9 +435,8 @@ class Recorder(RemasterNode):
         return ('warn' if trouble else 'ok'), trouble or state, values
 
     def _close(self, exit_status: ExitStatus) -> None:
-        if not self._closed:
-            self._closed = exit_status
-            self.writer.close(exit_status)
+        if not self.logbook.closed:
+            self.logbook.close(exit_status)
             self._bag.close()
             self.status.publish()
 

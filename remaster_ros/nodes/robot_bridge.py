@@ -257,6 +257,8 @@ class RobotBridge(RemasterNode):
             'halted': self._visitor.halted,
             'joints_age_s': f'{self._visitor.report_age_s(time.monotonic()):.1f}',
             'joints_trouble': self._visitor.trouble,
+            # By it the planner sees whether a bridge that was started again knows the pose.
+            'pose': self._pose_stamp,
         }
         return ('warn' if blocked else 'ok'), blocked or text, values
 

@@ -1,0 +1,241 @@
+"""SIGKILL of random nodes at random moments of complete runs: is anything lost, twice or wrong?
+
+Each run is `remaster demo` at the highest clock rate: real nodes, real DDS, real sockets; what is
+killed is started again as a supervisor would. The session is held to what was ever on the disk,
+to the plan, and to the opened truth; the fit to that of the undisturbed run of the same seed.
+Results are kept a line per run, and runs that are there already are not done again.
+
+    python benchmarks/bench_kills.py [--kills 200] [--per-run 5] [--out kills.jsonl]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from remaster_ros.core import transforms
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.storage.journal import read_journal
+from remaster_ros.storage.session import read_session
+
+NODES = (
+    'pose_planner',
+    'robot_bridge',
+    'optitrack_markers',
+    'laser_tracker_markers',
+    'recorder',
+    'optimizer',
+)
+LARGEST_ERROR_M = {'mocap': 0.3e-3, 'tracker': 0.15e-3}
+"""Six standard deviations of what the fakes add; two configurations lie millimetres apart."""
+
+
+def node_processes(parent: int) -> dict[str, int]:
+    """Return the process of each node that the demo runs now."""
+    found = {}
+    for entry in Path('/proc').iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            ppid = int((entry / 'stat').read_text().rpartition(')')[2].split()[1])
+            words = (entry / 'cmdline').read_bytes().split(b'\0')
+        except OSError:
+            continue
+        if ppid == parent and b'remaster_ros.nodes' in words:
+            found[words[words.index(b'remaster_ros.nodes') + 1].decode()] = int(entry.name)
+    return found
+
+
+class Run:
+    """One demo, disturbed or not."""
+
+    def __init__(self, out: Path, seed: int, candidates: int, rate: float) -> None:
+        self.out, self.session = out, out / 'session'
+        self.seen: set[str] = set()
+        self.killed: list[str] = []
+        command = [
+            *(sys.executable, '-m', 'remaster_ros.cli.main', 'demo', '--no-figures'),
+            *('--out', str(out), '--seed', str(seed)),
+            *('--candidates', str(candidates), '--rate', str(rate)),
+        ]
+        self.log = (out.parent / f'{out.name}.log').open('w')
+        self.process = subprocess.Popen(command, stdout=self.log, stderr=subprocess.STDOUT)
+
+    def look(self) -> None:
+        """Note every whole row that is on the disk now."""
+        path = self.session / 'observations.csv'
+        if path.exists():
+            text = path.read_text(errors='replace')
+            self.seen.update(text[: text.rfind('\n') + 1].splitlines()[1:])
+
+    def watch(self, chooser: random.Random, kills: int, mean_s: float, timeout_s: float) -> None:
+        """Kill so many nodes at random moments; wait for the end."""
+        began, due = time.monotonic(), None
+        while self.process.poll() is None:
+            if time.monotonic() - began > timeout_s:
+                self.process.send_signal(signal.SIGINT)
+                self.process.wait(30)
+                break
+            time.sleep(0.05)
+            self.look()
+            if due is None and (self.session / 'plan.jsonl').exists():
+                due = time.monotonic() + chooser.expovariate(1.0 / mean_s)
+            if due is not None and time.monotonic() > due and len(self.killed) < kills:
+                name = chooser.choice(NODES)
+                pid = node_processes(self.process.pid).get(name)
+                if pid is not None:
+                    os.kill(pid, signal.SIGKILL)
+                    self.killed.append(name)
+                due = time.monotonic() + chooser.expovariate(1.0 / mean_s)
+        self.look()
+        self.log.close()
+
+
+def judge(run: Run) -> dict[str, Any]:
+    """Count what was lost, twice or wrong in a run that has ended."""
+    result: dict[str, Any] = {'status': run.process.returncode, 'killed': run.killed}
+    session = read_session(run.session)
+    m = session.measurements
+    rows = (run.session / 'observations.csv').read_text().splitlines()[1:]
+    pairs = Counter(zip(m.configuration.tolist(), m.sensor.tolist()))
+    records = [r for r in read_journal(run.session / 'journal.jsonl').records if 'rows' in r]
+    decided = Counter((record['pose'], record['solution']) for record in records)
+    tours = [r for r in read_journal(run.session / 'plan.jsonl').records if r['kind'] == 'tour']
+    planned = sum(len(p['solutions']) for s in tours[-1]['plans'].values() for p in s['poses'])
+    result |= {
+        'exit_status': session.exit_status,
+        'rows': len(m),
+        'planned_configurations': planned,
+        'configurations': len(set(m.configuration.tolist())),
+        'lost': len(run.seen - set(rows)),
+        'twice': sum(n - 1 for n in pairs.values()) + sum(n - 1 for n in decided.values()),
+        'closest_rad': closest(m),
+        'wrong': 0,
+    }
+    truth_path = run.out / 'truth.yaml'
+    if truth_path.exists():
+        truth = yaml.safe_load(truth_path.read_text())
+        result['wrong'] = wrong_pairs(session, truth)
+    fit_path = run.out / 'fit' / 'fit.json'
+    if fit_path.exists():
+        fit = json.loads(fit_path.read_text())
+        result['offsets'] = {
+            row['joint']: (row['mean_deg'], row['std_deg'])
+            for row in fit['joint_offsets']
+            if row['identifiable']
+        }
+    return result
+
+
+def closest(m: Any) -> float:
+    """Return how near two configurations of one pose are, as one sensor saw them, rad."""
+    nearest = np.inf
+    for sensor in set(m.sensor.tolist()):
+        for pose in set(m.pose.tolist()):
+            q = m.q[(m.sensor == sensor) & (m.pose == pose)]
+            if len(q) > 1:
+                distance = np.max(np.abs(q[:, None] - q), axis=-1) + 10.0 * np.eye(len(q))
+                nearest = min(nearest, float(distance.min()))
+    return nearest
+
+
+def wrong_pairs(session: Any, truth: dict[str, Any]) -> int:
+    """Count the rows whose marker is not where the truth has it at these joint positions."""
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    m, wrong = session.measurements, 0
+    for index, name in enumerate(session.sensor_names):
+        sensor, mine = truth['sensors'][name], m.sensor == index
+        expected = transforms.apply(
+            transforms.inverse(np.array(sensor['T_R_N'])),
+            chain.positions(m.q[mine], sensor['marker_m'], np.array(truth['joint_offsets_rad'])),
+        )
+        error = np.linalg.norm(m.position[mine] - expected, axis=1)
+        wrong += int(np.sum(error > LARGEST_ERROR_M[name]))
+    return wrong
+
+
+def largest_z(a: dict[str, Any], b: dict[str, Any]) -> float:
+    """Return the largest difference of two fits' offsets in standard deviations of it."""
+    both = [(a[joint], b[joint]) for joint in a if joint in b]
+    return max((abs(x[0] - y[0]) / np.hypot(x[1], y[1]) for x, y in both), default=np.nan)
+
+
+def one(folder: Path, seed: int, kills: int, args: argparse.Namespace) -> dict[str, Any]:
+    run = Run(folder / f'seed_{seed}_kills_{kills}', seed, args.candidates, args.rate)
+    began = time.monotonic()
+    run.watch(random.Random(f'kills {seed}'), kills, args.mean_s, args.timeout_s)
+    return {
+        'seed': seed,
+        'kills': kills,
+        'candidates': args.candidates,
+        'seconds': round(time.monotonic() - began, 1),
+        **judge(run),
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--kills', type=int, default=200, help='in all')
+    parser.add_argument('--per-run', type=int, default=5, help='kills in a run')
+    parser.add_argument('--candidates', type=int, default=8)
+    parser.add_argument('--rate', type=float, default=20.0, help='world time over wall time')
+    parser.add_argument('--mean-s', type=float, default=6.0, help='wall time between kills')
+    parser.add_argument('--timeout-s', type=float, default=900.0, help='wall time of a run')
+    parser.add_argument('--out', type=Path, default=Path('kills.jsonl'))
+    parser.add_argument('--keep', type=Path, help='keep the runs in this folder')
+    args = parser.parse_args()
+    done = (
+        [json.loads(line) for line in args.out.read_text().splitlines()]
+        if (args.out.exists())
+        else []
+    )
+    print(' seed  kills  rows  configurations  lost  twice  wrong  largest z  status  seconds')
+    failed = total = 0
+    with tempfile.TemporaryDirectory() as name:
+        folder = args.keep or Path(name)
+        folder.mkdir(parents=True, exist_ok=True)
+        for seed in range(1, 1 + -(-args.kills // args.per_run)):
+            pair = {}
+            for kills in (0, args.per_run):
+                known = [r for r in done if (r['seed'], r['kills']) == (seed, kills)]
+                pair[kills] = known[0] if known else one(folder, seed, kills, args)
+                if not known:
+                    with args.out.open('a') as file:
+                        file.write(json.dumps(pair[kills]) + '\n')
+            clean, run = pair[0], pair[args.per_run]
+            z = largest_z(clean.get('offsets', {}), run.get('offsets', {}))
+            total += len(run['killed'])
+            print(
+                f'{seed:5d} {len(run["killed"]):6d} {run["rows"]:5d} '
+                f'{run["configurations"]:7d}/{run["planned_configurations"]:<7d} {run["lost"]:4d} '
+                f'{run["twice"]:6d} {run["wrong"]:6d} {z:10.2f} {run["status"]:7d} '
+                f'{run["seconds"]:8.1f}  {" ".join(run["killed"])}',
+                flush=True,
+            )
+            failed += bool(
+                run['status']
+                or run['lost']
+                or run['twice']
+                or run['wrong']
+                or not z < 4.0
+                or run['exit_status'] != 'complete'
+            )
+    print(f'{total} kills; {failed} runs with something lost, twice, wrong or incomplete')
+    return 1 if failed else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

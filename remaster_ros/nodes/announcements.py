@@ -1,0 +1,85 @@
+"""What the planner announced: the pose under way and its joint solutions, from two topics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from trajectory_msgs.msg import JointTrajectory
+
+from remaster_ros.core.tour import nearest_solution
+from remaster_ros.core.types import FloatArray
+from remaster_ros.nodes.messages import stamp_key
+
+
+@dataclass(frozen=True)
+class Announced:
+    """A pose under way.
+
+    Attributes
+    ----------
+    pose, split
+        As in the session.
+    ids
+        The planner's own numbers of the joint solutions, in the order published.
+    plan
+        The plan that both are numbered by.
+    stamp
+        Names this announcement; the same pose announced again has another one.
+    """
+
+    pose: int
+    split: str
+    ids: tuple[int, ...]
+    plan: str
+    stamp: str = ''
+
+
+class Announcements:
+    """Bring the two together; the last announcement counts.
+
+    Parameters
+    ----------
+    joint_names
+        The wanted order of joints.
+    """
+
+    def __init__(self, joint_names: Sequence[str]) -> None:
+        self._joint_names = tuple(joint_names)
+        self._said: Announced | None = None
+        self._solutions: FloatArray | None = None
+        self._stamp = ''
+
+    def hear_pose(self, values: Mapping[str, str]) -> None:
+        """Take the values of the planner's event ``pose``."""
+        # Bags of the first version have neither ids nor plan.
+        ids = values.get('ids', ' '.join(map(str, range(int(values['solutions'])))))
+        self._said = Announced(
+            int(values['pose']),
+            values['split'],
+            tuple(map(int, ids.split())),
+            values.get('plan', ''),
+            values['stamp'],
+        )
+
+    def hear_solutions(self, message: JointTrajectory) -> None:
+        """Take /remaster/joint_solutions; without points it takes the pose back."""
+        self._stamp, self._solutions = '', None
+        names = list(message.joint_names)
+        if message.points and set(self._joint_names) <= set(names):
+            columns = [names.index(name) for name in self._joint_names]
+            points = np.array([point.positions for point in message.points])
+            self._stamp, self._solutions = stamp_key(message.header.stamp), points[:, columns]
+
+    @property
+    def now(self) -> Announced | None:
+        """The pose under way; None where either topic has not said it."""
+        said = self._said
+        return said if said is not None and said.stamp == self._stamp else None
+
+    def which(self, q: FloatArray) -> int | None:
+        """Return which of the solutions the arm stands at, rad, (k,); None at none."""
+        if self.now is None or self._solutions is None:
+            return None
+        return nearest_solution(self._solutions, q)
