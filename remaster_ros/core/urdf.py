@@ -17,6 +17,11 @@ from remaster_ros.core.errors import InputError
 from remaster_ros.core.transforms import matrix_from_rpy, transform
 from remaster_ros.core.types import FloatArray
 
+_LARGEST = 1e6
+"""No robot has a length (m), angle (rad) or mass (kg) above it; larger ones would overflow."""
+_NO_LIMIT = 1e300
+"""Some programs write a huge limit, such as 1e16, where they mean none."""
+
 
 @dataclass(frozen=True, eq=False)
 class UrdfLink:
@@ -174,7 +179,7 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
     limits: dict[str, float | None] = {}
     for key in ('lower', 'upper', 'velocity'):
         written = None if limit is None else limit.get(key)
-        limits[key] = None if written is None else _number(written, f'{key} of {where}')
+        limits[key] = None if written is None else _number(written, f'{key} of {where}', _NO_LIMIT)
     return UrdfJoint(
         name=name,
         kind=_attribute(element, 'type', where),
@@ -212,12 +217,12 @@ def _triple(text: str, what: str) -> FloatArray:
     return np.array([_number(word, what) for word in words])
 
 
-def _number(text: str, what: str) -> float:
+def _number(text: str, what: str, largest: float = _LARGEST) -> float:
     try:
         value = float(text)
     except ValueError:
         hint = ' (run xacro on the file first)' if '$' in text else ''
         raise InputError(f"URDF: {what} is '{text}', not a number{hint}") from None
-    if not np.isfinite(value):
-        raise InputError(f"URDF: {what} is '{text}', not a finite number")
+    if not abs(value) <= largest:
+        raise InputError(f"URDF: {what} is '{text}', not a finite number of at most {largest:g}")
     return value

@@ -17,7 +17,7 @@ def test_nothing_is_lost_when_the_cable_is_cut(ros_environment, tmp_path):
     done = subprocess.run(
         [
             sys.executable, ROOT / 'benchmarks' / 'bench_two_hosts.py', '--candidates', '2',
-            '--rate', '6', '--cut', '8', '--out', tmp_path,
+            '--rate', '2.5', '--cut', '8', '--out', tmp_path,
         ],
         env=ros_environment,
         capture_output=True,

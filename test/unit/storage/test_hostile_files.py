@@ -176,6 +176,16 @@ def test_a_message_that_quotes_too_much_is_one_short_line():
     assert str(caught.value).endswith('; correct it')
 
 
+@pytest.mark.parametrize('number', ['1e308', '-1e7', 'inf', 'nan'])
+def test_a_length_that_no_robot_has_is_refused(number):
+    links = ['<link name="a"/>', '<link name="b"/>']
+    text = urdf_of(links, [joint(1, 'a', 'b')]).replace(
+        '<limit', f'<origin xyz="0 {number} 0"/><limit'
+    )
+    with pytest.raises(InputError, match=r"origin xyz of joint 'j1' is .*, not a finite number"):
+        parse_urdf(text)
+
+
 def test_an_axis_too_long_to_be_measured_is_refused():
     links = ['<link name="a"/>', '<link name="b"/>']
     text = urdf_of(links, [joint(1, 'a', 'b')]).replace(
