@@ -36,6 +36,9 @@ class MarkerWorld:
     def faults(self, device: str) -> dict[str, float]:
         return {}
 
+    def warming_k(self, t: float) -> float:
+        return 0.0
+
     def is_moving(self, t: float) -> bool:
         return True
 

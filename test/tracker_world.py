@@ -41,6 +41,9 @@ class ReflectorWorld:
     def faults(self, device: str) -> dict[str, float]:
         return {}
 
+    def warming_k(self, t: float) -> float:
+        return 0.0
+
 
 def across_and_along(error: np.ndarray, position: np.ndarray) -> tuple[float, float]:
     """Split an error into its lengths across the ray to `position` and along it."""

@@ -12,14 +12,17 @@ import numpy as np
 from remaster_ros.cli.console import progress_bar, say
 from remaster_ros.cli.options import integer, names, number
 from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.collision import ArmCapsules
 from remaster_ros.core.errors import InputError
-from remaster_ros.core.inverse import FREE_JOINTS, InverseKinematics
-from remaster_ros.core.planning import candidate_poses, plan_poses
+from remaster_ros.core.inverse import FREE_JOINTS
 from remaster_ros.core.simulation import SimulatedSensor, Truth, simulate_session
-from remaster_ros.core.tour import Tour
 from remaster_ros.core.transforms import looking_at, quaternion_xyzw, transform
 from remaster_ros.core.types import FloatArray
+from remaster_ros.fakes.effects import HiddenEffect
+from remaster_ros.fakes.hidden_arm import ChainArm
+from remaster_ros.fakes.hiding import Request, hide
+from remaster_ros.fakes.practice import plan_tour, visit
+from remaster_ros.fakes.stage import Round, Stage, StagedSensor
+from remaster_ros.fakes.wrong_arm import Warming
 from remaster_ros.storage.cell import Cell, CellRobot, config_path, read_cell
 from remaster_ros.storage.files import decode_text, read_limited, write_atomically
 from remaster_ros.storage.session import URDF_LIMIT, write_session
@@ -28,8 +31,10 @@ TRUTH_FILE = 'truth.json'
 # How far a sensor stands from where the cell has it: roughly known places are good to this.
 PLACEMENT_STD_M = 0.05
 ROLL_RAD = 0.2
-# As the planner node's default: distance kept from the joint limits.
-LIMIT_MARGIN_RAD = np.deg2rad(1.0)
+SECONDS_PER_CONFIGURATION = 10.0
+AMBIENT_C = 20.0
+# The arm gets warmer while it works.
+WARMING = Warming(kelvin=5.0, time_s=1200.0, start_s=0.0)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -88,6 +93,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='S',
         help='the true zero-offsets are drawn with this std (default 0.3)',
     )
+    parser.add_argument(
+        '--effect',
+        type=Request.parse,
+        action='append',
+        default=[],
+        metavar='NAME[@JOINT][:MM]',
+        help='hide something else in it, such as backlash@4:0.3, of that size in mm after '
+        'offsets, registration and marker are fitted; may be repeated; `random` draws one',
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -96,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
     chain = choose_robot(cell, args.robot, args.base_link, args.tip_link)
     choose_sensors(cell, args.sensors)
     # One stream each: less noise, say, leaves the poses and the offsets as they were.
-    placement, planning, drawing = np.random.default_rng(args.seed).spawn(3)
+    placement, planning, drawing, hiding = np.random.default_rng(args.seed).spawn(4)
     sensors = {
         name: SimulatedSensor(
             sensor.marker,
@@ -109,9 +123,11 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar(args.quiet) as progress:
         progress('planning', 0.0)
         counts = {'optimization': args.poses, 'validation': args.validation}
-        tour = plan_tour(chain, cell, sensors, counts, planning)
+        places = {name: sensor.T_R_N for name, sensor in sensors.items()}
+        tour = plan_tour(chain, cell, places, counts, planning)
         visits = visit(tour, chain)
         progress('measuring', 0.9)
+        hidden = _Hidden(chain, sensors, visits, args.effect, hiding)
         session, truth = simulate_session(
             chain,
             cell.urdf_text,
@@ -123,13 +139,45 @@ def run(args: argparse.Namespace) -> int:
             joint_offset_std=np.deg2rad(args.offset_std_deg),
             marker_std_m=cell.marker_std_m,
             outlier_share=args.outliers,
+            seconds_per_configuration=SECONDS_PER_CONFIGURATION,
+            temperature_c=AMBIENT_C + hidden.round.warming_k,
+            seen=hidden.seen if args.effect else None,
         )
         write_session(args.out, session)
-        text = json.dumps(truth_to_dict(truth, chain, args.seed), indent=2)
+        text = json.dumps(truth_to_dict(truth, chain, args.seed, hidden.found), indent=2)
         write_atomically(args.out / TRUTH_FILE, text + '\n')
     say(args.quiet, tour.describe())
     say(args.quiet, f'written: {args.out}, {len(session.measurements)} observations')
     return 0
+
+
+class _Hidden:
+    """What is hidden in a session; drawn when the truth is known, of the size it has there."""
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        sensors: dict[str, SimulatedSensor],
+        visits: dict[str, list[FloatArray]],
+        requests: list[Request],
+        rng: np.random.Generator,
+    ) -> None:
+        self._chain, self._sensors, self._requests, self._rng = chain, sensors, requests, rng
+        q = np.concatenate([*visits['optimization'], *visits['validation']])
+        time_s = SECONDS_PER_CONFIGURATION * np.arange(len(q))
+        self.round = Round(q, q[0], time_s, WARMING.at(time_s))
+        self.found: list[tuple[HiddenEffect, float]] = []
+
+    def seen(self, joint_offsets: FloatArray, markers: dict[str, FloatArray]) -> FloatArray:
+        """See the parameter of `simulate_session`; remembers the effects and their sizes, m."""
+        staged = {
+            name: StagedSensor(sensor.T_R_N[:3, :3], sensor.T_R_N[:3, 3], sensor.marker)
+            for name, sensor in self._sensors.items()
+        }
+        stage = Stage(ChainArm(self._chain), self.round, staged, markers, joint_offsets)
+        effects = hide(stage, self._requests, self._rng)
+        self.found = [(effect, stage.size_m(effect)) for effect in effects]
+        return stage.seen(effects).reshape(len(self.round.q), len(staged), 3)
 
 
 def choose_robot(
@@ -190,49 +238,9 @@ def place_sensor(cell: Cell, rough: FloatArray, rng: np.random.Generator) -> Flo
     return transform(looking_at(position, middle, rng.uniform(-ROLL_RAD, ROLL_RAD)), position)
 
 
-def plan_tour(
-    chain: SerialChain,
-    cell: Cell,
-    sensors: dict[str, SimulatedSensor],
-    counts: dict[str, int],
-    rng: np.random.Generator,
-) -> Tour:
-    """Plan poses that face one sensor and that all of them see, for every split with a count.
-
-    Raises
-    ------
-    InputError
-        No closed form for this robot, or no pose to fit that it can take.
-    """
-    inverse = InverseKinematics(chain, cell.held(chain))
-    arm = ArmCapsules(chain, cell.link_radius_m)
-    sights = cell.lines_of_sight({name: s.T_R_N[:3, 3] for name, s in sensors.items()})
-    aim = sensors[cell.aim_at].T_R_N[:3, 3]
-    plans = {}
-    for split, count in counts.items():
-        if count:
-            candidates = candidate_poses(count, cell.poses.ranges(), aim, rng)
-            plans[split] = plan_poses(inverse, arm, candidates, sights, LIMIT_MARGIN_RAD)
-    tour = Tour(chain, plans)
-    if not tour.poses['optimization']:
-        raise InputError(
-            f'{tour.describe()}: no pose is left to fit; give more --poses, or a --cell with '
-            'ranges of poses that suit this robot'
-        )
-    return tour
-
-
-def visit(tour: Tour, chain: SerialChain) -> dict[str, list[FloatArray]]:
-    """Return each split's joint solutions, (m, k) per pose, in the order of the visits."""
-    visits: dict[str, list[FloatArray]] = {'optimization': [], 'validation': []}
-    q = np.clip(np.zeros(len(chain)), chain.lower, chain.upper)
-    while (stop := tour.next(q)) is not None:
-        visits[stop.split].append(stop.solutions)
-        q = stop.solutions[-1]
-    return visits
-
-
-def truth_to_dict(truth: Truth, chain: SerialChain, seed: int) -> dict[str, Any]:
+def truth_to_dict(
+    truth: Truth, chain: SerialChain, seed: int, hidden: list[tuple[HiddenEffect, float]]
+) -> dict[str, Any]:
     """Return everything that an estimate of the session is to find."""
     return {
         'format': 'remaster-truth/1',
@@ -257,4 +265,5 @@ def truth_to_dict(truth: Truth, chain: SerialChain, seed: int) -> dict[str, Any]
             for name, sensor in truth.sensors.items()
         },
         'outliers': list(truth.outliers),
+        'effects': [{**effect.to_dict(), 'size_mm': 1e3 * size} for effect, size in hidden],
     }

@@ -6,7 +6,7 @@ own, which no estimator takes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -78,6 +78,8 @@ def simulate_session(
     outlier_share: float = 0.0,
     outlier_m: float = 0.02,
     seconds_per_configuration: float = 10.0,
+    temperature_c: FloatArray | None = None,
+    seen: Callable[[FloatArray, dict[str, FloatArray]], FloatArray] | None = None,
 ) -> tuple[Session, Truth]:
     """Visit the poses with a robot whose truth is drawn, and measure with noise.
 
@@ -97,6 +99,12 @@ def simulate_session(
         The true zero-offsets, rad, (k,); where None drawn from N(0, ``joint_offset_std``²).
     outlier_share
         Share of the observations moved by ``outlier_m`` in a random direction.
+    temperature_c
+        At each configuration, °C, (m,), m over all poses; None where it was not measured.
+    seen
+        What the sensors see without noise of an arm with these zero-offsets (rad, (k,)) and
+        markers (m, name -> (3,)), each in its own frame N: m, (m, sensors, 3). None for an arm
+        that has no other errors.
 
     Returns
     -------
@@ -125,12 +133,18 @@ def simulate_session(
 
     q = np.concatenate(solutions)
     pose = np.repeat(np.arange(len(solutions)), [len(part) for part in solutions])
+    offsets = np.asarray(joint_offsets, dtype=float)
+    clean = None if seen is None else seen(offsets, true_markers)
     columns = []
-    for sensor in sensors.values():
-        points = chain.positions(q, true_markers[sensor.marker], joint_offsets)
+    for s, sensor in enumerate(sensors.values()):
+        if clean is None:
+            points = chain.positions(q, true_markers[sensor.marker], offsets)
+            noiseless = apply(inverse(sensor.T_R_N), points)
+        else:
+            noiseless = clean[:, s]
         common = sensor.pose_sigma_m * rng.standard_normal((len(solutions), 3))
         noise = common[pose] + sensor.sigma_m * rng.standard_normal((len(q), 3))
-        columns.append(apply(inverse(sensor.T_R_N), points) + noise)
+        columns.append(noiseless + noise)
     # Row order as recorded: configuration by configuration, sensor by sensor.
     position = np.stack(columns, axis=1).reshape(-1, 3)
     gross = np.flatnonzero(rng.random(len(position)) < outlier_share)
@@ -148,6 +162,7 @@ def simulate_session(
         np.tile([names.index(sensor.marker) for sensor in sensors.values()], len(q)),
         position,
         seconds_per_configuration,
+        np.full(len(q), np.nan) if temperature_c is None else np.asarray(temperature_c),
     )
     session = Session(
         urdf=urdf,
@@ -161,7 +176,7 @@ def simulate_session(
         notes='simulated',
     )
     truth = Truth(
-        np.asarray(joint_offsets, dtype=float),
+        offsets,
         true_markers,
         dict(sensors),
         tuple(int(row) for row in gross),
@@ -178,8 +193,9 @@ def _measurements(
     marker: IntArray,
     position: FloatArray,
     seconds_per_configuration: float,
+    temperature_c: FloatArray,
 ) -> Measurements:
-    """Fill the columns of a recording without dwell statistics, temperature or torques."""
+    """Fill the columns of a recording without dwell statistics or torques."""
     n = len(position)
     came_from = np.concatenate((np.full((1, q.shape[1]), np.nan), q[:-1]))
     return Measurements(
@@ -195,5 +211,5 @@ def _measurements(
         position=position,
         std=np.full((n, 3), np.nan),
         samples=np.full(n, -1, dtype=np.int64),
-        temperature_c=np.full(n, np.nan),
+        temperature_c=temperature_c[configuration],
     )

@@ -6,15 +6,21 @@ of about the largest size that is plausible; `Stage.of_size` makes it smaller.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.types import FloatArray
-from remaster_ros.fakes.effects import ARC_MINUTE, Circumstances, HiddenEffect
+from remaster_ros.fakes.effects import ARC_MINUTE, NAMED, Circumstances, HiddenEffect
 from remaster_ros.fakes.stage import Stage
+
+RANDOM = 'random'
+# What a hidden effect leaves where nobody says how much, m.
+USUAL_M = (0.2e-3, 0.6e-3)
+TRIES = 30
 
 Draw = Callable[[np.random.Generator, int, Circumstances, tuple[str, ...]], HiddenEffect]
 """(rng, number of joints, circumstances, names of the sensors) -> an effect."""
@@ -187,15 +193,88 @@ DRAWS: dict[str, Draw] = {
 }
 
 
-def draw_effect(stage: Stage, kind: str, rng: np.random.Generator, size_m: float) -> HiddenEffect:
+@dataclass(frozen=True)
+class Request:
+    """What somebody wants hidden.
+
+    Attributes
+    ----------
+    kind
+        Of `DRAWS`, or ``random`` for any of those that have a name.
+    joint
+        The joint that errs, 1-based; any where None.
+    size_m
+        What it leaves, see `Stage.size_m`; drawn where None.
+    """
+
+    kind: str
+    joint: int | None = None
+    size_m: float | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> Request:
+        """Read ``NAME[@JOINT][:SIZE_MM]``, such as ``backlash``, ``backlash@4:0.3``, ``random``.
+
+        Raises
+        ------
+        InputError
+            Text that is no request.
+        """
+        match = re.fullmatch(r'([a-z_]+)(?:@(\d+))?(?::(\d*\.?\d+))?', text)
+        if match is None or match[1] not in (RANDOM, *DRAWS):
+            raise InputError(
+                f'{text!r} is nothing to hide; write NAME[@JOINT][:SIZE_MM] with NAME one of '
+                f'{RANDOM}, {", ".join(DRAWS)}'
+            )
+        joint = int(match[2]) if match[2] else None
+        size_m = 1e-3 * float(match[3]) if match[3] else None
+        if joint == 0 or size_m == 0.0:
+            raise InputError(f'{text!r}: joints count from 1, and a size is above 0 mm')
+        return cls(match[1], joint, size_m)
+
+
+def hide(
+    stage: Stage, requests: Sequence[Request], rng: np.random.Generator
+) -> tuple[HiddenEffect, ...]:
+    """Draw what was asked for.
+
+    Raises
+    ------
+    InputError
+        Something that this arm cannot show on these visits.
+    """
+    effects = []
+    for request in requests:
+        kind = request.kind
+        if kind == RANDOM:
+            kind = str(rng.choice(tuple(NAMED)))
+        size_m = request.size_m
+        if size_m is None:
+            # A marker is known to half a millimetre: less than that would be nothing new.
+            scale = 10.0 if kind == 'marker_offset' else 1.0
+            size_m = scale * rng.uniform(*USUAL_M)
+        effects.append(draw_effect(stage, kind, rng, size_m, request.joint))
+    return tuple(effects)
+
+
+def draw_effect(
+    stage: Stage, kind: str, rng: np.random.Generator, size_m: float, joint: int | None = None
+) -> HiddenEffect:
     """Draw an effect of that kind of which so much is left (see `Stage.size_m`).
 
     Drawn again as long as it would have to be larger than is plausible: a joint that hardly moves
     shows no eccentricity. Where no draw gets there, the most visible of them is taken.
+
+    Raises
+    ------
+    InputError
+        Where all draws leave nothing, or none is about that joint.
     """
     best, best_size = None, 0.0
-    for _ in range(30):
+    for _ in range(TRIES if joint is None else TRIES * stage.arm.joints):
         effect = DRAWS[kind](rng, stage.arm.joints, stage.circumstances, tuple(stage.sensors))
+        if joint is not None and effect.joints != (joint,):
+            continue
         if len(effect.joints) > 1:
             effect = _balanced(stage, effect)
         largest = stage.size_m(effect)
@@ -204,7 +283,8 @@ def draw_effect(stage: Stage, kind: str, rng: np.random.Generator, size_m: float
         if largest >= size_m:
             break
     if best is None or best_size < 1e-6:
-        raise InputError(f'{kind} cannot be seen on these visits, whatever its size')
+        where = '' if joint is None else f' at joint {joint}'
+        raise InputError(f'{kind}{where} cannot be seen on these visits, whatever its size')
     return stage.of_size(best, size_m)
 
 

@@ -351,6 +351,8 @@ class TrackerInstrument:
         cov = covariance(truth, self.behaviour)
         self._last_measured = self._rng.multivariate_normal(truth, cov)
         temperature, pressure, humidity = map(float, self._settings[Command.GET_ENVIRONMENT])
+        # The weather station goes by what was set, and notices when it gets warmer.
+        temperature += self._world.warming_k(self._time)
         return adm_result(
             self._last_measured,
             np.sqrt(np.diag(cov)),

@@ -5,14 +5,26 @@ from __future__ import annotations
 import os
 import tempfile
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import yaml
 
+from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.errors import InputError
-from remaster_ros.fakes.world import Truth, World
+from remaster_ros.fakes.effects import HiddenEffect
+from remaster_ros.fakes.hidden_arm import ChainArm
+from remaster_ros.fakes.hiding import Request, hide
+from remaster_ros.fakes.practice import plan_tour, visit
+from remaster_ros.fakes.stage import Round, Stage
+from remaster_ros.fakes.world import START_S, Truth, World
 from remaster_ros.storage.cell import Cell, config_path
+
+PRACTICE_CANDIDATES = 14
+# About what a configuration takes, world time.
+PRACTICE_STEP_S = 10.0
 
 
 def default_folder() -> Path:
@@ -21,7 +33,14 @@ def default_folder() -> Path:
     return Path(tempfile.gettempdir()) / f'remaster_world_{os.getuid()}_{domain}'
 
 
-def make_world(folder: Path, cell: Cell, seed: int, rate: float) -> World:
+def make_world(
+    folder: Path,
+    cell: Cell,
+    seed: int,
+    rate: float,
+    hidden: Sequence[Request] = (),
+    candidates: int = PRACTICE_CANDIDATES,
+) -> World:
     """Draw a hidden World for a cell; its time begins now.
 
     Parameters
@@ -35,6 +54,11 @@ def make_world(folder: Path, cell: Cell, seed: int, rate: float) -> World:
         Of everything drawn.
     rate
         World time over wall time.
+    hidden
+        What else is wrong with the arm or the sensors.
+    candidates
+        Candidate poses of each split that will be visited; how large a hidden effect is depends
+        on them.
     """
     settings = yaml.safe_load(config_path('fake_world.yaml').read_text())
     chain = cell.chain()
@@ -50,6 +74,8 @@ def make_world(folder: Path, cell: Cell, seed: int, rate: float) -> World:
         {name: settings['sensors'][name] for name in cell.sensors},
         np.deg2rad(settings['offset_std_deg']),
     )
+    if hidden:
+        truth = replace(truth, effects=_draw_hidden(truth, cell, chain, hidden, candidates))
     return World.create(
         folder,
         truth,
@@ -60,6 +86,21 @@ def make_world(folder: Path, cell: Cell, seed: int, rate: float) -> World:
         start_q=start_q[: len(chain)],
         link_radius_m=cell.link_radius_m,
     )
+
+
+def _draw_hidden(
+    truth: Truth, cell: Cell, chain: SerialChain, hidden: Sequence[Request], candidates: int
+) -> tuple[HiddenEffect, ...]:
+    """Draw effects of the sizes they have on a round like the one that will be visited."""
+    rng = np.random.default_rng([truth.seed, 2])
+    places = {name: sensor.T_R_N for name, sensor in truth.sensors.items()}
+    counts = dict.fromkeys(('optimization', 'validation'), candidates)
+    visits = visit(plan_tour(chain, cell, places, counts, rng), chain)
+    q = np.concatenate([*visits['optimization'], *visits['validation']])
+    time_s = PRACTICE_STEP_S * np.arange(len(q))
+    practice = Round(q, q[0], time_s, truth.warming.at(START_S + time_s))
+    stage = Stage(ChainArm(chain), practice, *truth.staged(), truth.joint_offsets)
+    return hide(stage, hidden, rng)
 
 
 def open_world(folder: str, timeout_s: float = 20.0) -> World:

@@ -16,7 +16,7 @@ import json
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol, TextIO
 
@@ -28,11 +28,15 @@ from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.collision import ArmCapsules
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.types import FloatArray
+from remaster_ros.fakes.effects import HiddenEffect
 from remaster_ros.fakes.faults import Faults, Numbers, is_out
 from remaster_ros.fakes.motion import Motion, Waypoint
+from remaster_ros.fakes.stage import StagedSensor
+from remaster_ros.fakes.wrong_arm import Warming, WrongArm
 
 START_S = 100.0
 """World time at the beginning, s; ROS reads a time of 0 as "no time yet"."""
+NO_WARMING = Warming(0.0, 1.0, START_S)
 
 
 class WorldView(Protocol):
@@ -55,6 +59,9 @@ class WorldView(Protocol):
 
     def line_of_sight(self, sensor: str, t: float) -> bool:
         """Whether the sensor sees its marker at time t."""
+
+    def warming_k(self, t: float) -> float:
+        """How much warmer than at the beginning it is at time t, K."""
 
     def faults(self, device: str) -> Numbers:
         """Faults of the device now, see `remaster_ros.fakes.faults`."""
@@ -94,6 +101,10 @@ class Truth:
         Standard deviation with which a joint comes back to a commanded position, rad.
     encoder_rad
         Standard deviation of the noise of a reported joint position, rad.
+    warming
+        How the arm, and the air around it, warms up.
+    effects
+        What else is wrong with the arm or the sensors.
     """
 
     seed: int
@@ -101,6 +112,8 @@ class Truth:
     sensors: dict[str, SensorTruth]
     repeatability_rad: float = 2e-5
     encoder_rad: float = 2e-6
+    warming: Warming = NO_WARMING
+    effects: tuple[HiddenEffect, ...] = ()
 
     @classmethod
     def draw(
@@ -137,7 +150,9 @@ class Truth:
             T_R_N = transforms.transform(turn, position)
             marker = np.asarray(markers[name], float) + rng.normal(0, marker_std_m, 3)
             sensors[name] = SensorTruth(T_R_N, marker, np.deg2rad(place['acceptance_deg']))
-        return cls(seed, rng.normal(0, offset_std_rad, joints), sensors)
+        joint_offsets = rng.normal(0, offset_std_rad, joints)
+        warming = Warming(rng.uniform(2.0, 6.0), rng.uniform(300.0, 1500.0), START_S)
+        return cls(seed, joint_offsets, sensors, warming=warming)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and numbers for YAML."""
@@ -146,6 +161,8 @@ class Truth:
             'joint_offsets_rad': self.joint_offsets.tolist(),
             'repeatability_rad': self.repeatability_rad,
             'encoder_rad': self.encoder_rad,
+            'warming': asdict(self.warming),
+            'effects': [effect.to_dict() for effect in self.effects],
             'sensors': {
                 name: {
                     'T_R_N': s.T_R_N.tolist(),
@@ -169,7 +186,17 @@ class Truth:
             sensors,
             data['repeatability_rad'],
             data['encoder_rad'],
+            Warming(**data['warming']),
+            tuple(HiddenEffect.from_dict(effect) for effect in data['effects']),
         )
+
+    def staged(self) -> tuple[dict[str, StagedSensor], dict[str, FloatArray]]:
+        """Return sensors and true markers, one of its own for each, as a stage wants them."""
+        sensors = {
+            name: StagedSensor(s.T_R_N[:3, :3], s.T_R_N[:3, 3], name)
+            for name, s in self.sensors.items()
+        }
+        return sensors, {name: s.marker for name, s in self.sensors.items()}
 
 
 class World:
@@ -187,6 +214,15 @@ class World:
         self._capsules = ArmCapsules(self.chain, data['link_radius_m'])
         self.start_q = np.array(data['start_q_rad'], float)
         self._motion = Motion(START_S, self.start_q)
+        self._wrong = WrongArm(
+            self.chain,
+            self.truth.joint_offsets,
+            *self.truth.staged(),
+            self.truth.effects,
+            START_S,
+            self.start_q,
+            self.truth.warming,
+        )
         self._faults = Faults(folder)
         self._lines: TextIO | None = None
         self._torn = ''
@@ -285,7 +321,10 @@ class World:
                     Waypoint(time_s, np.array(q), None if v is None else np.array(v))
                     for time_s, q, v in trajectory['points']
                 ]
-                self._motion.follow(trajectory['start_s'], waypoints)
+                start_s = trajectory['start_s']
+                end_s, end = start_s + waypoints[-1].time_s, waypoints[-1].q
+                self._wrong.move(start_s, self._motion.at(start_s)[0], end_s, end)
+                self._motion.follow(start_s, waypoints)
 
     def reported(self, t: float) -> tuple[FloatArray, FloatArray]:
         """Joint positions (rad) and velocities (rad/s) as the encoders have them, each (k,)."""
@@ -311,10 +350,19 @@ class World:
         """True position of the sensor's marker in the sensor's frame at time t, m, (3,)."""
         truth = self._sensor(sensor)
         q = self.reported(t)[0]
-        marker_R = self.chain.positions(q, truth.marker, self.truth.joint_offsets)
-        marker_N = transforms.apply(transforms.inverse(truth.T_R_N), marker_R)
+        if self.truth.effects:
+            with self._lock:
+                marker_N = self._wrong.marker_in_sensor(sensor, t, q)
+        else:
+            # The same, without working out what is nothing.
+            marker_R = self.chain.positions(q, truth.marker, self.truth.joint_offsets)
+            marker_N = transforms.apply(transforms.inverse(truth.T_R_N), marker_R)
         marker_N[0] += self.faults(sensor).get('swapped', 0.0)
         return marker_N
+
+    def warming_k(self, t: float) -> float:
+        """How much warmer than at the beginning it is at time t, K."""
+        return float(self.truth.warming.at(np.array(t)))
 
     def line_of_sight(self, sensor: str, t: float) -> bool:
         """Whether the sensor sees its marker at time t: turned to it, and no link between."""

@@ -84,7 +84,8 @@ def planned(cell):
     chain = cell.chain()
     counts = {'optimization': 12, 'validation': 6}
     sensors = place_all(cell, 5)
-    tour = simulate.plan_tour(chain, cell, sensors, counts, np.random.default_rng(5))
+    places = {name: sensor.T_R_N for name, sensor in sensors.items()}
+    tour = simulate.plan_tour(chain, cell, places, counts, np.random.default_rng(5))
     return chain, sensors, tour
 
 
@@ -118,7 +119,7 @@ def test_ranges_out_of_reach_are_refused(cell):
         simulate.plan_tour(
             cell.chain(),
             cell,
-            place_all(cell, 1),
+            {name: sensor.T_R_N for name, sensor in place_all(cell, 1).items()},
             {'optimization': 5, 'validation': 0},
             np.random.default_rng(1),
         )
