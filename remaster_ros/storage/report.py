@@ -7,16 +7,15 @@ import gzip
 import importlib.resources
 import json
 import os
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from remaster_ros.storage.figures import draw_figures
 from remaster_ros.storage.files import make_folder, write_atomically
+from remaster_ros.storage.pages import inlined, page
 from remaster_ros.storage.results import REPORT_FILE, fit_to_dict
 
 if TYPE_CHECKING:
@@ -72,23 +71,19 @@ def write_report(result: FitResult, folder: str | os.PathLike[str]) -> Path:
 
 def report_html(result: FitResult, drawings: dict[str, str]) -> str:
     """Return the page; with drawings (of `draw_figures`) it also has the 3-D view."""
-    template = importlib.resources.files(__package__).joinpath('report.html.jinja')
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters |= {'fixed': _fixed, 'signed': _signed}
     scene: Scene | None = None
     if drawings:
         from remaster_ros.storage.scene import draw_scene
 
         scene = draw_scene(result)
-    return environment.from_string(template.read_text(encoding='utf-8')).render(
+    return page(
+        'report.html.jinja',
         fit=fit_to_dict(result),
         verdict=verdict(result),
         accuracy=_accuracy_rows(result),
         markers=_marker_rows(result),
         notes=result.session.notes,
-        drawings={name: Markup(_inline(name, text)) for name, text in drawings.items()},
+        drawings={name: inlined(name, text) for name, text in drawings.items()},
         scene=scene,
         scene_json=_json({'data': scene.data, 'layout': scene.layout}) if scene else '',
         plotly=_plotly() if scene else '',
@@ -204,20 +199,6 @@ def _marker_rows(result: FitResult) -> list[dict[str, Any]]:
     ]
 
 
-def _inline(name: str, svg: str) -> str:
-    """Make a figure part of the page: its colours, its font, its width, identifiers of its own."""
-    from remaster_ros.storage.figures import GRID, INK, PAPER
-
-    svg = svg[svg.index('<svg') :]
-    for color, ours in ((INK, 'var(--ink)'), (GRID, 'var(--line)'), (PAPER, 'none')):
-        svg = svg.replace(color, ours)
-    svg = re.sub(r"'DejaVu Sans'(, [^;\"]*)?", 'var(--font)', svg)
-    svg = re.sub(r'(<svg [^>]*?) width="[^"]*"', r'\1', svg, count=1)
-    svg = re.sub(r'(<svg [^>]*?) height="[^"]*"', r'\1', svg, count=1)
-    svg = re.sub(r'\bid="([^"]+)"', rf'id="{name}-\1"', svg)
-    return re.sub(r'(url\(#|href="#)', rf'\1{name}-', svg)
-
-
 def _plotly() -> str:
     """Return plotly.js, compressed and in base64: a third of its size in the page."""
     script = importlib.resources.files('plotly').joinpath('package_data', 'plotly.min.js')
@@ -228,11 +209,3 @@ def _json(content: Any) -> Markup:
     """Return JSON that no script element can be left with."""
     text = json.dumps(content, separators=(',', ':'), allow_nan=False)
     return Markup(text.replace('<', '\\u003c'))
-
-
-def _fixed(number: float | None, digits: int) -> str:
-    return '–' if number is None else f'{number:.{digits}f}'.replace('-', '−')
-
-
-def _signed(number: float, digits: int) -> str:
-    return f'{number:+.{digits}f}'.replace('-', '−')
