@@ -157,6 +157,8 @@ class PlanBook:
                 'one_solution': tour.one_solution,
             }
         )
+        # Said before there was a file to keep it in.
+        self._append({'kind': 'state', 'state': self.state})
         self.tour, self.stop = tour, None
 
     def open_stop(self, stop: Stop) -> None:

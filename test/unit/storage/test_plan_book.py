@@ -91,8 +91,9 @@ def test_a_registration_tour_keeps_its_order_and_its_numbers(chain, tmp_path):
 
 def test_the_state_and_the_time_of_silence_are_known(chain, tmp_path):
     book = PlanBook(tmp_path, SETTINGS, chain)
-    book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
     book.say_state('running')
+    assert not book.path.exists()
+    book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
     with pytest.raises(InputError, match='another process'):
         PlanBook(tmp_path, SETTINGS, chain)
     book.close()
@@ -139,5 +140,5 @@ def test_a_torn_line_is_dropped_and_a_damaged_one_refused(chain, tmp_path):
     assert book.stop.ids == stop.ids
     book.close()
     book.path.write_bytes(whole.replace(b'"stop"', b'"step"', 1))
-    with pytest.raises(InputError, match='line 3: damaged'):
+    with pytest.raises(InputError, match='line 4: damaged'):
         PlanBook(tmp_path, SETTINGS, chain)
