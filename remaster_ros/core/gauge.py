@@ -15,7 +15,7 @@ import numpy as np
 
 from remaster_ros.core.errors import InsufficientDataError
 from remaster_ros.core.model import Model, Rows
-from remaster_ros.core.posterior import Prior, extension_root, prior_rows
+from remaster_ros.core.posterior import Prior, prior_rows
 from remaster_ros.core.start import robust_spread
 from remaster_ros.core.types import BoolArray, FloatArray, IntArray
 
@@ -159,8 +159,8 @@ def _null_space(
 
     basis, pivots = _reduce((vectors[unseen] / scale).T, scale, _kinds(model))
     # A prior on effects counts as data for what is nearly unseen: it is what keeps them apart.
-    root = np.zeros((len(rooted := extension_root(model)), model.size))
-    root[:, model.core :] = rooted
+    root = np.zeros((len(model.extension_root), model.size))
+    root[:, model.core :] = model.extension_root
     triangle = np.asarray(np.linalg.qr(np.concatenate((triangle, root / scale)), 'r'))
     angles = np.array([_is_angle(model, index) for index in range(model.size)])
     for direction, pivot, _ in _nearly_null(triangle, scale, pivots, angles, UNKNOWN_ANGLE):
@@ -380,6 +380,6 @@ def _resolving_priors(
         for prior in priors
     }
     pull['the prior on the effects'] = float(
-        np.linalg.norm(extension_root(model) @ model.theta(direction))
+        np.linalg.norm(model.extension_root @ model.theta(direction))
     )
     return _listed([name for name, p in pull.items() if p > 1e-3 * max(pull.values())])

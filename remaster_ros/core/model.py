@@ -200,6 +200,16 @@ class Model:
         return result
 
     @cached_property
+    def extension_root(self) -> FloatArray:
+        """W with W theta standard normal by the extension's prior, (rank, m)."""
+        if self.extension is None:
+            return np.zeros((0, 0))
+        values, vectors = np.linalg.eigh(self.extension.prior_precision)
+        kept = values > 1e-12 * values.max(initial=0.0)
+        root: FloatArray = np.sqrt(values[kept])[:, None] * vectors[:, kept].T
+        return root
+
+    @cached_property
     def base_axis(self) -> tuple[FloatArray, FloatArray]:
         """Axis of joint 1 in R: a point on it, m, (3,), and its unit direction, (3,)."""
         first = self.chain.T_fixed[0]

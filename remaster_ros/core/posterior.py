@@ -106,22 +106,12 @@ def prior_rows(
     )
     by_z = np.zeros((values.shape[1], model.size))
     by_z[:, :core] = (values[1 : core + 1] - values[core + 1 :]).T / 2e-6
-    root = extension_root(model)
+    root = model.extension_root
     by_theta = np.concatenate((np.zeros((len(root), core)), root), axis=1)
     return (
         np.concatenate((values[0], root @ model.theta(z))),
         np.concatenate((by_z, by_theta)),
     )
-
-
-def extension_root(model: Model) -> FloatArray:
-    """Return W with W theta standard normal by the extension's prior, (rank, m)."""
-    if model.extension is None:
-        return np.zeros((0, 0))
-    values, vectors = np.linalg.eigh(model.extension.prior_precision)
-    kept = values > 1e-12 * max(values.max(initial=0.0), 0.0)
-    root: FloatArray = np.sqrt(values[kept])[:, None] * vectors[:, kept].T
-    return root
 
 
 @dataclass(frozen=True)
