@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,12 @@ from std_srvs.srv import Trigger
 
 from remaster_ros.core.errors import RemasterError
 from remaster_ros.core.fit import FitResult, fit_session
+from remaster_ros.core.types import FloatArray
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import LATCHED, Status
 from remaster_ros.storage.priors import read_priors
-from remaster_ros.storage.results import prepare_folder, save_fit
+from remaster_ros.storage.results import FIT_FILE, prepare_folder, read_fit, save_fit
 from remaster_ros.storage.session import read_session
 
 
@@ -51,6 +53,7 @@ class Optimizer(RemasterNode):
             Trigger, '/remaster/fit', self._on_fit, callback_group=MutuallyExclusiveCallbackGroup()
         )
         self.status = Status(self, self._summary)
+        self._publish_last()
 
     def _on_fit(self, request: Trigger.Request, response: Trigger.Response) -> Any:
         if not self._busy.acquire(blocking=False):
@@ -58,7 +61,7 @@ class Optimizer(RemasterNode):
             return response
         try:
             result, report = self._fit()
-            self._publish(result)
+            self._publish(result.joint_names, result.joint_offsets, result.joint_offsets_std)
             response.success, response.message = True, str(report)
             self._state = 'fitted'
         except RemasterError as error:
@@ -87,13 +90,26 @@ class Optimizer(RemasterNode):
             raise RemasterError('stopped')
         self._state = f'{stage} {100 * share:.0f} %'
 
-    def _publish(self, result: FitResult) -> None:
+    def _publish_last(self) -> None:
+        """Publish what was fitted before this optimizer was started (again)."""
+        path = Path(self.p.out) / FIT_FILE
+        if not path.exists():
+            return
+        try:
+            rows = read_fit(path)['joint_offsets']
+        except RemasterError as error:
+            self.get_logger().warning(f'the last fit is not published: {error}')
+            return
+        self._publish(
+            [row['joint'] for row in rows],
+            np.deg2rad([row['mean_deg'] for row in rows]),
+            np.deg2rad([row['std_deg'] for row in rows]),
+        )
+
+    def _publish(self, names: Sequence[str], offsets: FloatArray, std: FloatArray) -> None:
         stamp = self.get_clock().now().to_msg()
-        for publisher, values in (
-            (self._means, result.joint_offsets),
-            (self._stds, result.joint_offsets_std),
-        ):
-            message = JointState(name=list(result.joint_names), position=values.tolist())
+        for publisher, values in ((self._means, offsets), (self._stds, std)):
+            message = JointState(name=list(names), position=values.tolist())
             message.header.stamp = stamp
             publisher.publish(message)
 

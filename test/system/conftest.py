@@ -91,3 +91,17 @@ def wait_until(condition, timeout_s, what):
     while not condition():
         assert time.monotonic() < deadline, f'waited {timeout_s} s in vain for {what}'
         time.sleep(0.05)
+
+
+def call(client, service):
+    """Call a Trigger service and return its response."""
+    from std_srvs.srv import Trigger
+
+    caller = client.create_client(Trigger, service)
+    assert caller.wait_for_service(timeout_sec=20.0), service
+    future = caller.call_async(Trigger.Request())
+    deadline = time.monotonic() + 120
+    while not future.done():
+        assert time.monotonic() < deadline, f'no answer of {service}'
+        client.spin_some()
+    return future.result()

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from conftest import ROOT, node_arguments, wait_until
+from conftest import ROOT, call, node_arguments, wait_until
 
 from remaster_ros.core import transforms
 from remaster_ros.core.chain import SerialChain
@@ -179,7 +179,9 @@ def test_third_parties_open_the_bag(demo):
     assert frames == {'mocap'}
 
 
-def test_a_replay_into_a_fresh_recorder_gives_the_same_observations(demo, start, tmp_path):
+def test_a_replay_at_ten_times_the_speed_gives_the_same_session_and_fit(
+    demo, start, client, tmp_path
+):
     fresh = tmp_path / 'again'
     recorder = start(
         'remaster_ros.nodes.recorder',
@@ -208,6 +210,21 @@ def test_a_replay_into_a_fresh_recorder_gives_the_same_observations(demo, start,
                 assert float(b[column]) == pytest.approx(float(value), abs=1e-9), column
             except ValueError:
                 assert b[column] == value, column
+
+    start(
+        'remaster_ros.nodes.optimizer',
+        *node_arguments(session=fresh, out=tmp_path / 'fit', seed=SEED, figures=False),
+    )
+    response = call(client, '/remaster/fit')
+    assert response.success, response.message
+    ours, theirs = (
+        json.loads((folder / 'fit.json').read_text())['joint_offsets']
+        for folder in (demo[0] / 'fit', tmp_path / 'fit')
+    )
+    for a, b in zip(ours, theirs, strict=True):
+        assert b['joint'] == a['joint']
+        assert b['mean_deg'] == pytest.approx(a['mean_deg'], abs=0.01 * a['std_deg'])
+        assert b['std_deg'] == pytest.approx(a['std_deg'], rel=0.01)
 
 
 def test_nothing_the_estimate_saw_holds_the_truth(demo):

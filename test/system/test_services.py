@@ -6,25 +6,11 @@ import time
 import numpy as np
 import pytest
 from command_line import remaster
-from conftest import node_arguments, wait_until
+from conftest import call, node_arguments, wait_until
 
 from remaster_ros.storage.session import read_session
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
-
-
-def call(client, service):
-    """Call a Trigger service and return its response."""
-    from std_srvs.srv import Trigger
-
-    caller = client.create_client(Trigger, service)
-    assert caller.wait_for_service(timeout_sec=20.0), service
-    future = caller.call_async(Trigger.Request())
-    deadline = time.monotonic() + 120
-    while not future.done():
-        assert time.monotonic() < deadline, f'no answer of {service}'
-        client.spin_some()
-    return future.result()
 
 
 def test_pause_stops_the_arm_at_once_and_going_on_loses_nothing(start, client, tmp_path):
@@ -108,6 +94,28 @@ def test_the_optimizer_fits_and_publishes_latched(start, client, tmp_path):
     for name, key in (('joint_offsets', 'mean_deg'), ('joint_offsets_std', 'std_deg')):
         expected = np.deg2rad([row[key] for row in rows])
         np.testing.assert_allclose(heard[name].position, expected, atol=1e-12)
+
+
+def test_an_optimizer_started_again_publishes_the_last_fit(start, client, tmp_path):
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from sensor_msgs.msg import JointState
+
+    session = tmp_path / 'session'
+    made = remaster('simulate', session, '--poses', '20', '--validation', '5', '--seed', '2')
+    assert made.returncode == 0
+    assert remaster('fit', session, '--out', tmp_path / 'fit', '--no-figures').returncode == 0
+    start('remaster_ros.nodes.optimizer', *node_arguments(session=session, out=tmp_path / 'fit'))
+    heard = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    client.create_subscription(JointState, '/remaster/joint_offsets', heard.append, latched)
+
+    def any_heard():
+        client.spin_some()
+        return bool(heard)
+
+    wait_until(any_heard, 30, 'the latched offsets')
+    rows = json.loads((tmp_path / 'fit' / 'fit.json').read_text())['joint_offsets']
+    np.testing.assert_allclose(heard[0].position, np.deg2rad([r['mean_deg'] for r in rows]))
 
 
 def test_a_fit_of_no_session_says_why(start, client, tmp_path):
