@@ -6,7 +6,7 @@ bag replayed at any speed gives the same observations.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,6 +130,8 @@ class Pairing:
         self._decided_s: dict[str, float] = {}
         self._now_s = self._looked_s = settled_stamp_s
         self._excused_s = dict.fromkeys(self.rules, 0.0)
+        self._silent_s = dict.fromkeys(self.rules, 0.0)
+        self._words: dict[str, int] = {}
         self._joints: list[tuple[float, FloatArray]] = []
         self._readings: dict[str, list[MarkerReading]] = {name: [] for name in self.rules}
 
@@ -153,8 +155,14 @@ class Pairing:
         """Note that the device itself said that there is no measurement."""
         self._set(Rejection(sensor, 'device', detail))
 
-    def give_up(self, now_s: float, absent: Collection[str] = ()) -> None:
+    def give_up(
+        self, now_s: float, absent: Collection[str] = (), words: Mapping[str, int] | None = None
+    ) -> None:
         """Reject every sensor whose time is over at `now_s`.
+
+        A cut cable shows only when the heartbeat is over, and simulated time may run faster than
+        that: a required sensor is not rejected before its node has been heard again, and if that
+        turns out to be absent, all of its silence is excused.
 
         Parameters
         ----------
@@ -163,18 +171,33 @@ class Pairing:
         absent
             Sensors that are not there at all now: a required one is waited for, and the time is
             not counted; another one is left out.
+        words
+            How often each sensor's node has been heard (`Presence.words`); without it, or for a
+            sensor that is not in it, silence means nothing.
         """
         passed = max(now_s - self._looked_s, 0.0)
         self._looked_s = now_s
+        self._listen(words or {}, passed)
         for name in absent:
             if name in self.rules and self.is_required(name):
-                self._excused_s[name] += passed
+                self._excused_s[name] += max(passed, self._silent_s[name])
+                self._silent_s[name] = 0.0
             elif name in self.rules:
                 self._set(Rejection(name, 'absent', 'it is not there, and not required'))
-        for rules in self.rules.values():
+        for name, rules in self.rules.items():
             allowed = self._allowed_s(rules)
-            if now_s > self.settled_stamp_s + allowed:
+            unsure = self.is_required(name) and self._silent_s[name] > 0.0
+            if now_s > self.settled_stamp_s + allowed and not unsure:
                 self._set(self._late(rules, allowed))
+
+    def _listen(self, words: Mapping[str, int], passed_s: float) -> None:
+        """Add up how long each sensor's node has said nothing."""
+        for name in self.rules:
+            if name in words and words[name] == self._words.get(name):
+                self._silent_s[name] += passed_s
+            else:
+                self._silent_s[name] = 0.0
+        self._words = dict(words)
 
     def is_required(self, sensor: str) -> bool:
         """Whether the arm waits for this sensor."""

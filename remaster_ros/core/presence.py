@@ -19,6 +19,8 @@ class Presence:
     ----------
     readings
         Readings received, per sensor.
+    words
+        How often each sensor's node has been heard; none where it never was.
     """
 
     def __init__(self, sensors: Iterable[str], heartbeat_s: float) -> None:
@@ -27,11 +29,13 @@ class Presence:
         self._trouble: dict[str, str] = {}
         self._read: dict[str, float] = {}
         self.readings = dict.fromkeys(sensors, 0)
+        self.words: dict[str, int] = {}
 
     def says(self, sensor: str, ready: bool, message: str, now_s: float) -> None:
         """Take the word of a sensor's node; `message` says what is wrong if it is not ready."""
         if sensor in self.readings:
             self._heard[sensor] = now_s
+            self.words[sensor] = self.words.get(sensor, 0) + 1
             self._trouble[sensor] = '' if ready else message or 'not ready'
 
     def reads(self, sensor: str, now_s: float) -> None:

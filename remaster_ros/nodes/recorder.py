@@ -305,7 +305,7 @@ class Recorder(RemasterNode):
         absent = self._presence.absent(time.monotonic())
         if self._taking is not None:
             self._shots.look(self._taking.pairing, absent)
-            self._taking.pairing.give_up(self._now, absent)
+            self._taking.pairing.give_up(self._now, absent, self._presence.words)
             self._finish_if_complete()
         waiting_for = self._waiting_for(absent)
         if bool(waiting_for) != self._was_waiting:

@@ -236,6 +236,22 @@ def test_back_again_and_silent_it_has_its_time_out_as_ever():
     assert pairing.decided['mocap'].reason == 'stale'
 
 
+def test_a_silence_that_is_longer_than_the_time_out_decides_nothing():
+    """The clock runs fast: the time-out (2.5 s) passes before the heartbeat (here 18 s)."""
+    pairing = Pairing(10.0, Q, (STREAM,))
+    for stamp in np.arange(10.0, 60.0, 0.1):
+        pairing.give_up(stamp, {'mocap'} if stamp > 28 else set(), {'mocap': 7})
+    assert not pairing.decided
+    pairing.give_up(60.1, set(), {'mocap': 8})
+    assert not pairing.decided, 'heard again, it has its time from now on'
+    pairing.give_up(62.2, set(), {'mocap': 9})
+    assert not pairing.decided
+    pairing.give_up(62.7, set(), {'mocap': 9})
+    assert not pairing.decided, 'its time is over, but who knows whether it is still there?'
+    pairing.give_up(62.8, set(), {'mocap': 10})
+    assert pairing.decided['mocap'].reason == 'stale'
+
+
 def test_an_absent_sensor_that_is_not_required_is_left_out_at_once():
     pairing = Pairing(10.0, Q, (STREAM, SHOT), require='mocap')
     pairing.give_up(10.1, {'tracker', 'another'})

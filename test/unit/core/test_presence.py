@@ -11,6 +11,7 @@ def test_silent_or_not_ready_is_absent_and_says_why():
     presence.says('mocap', True, '', 10.0)
     presence.says('tracker', False, 'warming up', 10.0)
     presence.says('stranger', False, 'whatever', 10.0)
+    assert presence.words == {'mocap': 1, 'tracker': 1}
     assert presence.absent(13.0) == {'tracker': 'warming up'}
     silent = 'its node has been silent for 3 s'
     assert presence.absent(13.1) == {'mocap': silent, 'tracker': silent}
