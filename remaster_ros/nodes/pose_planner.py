@@ -40,8 +40,8 @@ from remaster_ros.storage.cell import read_cell
 from remaster_ros.storage.plan_book import PlanBook
 
 PEERS = ('robot_bridge', 'recorder')
-ANNOUNCE_WALL_S = 1.0
-"""A summary this long after an announcement tells whether its node has heard it, wall time."""
+ANNOUNCE_WALL_S = 5.0
+"""Who does not know an announcement so long after it has missed it, wall time."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,8 @@ class PosePlanner(RemasterNode):
         # Stamp of each announcement of the open pose -> its solutions, in the order announced.
         self._announced: dict[str, tuple[int, ...]] = {}
         self._stamp, self._published_wall = '', 0.0
+        # Which start of each peer was there to hear it.
+        self._told: dict[str, str] = {}
         self._resume()
         self._poses = self.create_publisher(PoseStamped, '/remaster/target_pose', RELIABLE)
         self._solutions = self.create_publisher(
@@ -234,9 +236,13 @@ class PosePlanner(RemasterNode):
         if ids is None or self.book.stop is None:
             return
         solution = ids[int(event.values['solution'])]
+        result = event.values.get('result', 'failed')
+        if event.values['stamp'] != self._stamp and result not in ('recorded', 'partial'):
+            # It was announced again meanwhile, and will be visited again.
+            return
         if solution in self.book.stop.ids:
             self._registered = event.values.get('registered') == 'yes'
-            self.book.outcome(solution, event.values.get('result', 'failed'))
+            self.book.outcome(solution, result)
             self._step()
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
@@ -298,10 +304,11 @@ class PosePlanner(RemasterNode):
             return True
         if self._peers['recorder'].values.get('state') == 'measuring':
             return False
-        settled_wall = self._published_wall + ANNOUNCE_WALL_S
+        missed_wall = self._published_wall + ANNOUNCE_WALL_S
         return any(
-            peer.heard_wall > settled_wall and peer.values.get('pose') != self._stamp
-            for peer in self._peers.values()
+            peer.values.get('pose') != self._stamp
+            and (peer.values.get('started') != self._told[node] or peer.heard_wall > missed_wall)
+            for node, peer in self._peers.items()
         )
 
     def _heard(self) -> bool:
@@ -395,6 +402,7 @@ class PosePlanner(RemasterNode):
         stamp = self.get_clock().now().to_msg()
         self._stamp, self._published_wall = stamp_key(stamp), time.monotonic()
         self._announced[self._stamp] = stop.ids
+        self._told = {n: peer.values.get('started', '') for n, peer in self._peers.items()}
         tour = self.book.tour
         if tour is not None and self.phase != REGISTRATION and not self._described:
             self._described = True

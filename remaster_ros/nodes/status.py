@@ -8,6 +8,7 @@ of its joint solutions. Events are identified by the pose's stamp and the soluti
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -55,6 +56,8 @@ class Status:
     def __init__(self, node: Node, summary: Callable[[], tuple[str, str, dict[str, Any]]]) -> None:
         self._node = node
         self._summary = summary
+        # Tells a node that was started again from the one before it.
+        self._started = str(time.time_ns())
         self._publisher = node.create_publisher(DiagnosticArray, TOPIC, RELIABLE)
         # A wall timer: status must go on when the simulated clock stands still.
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -63,7 +66,7 @@ class Status:
     def publish(self) -> None:
         """Publish the summary now."""
         level, message, values = self._summary()
-        self._send(self._node.get_name(), level, message, values)
+        self._send(self._node.get_name(), level, message, {**values, 'started': self._started})
 
     def event(self, event: str, message: str, level: str = 'ok', **values: Any) -> None:
         """Publish an event now."""
