@@ -21,7 +21,8 @@ from hidden_world import HiddenTruth, HiddenWorld
 from scipy.interpolate import BSpline
 
 from remaster_ros.core.types import FloatArray
-from remaster_ros.fakes.effects import UNNAMED, HiddenEffect
+from remaster_ros.fakes.answers import Cause, causes, named_cause, true_parameters
+from remaster_ros.fakes.effects import HiddenEffect
 
 INDISTINGUISHABLE = 4.0
 SIZE_STD = 3.0
@@ -29,9 +30,6 @@ SIZE_STD = 3.0
 CURVE_SHARE = 0.4
 # A component of which less than this share is left cannot be asked for.
 UNSEEN_SHARE = 0.02
-
-Cause = tuple[str, tuple[int, ...], str]
-"""Name, joints, and for a cell without a name its place and driver; for a sensor its name."""
 
 
 @dataclass
@@ -87,37 +85,10 @@ def judge(world: HiddenWorld, truth: HiddenTruth, discovery: Any) -> Judgement:
     )
 
 
-def causes(effect: HiddenEffect) -> list[Cause]:
-    """Return what has to be named: one cause for each joint that gives way, else one."""
-    if effect.kind == 'joint_compliance':
-        return [(effect.kind, (joint,), '') for joint in effect.joints]
-    if effect.kind == 'joint_coupling':
-        return [(effect.kind, (effect.joints[0], effect.detail['by']), '')]
-    if effect.kind in UNNAMED:
-        return [_without_name(effect)]
-    return [(effect.kind, effect.joints, effect.detail.get('sensor', ''))]
-
-
-def _without_name(effect: HiddenEffect) -> Cause:
-    cell = UNNAMED[effect.kind]
-    joints, driver = effect.joints, cell.driver
-    if 'by' in effect.detail:
-        joints = (*joints, effect.detail['by'])
-        driver = f'{driver}_of_joint_{effect.detail["by"]}'
-    return 'unnamed', joints, f'{cell.place} {driver}'
-
-
 def _claimed(effect: Any) -> list[Cause]:
-    joints = tuple(effect.joints)
-    if effect.name == 'unnamed':
-        return [('unnamed', joints, f'{effect.place} {effect.driver}')]
-    if effect.name != 'joint_coupling' and len(joints) > 1:
-        # One entry for several joints that err in the same way.
-        return [(effect.name, (joint,), '') for joint in joints]
-    sensor = ''
-    if effect.place == 'sensor_frame':
-        sensor = effect.parameters[0].name.rpartition('_')[2]
-    return [(effect.name, joints, sensor)]
+    names = [{'name': parameter.name} for parameter in effect.parameters]
+    plain = {key: getattr(effect, key) for key in ('name', 'joints', 'place', 'driver')}
+    return named_cause({**plain, 'parameters': names})
 
 
 def _forgiven(
@@ -216,7 +187,7 @@ def _deviations(
             deviations |= _marker_deviations(world, effect, estimates)
             continue
         spread = max(std for _, std in estimates.values())
-        for name, true in expected(world, effect).items():
+        for name, true in true_parameters(effect).items():
             if name not in estimates and _unseen(world, effect, name):
                 continue
             value, std = estimates.get(name, (0.0, spread))
@@ -231,57 +202,6 @@ def _unseen(world: HiddenWorld, effect: HiddenEffect, name: str) -> bool:
         return False
     size = np.linalg.norm(effect.values) / np.linalg.norm(part.values)
     return world.size_m(part.scaled(size)) < UNSEEN_SHARE * world.size_m(effect)
-
-
-def expected(world: HiddenWorld, effect: HiddenEffect) -> dict[str, float]:
-    """Return the true parameters under the names that an estimate gives them.
-
-    Without a name to a cell there is no size to compare but that of a line.
-    """
-    j = effect.joints[0] if effect.joints else 0
-    values = [float(value) for value in effect.values]
-    sensor, by = effect.detail.get('sensor'), effect.detail.get('by')
-    match effect.kind:
-        case 'joint_compliance':
-            return {f'compliance_{i}': v for i, v in zip(effect.joints, values, strict=True)}
-        case 'encoder_eccentricity' | 'gear_periodic':
-            orders = effect.detail['orders']
-            names = [f'{wave}{order}_{j}' for order in orders for wave in ('sin', 'cos')]
-            return dict(zip(names, values, strict=True))
-        case 'encoder_scale':
-            return {f'scale_{j}': values[0]}
-        case 'backlash':
-            return {f'half_backlash_{j}': 0.5 * values[0]}
-        case 'settling':
-            return {f'settling_{j}': values[0]}
-        case 'joint_coupling' if effect.detail['form'] == 'linear':
-            return {f'coupling_{j}_by_{by}': values[0]}
-        case 'joint_coupling':
-            return {f'sin_{j}_by_{by}': values[0], f'cos_{j}_by_{by}': values[1]}
-        case 'link_length':
-            axis = effect.detail['axis']
-            return {f'length_{j}' if axis == 'along' else f'offset_{axis}_{j}': values[0]}
-        case 'joint_axis_tilt':
-            return {f'tilt_{a}_{j}': float(t) for a, t in zip('xyz', values) if abs(t) > 1e-12}
-        case 'thermal_growth':
-            return {'growth': values[0]}
-        case 'base_compliance':
-            return {'base_compliance': values[0]}
-        case 'registration_drift':
-            return {f'drift_{a}_{sensor}': v for a, v in zip('xyz', values, strict=True)}
-        case 'sensor_scale':
-            prefix = 'scale_z' if effect.detail['form'] == 'depth' else 'scale'
-            return {f'{prefix}_{sensor}': values[0]}
-        case 'sensor_distortion':
-            return {f'radial_{sensor}': values[0]}
-        case 'foreign_torque':
-            return {f'joint_{j}_by_gravity_torque_of_joint_{by}': values[0]}
-        case 'creeping_joint' | 'slipped_joint':
-            return {f'joint_{j}_by_time': values[0]}
-        case 'warm_joint':
-            return {f'joint_{j}_by_temperature': values[0]}
-        case _:
-            return {}
 
 
 def _marker_deviations(

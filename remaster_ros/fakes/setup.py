@@ -97,7 +97,7 @@ def _draw_hidden(
     counts = dict.fromkeys(('optimization', 'validation'), candidates)
     visits = visit(plan_tour(chain, cell, places, counts, rng), chain)
     q = np.concatenate([*visits['optimization'], *visits['validation']])
-    time_s = PRACTICE_STEP_S * np.arange(len(q))
+    time_s = PRACTICE_STEP_S * np.arange(len(q), dtype=float)
     practice = Round(q, q[0], time_s, truth.warming.at(START_S + time_s))
     stage = Stage(ChainArm(chain), practice, *truth.staged(), truth.joint_offsets)
     return hide(stage, hidden, rng)
