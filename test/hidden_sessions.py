@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from hidden_tours import world
 from hidden_world import HiddenTruth, HiddenWorld, Noise
 
 from remaster_ros.core.types import Session
+from remaster_ros.fakes.effects import HiddenEffect
 from remaster_ros.fakes.hiding import draw_effect
 
 NOISES = {
@@ -91,6 +93,27 @@ def hidden_session(recipe: Recipe) -> HiddenSession:
         )
     session, truth = hidden.measure(effects, noise, np.random.default_rng(noise_seed))
     return HiddenSession(session, hidden, truth, tuple(best))
+
+
+def another_session(
+    first: HiddenSession, recipe: Recipe, effects: Sequence[HiddenEffect]
+) -> HiddenSession:
+    """Measure the arm of a session again, on another tour before sensors set up anew.
+
+    Parameters
+    ----------
+    first
+        Whose zero-offsets the arm still has.
+    recipe
+        Its seed, robot, sensors and noise count.
+    effects
+        What else is wrong with the arm now.
+    """
+    rng = np.random.default_rng([recipe.seed, 9])
+    hidden = world(recipe.robot, rng, sensors=recipe.sensors)
+    hidden.joint_offsets = first.world.joint_offsets
+    session, truth = hidden.measure(effects, NOISES[recipe.noise], rng)
+    return HiddenSession(session, hidden, truth, ())
 
 
 def held_out_noise_m(hidden: HiddenSession) -> float:

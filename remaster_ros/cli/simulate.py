@@ -164,7 +164,7 @@ class _Hidden:
     ) -> None:
         self._chain, self._sensors, self._requests, self._rng = chain, sensors, requests, rng
         q = np.concatenate([*visits['optimization'], *visits['validation']])
-        time_s = SECONDS_PER_CONFIGURATION * np.arange(len(q))
+        time_s = SECONDS_PER_CONFIGURATION * np.arange(len(q), dtype=float)
         self.round = Round(q, q[0], time_s, WARMING.at(time_s))
         self.found: list[tuple[HiddenEffect, float]] = []
 
