@@ -28,6 +28,7 @@ import yaml
 
 from remaster_ros.core import transforms
 from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.errors import InputError
 from remaster_ros.storage.journal import read_journal
 from remaster_ros.storage.session import read_session
 
@@ -39,6 +40,7 @@ NODES = (
     'recorder',
     'optimizer',
 )
+COUNTS = ('rows', 'planned_configurations', 'configurations', 'lost', 'twice', 'wrong')
 LARGEST_ERROR_M = {'mocap': 0.3e-3, 'tracker': 0.15e-3}
 """Six standard deviations of what the fakes add; two configurations lie millimetres apart."""
 
@@ -104,32 +106,38 @@ class Run:
         self.log.close()
 
 
-def judge(run: Run) -> dict[str, Any]:
-    """Count what was lost, twice or wrong in a run that has ended."""
-    result: dict[str, Any] = {'status': run.process.returncode, 'killed': run.killed}
-    session = read_session(run.session)
+def judge(out: Path, seen: set[str]) -> dict[str, Any]:
+    """Count what was lost, twice or wrong in the folder of a demo that has ended.
+
+    `seen` are the rows that were ever on the disk.
+    """
+    folder = out / 'session'
+    try:
+        session = read_session(folder)
+    except InputError as error:
+        return {**dict.fromkeys(COUNTS, -1), 'exit_status': str(error)}
     m = session.measurements
-    rows = (run.session / 'observations.csv').read_text().splitlines()[1:]
+    rows = (folder / 'observations.csv').read_text().splitlines()[1:]
     pairs = Counter(zip(m.configuration.tolist(), m.sensor.tolist()))
-    records = [r for r in read_journal(run.session / 'journal.jsonl').records if 'rows' in r]
+    records = [r for r in read_journal(folder / 'journal.jsonl').records if 'rows' in r]
     decided = Counter((record['pose'], record['solution']) for record in records)
-    tours = [r for r in read_journal(run.session / 'plan.jsonl').records if r['kind'] == 'tour']
+    tours = [r for r in read_journal(folder / 'plan.jsonl').records if r['kind'] == 'tour']
     planned = sum(len(p['solutions']) for s in tours[-1]['plans'].values() for p in s['poses'])
-    result |= {
+    result: dict[str, Any] = {
         'exit_status': session.exit_status,
         'rows': len(m),
         'planned_configurations': planned,
         'configurations': len(set(m.configuration.tolist())),
-        'lost': len(run.seen - set(rows)),
+        'lost': len(seen - set(rows)),
         'twice': sum(n - 1 for n in pairs.values()) + sum(n - 1 for n in decided.values()),
         'closest_rad': closest(m),
         'wrong': 0,
     }
-    truth_path = run.out / 'truth.yaml'
+    truth_path = out / 'truth.yaml'
     if truth_path.exists():
         truth = yaml.safe_load(truth_path.read_text())
         result['wrong'] = wrong_pairs(session, truth)
-    fit_path = run.out / 'fit' / 'fit.json'
+    fit_path = out / 'fit' / 'fit.json'
     if fit_path.exists():
         fit = json.loads(fit_path.read_text())
         result['offsets'] = {
@@ -182,7 +190,9 @@ def one(folder: Path, seed: int, kills: int, args: argparse.Namespace) -> dict[s
         'kills': kills,
         'candidates': args.candidates,
         'seconds': round(time.monotonic() - began, 1),
-        **judge(run),
+        'status': run.process.returncode,
+        'killed': run.killed,
+        **judge(run.out, run.seen),
     }
 
 

@@ -1,0 +1,61 @@
+"""SIGKILL of nodes in a running demo: nothing lost, nothing twice, the run completes.
+
+benchmarks/bench_kills.py is the long version.
+"""
+
+import os
+import random
+import signal
+import sys
+import time
+
+import pytest
+from conftest import ROOT, wait_until
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(400)]
+
+SEED = 5
+SENSOR_NODES = ('optitrack_markers', 'laser_tracker_markers')
+
+
+def test_killed_nodes_cost_nothing(start, tmp_path):
+    """Recorder, planner, bridge and a random sensor node, one after the other."""
+    sys.path.insert(0, str(ROOT / 'benchmarks'))
+    try:
+        from bench_kills import judge, node_processes
+    finally:
+        sys.path.pop(0)
+    print('seed', SEED)
+    chooser = random.Random(SEED)
+    out = tmp_path / 'out'
+    demo = start(
+        'remaster_ros.cli.main', 'demo', '--out', out, '--candidates', '6', '--no-figures',
+        '--seed', SEED,
+    )  # fmt: skip
+    path = out / 'session' / 'observations.csv'
+    seen = set()
+
+    def rows():
+        if not path.exists():
+            return -1
+        text = path.read_text()
+        seen.update(text[: text.rfind('\n') + 1].splitlines()[1:])
+        return len(seen)
+
+    for node in ('recorder', 'pose_planner', 'robot_bridge', chooser.choice(SENSOR_NODES)):
+        before = rows()
+        wait_until(
+            lambda before=before: rows() > before or demo.poll() is not None, 120, 'progress'
+        )
+        assert demo.poll() is None, demo.communicate()
+        time.sleep(chooser.uniform(0.0, 1.0))
+        os.kill(node_processes(demo.pid)[node], signal.SIGKILL)
+    wait_until(lambda: rows() is None or demo.poll() is not None, 240, 'the demo to end')
+    assert demo.returncode == 0, demo.communicate()
+    rows()
+
+    result = judge(out, seen)
+    assert result['exit_status'] == 'complete'
+    assert (result['lost'], result['twice'], result['wrong']) == (0, 0, 0)
+    assert result['configurations'] == result['planned_configurations'] > 10
+    assert result['closest_rad'] > 1e-3
