@@ -16,6 +16,12 @@ import numpy as np
 from remaster_ros.core.discovery_causes import FoundEffect, describe
 from remaster_ros.core.discovery_evidence import Solution
 from remaster_ros.core.discovery_extend import extension_of
+from remaster_ros.core.discovery_gain import (
+    Gain,
+    gain_of,
+    noise_by_range,
+    pose_common_fraction,
+)
 from remaster_ros.core.discovery_markers import moved_markers
 from remaster_ros.core.discovery_noise import Residuals
 from remaster_ros.core.discovery_screen import Catalogue
@@ -27,26 +33,9 @@ from remaster_ros.core.fit import fit_session
 from remaster_ros.core.outliers import find_outliers
 from remaster_ros.core.result import FitResult
 from remaster_ros.core.sampling import Progress, silent
-from remaster_ros.core.types import BoolArray, FloatArray, Session
+from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Session
 
 Verdict = Literal['effects', 'none', 'undetermined']
-
-
-@dataclass(frozen=True)
-class Gain:
-    """RMS of the 3-D error over all validation rows, m; None where there are none.
-
-    Attributes
-    ----------
-    held_out_rms_before_m, held_out_rms_after_m
-        With offsets only, and with the effects.
-    noise_floor_m
-        What the noise alone leaves, by the sensors' estimated noise.
-    """
-
-    held_out_rms_before_m: float | None
-    held_out_rms_after_m: float | None
-    noise_floor_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +58,8 @@ class Discovery:
         ``observation`` of every row set aside, with the reason.
     untestable
         Name of an effect -> why this session cannot show it.
+    groups
+        The cells of each effect that was searched for, in the order of ``effects``.
     selection
         How the cells were found.
     residuals
@@ -87,6 +78,7 @@ class Discovery:
     outliers: tuple[tuple[int, str], ...]
     untestable: Mapping[str, str]
     offsets_before: tuple[FloatArray, FloatArray]
+    groups: tuple[tuple[Cell, ...], ...]
     selection: Selection
     residuals: Residuals
     fit: FitResult
@@ -136,12 +128,13 @@ def discover_session(
     return Discovery(
         verdict=verdict,
         effects=effects,
-        gain=_gain(residuals, solution, fit),
-        pose_common_fraction=_pose_common_fraction(solution),
-        noise_by_range=_noise_by_range(residuals, solution),
+        gain=gain_of(findings.estimate, solution, fit, rng),
+        pose_common_fraction=pose_common_fraction(solution),
+        noise_by_range=noise_by_range(residuals, solution),
         outliers=fit.left_out,
         untestable=findings.untestable,
         offsets_before=_offsets(findings.estimate),
+        groups=findings.groups,
         selection=findings.selection,
         residuals=residuals,
         fit=fit,
@@ -155,6 +148,7 @@ class Findings:
     estimate: Estimate
     residuals: Residuals
     selection: Selection
+    groups: tuple[tuple[Cell, ...], ...]
     effects: tuple[FoundEffect, ...]
     untestable: Mapping[str, str]
 
@@ -175,11 +169,11 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         for cell in effect.cells(residuals.scene)
     ]
     residuals, selection = _searched(found, residuals, cells, rng, progress)
-    effects = describe(
+    groups, effects = describe(
         residuals, selection, cells, lambda share: progress('comparing look-alikes', share)
     )
     effects += moved_markers(found, residuals, selection.solution)
-    return Findings(found, residuals, selection, effects, untestable)
+    return Findings(found, residuals, selection, groups, effects, untestable)
 
 
 def _offsets(found: Estimate) -> tuple[FloatArray, FloatArray]:
@@ -217,63 +211,14 @@ def _searched(
     raise AssertionError('unreachable')
 
 
-def _kept(found: Estimate, residuals: Residuals, solution: Solution) -> FloatArray:
+def _kept(found: Estimate, residuals: Residuals, solution: Solution) -> IntArray:
     """Return the optimization rows that the extended model does not call gross."""
     problem = found.problem
     every = residuals.only(problem.fitted, found.model.reference)
-    left = every.errors - every.base @ solution.base
-    left -= residuals.columns(solution.cells)[every.rows.source] @ solution.parameters
+    left = residuals.unexplained(solution)[every.rows.source]
 
     def refit(keep: BoolArray) -> FloatArray:
         return left
 
     judgement = find_outliers(every.rows, refit, left, problem.sensor_names)
     return np.sort(every.rows.source[~judgement.gross])
-
-
-def _gain(residuals: Residuals, solution: Solution, fit: FitResult) -> Gain:
-    measurements = residuals.scene.measurements
-    held_out = measurements.is_validation
-    noise = solution.noise
-    variance = 3.0 * (noise.sigma**2 + noise.pose_sigma**2)
-    rows = held_out if held_out.any() else ~held_out
-    floor = float(np.sqrt(np.mean(variance[measurements.sensor[rows]])))
-    if not held_out.any():
-        return Gain(None, None, floor)
-
-    def rms(errors: FloatArray) -> float:
-        return float(np.sqrt(np.mean(np.sum(errors[held_out] ** 2, axis=1))))
-
-    return Gain(rms(residuals.full_errors), rms(fit.residuals_after), floor)
-
-
-def _pose_common_fraction(solution: Solution) -> float:
-    common = np.sum(solution.noise.pose_sigma**2)
-    return float(common / (common + np.sum(solution.noise.sigma**2)))
-
-
-def _noise_by_range(residuals: Residuals, solution: Solution) -> dict[str, dict[str, float]]:
-    """Compare the sizes of errors near and far, sensor by sensor.
-
-    The logarithm of the error's length against that of the range: slope, and the normal p-value
-    of its rank correlation.
-    """
-    from scipy.stats import spearmanr
-
-    rows = residuals.rows
-    left = residuals.errors - residuals.base @ solution.base
-    left = left - residuals.columns(solution.cells)[rows.source] @ solution.parameters
-    length = np.linalg.norm(left, axis=1)
-    found = {}
-    for sensor, span in rows.spans:
-        distance = residuals.scene.range_m[rows.source[span]]
-        low, high = np.quantile(distance, (0.25, 0.75))
-        near, far = length[span][distance <= low], length[span][distance >= high]
-        _, p_value = spearmanr(distance, length[span])
-        found[residuals.scene.sensor_names[sensor]] = {
-            'near_m': float(low),
-            'far_m': float(high),
-            'far_over_near': float(np.sqrt(np.mean(far**2) / np.mean(near**2))),
-            'p_value': float(p_value) if np.isfinite(p_value) else 1.0,
-        }
-    return found

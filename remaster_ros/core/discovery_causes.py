@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from remaster_ros.core.discovery_evidence import Solution, solve
+from remaster_ros.core.discovery_gain import shares
 from remaster_ros.core.discovery_noise import Residuals
 from remaster_ros.core.discovery_screen import Catalogue, screen
 from remaster_ros.core.discovery_select import Selection, log_prior
@@ -64,6 +65,9 @@ class FoundEffect:
     ----------
     size_m
         RMS of what it does to the marker after absorption, over the fitted rows, m.
+    share
+        Of the gain on held-out poses, the causes added in their order; None where it was not the
+        residuals that told.
     tied
         A look-alike that measurements could tell apart explains the data as well.
     """
@@ -79,6 +83,7 @@ class FoundEffect:
     confusable_with: tuple[LookAlike, ...]
     cause: str
     size_m: float
+    share: float | None = None
     tied: bool = False
 
     def sampled(self, result: FitResult) -> FoundEffect:
@@ -102,18 +107,19 @@ def describe(
     selection: Selection,
     cells: Sequence[Cell],
     progress: Callable[[float], None],
-) -> tuple[FoundEffect, ...]:
-    """Return the chosen cells as causes, the largest first."""
+) -> tuple[tuple[tuple[Cell, ...], ...], tuple[FoundEffect, ...]]:
+    """Return the chosen cells grouped to causes, and the causes, the largest first."""
     solution = selection.solution
     if not solution.cells:
-        return ()
+        return (), ()
     catalogue = Catalogue.of(data, [cell for cell in cells if cell.name != 'gear_periodic'])
-    groups = _groups(solution)
-    found = []
-    for count, group in enumerate(groups):
+    groups = sorted(_groups(solution), key=lambda group: -_size(data, solution, group))
+    parts = shares(data, groups, solution)
+    effects = []
+    for count, (group, share) in enumerate(zip(groups, parts, strict=True)):
         progress(count / len(groups))
-        found.append(_described(data, selection, catalogue, group))
-    return tuple(sorted(found, key=lambda effect: -effect.size_m))
+        effects.append(_described(data, selection, catalogue, group, share))
+    return tuple(groups), tuple(effects)
 
 
 def _groups(solution: Solution) -> list[tuple[Cell, ...]]:
@@ -128,7 +134,11 @@ def _groups(solution: Solution) -> list[tuple[Cell, ...]]:
 
 
 def _described(
-    data: Residuals, selection: Selection, catalogue: Catalogue, group: tuple[Cell, ...]
+    data: Residuals,
+    selection: Selection,
+    catalogue: Catalogue,
+    group: tuple[Cell, ...],
+    share: float,
 ) -> FoundEffect:
     solution = selection.solution
     first = group[0]
@@ -145,7 +155,9 @@ def _described(
     )
     rest = tuple(cell for cell in solution.cells if cell not in group)
     without = solve(data, rest, solution, prior=log_prior(rest, catalogue.cells))
-    gain = np.inf if without is None else solution.log_evidence - without.log_evidence
+    gain = sum(step.log_evidence_gain for step in selection.steps)
+    if without is not None:
+        gain = solution.log_evidence - without.log_evidence
     p_values = [step.p_value for step in selection.steps if set(step.cells) & set(group)]
     if not p_values:
         # It came in exchange for what had passed.
@@ -164,7 +176,8 @@ def _described(
         log_evidence_gain=float(gain),
         confusable_with=alike,
         cause=in_words(group),
-        size_m=_size(data, solution, group, wheres),
+        size_m=_size(data, solution, group),
+        share=share,
         tied=any(not other.same and other.log_evidence_gain > gain - TIED for other in alike),
     )
     return effect
@@ -224,9 +237,9 @@ def _size(
     data: Residuals,
     solution: Solution,
     group: tuple[Cell, ...],
-    wheres: dict[Cell, slice],
 ) -> float:
     """Return the RMS of a cause's displacement after absorption by the offsets model, m."""
+    wheres = dict(zip(solution.cells, solution.slices(), strict=True))
     shift = np.zeros((len(data), 3))
     for cell in group:
         shift += data.columns([cell])[data.rows.source] @ solution.parameters[wheres[cell]]

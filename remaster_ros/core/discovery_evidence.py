@@ -14,6 +14,7 @@ one has its proper Gaussian prior.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -119,7 +120,7 @@ class Solution:
     def slices(self) -> list[slice]:
         """Return where each cell's parameters are."""
         edges = np.cumsum([0, *(cell.size for cell in self.cells)])
-        return [slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
     def prior_precision(self) -> FloatArray:
         """Return the precision of the Gaussian prior on the parameters, (m, m)."""
@@ -189,7 +190,7 @@ class _System:
     def __post_init__(self) -> None:
         self.size = len(self.unit)
         edges = self.p + np.cumsum([0, *(cell.size for cell in self.cells)])
-        self.where = [slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        self.where = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
         self.penalised = [i for i, cell in enumerate(self.cells) if cell.penalty is not None]
         self.penalties = []
         for i in self.penalised:

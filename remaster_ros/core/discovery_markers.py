@@ -59,9 +59,7 @@ def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple
     return tuple(effects)
 
 
-def _unseen(
-    moved: FloatArray, place: FloatArray, axes: FloatArray, seen: BoolArray
-) -> FloatArray:
+def _unseen(moved: FloatArray, place: FloatArray, axes: FloatArray, seen: BoolArray) -> FloatArray:
     """Return the covariance due to directions that the data cannot see, m², (3, 3).
 
     A marker moves about as far in them as in the others. Around the last joint's axis it moves on

@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
 from remaster_ros.core.effects.cell import Cell
 from remaster_ros.core.effects.scene import Scene
 from remaster_ros.core.estimate import Estimate
+from remaster_ros.core.laplace import Mode
 from remaster_ros.core.model import Rows
 from remaster_ros.core.outliers import robust_noise
 from remaster_ros.core.types import BoolArray, FloatArray, IntArray
@@ -30,6 +32,22 @@ class Noise:
 
     sigma: FloatArray
     pose_sigma: FloatArray
+
+
+class Fit(Protocol):
+    """Cells with their parameters (m,), and the step of the base columns (p,) beside them."""
+
+    @property
+    def cells(self) -> tuple[Cell, ...]:
+        """The cells."""
+
+    @property
+    def parameters(self) -> FloatArray:
+        """Their parameters, (m,)."""
+
+    @property
+    def base(self) -> FloatArray:
+        """Coefficients of the base columns, (p,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +68,10 @@ class Residuals:
         The same columns for every row of the session, (all rows, 3, p).
     full_errors
         Errors of every row of the session, m, (all rows, 3).
+    full_jacobian
+        Derivative of the prediction by the model's natural parameters, (all rows, 3, size).
     noise
-        As the offsets model has it.
-    to_parameters
-        What a unit of each base column changes of the model's natural parameters, (size, p).
+        A robust first estimate.
     """
 
     scene: Scene
@@ -62,14 +80,19 @@ class Residuals:
     base: FloatArray
     full_base: FloatArray
     full_errors: FloatArray
+    full_jacobian: FloatArray
     noise: Noise
-    to_parameters: FloatArray
 
     @classmethod
     def of(cls, found: Estimate) -> Residuals:
         """Take over a fit with offsets: its residuals on the rows it kept."""
+        return cls.at(found, found.mode)
+
+    @classmethod
+    def at(cls, found: Estimate, mode: Mode) -> Residuals:
+        """Take over the rows a fit kept, with the residuals of another mode of its model."""
         problem, model = found.problem, found.model
-        x = model.natural(found.mode.z)
+        x = model.natural(mode.z)
         scene = Scene(
             problem.chain,
             problem.measurements,
@@ -79,12 +102,11 @@ class Residuals:
             model.markers(x),
             model.T_R_N(x),
         )
-        every = Rows.of(
-            problem.measurements, np.arange(len(problem.measurements)), model.reference
-        )
-        full_errors, full_jacobian = np.empty((len(scene), 3)), None
-        full_errors[every.source] = every.target - model.predict(found.mode.z, every)
-        full_jacobian = np.empty((len(scene), 3, model.size))
+        count = len(scene)
+        every = Rows.of(problem.measurements, np.arange(count), model.reference)
+        full_errors = np.empty((count, 3))
+        full_errors[every.source] = every.target - model.predict(mode.z, every)
+        full_jacobian = np.empty((count, 3, model.size))
         full_jacobian[every.source] = model.natural_jacobian(x, every)
 
         rows = Rows.of(problem.measurements, found.kept, model.reference)
@@ -93,8 +115,7 @@ class Residuals:
         scale = np.where(scale > 0.0, scale, 1.0)
         _, singular, vectors = np.linalg.svd(flat / scale, full_matrices=False)
         seen = singular > ROUNDING * singular[0]
-        turn = (vectors[seen] / scale).T / singular[seen]
-        full_base = full_jacobian @ turn
+        full_base = full_jacobian @ ((vectors[seen] / scale).T / singular[seen])
         sigma, pose_sigma = robust_noise(rows, full_errors[rows.source], np.ones(len(rows), bool))
         return cls(
             scene,
@@ -103,8 +124,8 @@ class Residuals:
             full_base[rows.source],
             full_base,
             full_errors,
+            full_jacobian,
             Noise(sigma, pose_sigma),
-            turn,
         )
 
     def only(self, source: IntArray, reference: FloatArray) -> Residuals:
@@ -144,6 +165,12 @@ class Residuals:
         """Return what a unit of each parameter displaces in every row of the session."""
         parts = [cell.columns(self.scene).displacement(self.scene) for cell in cells]
         return np.concatenate([np.zeros((len(self.scene), 3, 0)), *parts], axis=2)
+
+    def unexplained(self, fit: Fit) -> FloatArray:
+        """Return what a fit leaves of the errors in every row of the session, m, (all rows, 3)."""
+        return (
+            self.full_errors - self.full_base @ fit.base - self.columns(fit.cells) @ fit.parameters
+        )
 
     def whitened(self, values: FloatArray, noise: Noise) -> FloatArray:
         """Return values (n, ...) in units of the noise: independent of variance 1 in all rows."""

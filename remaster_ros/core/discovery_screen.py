@@ -9,7 +9,7 @@ The p-value of the best cell is the share of surrogate residuals whose best cell
 scores as high: the family-wise error is held whatever the number of cells and their likeness
 (Westfall & Young 1993). Surrogates of two kinds, and the larger p-value counts: signs of whole
 poses flipped at random, which holds for any symmetric noise independent between poses, of any
-spread (Winkler et al. 2014); and draws from the fitted noise, which is exact where that is Gaussian.
+spread (Winkler et al. 2014); and draws from the fitted noise, exact where that is Gaussian.
 """
 
 from __future__ import annotations

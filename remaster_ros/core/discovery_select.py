@@ -1,10 +1,11 @@
-"""Which cells the residuals ask for: forward by the evidence, in physical groups, with second thoughts.
+"""Which cells the residuals ask for: forward by the evidence, in groups, with second thoughts.
 
 A round screens all cells beside the set found so far and tries the best of them, and every
 physical group as a whole (all joints sag, all links are off), less the members that do not pay.
-The proposal of the highest evidence joins if it passes two tests: its p-value over all cells tried,
-and its gain on poses left out in turn. After each round, members that no longer pay leave, and each
-is exchanged for whatever explains more in its place, since the first step sees a mixture of causes.
+The proposal of the highest evidence joins if it passes two tests: its p-value over all cells
+tried, and its gain on poses left out in turn. After each round, members that no longer pay leave,
+and each is exchanged for whatever explains more in its place, since the first step sees a mixture
+of causes.
 """
 
 from __future__ import annotations

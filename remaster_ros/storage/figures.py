@@ -36,7 +36,7 @@ TRACE_POINTS = 1500
 SCATTER_POINTS = 1500
 WHOLE_TURN_DEG = 359.999
 
-_STYLE: Any = {
+STYLE: Any = {
     'svg.fonttype': 'none',
     # Wider than the fonts that pages use: what fits in it is never cut off in them.
     'font.family': 'sans-serif',
@@ -81,7 +81,7 @@ def draw_figures(result: FitResult) -> dict[str, str]:
     texts = {}
     for name, draw in figures.items():
         # The salt makes the same fit give the same file.
-        with matplotlib.rc_context({**_STYLE, 'svg.hashsalt': name}):
+        with matplotlib.rc_context({**STYLE, 'svg.hashsalt': name}):
             figure = draw(result)
             out = StringIO()
             FigureCanvasSVG(figure).print_svg(out, metadata={'Date': None, 'Creator': None})
@@ -176,7 +176,7 @@ def errors_by_configuration(result: FitResult) -> Figure:
                     alpha=0.85,
                 )
             legend.append(_legend_entry(marker, INK, name))
-        _log_axis(ax, 'y')
+        log_axis(ax, 'y')
         ax.set_title(f'{title}{note}')
         ax.set_ylabel('3-D error (mm)')
         ax.set_xlabel('joint configuration, in the order measured')
@@ -206,7 +206,7 @@ def residual_distribution(result: FitResult) -> Figure:
                 label=f'{when}: mean {mean:.3f} mm',
             )
             ax.axvline(mean, color=color, linewidth=1.3)
-        _log_axis(ax, 'x')
+        log_axis(ax, 'x')
         ax.set_title(title)
         ax.set_xlabel('3-D error (mm); lines: means')
         ax.set_ylabel('observations')
@@ -274,7 +274,7 @@ def _short(why: str) -> str:
     return f'Not identifiable: {reason}.'
 
 
-def _log_axis(ax: Axes, which: str) -> None:
+def log_axis(ax: Axes, which: str) -> None:
     """Make an axis logarithmic, labelled in plain numbers at 1, 2 and 5."""
     axis = ax.yaxis if which == 'y' else ax.xaxis
     (ax.set_yscale if which == 'y' else ax.set_xscale)('log')

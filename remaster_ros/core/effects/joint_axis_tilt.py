@@ -10,7 +10,6 @@ from remaster_ros.core.effects.cell import Cell, Columns, Effect, turned
 from remaster_ros.core.effects.scene import Scene
 from remaster_ros.core.types import FloatArray
 
-
 # A tilt along the axis before is, with that joint's zero-offset, another name for a shift of the
 # link: of the two the shift is the simpler.
 RARITY = 3

@@ -14,7 +14,7 @@ from remaster_ros.core.types import FloatArray
 # The finest: gearbox errors have structure down to a few degrees; finer overfits any session.
 FINEST_KNOTS = np.radians(4.0)
 # Below this many configurations per knot the curve is coarser.
-ROWS_PER_KNOT = 3.0
+ROWS_PER_KNOT = 6.0
 
 
 def knots_of(scene: Scene, joint: int) -> FloatArray:

@@ -1,0 +1,84 @@
+"""Find what the offsets leave: discovery.json, figures and report.html."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+from remaster_ros.cli.console import progress_bar, say
+from remaster_ros.core.discovery import Discovery, discover_session
+from remaster_ros.core.discovery_confirm import Confirmation, confirm, share_in_words
+from remaster_ros.storage.discovery_results import save_discovery
+from remaster_ros.storage.results import prepare_folder
+from remaster_ros.storage.session import read_session
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``remaster discover``."""
+    parser.add_argument('session', metavar='SESSION', type=Path, help='session folder')
+    parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='output folder')
+    parser.add_argument(
+        '--confirm',
+        metavar='OTHER',
+        type=Path,
+        help='another session of the same arm: do the causes, frozen, predict it?',
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Search, extend, measure the gain, write, and say in a few lines what came out."""
+    session = read_session(args.session)
+    other = None if args.confirm is None else read_session(args.confirm)
+    prepare_folder(args.out)
+    with progress_bar(args.quiet) as progress:
+        found = discover_session(
+            session,
+            rng=np.random.default_rng(args.seed),
+            progress=progress,
+            clock=time.perf_counter,
+        )
+        confirmation = None
+        if other is not None:
+            progress('confirming', 0.0)
+            confirmation = confirm(found, other)
+        progress('writing', 0.0)
+        report = save_discovery(found, args.out, confirmation, figures=not args.no_figures)
+    say(args.quiet, summary(found, confirmation))
+    say(args.quiet, f'written: {report}')
+    return 0
+
+
+def summary(found: Discovery, confirmation: Confirmation | None = None) -> str:
+    """Return verdict, causes and gain in a few lines."""
+    lines = [f'verdict: {found.verdict}']
+    for effect in found.effects:
+        joints = f' {list(effect.joints)}' if effect.joints else ''
+        share = '' if effect.share is None else f', {100 * effect.share:.0f} % of the gain'
+        lines.append(f'{effect.name}{joints}: {1e3 * effect.size_m:.3f} mm{share}; {effect.cause}')
+        for alike in effect.confusable_with:
+            where = f' {list(alike.joints)}' if alike.joints else ''
+            lines.append(f'    could be {alike.name}{where}; to tell: {alike.separate_by}')
+    if not found.effects:
+        lines.append('nothing beyond the zero-offsets and the noise was found')
+    gain = found.gain
+    if gain.held_out_rms_before_m is not None and gain.held_out_rms_after_m is not None:
+        lines.append(
+            f'held out: {1e3 * gain.held_out_rms_before_m:.3f} mm RMS before, '
+            f'{1e3 * gain.held_out_rms_after_m:.3f} mm after; '
+            f'the noise alone is {1e3 * gain.noise_floor_m:.3f} mm'
+        )
+    lines += [f'not testable: {name}: {why}' for name, why in found.untestable.items()]
+    if confirmation is not None:
+        lines.append(
+            f'other session: {1e3 * confirmation.rms_before_m:.3f} mm RMS with frozen offsets, '
+            f'{1e3 * confirmation.rms_after_m:.3f} mm with the frozen causes; '
+            f'{100 * confirmation.carried_over:.0f} % of the gain carries over'
+        )
+        lines += [
+            share_in_words(effect, share)
+            for effect, share in zip(found.effects, confirmation.effects, strict=False)
+        ]
+    return '\n'.join(lines)

@@ -1,0 +1,170 @@
+"""Do the causes of one session predict another of the same arm? Only the set-up is refitted.
+
+Zero-offsets and causes stay as found; the other session's registrations and markers are fitted to
+its optimization rows, and the error is measured on its validation rows, or on the fitted ones
+where it has none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.core.discovery import Discovery
+from remaster_ros.core.discovery_causes import FoundEffect
+from remaster_ros.core.discovery_evidence import solve
+from remaster_ros.core.discovery_gain import rms
+from remaster_ros.core.discovery_noise import Residuals
+from remaster_ros.core.effects.cell import Cell
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.estimate import Estimate, Problem, estimate, hold_offsets
+from remaster_ros.core.types import FloatArray, Session
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """How causes found in one session do in another.
+
+    Attributes
+    ----------
+    rms_before_m, rms_after_m
+        RMS of the 3-D error in the other session with the frozen offsets alone, and with the
+        frozen causes too.
+    carried_over
+        Share of the gain in mean square that carries over: 1 all, 0 none, negative where the
+        causes make it worse.
+    effects
+        The same share for each cause alone, in the order of the discovery.
+    confirmed
+        More than half of the gain carries over.
+    """
+
+    rms_before_m: float
+    rms_after_m: float
+    carried_over: float
+    effects: tuple[float, ...]
+    confirmed: bool
+
+
+def confirm(discovery: Discovery, session: Session) -> Confirmation:
+    """Apply a discovery, frozen, to another session of the same arm.
+
+    Raises
+    ------
+    InputError
+        Another robot, or other sensors.
+    InsufficientDataError
+        Data that do not allow a fit.
+    """
+    problem = Problem.of(session)
+    _require_same_cell(discovery, problem)
+    found = estimate(problem)
+    before = _left(discovery, found, discovery.offsets_before[0], ())
+    after = _left(discovery, found, discovery.fit.joint_offsets, discovery.groups)
+    rows = problem.measurements.is_validation
+    if not rows.any():
+        rows = np.isin(np.arange(len(rows)), found.kept)
+    base, best = rms(before, rows), rms(after, rows)
+    own = _own_gain(discovery)
+    alone = tuple(_alone(discovery, found, group, base, rows) for group in discovery.groups)
+    carried = (base**2 - best**2) / own if own > 0.0 else 0.0
+    return Confirmation(base, best, float(carried), alone, bool(carried > 0.5))
+
+
+def _own_gain(discovery: Discovery) -> float:
+    """Return by how much the causes lower the mean square in their own session, m²."""
+    data = discovery.residuals
+    rows = data.scene.measurements.is_validation
+    if not rows.any():
+        rows = np.isin(np.arange(len(rows)), data.rows.source)
+    return (
+        rms(data.unexplained(discovery.selection.empty), rows) ** 2
+        - rms(data.unexplained(discovery.selection.solution), rows) ** 2
+    )
+
+
+def _alone(
+    discovery: Discovery,
+    found: Estimate,
+    group: tuple[Cell, ...],
+    base: float,
+    rows: FloatArray,
+) -> float:
+    """Return the share of a cause's own gain that it alone carries over."""
+    data, solution = discovery.residuals, discovery.selection.solution
+    rest = tuple(cell for cell in solution.cells if cell not in group)
+    without = solve(data, rest, solution)
+    if without is None:
+        return float('nan')
+    own_rows = data.scene.measurements.is_validation
+    if not own_rows.any():
+        own_rows = np.isin(np.arange(len(own_rows)), data.rows.source)
+    own = (
+        rms(data.unexplained(without), own_rows) ** 2
+        - rms(data.unexplained(solution), own_rows) ** 2
+    )
+    others = tuple(other for other in discovery.groups if other is not group)
+    offsets = discovery.fit.joint_offsets
+    lost = (
+        rms(_left(discovery, found, offsets, others), rows) ** 2
+        - rms(_left(discovery, found, offsets, discovery.groups), rows) ** 2
+    )
+    return float(lost / own) if own > 0.0 else 0.0
+
+
+def _left(
+    discovery: Discovery,
+    found: Estimate,
+    joint_offsets: FloatArray,
+    groups: Sequence[tuple[Cell, ...]],
+) -> FloatArray:
+    """Return the errors of every row with offsets and causes held, m, (n, 3)."""
+    held = hold_offsets(found.mode, joint_offsets)
+    data = Residuals.at(found, held)
+    joints = found.model.joints
+    values = dict(zip(discovery.fit.theta_names, discovery.fit.theta, strict=True))
+    cells = [cell for group in groups for cell in group]
+    theta = np.array([values[name] for cell in cells for name in cell.parameters])
+    left = data.full_errors - data.columns(cells) @ theta
+    # Registration and markers again: a small step, so linear.
+    columns = data.full_jacobian[:, :, joints:]
+    white = data.whitened(columns[data.rows.source], data.noise).reshape(3 * len(data), -1)
+    target = data.whitened(left[data.rows.source], data.noise).ravel()
+    scale = np.linalg.norm(white, axis=0)
+    step = np.linalg.lstsq(white / scale, target, rcond=1e-9)[0] / scale
+    return left - columns @ step
+
+
+def _require_same_cell(discovery: Discovery, problem: Problem) -> None:
+    chain, scene = discovery.residuals.scene.chain, discovery.residuals.scene
+    if chain.joint_names != problem.chain.joint_names:
+        raise InputError(
+            f'the other session is of another robot: its joints are '
+            f'{", ".join(problem.chain.joint_names)}, not {", ".join(chain.joint_names)}'
+        )
+    if not np.allclose(chain.T_fixed, problem.chain.T_fixed, atol=1e-6):
+        raise InputError(
+            "the other session's URDF has another geometry; confirm with the same arm"
+        )
+    for kind, mine, theirs in (
+        ('sensors', scene.sensor_names, problem.sensor_names),
+        ('markers', scene.marker_names, problem.marker_names),
+    ):
+        if mine != theirs:
+            raise InputError(
+                f'the other session has the {kind} {", ".join(theirs)}, not {", ".join(mine)}; '
+                'confirm with a session of the same cell'
+            )
+
+
+def share_in_words(effect: FoundEffect, share: float) -> str:
+    """Say how a cause did in the other session."""
+    if not np.isfinite(share):
+        return f'{effect.cause} The other session cannot tell.'
+    if share > 0.5:
+        return f'{effect.cause} Confirmed: {100 * share:.0f} % of its gain carries over.'
+    if share > 0.1:
+        return f'{effect.cause} Changed: only {100 * share:.0f} % of its gain carries over.'
+    return f'{effect.cause} Not there any more: its correction gains nothing in this session.'
