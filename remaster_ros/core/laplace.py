@@ -237,18 +237,19 @@ def _noise_covariance(linearisation: Linearisation, peak: FloatArray) -> FloatAr
     spread = {}
     for index in range(count, len(peak)):
         if peak[index] < 2.0 * std[index]:
-            ratio = np.linspace(0.0, 5.0, 51)
+            # From a thousandth of a sigma to as much as matters, evenly in the logarithm.
+            ratio = np.geomspace(1e-3, 5.0, 100)
             points = np.repeat(peak[None], len(ratio), axis=0)
             points[:, index] = ratio
             log_weight = linearisation.whitened(points)[2]
-            weight = np.exp(log_weight - log_weight.max())
+            weight = np.exp(log_weight - log_weight.max()) * ratio
             spread[index] = float(np.average((ratio - peak[index]) ** 2, weights=weight))
     values, vectors = np.linalg.eigh(precision)
     covariance: FloatArray = (vectors / np.maximum(values, 0.45)) @ vectors.T
     for index, square in spread.items():
         # At the boundary there is no tangent to correlate by.
         covariance[index], covariance[:, index] = 0.0, 0.0
-        covariance[index, index] = max(square, 1e-4)
+        covariance[index, index] = max(square, 1e-6)
     return covariance
 
 

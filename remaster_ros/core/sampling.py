@@ -237,7 +237,8 @@ def _long_enough(
     while length.draws is None and run.acceptance_rate >= poor:
         count = run.draws.shape[1]
         values = quantities(run.draws)
-        ess = np.minimum(convergence.ess_bulk(values), convergence.ess_tail(values))
+        # What never moved has no effective draws.
+        ess = np.nan_to_num(np.minimum(convergence.ess_bulk(values), convergence.ess_tail(values)))
         if length.reached(convergence.r_hat(values), ess) or count >= ALLOWANCE:
             break
         # A tenth more than the rate so far promises, but no more than three times what there is.

@@ -33,7 +33,9 @@ def test_ur10_with_two_solutions() -> None:
     # Its marker lies on the last axis within half a millimetre.
     assert result.identifiable.tolist() == [False, True, True, True, True, False]
     relative = result.accuracy['validation']['relative']
-    assert relative['after']['mean_mm'] == pytest.approx(1.73, abs=0.02)
+    # 1.73 with one noise for all directions; here the one along the line of sight differs.
+    assert result.noise['tracker'].directions
+    assert relative['after']['mean_mm'] <= 1.75
 
 
 def test_irb120_with_three_points() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from calibration_scenes import scene
@@ -71,6 +73,21 @@ def test_an_expansion_that_is_too_rough_is_replaced_by_the_exact_density(
     # 1,000 effective draws each; 1 in 1,000 over all parameters.
     for index in range(found.posterior.size):
         assert ks_2samp(a[::3, index], b[::3, index]).pvalue > 1e-3 / found.posterior.size
+
+
+def test_proposals_fit_a_pose_sigma_that_is_surely_zero() -> None:
+    """Rows of a pose that differ more than poses do: the density falls steeply from zero."""
+    session, _ = scene(44, poses=40, pose_sigma_m=0.0)
+    found = estimate(Problem.of(session))
+    rows = found.posterior.rows
+    # Take most of each pose's mean error away.
+    errors = rows.target - found.model.predict(found.mode.z, rows)
+    means = rows.group_sum(errors, axis=0) / rows.group_size[:, None]
+    calmer = replace(rows, target=rows.target - 0.8 * means[rows.group_of_row])
+    mode = find_mode(replace(found.posterior, rows=calmer))
+    assert mode.eta[-1] < 0.01
+    sampled = sample_posterior(mode, chains=4, draws=500, rng=np.random.default_rng(7))
+    assert sampled.run.acceptance_rate > 0.5
 
 
 def test_sampling_goes_on_until_the_precision_is_reached() -> None:
