@@ -20,12 +20,12 @@ import argparse
 import json
 import multiprocessing
 import os
+import signal
 import sys
 import time
 import warnings
 import zlib
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +123,10 @@ def run(name: str, recipe: Recipe, talk: bool = False) -> dict[str, Any]:
     return line
 
 
+def _run(item: tuple[str, Recipe]) -> dict[str, Any]:
+    return run(*item)
+
+
 def _cause(cause: tuple[str, tuple[int, ...], str]) -> str:
     name, joints, rest = cause
     return ' '.join(part for part in (name, ','.join(map(str, joints)), rest) if part)
@@ -147,6 +151,7 @@ def main() -> None:
     parser.add_argument('--only', nargs='+', choices=GROUPS, default=list(GROUPS))
     parser.add_argument('--kind', nargs='+', help='only sessions with these effects')
     parser.add_argument('--count', type=int, help='sessions (of each kind) instead of all')
+    parser.add_argument('--above', type=float, default=0.0, help='only larger multiples than this')
     parser.add_argument('--jobs', type=int, default=os.cpu_count())
     parser.add_argument('--report', action='store_true', help='print what is known, run nothing')
     parser.add_argument('--session', metavar='NAME', help='run one again and print all of it')
@@ -159,6 +164,7 @@ def main() -> None:
         for group in args.only
         for name, recipe in recipes(group, args.count or GROUPS[group])
         if not args.kind or set(args.kind) & set(recipe.kinds)
+        if recipe.multiple > args.above or not recipe.kinds
     }
     if args.session:
         everything = {n: r for g in GROUPS for n, r in recipes(g, 1000)}
@@ -170,14 +176,11 @@ def main() -> None:
     if args.report:
         todo = {}
     print(f'{len(wanted) - len(todo)} sessions known, {len(todo)} to run', flush=True)
+    # Ended from outside it ends its processes too.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     fresh = multiprocessing.get_context('spawn')
-    with (
-        ProcessPoolExecutor(args.jobs, fresh) as pool,
-        args.results.open('a', encoding='utf-8') as file,
-    ):
-        futures = [pool.submit(run, name, recipe) for name, recipe in todo.items()]
-        for number, future in enumerate(as_completed(futures), 1):
-            line = future.result()
+    with fresh.Pool(args.jobs) as pool, args.results.open('a', encoding='utf-8') as file:
+        for number, line in enumerate(pool.imap_unordered(_run, todo.items()), 1):
             done[line['name']] = line
             file.write(json.dumps(line) + '\n')
             file.flush()
