@@ -24,16 +24,16 @@ from remaster_ros.core.discovery_gain import (
 )
 from remaster_ros.core.discovery_markers import moved_markers
 from remaster_ros.core.discovery_noise import Residuals
-from remaster_ros.core.discovery_screen import Catalogue
 from remaster_ros.core.discovery_select import Search, Selection
 from remaster_ros.core.effects.cell import Cell
 from remaster_ros.core.effects.registry import EFFECTS
+from remaster_ros.core.errors import InsufficientDataError
 from remaster_ros.core.estimate import Estimate, Problem, estimate
 from remaster_ros.core.fit import fit_session
 from remaster_ros.core.outliers import find_outliers
 from remaster_ros.core.result import FitResult
 from remaster_ros.core.sampling import Progress, silent
-from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Session
+from remaster_ros.core.types import BoolArray, FloatArray, Session
 
 Verdict = Literal['effects', 'none', 'undetermined']
 
@@ -168,7 +168,15 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         if name not in untestable and name != 'marker_offset'
         for cell in effect.cells(residuals.scene)
     ]
-    residuals, selection = _searched(found, residuals, cells, rng, progress)
+    search = Search(
+        residuals,
+        tuple(cells),
+        rng,
+        lambda data, solution: _judged(found, data, solution),
+        lambda share: progress('searching causes', share),
+    )
+    selection = search.run()
+    residuals = search.data
     groups, effects = describe(
         residuals, selection, cells, lambda share: progress('comparing look-alikes', share)
     )
@@ -186,33 +194,8 @@ def _offsets(found: Estimate) -> tuple[FloatArray, FloatArray]:
     return found.model.offsets(found.mode.z), std
 
 
-def _searched(
-    found: Estimate,
-    residuals: Residuals,
-    cells: list[Cell],
-    rng: np.random.Generator,
-    report: Progress,
-) -> tuple[Residuals, Selection]:
-    """Search; where the extended model judges other rows gross, search again without those."""
-    for attempt in range(3):
-        search = Search(
-            residuals,
-            Catalogue.of(residuals, cells),
-            rng,
-            lambda share: report('searching causes', share),
-        )
-        selection = search.run()
-        if not selection.solution.cells or attempt == 2:
-            return residuals, selection
-        kept = _kept(found, residuals, selection.solution)
-        if np.array_equal(kept, np.sort(residuals.rows.source)):
-            return residuals, selection
-        residuals = residuals.only(kept, found.model.reference)
-    raise AssertionError('unreachable')
-
-
-def _kept(found: Estimate, residuals: Residuals, solution: Solution) -> IntArray:
-    """Return the optimization rows that the extended model does not call gross."""
+def _judged(found: Estimate, residuals: Residuals, solution: Solution) -> Residuals:
+    """Return the residuals of the rows that the extended model does not call gross."""
     problem = found.problem
     every = residuals.only(problem.fitted, found.model.reference)
     left = residuals.unexplained(solution)[every.rows.source]
@@ -220,5 +203,12 @@ def _kept(found: Estimate, residuals: Residuals, solution: Solution) -> IntArray
     def refit(keep: BoolArray) -> FloatArray:
         return left
 
-    judgement = find_outliers(every.rows, refit, left, problem.sensor_names)
-    return np.sort(every.rows.source[~judgement.gross])
+    try:
+        gross = find_outliers(every.rows, refit, left, problem.sensor_names).gross
+    except InsufficientDataError:
+        # What is left has long tails: no reason to set a tenth of the rows aside.
+        return residuals
+    kept = np.sort(every.rows.source[~gross])
+    if np.array_equal(kept, np.sort(residuals.rows.source)):
+        return residuals
+    return residuals.only(kept, found.model.reference)

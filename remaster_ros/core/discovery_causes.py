@@ -11,9 +11,10 @@ from remaster_ros.core.discovery_evidence import Solution, solve
 from remaster_ros.core.discovery_gain import shares
 from remaster_ros.core.discovery_noise import Residuals
 from remaster_ros.core.discovery_screen import Catalogue, screen
-from remaster_ros.core.discovery_select import Selection, log_prior
+from remaster_ros.core.discovery_select import Selection, grouped, log_prior
 from remaster_ros.core.effects.cell import Cell
 from remaster_ros.core.effects.registry import EFFECTS
+from remaster_ros.core.effects.scene import Scene
 from remaster_ros.core.result import FitResult
 
 # Look-alikes within this of the evidence are named; within the other, the leaders tie.
@@ -113,24 +114,13 @@ def describe(
     if not solution.cells:
         return (), ()
     catalogue = Catalogue.of(data, [cell for cell in cells if cell.name != 'gear_periodic'])
-    groups = sorted(_groups(solution), key=lambda group: -_size(data, solution, group))
+    groups = sorted(grouped(solution.cells), key=lambda group: -_size(data, solution, group))
     parts = shares(data, groups, solution)
     effects = []
     for count, (group, share) in enumerate(zip(groups, parts, strict=True)):
         progress(count / len(groups))
         effects.append(_described(data, selection, catalogue, group, share))
     return tuple(groups), tuple(effects)
-
-
-def _groups(solution: Solution) -> list[tuple[Cell, ...]]:
-    """Return the cells grouped to one cause each."""
-    groups: dict[tuple[str, ...], list[Cell]] = {}
-    for cell in solution.cells:
-        key: tuple[str, ...] = (cell.name, cell.driver, cell.form, cell.subject)
-        if cell.name in ('unnamed', 'joint_coupling', 'gear_periodic'):
-            key += (str(cell.joints), cell.variant)
-        groups.setdefault(key, []).append(cell)
-    return [tuple(group) for group in groups.values()]
 
 
 def _described(
@@ -175,7 +165,7 @@ def _described(
         p_value=float(min(p_values)),
         log_evidence_gain=float(gain),
         confusable_with=alike,
-        cause=in_words(group),
+        cause=in_words(group, data.scene),
         size_m=_size(data, solution, group),
         share=share,
         tied=any(not other.same and other.log_evidence_gain > gain - TIED for other in alike),
@@ -262,8 +252,8 @@ def separate_by(cell: Cell, other: Cell, same: bool) -> str:
     return '; and '.join(dict.fromkeys(texts))
 
 
-def in_words(group: Sequence[Cell]) -> str:
-    """Return the sentence for a technician."""
+def in_words(group: Sequence[Cell], scene: Scene) -> str:
+    """Return the sentence for a technician, with what the session cannot tell."""
     first = group[0]
     joints = _joints(group)
     subject = first.subject or _listed(joints if first.name != 'joint_coupling' else joints[:1])
@@ -276,7 +266,13 @@ def in_words(group: Sequence[Cell]) -> str:
     sentence = EFFECTS[first.name].sentence.format(
         subject=subject, other=other, driver=first.driver.replace('_', ' '), place=place
     )
-    return sentence[:1].upper() + sentence[1:]
+    sentence = sentence[:1].upper() + sentence[1:]
+    if not scene.has_gravity and first.place == 'joint_angle' and 'angle' in first.driver:
+        sentence += (
+            ' It may be gravity that bends the arm: without link masses in the URDF '
+            'nobody can tell the two apart.'
+        )
+    return sentence
 
 
 def _listed(joints: Sequence[int]) -> str:

@@ -34,6 +34,8 @@ LEAST_GAIN = 0.004
 HYSTERESIS = 0.5
 MOST_EXCHANGED = 6
 MOST_MERGED = 4
+# So many cells of one family are a family.
+WHOLE = 3
 # Physical causes that strike all joints or links of an arm alike.
 FAMILIES: tuple[tuple[str, ...], ...] = (
     ('joint_compliance',),
@@ -97,18 +99,37 @@ def log_prior(cells: Sequence[Cell], catalogue: Sequence[Cell]) -> float:
 
 @dataclass(eq=False)
 class Search:
-    """The search on one set of residuals."""
+    """The search on one set of residuals.
+
+    Attributes
+    ----------
+    data
+        The residuals; fewer or more rows as a better model tells gross errors better.
+    cells
+        All that are tried.
+    rng
+        Source of all randomness.
+    judge
+        Residuals and a fit to the same residuals without the rows that it shows to be gross.
+    progress
+        Called with the share that is done.
+    """
 
     data: Residuals
-    catalogue: Catalogue
+    cells: tuple[Cell, ...]
     rng: np.random.Generator
+    judge: Callable[[Residuals, Solution], Residuals]
     progress: Callable[[float], None]
 
     def __post_init__(self) -> None:
-        cells = self.catalogue.cells
-        self._cheap = np.array([cell.name != 'gear_periodic' for cell in cells])
-        order = self.rng.permutation(self.data.poses)
-        self._fold_of_pose = order % min(FOLDS, self.data.poses)
+        self._cheap = np.array([cell.name != 'gear_periodic' for cell in self.cells])
+        self._look_at(self.data)
+
+    def _look_at(self, data: Residuals) -> None:
+        self.data = data
+        self.catalogue = Catalogue.of(data, self.cells)
+        order = self.rng.permutation(data.poses)
+        self._fold_of_pose = order % min(FOLDS, data.poses)
 
     def run(self, given: Solution | None = None) -> Selection:
         """Search until nothing passes both tests."""
@@ -131,8 +152,19 @@ class Search:
                 rejected = step
                 break
             steps.append(step)
-            solution = self.exchange(self.prune(candidate))
+            solution = self._judged(self.keep_what_pays(self.exchange(self.prune(candidate))))
+        empty = self.fit(())
+        assert empty is not None
         return Selection(empty, solution, tuple(steps), rejected)
+
+    def _judged(self, solution: Solution) -> Solution:
+        """Set aside what the better model shows to be gross, and fit again without it."""
+        data = self.judge(self.data, solution)
+        if data is self.data:
+            return solution
+        self._look_at(data)
+        again = self.fit(solution.cells, solution)
+        return solution if again is None else self.prune(again)
 
     def fit(self, cells: Sequence[Cell], start: Solution | None = None) -> Solution | None:
         """Fit a set with its prior probability."""
@@ -240,15 +272,37 @@ class Search:
     def _best_exchange(self, solution: Solution) -> Solution | None:
         """Return the best fit with one cell, or two, replaced by one other; None if none gains."""
         best = None
-        removed = [{cell} for cell in solution.cells]
-        if len(solution.cells) <= MOST_MERGED:
-            removed += [set(pair) for pair in itertools.combinations(solution.cells, 2)]
+        # A family found as a whole stays one: part of it looks like many other things.
+        loose = [cell for cell in solution.cells if self._relatives(solution, cell) < WHOLE]
+        removed = [{cell} for cell in loose]
+        if len(loose) <= MOST_MERGED:
+            removed += [set(pair) for pair in itertools.combinations(loose, 2)]
         for cells in removed:
             for candidate in self.replacements(solution, cells, 3):
                 limit = solution if best is None else best
                 if candidate.log_evidence > limit.log_evidence + HYSTERESIS:
                     best = candidate
+        if best is not None and self.held_out_share(solution, best) < 0.0:
+            return None
         return best
+
+    def _relatives(self, solution: Solution, cell: Cell) -> int:
+        """Return how many cells of a cell's family are in the set."""
+        for family in FAMILIES:
+            if cell.name in family:
+                return sum(other.name in family for other in solution.cells)
+        return 1
+
+    def keep_what_pays(self, solution: Solution) -> Solution:
+        """Drop the causes without which poses left out are predicted better."""
+        for group in grouped(solution.cells):
+            if len(group) == len(solution.cells):
+                continue
+            rest = tuple(cell for cell in solution.cells if cell not in group)
+            without = self.fit(rest, solution)
+            if without is not None and self.held_out_share(without, solution) < 0.0:
+                solution = without
+        return solution
 
     def replacements(self, solution: Solution, cells: set[Cell], count: int) -> list[Solution]:
         """Return fits with the best other cells in the place of these, best first."""
@@ -272,6 +326,17 @@ class Search:
         before = held_out_error(self.data, smaller, larger.noise, self._fold_of_pose)
         after = held_out_error(self.data, larger, larger.noise, self._fold_of_pose)
         return float(1.0 - after.sum() / before.sum())
+
+
+def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
+    """Return the cells of each cause together, in the order of their first."""
+    groups: dict[tuple[str, ...], list[Cell]] = {}
+    for cell in cells:
+        key: tuple[str, ...] = (cell.name, cell.driver, cell.form, cell.subject)
+        if cell.name in ('unnamed', 'joint_coupling', 'gear_periodic'):
+            key += (str(cell.joints), cell.variant)
+        groups.setdefault(key, []).append(cell)
+    return [tuple(group) for group in groups.values()]
 
 
 # A member of a family that the others explain to this share of its size is another name for them.

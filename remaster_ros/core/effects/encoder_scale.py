@@ -37,7 +37,7 @@ EFFECT = Effect(
     source='Mooring, Roth & Driels 1991, Fundamentals of Manipulator Calibration, ch. 2',
     unit='rad/rad',
     plausible=(1e-6, 1e-2),
-    sentence='{subject} turns more or less than it reports (gear ratio or encoder scale).',
+    sentence='The true turn of {subject} is not what is reported (gear ratio or encoder scale).',
     separate_by='poses that turn the joint through its whole range',
     cells=cells,
 )

@@ -59,7 +59,7 @@ EFFECT = Effect(
     source='Eilers & Marx 1996, Statistical Science 11 (P-splines)',
     unit='rad',
     plausible=(1e-6, 5e-3),
-    sentence='{subject} errs in a way that follows its own angle (gearbox or encoder); '
+    sentence='The error of {subject} follows its own angle (gearbox or encoder): '
     'the curve shows where.',
     separate_by='poses that step the joint through its range, all else held; '
     'with and without a payload',
