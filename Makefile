@@ -5,12 +5,13 @@
 #   make check    lint, types, layers; CI runs this and make test
 #   make bench    the benchmarks
 #   make docs     docs/parameters.md from the code
+#   make faults   the tables of docs/faults.md from what the tests observe
 # The first of them makes a virtual environment. With ROS 2 Jazzy sourced its rclpy is used and the
 # system's NumPy kept; else the ROS 2 wheels are installed. PYTHON=... chooses the interpreter.
 
 SHELL := /bin/bash
 .NOTPARALLEL:
-.PHONY: help demo test check bench docs format clean
+.PHONY: help demo test check bench docs faults format clean
 
 ifneq ($(and $(ROS_DISTRO),$(AMENT_PREFIX_PATH)),)
 KIND := ros
@@ -29,7 +30,7 @@ export PYTHON
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 help:
-	@sed -n '1,9s/^# \{0,1\}//p' Makefile
+	@sed -n '1,10s/^# \{0,1\}//p' Makefile
 
 $(VENV)/installed: setup.py setup.cfg $(CONSTRAINTS) tools/make-venv
 	@tools/make-venv $(VENV) $(KIND)
@@ -55,6 +56,10 @@ bench: $(VENV)/installed
 
 docs: $(VENV)/installed
 	$(BIN)/python docs/make_parameters.py
+
+faults: $(VENV)/installed
+	FAULTS_PAGE=write PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest -q \
+		-p pytest_timeout test/integration/test_fault_matrix.py
 
 format: $(VENV)/installed
 	$(BIN)/ruff check --fix .

@@ -20,7 +20,7 @@ from collections import Counter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-MODULES = ('motion', 'visiting', 'settling')
+MODULES = ('motion', 'visiting', 'settling', 'preflight')
 TESTS = [f'test/unit/core/test_{name}.py' for name in MODULES]
 CONFIG = """\
 [mutmut]

@@ -72,19 +72,17 @@ class Move:
 
     def at(self, time_s: float) -> tuple[FloatArray, FloatArray]:
         """Return where the arm should be (rad) and how fast (rad/s), (k,) each."""
-        left = self.duration_s - time_s
-        if time_s <= 0.0:
-            share, rate = 0.0, 0.0
-        elif left <= 0.0:
-            share, rate = 1.0, 0.0
-        elif time_s < RAMP_S:
-            share, rate = 0.5 * self.speed * time_s**2 / RAMP_S, self.speed * time_s / RAMP_S
-        elif left < RAMP_S:
-            share, rate = 1.0 - 0.5 * self.speed * left**2 / RAMP_S, self.speed * left / RAMP_S
-        else:
-            share, rate = self.speed * (time_s - 0.5 * RAMP_S), self.speed
-        way = self.end - self.start
-        return self.start + share * way, rate * way
+        # The speed goes up from the start, and down by as much from where it is to be lost.
+        up, gone_up = _ramp(time_s)
+        down, gone_down = _ramp(time_s - RAMP_S - self.cruise_s)
+        velocity = self.speed * (self.end - self.start)
+        return self.start + (gone_up - gone_down) * velocity, (up - down) * velocity
+
+
+def _ramp(time_s: float) -> tuple[float, float]:
+    """Return a speed that goes from 0 to 1 in `RAMP_S`, and its integral, s."""
+    speed = min(max(time_s / RAMP_S, 0.0), 1.0)
+    return speed, 0.5 * RAMP_S * speed**2 + max(time_s - RAMP_S, 0.0)
 
 
 @dataclass(frozen=True)
@@ -125,7 +123,7 @@ class MotionLimits:
         offsets
             Joint zero-offsets in use, rad, (k,); None for none.
         """
-        shift = np.zeros(len(chain)) if offsets is None else np.asarray(offsets, float)
+        shift = np.zeros(len(chain)) if offsets is None else offsets
         known = np.isfinite(chain.velocity_limits)
         velocity = np.where(known, chain.velocity_limits, _UNKNOWN_VELOCITY)
         return cls(

@@ -8,6 +8,7 @@ that jumps adds at most `LONGEST_STEP_S`, so that no deadline comes early or nev
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,15 +25,13 @@ PROBE_RAD = 1e-6
 """How far it goes, rad: less than the arm repeats, more than the last bit."""
 PROBE_WAIT_S = 0.5
 """After its end a robot that copies commands has copied this one, s."""
-STANDING_S = 0.2
+STANDING_S = 0.25
 """An arm that has not moved for so long stands; it must before it is sent anywhere, s."""
-OLD_REPORT_S = 0.2
+OLD_REPORT_S = 0.25
 """A report older than this (wall time) no longer tells where a moving arm is, s."""
-LAG_S = 0.5
-"""How far an arm may lag behind its trajectory and still follow it, s."""
-ON_PATH_RAD = 0.05
-"""How far an arm that follows its trajectory may be beside it, rad."""
-EARLY_S = 0.1
+LAG_S = 0.25
+"""An arm that is not further from its trajectory than it goes in this time follows it, s."""
+EARLY_S = 0.125
 """An arm that stands so long before its trajectory ends has been stopped, s."""
 REACTION_WALL_S = 0.5
 """Wall time that a command may take to reach the robot and be seen in its reports, s."""
@@ -140,6 +139,26 @@ class _Visit:
     settled: bool = False
 
 
+@dataclass(frozen=True)
+class _Seen:
+    """The last report: positions (rad), speeds (rad/s), stamp, wall time and robot time (s).
+
+    And where, and since when in robot time, the arm has been standing.
+    """
+
+    q: FloatArray
+    velocity: FloatArray
+    stamp: float
+    wall: float
+    time: float
+    stands_at: FloatArray
+    stands_since: float
+
+
+NAMES = ('planner', 'recorder', 'robot')
+"""Who must be heard; what they say about themselves counts in this order."""
+
+
 class Visitor:
     """Visit the joint solutions of a pose one by one, and stop when anything is wrong.
 
@@ -156,31 +175,18 @@ class Visitor:
     ----------
     halted
         Why the arm stays where it is until somebody starts the collection again; ''.
-    trouble
-        What is wrong with the reports of the joints; ''.
     """
 
     def __init__(self, limits: MotionLimits, rules: VisitRules) -> None:
         self.limits, self.rules = limits, rules
         self.halted = ''
-        self._heard = dict.fromkeys(('planner', 'recorder', 'robot'), -np.inf)
-        self._planner_state = 'unknown'
-        self._waiting_for = ''
-        self.trouble = ''
-        self._emergency = False
-        self._solutions: FloatArray | None = None
-        self._next, self._attempt = 0, 1
-        self._visit: _Visit | None = None
+        self._heard: dict[str, float] = {}
+        # Why the arm must not move, by the word of each; '' if it may.
+        self._words: dict[str, str] = {}
         self._failures = 0
         self._probed = False
-        # What the reports say.
-        self._q: FloatArray | None = None
-        self._velocity = np.zeros(len(limits.lower))
-        self._stamp = 0.0
-        self._report_wall = 0.0
-        self._time = 0.0
-        self._stands_at = np.full(len(limits.lower), np.nan)
-        self._stands_since = 0.0
+        self._seen: _Seen | None = None
+        self._begin(())
 
     # What comes in
 
@@ -189,23 +195,19 @@ class Visitor:
 
         The change from another state to ``running`` is somebody's word to go on after a halt.
         """
-        self._heard['planner'] = wall_s
-        if state == 'running' and self._planner_state != 'running':
+        word = '' if state == 'running' else f'planner is {state}'
+        if self._words.get('planner') and not word:
             self.halted, self._failures = '', 0
-        self._planner_state = state
-        return self.tick(wall_s)
+        return self._hear('planner', word, wall_s)
 
     def recorder_says(self, waiting_for: str, wall_s: float) -> list[Action]:
         """Take the recorder's sign of life, and which required sensor it misses ('' for none)."""
-        self._heard['recorder'] = wall_s
-        self._waiting_for = waiting_for
-        return self.tick(wall_s)
+        return self._hear('recorder', f'waiting for {waiting_for}' if waiting_for else '', wall_s)
 
     def plan(self, solutions: FloatArray, wall_s: float) -> list[Action]:
         """Take the solutions of a pose, rad, (m, k), in the order of visiting; none to stop."""
         actions = self._stop('another pose' if len(solutions) else 'stopped', wall_s)
-        self._solutions, self._visit = solutions, None
-        self._next, self._attempt = 0, 1
+        self._begin(solutions)
         return actions + self.tick(wall_s)
 
     def answered(self, solution: int, wall_s: float) -> list[Action]:
@@ -217,37 +219,34 @@ class Visitor:
 
     def unreadable(self, why: str, wall_s: float) -> list[Action]:
         """Take a report that says nothing about the joints."""
-        self._heard['robot'] = wall_s
-        self.trouble = why
-        return self.tick(wall_s)
+        return self._hear('robot', why, wall_s)
 
     def emergency(self, stopped: bool, wall_s: float) -> list[Action]:
         """Take the word of the robot's own safety circuit."""
-        self._emergency = stopped
+        self._words['safety'] = 'the robot says emergency stop' if stopped else ''
         return self.tick(wall_s)
 
     def report(self, stamp_s: float, q: FloatArray, wall_s: float) -> list[Action]:
         """Take reported joint positions, rad, (k,)."""
         if not np.all(np.isfinite(q)):
             return self.unreadable('joint_states are not finite', wall_s)
-        self._heard['robot'] = wall_s
-        self.trouble = ''
-        self._follow(stamp_s, q, wall_s)
+        self._seen = seen = self._look(stamp_s, q, wall_s)
         visit = self._visit
         actions: list[Action] = []
         if visit is not None and not visit.settled:
-            actions = self._judge(visit, stamp_s, q, wall_s)
-        elif visit is not None and self._waiting_for:
-            visit.deadline = self._time + self.rules.answer_timeout_s
-        elif visit is not None and self._time > visit.deadline:
+            actions = self._judge(visit, seen)
+        elif visit is not None and self._words.get('recorder'):
+            visit.deadline = seen.time + self.rules.answer_timeout_s
+        elif visit is not None and seen.time > visit.deadline:
             self._leave(visit)
             actions = [Failed(visit.solution, 'the recorder did not say what became of it')]
-        return actions + self.tick(wall_s)
+        return actions + self._hear('robot', '', wall_s)
 
     def tick(self, wall_s: float) -> list[Action]:
         """Look at the time: stop on silence, go on when nothing is in the way."""
-        if self._emergency and not self.halted:
-            return self._halt('the robot says emergency stop', wall_s)
+        emergency = self._words.get('safety')
+        if emergency and not self.halted:
+            return self._halt(emergency, wall_s)
         blocked = self.blocked(wall_s)
         return self._stop(blocked, wall_s) if blocked else self._go_on(wall_s)
 
@@ -258,81 +257,96 @@ class Visitor:
         """Whether a configuration is under way."""
         return self._visit is not None
 
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the reports of the joints; ''."""
+        return self._words.get('robot', '')
+
     def report_age_s(self, wall_s: float) -> float:
         """Time since the robot was heard, s; infinite if it never was."""
-        return wall_s - self._heard['robot']
+        return self._silence_s('robot', wall_s)
 
     def blocked(self, wall_s: float) -> str:
         """Why the arm must not move; '' if it may."""
         limit = self.rules.heartbeat_s
-        silent = [name for name, heard in self._heard.items() if wall_s - heard > limit]
+        silent = [name for name in NAMES if self._silence_s(name, wall_s) > limit]
         if self.halted:
             return self.halted
         if silent:
             return f'no sign of {", ".join(silent)} for {limit:g} s'
-        if self._planner_state != 'running':
-            return f'planner is {self._planner_state}'
-        if self._waiting_for:
-            return f'waiting for {self._waiting_for}'
-        return self.trouble
+        return next(filter(None, (self._words[name] for name in NAMES)), '')
 
     # Inside
 
-    def _follow(self, stamp_s: float, q: FloatArray, wall_s: float) -> None:
-        """Keep robot time, velocity and standstill."""
-        passed = stamp_s - self._stamp
-        seen_all_along = 0.0 < passed <= LONGEST_STEP_S
-        self._velocity = np.zeros_like(q)
-        if self._q is not None and seen_all_along:
-            self._velocity = (q - self._q) / passed
-        self._time += min(max(passed, 0.0), LONGEST_STEP_S)
-        still = np.all(np.abs(q - self._stands_at) <= self.rules.settle.still_tolerance)
-        if not (still and seen_all_along):
-            self._stands_at, self._stands_since = q, self._time
-        self._q, self._stamp, self._report_wall = q, stamp_s, wall_s
+    def _hear(self, name: str, word: str, wall_s: float) -> list[Action]:
+        self._heard[name], self._words[name] = wall_s, word
+        return self.tick(wall_s)
+
+    def _silence_s(self, name: str, wall_s: float) -> float:
+        return wall_s - self._heard[name] if name in self._heard else np.inf
+
+    def _begin(self, solutions: Sequence[FloatArray] | FloatArray) -> None:
+        """Begin another pose."""
+        self._solutions, self._next, self._attempt = solutions, 0, 1
+        self._visit: _Visit | None = None
+
+    def _look(self, stamp_s: float, q: FloatArray, wall_s: float) -> _Seen:
+        """Follow robot time, speed and standstill; a gap begins them anew."""
+        last = self._seen
+        if last is None:
+            return _Seen(q, q - q, stamp_s, wall_s, stamp_s, q, stamp_s)
+        passed = stamp_s - last.stamp
+        time = last.time + min(max(passed, 0.0), LONGEST_STEP_S)
+        if not 0.0 < passed <= LONGEST_STEP_S:
+            return _Seen(q, q - q, stamp_s, wall_s, time, q, time)
+        velocity = (q - last.q) / passed
+        if np.any(np.abs(q - last.stands_at) > self.rules.settle.still_tolerance):
+            return _Seen(q, velocity, stamp_s, wall_s, time, q, time)
+        return _Seen(q, velocity, stamp_s, wall_s, time, last.stands_at, last.stands_since)
 
     def _go_on(self, wall_s: float) -> list[Action]:
         """Command the next solution of the pose, if the arm stands."""
         actions: list[Action] = []
-        while self._visit is None and self._solutions is not None and self._q is not None:
-            stands = self._time - self._stands_since >= STANDING_S
-            if not stands or self._next >= len(self._solutions):
-                break
-            if not self._probed:
-                return [self._probe(self._q, wall_s)]
+        seen = self._seen
+        stands = seen is not None and seen.time - seen.stands_since >= STANDING_S
+        while stands and self._visit is None and self._next < len(self._solutions):
+            assert seen is not None
             target = self._solutions[self._next]
             outside = self.limits.outside(target)
-            if outside:
+            if not self._probed:
+                actions.append(self._drive(PROBE, self._probe(seen.q), wall_s))
+            elif outside:
                 actions.append(Failed(self._next, outside))
                 self._next += 1
             else:
-                move = self.limits.move(self._q, target)
-                actions.append(self._drive(self._next, move, wall_s))
+                actions.append(self._drive(self._next, self.limits.move(seen.q, target), wall_s))
         return actions
 
-    def _probe(self, q: FloatArray, wall_s: float) -> Drive:
-        """Command where the arm stands, but for a micrometre: it must not come back to the bit."""
+    def _probe(self, q: FloatArray) -> Move:
+        """Return a move by a micrometre: no measurement comes back to its end to the bit."""
         low, high = np.clip((self.limits.lower, self.limits.upper), -1e3, 1e3)
         inward = np.where(2 * q > low + high, -PROBE_RAD, PROBE_RAD)
-        return self._drive(PROBE, self.limits.move(q, q + inward), wall_s)
+        return self.limits.move(q, q + inward)
 
     def _drive(self, solution: int, move: Move, wall_s: float) -> Drive:
-        rules = self.rules
-        deadline = self._time + move.duration_s + rules.settle.settle_s + rules.arrive_timeout_s
+        assert self._seen is not None
+        time, rules = self._seen.time, self.rules
+        deadline = time + move.duration_s + rules.settle.settle_s + rules.arrive_timeout_s
         detector = SettleDetector(move.end, rules.settle)
-        self._visit = _Visit(solution, move, detector, self._time, self._stamp, wall_s, deadline)
+        self._visit = _Visit(solution, move, detector, time, self._seen.stamp, wall_s, deadline)
         return Drive(solution, move.waypoints())
 
     def _leave(self, visit: _Visit) -> None:
         """Be done with a configuration: the next one follows."""
         self._visit, self._next, self._attempt = None, visit.solution + 1, 1
 
-    def _judge(self, visit: _Visit, stamp_s: float, q: FloatArray, wall_s: float) -> list[Action]:
+    def _judge(self, visit: _Visit, seen: _Seen) -> list[Action]:
         """Say what becomes of the configuration that the arm is on its way to."""
-        detector, rules = visit.detector, self.rules
-        arrived = self._time - visit.sent > visit.move.duration_s + PROBE_WAIT_S
-        settled = detector.update(stamp_s, q) == 'settled'
-        if (arrived or settled) and np.array_equal(q, visit.move.end):
+        detector, rules, wall_s = visit.detector, self.rules, seen.wall
+        under_way_s = seen.time - visit.sent
+        arrived = under_way_s > visit.move.duration_s + PROBE_WAIT_S
+        settled = detector.update(seen.stamp, seen.q) == 'settled'
+        if (arrived or settled) and np.array_equal(seen.q, visit.move.end):
             why = 'joint_states repeat what was commanded to the last bit: no measurement'
             return self._halt(f'{why}; switch the driver to measured positions', wall_s)
         if visit.solution == PROBE:
@@ -342,32 +356,30 @@ class Visitor:
         if settled:
             assert detector.still_since is not None
             visit.settled, self._failures = True, 0
-            visit.deadline = self._time + rules.answer_timeout_s
+            visit.deadline = seen.time + rules.answer_timeout_s
             motion_s = detector.still_since - visit.sent_stamp
-            settle_s = stamp_s - detector.still_since
-            return [Settled(visit.solution, stamp_s, detector.mean, motion_s, settle_s)]
-        distance = float(np.max(np.abs(q - visit.move.end)))
-        stood_s = self._time - max(self._stands_since, visit.sent)
+            settle_s = seen.stamp - detector.still_since
+            return [Settled(visit.solution, seen.stamp, detector.mean, motion_s, settle_s)]
+        distance = float(np.max(np.abs(seen.q - visit.move.end)))
+        stood_s = min(seen.time - seen.stands_since, under_way_s)
         reacted = wall_s - visit.sent_wall > REACTION_WALL_S
         if distance > rules.settle.arrive_tolerance and stood_s >= rules.stall_s and reacted:
-            return self._stalled(visit, q, distance, wall_s)
-        if self._time > visit.deadline:
+            return self._stalled(visit, seen, distance)
+        if seen.time > visit.deadline:
             return self._fail(visit, 'did not come to rest at its target in time', wall_s)
         return []
 
-    def _stalled(
-        self, visit: _Visit, q: FloatArray, distance: float, wall_s: float
-    ) -> list[Action]:
-        """The arm stands, and not where it was sent."""
-        if np.max(np.abs(q - visit.move.start)) <= self.rules.settle.arrive_tolerance:
+    def _stalled(self, visit: _Visit, seen: _Seen, distance: float) -> list[Action]:
+        """Act on an arm that stands, and not where it was sent."""
+        if np.max(np.abs(seen.q - visit.move.start)) <= self.rules.settle.arrive_tolerance:
             if self._attempt < self.rules.attempts:
                 self._visit, self._attempt = None, self._attempt + 1
                 return []
-            return self._halt('the robot does not take commands: see its controller', wall_s)
-        if self._stands_since - visit.sent < visit.move.duration_s - EARLY_S:
+            return self._halt('the robot does not take commands: see its controller', seen.wall)
+        if seen.stands_since - visit.sent < visit.move.duration_s - EARLY_S:
             why = 'the robot stopped on its way: an emergency or protective stop?'
-            return self._halt(why, wall_s)
-        return self._fail(visit, f'arrived elsewhere: {distance:.4f} rad off', wall_s)
+            return self._halt(why, seen.wall)
+        return self._fail(visit, f'arrived elsewhere: {distance:.4f} rad off', seen.wall)
 
     def _fail(self, visit: _Visit, reason: str, wall_s: float) -> list[Action]:
         """Give a configuration up; halt where that happens too often in a row."""
@@ -387,22 +399,18 @@ class Visitor:
 
         An arm that has settled stands already: its reading goes on, only no command follows it.
         """
-        visit = self._visit
-        if visit is None or visit.settled or self._q is None:
+        visit, seen = self._visit, self._seen
+        if visit is None or visit.settled or seen is None:
             return []
-        q, velocity = self._q, self._velocity
-        age_s = wall_s - self._report_wall
-        if age_s > OLD_REPORT_S and self._follows(visit):
+        q, velocity = seen.q, seen.velocity
+        age_s = wall_s - seen.wall
+        if age_s > OLD_REPORT_S and self._follows(visit, seen):
             # It has gone on since; where it stood would be a way back at many times its speed.
-            q, velocity = visit.move.at(self._time - visit.sent + age_s)
+            q, velocity = visit.move.at(seen.time - visit.sent + age_s)
         self._visit, self._attempt = None, 1
         return [Stop(self.limits.stop(q, velocity), reason)]
 
-    def _follows(self, visit: _Visit) -> bool:
+    def _follows(self, visit: _Visit, seen: _Seen) -> bool:
         """Whether the last report was where the trajectory led."""
-        assert self._q is not None
-        time_s = self._time - visit.sent
-        lags = np.linspace(0.0, LAG_S, 6)
-        return any(
-            np.max(np.abs(self._q - visit.move.at(time_s - lag)[0])) <= ON_PATH_RAD for lag in lags
-        )
+        expected, _ = visit.move.at(seen.time - visit.sent)
+        return bool(np.all(np.abs(seen.q - expected) <= LAG_S * self.limits.velocity))

@@ -1,0 +1,518 @@
+"""Every device and node x every kind of fault: what happens, and the table of it in the docs.
+
+In stepped time where the loop is at stake (`fault_bench`), over real sockets where it is a
+driver's business. Whatever happens: no wrong observation, no command outside the limits, an arm
+that stands while it must not move, and a run that ends once the fault is over. `make faults`
+writes the table.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+import time
+from pathlib import Path
+
+import fault_bench
+import numpy as np
+import optitrack_world
+import pytest
+import tracker_world
+from fault_bench import NODES, SENSOR_OF, Bench, Node
+
+from remaster_ros.core.errors import DeviceError, InputError
+from remaster_ros.core.visiting import Visitor
+from remaster_ros.drivers.laser_tracker import LaserTrackerClient, LaserTrackerSettings
+from remaster_ros.drivers.natnet import MarkerChoice, NatNetClient, NatNetSettings
+from remaster_ros.fakes.laser_tracker import FakeLaserTracker
+from remaster_ros.fakes.laser_tracker_settings import TrackerBehaviour
+from remaster_ros.fakes.optitrack import FakeOptiTrackServer
+from remaster_ros.storage.results import joint_offsets_rad, read_fit
+
+PAGE = Path(__file__).parents[2] / 'docs' / 'faults.md'
+KINDS = ('off', 'stuck', 'wrong', 'slow', 'delayed', 'intermittent', 'garbage', 'restarted')
+BEGIN, END = '<!-- observed by the tests: {} -->', '<!-- end -->'
+observed: dict[str, dict[str, str]] = {}
+
+
+def observe(who: str, kind: str, text: str) -> None:
+    """Note what was seen, without what depends on the moment."""
+    text = re.sub(r' \([^)]*\)', '', text).replace('|', '/')
+    text = re.sub(r'\d+\.\d+|\d+(?= mm| usable| readings)', '…', text)
+    text = re.sub(r'(system status|status|search at a position) impossible', 'impossible', text)
+    text = re.sub(r'no answer to the [a-z ]+ within', 'no answer within', text)
+    observed.setdefault(who, {})[kind] = text[0].upper() + text[1:]
+
+
+# The robot, and everything that talks with the bridge: in stepped time
+
+
+ROBOT = {
+    'off': {'off': 1},
+    'stuck': {'dropped': 1},
+    'wrong': {'elsewhere': 0.02},
+    'slow': {'slow': 3.0},
+    'delayed': {'late': 1.0},
+    'intermittent': {'intermittent': 5.0},
+    'garbage': {'nan': 1},
+    'restarted': {'off': 1},
+}
+NAMED = {
+    'emergency stop': {'estop': 1},
+    'drops a command': {'dropped': 1},
+    'arrives elsewhere': {'elsewhere': 0.02},
+    'never arrives': {'slow': 20.0},
+    'drifts while settling': {'drift': 1e-3},
+    'stops publishing': {'off': 1},
+    'publishes commanded as measured': {'copy': 1},
+    'reports NaN': {'nan': 1},
+    'joints renamed': {'renamed': 1},
+    'joints reordered': {'reordered': 1},
+    'clock jumps an hour ahead': {'clock': 3600.0},
+    'clock jumps an hour back': {'clock': -3600.0},
+}
+
+
+@pytest.fixture
+def bench(tmp_path):
+    bench = Bench(tmp_path)
+    yield bench
+    bench.close()
+
+
+def under_way(bench: Bench) -> None:
+    """Let the first configuration be recorded and the second one begin."""
+    assert bench.run(60.0, lambda: len(bench.recorded) == 1)
+    assert bench.run(20.0, lambda: bench.speed() > 0.02)
+    bench.run(0.3)
+
+
+def tell(bench: Bench) -> str:
+    """Let the run end, starting it again where it was halted; say what happened."""
+    collected = False
+    for _ in range(6):
+        if bench.run(90.0, lambda: bench.done() or bench.state == 'paused') and bench.done():
+            break
+        bench.run(2.0)
+        collected, bench.state = True, 'running'
+    assert bench.done(), f'it did not end: {bench.reasons}, open {bench.open}'
+    bench.check()
+    assert set(bench.recorded) | bench.gave_up == {0, 1, 2}
+    missing = [
+        f'{name} missing at one configuration'
+        for name in SENSOR_OF.values()
+        if any(name not in readings for readings in bench.recorded.values())
+    ]
+    lost = sorted(bench.gave_up - set(bench.recorded))
+    given_up = [f'{len(lost)} of 3 configurations given up'] if lost else []
+    end = 'goes on after /remaster/collect' if collected else 'goes on by itself'
+    if not bench.reasons:
+        return 'no harm: nothing is lost and nothing stops'
+    result = '; '.join(missing + given_up) or 'nothing lost'
+    return f'{"; ".join(bench.reasons)}; {end}, {result}'
+
+
+def stands_if_it_must(bench: Bench) -> None:
+    if bench.visitor.blocked(bench.t):
+        late = [bench.speed() for _ in range(20) if bench.step() is None]
+        if bench.visitor.blocked(bench.t):
+            assert max(late) < 1e-3
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_robot(bench, kind):
+    under_way(bench)
+    bench.inject(**ROBOT[kind])
+    bench.run(8.0)
+    stands_if_it_must(bench)
+    bench.inject(**({'reordered': 1} if kind == 'restarted' else {}))
+    observe('robot', kind, tell(bench))
+
+
+@pytest.mark.parametrize('fault', NAMED)
+def test_named_faults_of_the_robot(bench, fault):
+    under_way(bench)
+    bench.inject(**NAMED[fault])
+    bench.run(14.0)
+    stands_if_it_must(bench)
+    bench.inject()
+    observe('named', f'robot: {fault}', tell(bench))
+
+
+def test_an_emergency_stop_that_is_released_does_not_let_the_arm_go(bench):
+    under_way(bench)
+    bench.inject(estop=1)
+    bench.run(3.0)
+    bench.inject()
+    assert bench.visitor.halted
+    speeds = [bench.speed() for _ in range(200) if bench.step() is None]
+    assert max(speeds) < 1e-3
+
+
+@pytest.mark.parametrize('fault', ['the first command is copied', 'no motion before it'])
+def test_commanded_as_measured_is_found_before_the_first_motion(bench, fault):
+    bench.inject(copy=1)
+    start = bench.world.reported(bench.t)[0]
+    assert bench.run(20.0, lambda: bench.visitor.halted)
+    assert 'to the last bit' in bench.visitor.halted
+    assert np.max(np.abs(bench.world.reported(bench.t)[0] - start)) < 1e-4
+    assert not bench.recorded
+
+
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('name', NODES)
+def test_node(bench, name, kind):
+    under_way(bench)
+    bench.node = Node(name, kind, faulty=True)
+    wrong = {
+        'wrong': bench.solutions[sorted(bench.open)] + np.deg2rad([0, 400, 0, 0, 0, 0, 0]),
+        'garbage': bench.solutions[sorted(bench.open)] * np.nan,
+    }
+    if name == 'pose_planner' and kind in wrong:
+        bench.plan(wrong[kind])
+    elif name == 'robot_bridge':
+        break_bridge(bench, kind)
+    elif name == 'recorder' and kind in ('off', 'restarted'):
+        bench.pairing = None
+    bench.run(12.0)
+    stands_if_it_must(bench)
+    bench.node = Node()
+    if name == 'robot_bridge' and kind in ('off', 'restarted', 'garbage', 'wrong'):
+        bench.visitor = Visitor(bench.limits, fault_bench.RULES)
+    if kind in ('off', 'restarted') and name in ('pose_planner', 'robot_bridge', 'recorder'):
+        bench.run(1.5)
+        bench.announce_again()
+    elif name in ('pose_planner', 'robot_bridge') and kind in wrong:
+        bench.announce_again()
+    observe(name, kind, tell(bench))
+
+
+def break_bridge(bench: Bench, kind: str) -> None:
+    """What the others see of a bridge that does not do its part."""
+    if kind == 'wrong':
+        bench._take(0, bench.t, bench.solutions[0] + 0.5)
+    elif kind == 'garbage':
+        bench._take(0, bench.t, bench.solutions[0] * np.nan)
+
+
+# The devices at their wires
+
+
+MOCAP = {
+    'off': {'off': 1},
+    'stuck': {'stopped': 1},
+    'wrong': {'jumping': 1},
+    'slow': {'slow': 4},
+    'delayed': {'late': 1.0},
+    'intermittent': {'occluded': 1},
+    'garbage': {'garbage': 1},
+    'restarted': {'renumbered': 1},
+}
+NAMED_MOCAP = {
+    'marker occluded': {'occluded': 1},
+    'marker model-filled': {'filled': 1},
+    'marker jumping': {'jumping': 1},
+    'stream stopped': {'stopped': 1},
+    'stream restarted': {'renumbered': 1},
+    'frames duplicated': {'duplicate': 1},
+    'frames out of order': {'reordered': 1},
+}
+
+
+class FaultyMarkerWorld(optitrack_world.MarkerWorld):
+    """A circling marker whose server has the faults that the test sets."""
+
+    def __init__(self):
+        super().__init__()
+        self.numbers = {}
+
+    def now(self):
+        return time.monotonic()
+
+    def sleep(self, seconds):
+        time.sleep(max(seconds, 0.0))
+
+    def faults(self, device):
+        return self.numbers
+
+    def line_of_sight(self, sensor, t):
+        return 'occluded' not in self.numbers
+
+
+@pytest.fixture
+def bar():
+    """Return (world, client, samples) of a server and the driver that follows its marker."""
+    world, samples = FaultyMarkerWorld(), []
+    port = optitrack_world.free_port()
+    with FakeOptiTrackServer(
+        world,
+        optitrack_world.SENSOR,
+        np.random.default_rng(1),
+        rate_hz=100.0,
+        command_port=0,
+        data_port=port,
+    ) as server:
+        settings = NatNetSettings(
+            server='127.0.0.1',
+            local_interface='127.0.0.1',
+            command_port=server.command_port,
+            data_port=port,
+            marker=MarkerChoice(rigid_body='tool', max_speed_m_s=1.0),
+            silence_s=0.4,
+        )
+        with NatNetClient(settings, samples.append, clock=world.now) as client:
+            assert optitrack_world.eventually(lambda: len(samples) > 5)
+            yield world, client, samples
+
+
+def spoil_bar(bar, numbers: dict[str, float]) -> str:
+    """Inject, let it tell what is wrong, end it; readings come again by themselves."""
+    world, client, samples = bar
+    before = dict(client.status().dropped)
+    count = len(samples)
+    world.numbers = numbers
+    harmless = {'slow', 'late', 'renumbered', 'duplicate', 'reordered', 'jumping'} & set(numbers)
+    if harmless:
+        assert optitrack_world.eventually(lambda: len(samples) > count + 20)
+    else:
+        assert optitrack_world.eventually(lambda: client.diagnosis().fault != 'none')
+        time.sleep(0.3)
+    said = client.diagnosis().message
+    now = client.status()
+    reason = max(now.dropped, key=lambda r: now.dropped[r] - before[r])
+    many = now.dropped[reason] - before[reason] > 4
+    world.numbers, count = {}, len(samples)
+    assert optitrack_world.eventually(lambda: len(samples) > count + 5)
+    assert optitrack_world.eventually(lambda: not client.diagnosis().message)
+    # No reading from where the marker never was: it circles at 0.3 m.
+    radii = [np.hypot(*sample.position[:2]) for sample in samples]
+    assert np.max(np.abs(np.array(radii) - 0.3)) < 5e-3
+    parts = [said] if said and not harmless else []
+    parts += [f'counted and dropped as {reason.value.replace("_", " ")}'] if many else []
+    return '; '.join([*parts, 'readings go on by themselves'])
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_optitrack(bar, kind):
+    observe('OptiTrack', kind, spoil_bar(bar, MOCAP[kind]))
+
+
+def test_another_version_after_a_restart():
+    """The server comes back with another bitstream: asked again, and read."""
+    world, samples = FaultyMarkerWorld(), []
+    port, command_port = optitrack_world.free_port(), optitrack_world.free_port()
+    settings = NatNetSettings(
+        server='127.0.0.1', local_interface='127.0.0.1', command_port=command_port,
+        data_port=port, marker=MarkerChoice(rigid_body='tool'), silence_s=0.4,
+    )  # fmt: skip
+    versions = []
+    with NatNetClient(settings, samples.append, clock=world.now) as client:
+        for version in ((3, 1), (4, 1), (2, 10)):
+            count = len(samples)
+            with FakeOptiTrackServer(
+                world, optitrack_world.SENSOR, np.random.default_rng(1), version=version,
+                command_port=command_port, data_port=port,
+            ):  # fmt: skip
+                assert optitrack_world.eventually(lambda c=count: len(samples) > c + 5)
+                versions.append(client.status().version[:2])
+    assert versions == [(3, 1), (4, 1), (2, 10)]
+    observe('named', 'OptiTrack: version changed', 'asked again, and read as what it is')
+
+
+def test_two_servers_on_one_group(bar):
+    """Another bar streams to the same group: its frames are counted, and never a reading."""
+    _world, client, samples = bar
+    other = FaultyMarkerWorld()
+    other.marker_in_sensor = lambda sensor, t: np.array([0.0, 0.0, 1.0])
+    count = len(samples)
+    settings = client._settings
+    with FakeOptiTrackServer(
+        other, optitrack_world.SENSOR, np.random.default_rng(2), host='127.0.0.2',
+        command_port=0, data_port=settings.data_port,
+    ):  # fmt: skip
+        assert optitrack_world.eventually(lambda: len(samples) > count + 20)
+        foreign = {reason.value: n for reason, n in client.status().dropped.items()}['foreign']
+        addresses = client.status().foreign
+    radii = [np.hypot(*sample.position[:2]) for sample in samples]
+    assert np.max(np.abs(np.array(radii) - 0.3)) < 5e-3
+    heard = f'counted and dropped as foreign, from {", ".join(addresses)}' if foreign else ''
+    assert heard
+    observe('named', 'OptiTrack: two servers on one group', f'{heard}; readings go on')
+
+
+def test_a_second_measurement_while_busy():
+    """Refused by name; the first one is not disturbed."""
+    world = FaultyReflectorWorld()
+    behaviour = TrackerBehaviour(warm_up_s=0.0, search_failure_share=0.0)
+    settings = LaserTrackerSettings(integration_s=10.0)
+    with FakeLaserTracker(world, 'tracker', np.random.default_rng(1), behaviour=behaviour) as fake:
+        client = LaserTrackerClient(
+            *fake.address, settings=settings, now=world.now, sleep=world.sleep
+        )
+        with client:
+            client.ensure_locked(tracker_world.MARKER)
+            first = []
+            thread = threading.Thread(target=lambda: first.append(client.measure()))
+            thread.start()
+            time.sleep(0.3)
+            with pytest.raises(DeviceError) as refusal:
+                client.measure()
+            thread.join(30)
+    assert np.linalg.norm(first[0].position - tracker_world.MARKER) < 1e-3
+    why = str(refusal.value).split(': ', 1)[1]
+    text = f'{why}; the first one is not disturbed'
+    observe('named', 'laser tracker: a second measurement while busy', text)
+
+
+@pytest.mark.parametrize('fault', NAMED_MOCAP)
+def test_named_faults_of_the_bar(bar, fault):
+    observe('named', f'OptiTrack: {fault}', spoil_bar(bar, NAMED_MOCAP[fault]))
+
+
+TRACKER = {
+    'off': {'off': 1},
+    'stuck': {'stuck': 1},
+    'slow': {'slow': 3.0},
+    'delayed': {'slow': 1.5},
+    'intermittent': {'occluded': 1},
+    'garbage': {'garbage': 1},
+    'restarted': {'renumbered': 1},
+    'wrong': {'swapped': 0.2},
+    'TCP cut in the middle of a packet': {'cut': 7},
+    'search fails': {'occluded': 1},
+    'instrument warm-up': {'renumbered': 1},
+}
+
+
+class FaultyReflectorWorld(tracker_world.ReflectorWorld):
+    """A standing reflector whose tracker has the faults that the test sets."""
+
+    def __init__(self):
+        super().__init__()
+        self.numbers = {}
+
+    def faults(self, device):
+        return self.numbers
+
+    def line_of_sight(self, sensor, t):
+        return 'occluded' not in self.numbers
+
+    def marker_in_sensor(self, sensor, t):
+        beside = np.array([self.numbers.get('swapped', 0.0), 0.0, 0.0])
+        return super().marker_in_sensor(sensor, t) + beside
+
+
+def measured(client: LaserTrackerClient) -> tuple[str, np.ndarray | None]:
+    """Measure as the node does, connecting again where the connection is lost."""
+    try:
+        if not client.connected:
+            client.connect()
+            client.initialise()
+        client.ensure_locked(tracker_world.MARKER, attempts=1)
+        return '', client.measure().position
+    except DeviceError as error:
+        return str(error), None
+
+
+@pytest.mark.parametrize('kind', TRACKER)
+def test_laser_tracker(kind):
+    world = FaultyReflectorWorld()
+    behaviour = TrackerBehaviour(warm_up_s=3.0, search_failure_share=0.0)
+    settings = LaserTrackerSettings(
+        search_timeout_s=3.0, integration_s=0.5, reply_timeout_s=2.0, connect_timeout_s=2.0
+    )
+    with FakeLaserTracker(world, 'tracker', np.random.default_rng(1), behaviour=behaviour) as fake:
+        client = LaserTrackerClient(
+            *fake.address, settings=settings, now=world.now, sleep=world.sleep
+        )
+        deadline = time.monotonic() + 30
+        while measured(client)[1] is None:
+            assert time.monotonic() < deadline
+        world.numbers = TRACKER[kind]
+        if kind in ('intermittent', 'wrong', 'search fails'):
+            fake.break_beam()
+        time.sleep(0.3)
+        why, position = measured(client)
+        world.numbers = {}
+        parts = [re.sub(r'laser tracker 127.0.0.1:\d+', 'laser tracker', why)] if why else []
+        if position is not None:
+            off = np.linalg.norm(position - tracker_world.MARKER)
+            assert (off > 0.1) == (kind == 'wrong')
+            parts.append(
+                'the reading is another reflector: refused by its place'
+                if off > 0.1
+                else 'waited for; the reading is good'
+            )
+        attempts = 0
+        while True:
+            attempts += 1
+            again, position = measured(client)
+            if position is not None and np.linalg.norm(position - tracker_world.MARKER) < 1e-3:
+                break
+            if position is not None:
+                fake.break_beam()
+            assert time.monotonic() < deadline + 30, again
+            time.sleep(0.1)
+        client.close()
+    row = 'laser tracker' if kind in KINDS else 'named'
+    name = kind if kind in KINDS else f'laser tracker: {kind}'
+    observe(row, name, '; '.join([*parts, 'measures again by itself']))
+
+
+# The optimizer takes no part in the collection; what it can do wrong is hand on wrong offsets
+
+
+FIT = """{"format": "remaster-fit/1", "joint_offsets": [%s]}"""
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_optimizer(bench, kind, tmp_path):
+    under_way(bench)
+    text = tell(bench)
+    if kind in ('wrong', 'garbage'):
+        path = tmp_path / 'fit.json'
+        path.write_text(FIT % '' if kind == 'wrong' else '\0\xff{"format": NaN')
+        with pytest.raises(InputError) as refusal:
+            joint_offsets_rad(read_fit(path), fault_bench.CHAIN.joint_names)
+        message = str(refusal.value).replace(f'{path}: ', '')
+        text = f'the bridge refuses such offsets and does not start: {message}'
+    observe('optimizer', kind, text)
+
+
+# The table
+
+
+def table(rows: dict[str, dict[str, str]]) -> str:
+    """Return the matrix."""
+    lines = ['| | ' + ' | '.join(KINDS) + ' |', '|---' * (len(KINDS) + 1) + '|']
+    for who, cells in rows.items():
+        lines.append('| ' + ' | '.join([f'**{who}**', *(cells[kind] for kind in KINDS)]) + ' |')
+    return '\n'.join(lines)
+
+
+def listing(cells: dict[str, str]) -> str:
+    """Return the list of the faults that have a name."""
+    return '\n'.join(
+        ['| fault | what happens |', '|---|---|', *(f'| {k} | {v} |' for k, v in cells.items())]
+    )
+
+
+def test_the_page_says_what_was_observed():
+    """Written anew with FAULTS_PAGE=write; else compared. Needs the whole file to have run."""
+    named = observed.get('named', {})
+    rows = {who: cells for who, cells in observed.items() if who != 'named'}
+    expected = {'robot', *NODES, 'OptiTrack', 'laser tracker', 'optimizer'}
+    if set(rows) != expected or any(set(cells) != set(KINDS) for cells in rows.values()):
+        pytest.skip('only a part of the matrix has run')
+    text = PAGE.read_text()
+    for name, body in (('matrix', table(rows)), ('named', listing(named))):
+        begin = BEGIN.format(name)
+        head, rest = text.split(begin)
+        old, tail = rest.split(END, 1)
+        if os.environ.get('FAULTS_PAGE') == 'write':
+            text = f'{head}{begin}\n\n{body}\n\n{END}{tail}'
+        else:
+            assert old.strip() == body, f'{PAGE.name} is not what was observed: make faults'
+    if os.environ.get('FAULTS_PAGE') == 'write':
+        PAGE.write_text(text)
