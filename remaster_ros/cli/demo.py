@@ -37,6 +37,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the paper's size: 60 candidate poses each",
     )
     parser.add_argument(
+        '--hide',
+        action='append',
+        default=[],
+        metavar='NAME[@JOINT][:MM]',
+        help='let something else be wrong with the arm or a sensor, such as backlash@4:0.3 (mm at '
+        'the tool), and look for it; `random` draws one; may be repeated',
+    )
+    parser.add_argument(
         '--rate',
         type=number(1.0, 20.0),
         default=10.0,
@@ -56,6 +64,7 @@ def run(args: argparse.Namespace) -> NoReturn:
             'rate': args.rate,
             'figures': not args.no_figures,
             'quiet': args.quiet,
+            'hide': ','.join(args.hide),
         },
     )
 

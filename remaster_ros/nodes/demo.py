@@ -29,13 +29,20 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from std_srvs.srv import Trigger
 
 from remaster_ros.core.errors import DeviceError, InputError, RemasterError
+from remaster_ros.fakes.hiding import Request
 from remaster_ros.fakes.setup import make_world
-from remaster_ros.nodes.demo_summary import ConfigurationTimes, print_offsets, print_times
+from remaster_ros.nodes.demo_summary import (
+    ConfigurationTimes,
+    print_hidden,
+    print_offsets,
+    print_times,
+)
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.processes import NodeProcesses
 from remaster_ros.nodes.running import report
 from remaster_ros.nodes.status import Event, listen
 from remaster_ros.storage.cell import config_path, read_cell
+from remaster_ros.storage.discovery_results import read_discovery
 from remaster_ros.storage.logbook import is_complete
 from remaster_ros.storage.results import read_fit
 from remaster_ros.storage.session_writer import JOURNAL
@@ -64,6 +71,9 @@ class Parameters:
     )
     rate: float = parameter(
         10.0, 'how many times as fast as the wall clock world time runs', low=1.0, high=20.0
+    )
+    hide: str = parameter(
+        '', 'what else is wrong with the hidden arm: NAME[@JOINT][:SIZE_MM],…, or random'
     )
     figures: bool = parameter(True, 'write figures and the report')
     quiet: bool = parameter(False, 'print nothing but errors')
@@ -113,6 +123,8 @@ class Demo:
         self.console = Console(quiet=self.p.quiet)
         self.out = output_folder(Path(self.p.out))
         self.session, self.fit = self.out / 'session', self.out / 'fit'
+        self.discovery = self.out / 'discovery'
+        self.requests = [Request.parse(text) for text in self.p.hide.split(',') if text]
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self.hidden = Path(tempfile.mkdtemp(prefix='remaster_world_'))
@@ -126,7 +138,9 @@ class Demo:
     def run(self) -> None:
         """Collect, fit, print."""
         cell = read_cell('demo')
-        world = make_world(self.hidden, cell, self.p.seed, self.p.rate)
+        world = make_world(
+            self.hidden, cell, self.p.seed, self.p.rate, self.requests, self.p.candidates
+        )
         self.console.print(f'hidden world drawn with seed {self.p.seed}; starting the nodes')
         self._start()
         self._wait(self._ready, 60.0, 'the nodes to come up')
@@ -135,14 +149,25 @@ class Demo:
         self.console.print('fitting')
         self._trigger('/remaster/fit', 'optimizer', timeout_s=300.0)
         result = read_fit(self.fit / 'fit.json')
+        discovery = self._discover() if self.requests else None
         self.processes.stop()
         print_times(self.console, self.node.times)
         # Only here, after everything that estimates has ended, is the truth opened.
         print_offsets(self.console, result, world.truth)
+        if discovery is not None:
+            print_hidden(self.console, discovery, world.truth)
         (self.out / 'truth.yaml').write_text(yaml.safe_dump(world.truth.to_dict()))
         self.console.print(f'session: {self.session}')
         name = 'report.html' if self.p.figures else 'fit.json'
         self.console.print(f'report: {self.fit / name}')
+        if discovery is not None:
+            name = 'report.html' if self.p.figures else 'discovery.json'
+            self.console.print(f'causes: {self.discovery / name}')
+
+    def _discover(self) -> dict[str, Any]:
+        self.console.print('looking for causes')
+        self._trigger('/remaster/discover', 'optimizer', timeout_s=300.0)
+        return read_discovery(self.discovery / 'discovery.json')
 
     def _start(self) -> None:
         common = config_path('fake.yaml')
@@ -163,6 +188,7 @@ class Demo:
             'optimizer': {
                 'session': str(self.session),
                 'out': str(self.fit),
+                'discovery': str(self.discovery),
                 'seed': self.p.seed,
                 'figures': self.p.figures,
             },

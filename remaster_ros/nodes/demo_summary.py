@@ -8,6 +8,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from remaster_ros.fakes.answers import causes, describe, named_cause, true_parameters
 from remaster_ros.fakes.world import Truth
 from remaster_ros.nodes.status import Event
 
@@ -111,3 +112,46 @@ def print_offsets(console: Console, fit: dict[str, Any], truth: Truth) -> None:
         ]
         accuracy.add_row(metric.replace('_', '-'), *cells)
     console.print(accuracy)
+
+
+def print_hidden(console: Console, discovery: dict[str, Any], truth: Truth) -> None:
+    """Print what was found beside what was hidden, which is opened only here, and the gain."""
+    found: dict[Any, list[dict[str, Any]]] = {}
+    for effect in discovery['effects']:
+        for cause in named_cause(effect):
+            found.setdefault(cause, []).append(effect)
+    hidden = [(cause, effect) for effect in truth.effects for cause in causes(effect)]
+    table = Table(title='beyond the zero-offsets')
+    for heading in ('hidden truth', 'found', 'parameter', 'estimate', 'std', 'truth', 'unit'):
+        table.add_column(
+            heading, justify='left' if heading in ('hidden truth', 'found') else 'right'
+        )
+    for cause, effect in hidden:
+        claims = found.pop(cause, [])
+        table.add_row(describe(cause), 'yes' if claims else 'no', *[''] * 5)
+        true = true_parameters(effect)
+        for row in (row for claim in claims for row in claim['parameters']):
+            if row['name'] in true:
+                figures = (f'{row[key]:.4g}' for key in ('value', 'std'))
+                table.add_row(
+                    '', '', row['name'], *figures, f'{true[row["name"]]:.4g}', row['unit']
+                )
+    for cause in found:
+        table.add_row('nothing of the kind', describe(cause), *[''] * 5)
+    console.print(table)
+    for effect in discovery['effects']:
+        console.print(effect['cause'])
+        for other in effect['confusable_with']:
+            console.print(
+                f'  looks like {other["name"]}; tell them apart by: {other["separate_by"]}'
+            )
+    gain = discovery['gain']
+    if gain['held_out_rms_before_m'] is not None:
+        before, after, floor = (
+            1e3 * gain[key]
+            for key in ('held_out_rms_before_m', 'held_out_rms_after_m', 'noise_floor_m')
+        )
+        console.print(
+            f'verdict: {discovery["verdict"]}; error on validation poses {before:.3f} mm with '
+            f'offsets only, {after:.3f} mm with what was found, noise {floor:.3f} mm (RMS)'
+        )

@@ -1,11 +1,16 @@
-"""Fit the session on request; publish the offsets, latched, with their standard deviations."""
+"""Fit the session on request, or look for what else is wrong; publish the offsets, latched.
+
+Offsets are published with their standard deviations, and only those of a fit: the ones that a
+discovery refits are right together with the effects it found, which a robot does not correct.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +20,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from remaster_ros.core.errors import RemasterError
-from remaster_ros.core.fit import FitResult, fit_session
+from remaster_ros.core.fit import fit_session
 from remaster_ros.core.types import FloatArray
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
@@ -31,6 +36,9 @@ class Parameters:
 
     session: str = parameter('session', 'folder of the session to fit')
     out: str = parameter('fit', 'folder for fit.json, figures and report')
+    discovery: str = parameter(
+        'discovery', 'folder for discovery.json, figures and report of what else is wrong'
+    )
     sampler: str = parameter('fast', 'which sampler', choices=('fast', 'paper'))
     chains: int = parameter(4, 'number of chains', low=2, high=64)
     prior: str = parameter('', 'YAML file of what is known before a fit; empty for nothing')
@@ -48,29 +56,37 @@ class Optimizer(RemasterNode):
         self._busy = threading.Lock()
         self._means = self.create_publisher(JointState, '/remaster/joint_offsets', LATCHED)
         self._stds = self.create_publisher(JointState, '/remaster/joint_offsets_std', LATCHED)
-        # A group of its own: status and clock go on while a fit takes its seconds.
-        self.create_service(
-            Trigger, '/remaster/fit', self._on_fit, callback_group=MutuallyExclusiveCallbackGroup()
-        )
+        # Groups of their own: status and clock go on while a fit takes its seconds.
+        for service, work in (
+            ('/remaster/fit', self._fit),
+            ('/remaster/discover', self._discover),
+        ):
+            serve = partial(self._serve, work)
+            group = MutuallyExclusiveCallbackGroup()
+            self.create_service(Trigger, service, serve, callback_group=group)
         self.status = Status(self, self._summary)
         self._publish_last()
 
-    def _on_fit(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+    def _serve(
+        self,
+        work: Callable[[], tuple[Path, str]],
+        request: Trigger.Request,
+        response: Trigger.Response,
+    ) -> Any:
         if not self._busy.acquire(blocking=False):
             response.message = 'a fit is under way'
             return response
         try:
-            result, report = self._fit()
-            self._publish(result.joint_names, result.joint_offsets, result.joint_offsets_std)
+            report, self._state = work()
             response.success, response.message = True, str(report)
-            self._state = 'fitted'
         except RemasterError as error:
             response.message = self._state = str(error)
         finally:
             self._busy.release()
         return response
 
-    def _fit(self) -> tuple[FitResult, Path]:
+    def _fit(self) -> tuple[Path, str]:
+        """Return what to open, and what to say in the status."""
         out = Path(self.p.out)
         session = read_session(self.p.session)
         prepare_folder(out)
@@ -83,7 +99,26 @@ class Optimizer(RemasterNode):
             clock=time.perf_counter,
             priors=read_priors(self.p.prior) if self.p.prior else None,
         )
-        return result, save_fit(result, out, figures=self.p.figures)
+        report = save_fit(result, out, figures=self.p.figures)
+        self._publish(result.joint_names, result.joint_offsets, result.joint_offsets_std)
+        return report, 'fitted'
+
+    def _discover(self) -> tuple[Path, str]:
+        # What takes a second to import comes when it is asked for: a node is there at once.
+        from remaster_ros.core.discovery import discover_session
+        from remaster_ros.storage.discovery_results import save_discovery
+
+        out = Path(self.p.discovery)
+        session = read_session(self.p.session)
+        prepare_folder(out)
+        found = discover_session(
+            session,
+            rng=np.random.default_rng(self.p.seed),
+            progress=self._progress,
+            clock=time.perf_counter,
+        )
+        names = ', '.join(effect.name for effect in found.effects) or 'nothing'
+        return save_discovery(found, out, figures=self.p.figures), f'discovered: {names}'
 
     def _progress(self, stage: str, share: float) -> None:
         if self._ending:

@@ -93,14 +93,14 @@ def wait_until(condition, timeout_s, what):
         time.sleep(0.05)
 
 
-def call(client, service):
+def call(client, service, timeout_s=120):
     """Call a Trigger service and return its response."""
     from std_srvs.srv import Trigger
 
     caller = client.create_client(Trigger, service)
     assert caller.wait_for_service(timeout_sec=20.0), service
     future = caller.call_async(Trigger.Request())
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + timeout_s
     while not future.done():
         assert time.monotonic() < deadline, f'no answer of {service}'
         client.spin_some()
