@@ -215,8 +215,11 @@ class OptiTrackScene:
         if t >= end:
             self._plan_occlusion(end)
             start, end = self._occlusion
-        if 'filled' in self._world.faults(self._sensor):
+        faults = self._world.faults(self._sensor)
+        if 'filled' in faults:
             self._hidden_params = MODEL_FILLED | HAS_MODEL
+        elif 'occluded' in faults:
+            self._hidden_params = OCCLUDED | HAS_MODEL
         elif tracked and not start <= t < end:
             self._hidden_params = None
         elif self._hidden_params is None:

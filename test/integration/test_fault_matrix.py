@@ -41,6 +41,8 @@ def observe(who: str, kind: str, text: str) -> None:
     text = re.sub(r' \([^)]*\)', '', text).replace('|', '/')
     text = re.sub(r'\d+\.\d+|\d+(?= mm| usable| readings)', '…', text)
     text = re.sub(r'(system status|status|search at a position) impossible', 'impossible', text)
+    lost = 'impossible: (connection lost|the instrument closed the connection)'
+    text = re.sub(lost, 'impossible: the connection is lost', text)
     text = re.sub(r'no answer to the [a-z ]+ within', 'no answer within', text)
     observed.setdefault(who, {})[kind] = text[0].upper() + text[1:]
 
@@ -281,7 +283,8 @@ def spoil_bar(bar, numbers: dict[str, float]) -> str:
     said = client.diagnosis().message
     now = client.status()
     reason = max(now.dropped, key=lambda r: now.dropped[r] - before[r])
-    many = now.dropped[reason] - before[reason] > 4
+    # How many frames are refused after a restart depends on how many there were before it.
+    many = now.dropped[reason] - before[reason] > 4 and 'renumbered' not in numbers
     world.numbers, count = {}, len(samples)
     assert optitrack_world.eventually(lambda: len(samples) > count + 5)
     assert optitrack_world.eventually(lambda: not client.diagnosis().message)
@@ -333,12 +336,12 @@ def test_two_servers_on_one_group(bar):
     ):  # fmt: skip
         assert optitrack_world.eventually(lambda: len(samples) > count + 20)
         foreign = {reason.value: n for reason, n in client.status().dropped.items()}['foreign']
-        addresses = client.status().foreign
+        assert client.status().foreign == ('127.0.0.2',)
     radii = [np.hypot(*sample.position[:2]) for sample in samples]
     assert np.max(np.abs(np.array(radii) - 0.3)) < 5e-3
-    heard = f'counted and dropped as foreign, from {", ".join(addresses)}' if foreign else ''
-    assert heard
-    observe('named', 'OptiTrack: two servers on one group', f'{heard}; readings go on')
+    assert foreign > 0
+    text = 'the other one is counted and dropped as foreign; readings go on'
+    observe('named', 'OptiTrack: two servers on one group', text)
 
 
 def test_a_second_measurement_while_busy():

@@ -1,0 +1,150 @@
+"""Faults in the middle of a whole run of real nodes: the reason in /remaster/status, and its end.
+
+The faults are injected into the fakes' hidden World one after the other; what each kind does to
+each device and node is in test/integration/test_fault_matrix.py.
+"""
+
+import time
+
+import numpy as np
+import pytest
+import yaml
+from conftest import wait_until
+
+from remaster_ros.core import transforms
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.fakes.faults import inject
+from remaster_ros.storage.session import read_session
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(600)]
+
+
+class Listener:
+    """What the nodes say, and how fast the arm moves."""
+
+    def __init__(self, client):
+        from diagnostic_msgs.msg import DiagnosticArray
+        from sensor_msgs.msg import JointState
+
+        from remaster_ros.nodes.status import RELIABLE, TOPIC, receiver
+
+        self.client = client
+        self.summaries, self.events, self.speeds = {}, [], []
+        client.create_subscription(
+            DiagnosticArray, TOPIC, receiver(self.events.append, self._summary), RELIABLE
+        )
+        # The latest one only: a test that lags behind must not look at the past.
+        client.create_subscription(JointState, '/joint_states', self._state, 1)
+
+    def _summary(self, node, message, values):
+        self.summaries[node] = message
+
+    def _state(self, message):
+        self.speeds.append((time.monotonic(), np.max(np.abs(message.velocity))))
+
+    def until(self, condition, timeout_s, what):
+        def turn():
+            for _ in range(20):
+                self.client.spin_some()
+            return condition()
+
+        wait_until(turn, timeout_s, what)
+
+    def says(self, node, text, timeout_s=60):
+        self.until(lambda: text in self.summaries.get(node, ''), timeout_s, f'{node}: {text}')
+
+    def moves(self):
+        """Wait until the arm is on its way."""
+        self.speeds.clear()
+        self.until(lambda: self.speeds and self.speeds[-1][1] > 0.1, 90, 'a moving arm')
+
+    def stands(self, seconds=1.5):
+        """Watch an arm that must stand still, after a second of wall time to come to rest."""
+        began = time.monotonic()
+        self.until(lambda: time.monotonic() > began + 1.0, 10, 'time')
+        self.speeds.clear()
+        began = time.monotonic()
+        self.until(lambda: time.monotonic() > began + seconds, 10, 'time')
+        assert not self.speeds or max(speed for _, speed in self.speeds) < 1e-3
+
+
+def collect(client):
+    from std_srvs.srv import Trigger
+
+    caller = client.create_client(Trigger, '/remaster/collect')
+    assert caller.wait_for_service(timeout_sec=20.0)
+    future = caller.call_async(Trigger.Request())
+    wait_until(lambda: client.spin_some() or future.done(), 30, '/remaster/collect')
+    assert future.result().success, future.result().message
+
+
+def test_one_fault_after_the_other_and_the_run_completes(start, client, tmp_path, ros_environment):
+    hidden, out = tmp_path / 'hidden', tmp_path / 'out'
+    hidden.mkdir()
+    ros_environment['TMPDIR'] = str(hidden)
+    demo = start(
+        'remaster_ros.cli.main', 'demo', '--out', out, '--candidates', '6', '--no-figures',
+        '--seed', '5',
+    )  # fmt: skip
+    listener = Listener(client)
+    rows = out / 'session' / 'observations.csv'
+    listener.until(
+        lambda: (rows.exists() and rows.read_text().count('\n') > 2) or demo.poll() is not None,
+        180,
+        'the first observations',
+    )
+    assert demo.poll() is None, demo.communicate()
+    (world,) = hidden.glob('remaster_world_*')
+
+    held = [
+        ({'robot': {'nan': 1}}, 'robot_bridge', 'joint_states are not finite'),
+        ({'robot': {'renamed': 1}}, 'robot_bridge', 'joint_states lacks joint_1'),
+        ({'robot': {'off': 1}}, 'robot_bridge', 'no sign of robot'),
+        ({'mocap': {'stopped': 1}}, 'recorder', 'waiting for mocap: no frame for'),
+        ({'tracker': {'off': 1}}, 'recorder', 'waiting for tracker'),
+    ]
+    for faults, node, reason in held:
+        listener.moves()
+        inject(world, faults)
+        listener.says(node, reason)
+        listener.stands()
+        inject(world, {})
+
+    listener.moves()
+    inject(world, {'robot': {'estop': 1}})
+    # On its way, or before it had begun: halted in both cases.
+    listener.says('pose_planner', 'the robot ')
+    inject(world, {})
+    listener.stands()
+    collect(client)
+
+    listener.moves()
+    inject(world, {'mocap': {'swapped': 0.2}})
+    swapped = 'mocap: swapped'
+    listener.until(
+        lambda: any(swapped in event.values.get('reason', '') for event in listener.events),
+        90,
+        swapped,
+    )
+    inject(world, {})
+
+    listener.until(lambda: demo.poll() is not None, 300, 'the demo to end')
+    assert demo.returncode == 0, demo.stderr.read()
+    # No wrong observation: each against the truth that the demo opened at its end.
+    truth = yaml.safe_load((out / 'truth.yaml').read_text())
+    session = read_session(out / 'session')
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    m = session.measurements
+    for index, name in enumerate(session.sensor_names):
+        sensor, mine = truth['sensors'][name], m.sensor == index
+        expected = transforms.apply(
+            transforms.inverse(np.array(sensor['T_R_N'])),
+            chain.positions(m.q[mine], sensor['marker_m'], np.array(truth['joint_offsets_rad'])),
+        )
+        assert np.linalg.norm(m.position[mine] - expected, axis=1).max() < 0.3e-3
+    # Once each; and only the swapped marker cost a reading.
+    pairs = list(zip(m.configuration.tolist(), m.sensor.tolist()))
+    assert len(set(pairs)) == len(pairs)
+    assert len(set(m.configuration.tolist())) > 8
+    for log in (out / 'log').iterdir():
+        assert 'Traceback' not in log.read_text(), log
