@@ -21,6 +21,8 @@ from remaster_ros.core.result import FitResult
 CONFUSABLE = 5.0
 TIED = 1.0
 SHORTLIST = 10
+# The screening keeps the noise fixed, which costs it this much of the evidence.
+SCREENING_ERROR = 5.0
 # Columns that agree to this in every pose are the same change under two names.
 SAME = 1.0 - 1e-6
 
@@ -189,9 +191,13 @@ def _look_alikes(
     """Return the other causes that explain nearly as much in a cell's place."""
     score = screen(data, catalogue, replace(without, noise=solution.noise)).score
     best: dict[tuple[str, tuple[int, ...]], LookAlike] = {}
+    own = [i for i, other in enumerate(catalogue.cells) if other.key == cell.key]
+    least = score[own[0]] - SCREENING_ERROR - CONFUSABLE if own else -np.inf
     for index in np.argsort(-score)[:SHORTLIST]:
         other = catalogue.cells[index]
-        if not np.isfinite(score[index]) or (other.name, other.joints) == (cell.name, cell.joints):
+        if score[index] < least or not np.isfinite(score[index]):
+            break
+        if (other.name, other.joints) == (cell.name, cell.joints):
             continue
         cells = (*without.cells, other)
         fit = solve(data, cells, solution, prior=log_prior(cells, catalogue.cells))

@@ -20,7 +20,7 @@ from remaster_ros.core.discovery_noise import Residuals
 from remaster_ros.core.effects.cell import Cell
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.estimate import Estimate, Problem, estimate, hold_offsets
-from remaster_ros.core.types import FloatArray, Session
+from remaster_ros.core.types import BoolArray, FloatArray, Session
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def _alone(
     found: Estimate,
     group: tuple[Cell, ...],
     base: float,
-    rows: FloatArray,
+    rows: BoolArray,
 ) -> float:
     """Return the share of a cause's own gain that it alone carries over."""
     data, solution = discovery.residuals, discovery.selection.solution

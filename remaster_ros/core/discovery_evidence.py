@@ -247,9 +247,9 @@ class _System:
         for s in range(self.data.sensors):
             mine = sensor == s
             slope[s] = np.sum((-2.0 * noise.sigma[s] ** 2 * weights * by_log_weight)[mine])
-        for i, s in enumerate(self.separable):
-            mine = sensor == s
-            change = -2.0 * size * noise.pose_sigma[s] ** 2 * weights * by_log_weight
+        for i, which in enumerate(self.separable):
+            mine = sensor == which
+            change = -2.0 * size * noise.pose_sigma[which] ** 2 * weights * by_log_weight
             slope[self.data.sensors + i] = np.sum(change[mine])
         for i, (index, penalty, factor) in enumerate(
             zip(self.penalised, self.penalties, factors, strict=True)
@@ -271,7 +271,7 @@ class _System:
         for index, penalty, factor in zip(self.penalised, self.penalties, factors, strict=True):
             where = self.where[index]
             H[where, where] += factor * penalty
-        root = np.linalg.cholesky(H)
+        root: FloatArray = np.linalg.cholesky(H).astype(float)
         return H, root, cho_solve((root, True), total[:-1, -1], check_finite=False)
 
     def _inverse(self, root: FloatArray) -> FloatArray:

@@ -76,7 +76,7 @@ def shares(data: Residuals, groups: Sequence[tuple[Cell, ...]], solution: Soluti
     rows = data.scene.measurements.is_validation
     if not rows.any():
         rows = np.isin(np.arange(len(rows)), data.rows.source)
-    left = []
+    left: list[float] = []
     chosen: tuple[Cell, ...] = ()
     for group in ((), *groups):
         chosen += group

@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from remaster_ros.core.effects.cell import Cell
 from remaster_ros.core.effects.scene import Scene
@@ -172,7 +173,7 @@ class Residuals:
             self.full_errors - self.full_base @ fit.base - self.columns(fit.cells) @ fit.parameters
         )
 
-    def whitened(self, values: FloatArray, noise: Noise) -> FloatArray:
+    def whitened(self, values: NDArray[Any], noise: Noise) -> NDArray[Any]:
         """Return values (n, ...) in units of the noise: independent of variance 1 in all rows."""
         rows = self.rows
         sensor = rows.group_sensor

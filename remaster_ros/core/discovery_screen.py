@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from remaster_ros.core.discovery_evidence import Solution
 from remaster_ros.core.discovery_noise import Noise, Residuals
@@ -87,7 +88,7 @@ class Catalogue:
             data.scene.jacobian[source].astype(np.float32),
         )
 
-    def block(self, columns: IntArray) -> FloatArray:
+    def block(self, columns: IntArray) -> NDArray[np.float32]:
         """Return displacements of the given columns, (n, 3, c), single precision."""
         at, position = self.at[columns], self.position[columns]
         block = np.empty((len(self.jacobian), 3, len(columns)), np.float32)

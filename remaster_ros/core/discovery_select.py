@@ -26,10 +26,10 @@ from remaster_ros.core.types import FloatArray, IntArray
 SIGNIFICANCE = 0.01
 DRAWS = 400
 SHORTLIST = 8
-ROUNDS = 12
+ROUNDS = 8
 FOLDS = 10
 # What leaves less than this share of the held-out error out is not worth a parameter.
-LEAST_GAIN = 0.004
+LEAST_GAIN = 0.01
 # The evidence must rise by this for an exchange: no to and fro between equals.
 HYSTERESIS = 0.5
 MOST_EXCHANGED = 6
@@ -394,4 +394,5 @@ def held_out_error(
         beta = np.linalg.solve(kept[:-1, :-1], kept[:-1, -1])
         errors[fold == index] = out[:, -1] - out[:, :-1] @ beta
     square = np.add.reduceat(errors**2, np.arange(0, len(errors), 3))
-    return np.bincount(data.pose_of_row, square)
+    by_pose: FloatArray = np.bincount(data.pose_of_row, square).astype(float)
+    return by_pose

@@ -17,7 +17,8 @@ class Extension:
 
     The marker of row n is predicted at::
 
-        chain.positions(q + offsets + joint @ theta) + displacement0 + displacement @ (theta - theta0)
+        chain.positions(q + offsets + joint @ theta)
+        + displacement0 + displacement @ (theta - theta0)
 
     in base coordinates R, then registered as without an extension. Rows are those of the
     `Measurements` (``Rows.source``).

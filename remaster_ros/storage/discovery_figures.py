@@ -73,11 +73,11 @@ def gain(discovery: Discovery) -> Figure:
         )
     values = np.array(parts)
     x = np.arange(len(names))
-    for when, (color, label) in enumerate(((BEFORE, 'before'), (AFTER, 'after'))):
+    for column, (color, label) in enumerate(((BEFORE, 'before'), (AFTER, 'after'))):
         for part, shift in ((0, -0.3), (1, 0.1)):
             right.bar(
-                x + shift + 0.2 * when,
-                values[:, when, part],
+                x + shift + 0.2 * column,
+                values[:, column, part],
                 0.18,
                 color=color,
                 alpha=1.0 if part == 0 else 0.5,

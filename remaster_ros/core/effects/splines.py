@@ -20,7 +20,8 @@ def knot_vector(low: float, high: float, spacing: float) -> FloatArray:
     """Return uniform knots over [low, high], about ``spacing`` apart, with those beyond."""
     count = max(2, int(np.ceil((high - low) / spacing)))
     step = (high - low) / count
-    return low + step * np.arange(-DEGREE, count + DEGREE + 1)
+    knots: FloatArray = low + step * np.arange(-DEGREE, count + DEGREE + 1.0)
+    return knots
 
 
 def basis(values: FloatArray, knots: FloatArray) -> FloatArray:

@@ -297,8 +297,11 @@ def _line_of_sight(scene: Scene, sensor: int, power: int) -> Columns:
 
 def _frames(scene: Scene) -> Iterator[Cell]:
     """Base, markers and sensors: over time, by temperature, gravity, joint 1, range."""
-    slow = [(driver.name, _form(scene, driver, 'linear')) for driver in slow_drivers(scene)]
-    slow = [(name, form) for name, form in slow if form is not None]
+    slow = [
+        (driver.name, form)
+        for driver in slow_drivers(scene)
+        if (form := _form(scene, driver, 'linear')) is not None
+    ]
     turns = tuple(f'base_r{axis}' for axis in 'xyz')
     first = Driver('angle_of_joint_1', 'rad', partial(_angle, joint=1))
     for name, form in (*slow, (first.name, _form(scene, first, 'sin/cos'))):
@@ -334,7 +337,8 @@ def _frames(scene: Scene) -> Iterator[Cell]:
         ]
         for name, form in forms:
             if form.penalty is not None:
-                form = replace(form, penalty=np.kron(form.penalty, np.eye(3)))
+                penalty: FloatArray = np.kron(form.penalty, np.eye(3)).astype(float)
+                form = replace(form, penalty=penalty)
             columns = partial(_shifted, turn=turn, form=form)
             yield _cell('sensor_frame', (), name, form, axes, 'm', columns, subject=sensor)
         for form_name, power, unit in (('constant', 0, 'm'), ('quadratic', 2, '1/m')):

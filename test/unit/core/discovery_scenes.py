@@ -1,0 +1,53 @@
+"""Sessions with something wrong in them, made row by row, for the tests of the discovery."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from calibration_scenes import CHAIN, scene
+
+from remaster_ros.core.discovery_noise import Residuals
+from remaster_ros.core.estimate import Problem, estimate
+from remaster_ros.core.transforms import apply, inverse
+from remaster_ros.core.types import FloatArray, Session
+
+
+def session_with(
+    seed: int,
+    angles: Callable[[Session], FloatArray] | None = None,
+    sensor: Callable[[Session], FloatArray] | None = None,
+    **options: object,
+) -> Session:
+    """Simulate a session whose joints turn by ``angles`` too, or whose sensor errs.
+
+    ``angles`` (n, k): the difference that they make is added to what a faultless arm showed;
+    ``sensor`` (n, 3): added to what it measured.
+    """
+    session, truth = scene(seed, **{'poses': 35, 'validation': 25, 'sigma_m': 0.1e-3, **options})  # type: ignore[arg-type]
+    m = session.measurements
+    position = m.position.copy()
+    if angles is not None:
+        markers = np.array([truth.markers[name] for name in session.marker_names])[m.marker]
+        places = [truth.sensors[name].T_R_N for name in session.sensor_names]
+        shift = CHAIN.positions(
+            m.q + angles(session), markers, truth.joint_offsets
+        ) - CHAIN.positions(m.q, markers, truth.joint_offsets)
+        turn = inverse(np.array(places))[m.sensor]
+        position += apply(turn, shift) - turn[:, :3, 3]
+    if sensor is not None:
+        position += sensor(session)
+    return replace(session, measurements=replace(m, position=position))
+
+
+def residuals_of(session: Session) -> Residuals:
+    """Fit the offsets and return what is left."""
+    return Residuals.of(estimate(Problem.of(session)))
+
+
+def at_joint(joint: int, values: FloatArray) -> FloatArray:
+    """Return joint angles (n, k) that are zero but for one joint, numbered from 1."""
+    angles = np.zeros((len(values), len(CHAIN)))
+    angles[:, joint - 1] = values
+    return angles
