@@ -14,13 +14,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from remaster_ros.cli.simulate import LIMIT_MARGIN_RAD
 from remaster_ros.core.collision import ArmCapsules
 from remaster_ros.core.inverse import InverseKinematics
 from remaster_ros.core.planning import candidate_poses, plan_poses
 from remaster_ros.core.simulation import SimulatedSensor, Truth, simulate_session
 from remaster_ros.core.transforms import looking_at, transform
 from remaster_ros.core.types import FloatArray, Session
+from remaster_ros.fakes.practice import LIMIT_MARGIN_RAD
 from remaster_ros.storage.cell import read_cell
 
 ROOT = Path(__file__).resolve().parents[1]

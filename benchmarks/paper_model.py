@@ -124,7 +124,7 @@ class PaperModel:
     def state_of(
         self, T_N_R: FloatArray, joint_offsets: FloatArray, sigma: FloatArray
     ) -> FloatArray:
-        """Return states (..., 13) of T_N_R (..., 4, 4), offsets (..., k), sigma (...), rad and m."""
+        """Return states (..., 13) of T_N_R (..., 4, 4), offsets (..., k), sigma (...); SI."""
         correction = T_N_R @ inverse(self.T_N_R)
         turn = correction[..., :3, :3]
         alpha = np.arctan2(turn[..., 1, 0], turn[..., 0, 0])
@@ -174,7 +174,7 @@ def product_states(model: PaperModel, mode: Mode, points: FloatArray) -> FloatAr
     posterior = mode.linearisation.posterior
     arm: Model = posterior.model
     x = arm.natural(posterior.parameters(points))
-    sigma, _ = posterior.noise(points[..., len(posterior.free) :])
+    sigma, _ = posterior.sensor_noise(points[..., len(posterior.free) :])
     return model.state_of(inverse(arm.T_R_N(x)[..., 0, :, :]), arm.offsets(x), sigma[..., 0])
 
 
