@@ -1,0 +1,52 @@
+"""What `remaster discover` prints."""
+
+import types
+
+from remaster_ros.cli.discover import summary
+from remaster_ros.core.discovery_causes import FoundEffect, LookAlike
+from remaster_ros.core.discovery_confirm import Confirmation
+from remaster_ros.core.discovery_gain import Gain
+
+EFFECT = FoundEffect(
+    name='joint_compliance',
+    joints=(2, 4),
+    place='joint_angle',
+    driver='gravity_torque',
+    form='linear',
+    parameters=(),
+    p_value=0.002,
+    log_evidence_gain=50.0,
+    confusable_with=(LookAlike('encoder_scale', (2,), 48.0, 'a payload'),),
+    cause='The weight it carries winds up joints 2 and 4.',
+    size_m=0.5e-3,
+    share=1.0,
+)
+
+
+def found(effects, gain, untestable):
+    verdict = 'effects' if effects else 'none'
+    return types.SimpleNamespace(
+        verdict=verdict, effects=effects, gain=gain, untestable=untestable
+    )
+
+
+def test_causes_look_alikes_and_gain_are_said():
+    text = summary(found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {}))
+    assert 'verdict: effects' in text
+    assert 'joint_compliance [2, 4]: 0.500 mm, 100 % of the gain' in text
+    assert 'could be encoder_scale [2]; to tell: a payload' in text
+    assert '1.000 mm RMS before, 0.300 mm after; the noise alone is 0.280 mm' in text
+
+
+def test_nothing_found_and_what_cannot_be_tested_are_said():
+    text = summary(found((), Gain(None, None, 0.1e-3, {}), {'backlash': 'no from_q'}))
+    assert 'nothing beyond the zero-offsets' in text
+    assert 'not testable: backlash: no from_q' in text
+    assert 'held out' not in text
+
+
+def test_a_cause_that_was_cured_is_not_confirmed():
+    session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {})
+    text = summary(session, Confirmation(0.3e-3, 0.9e-3, -0.9, (-0.9,), False))
+    assert '-90 % of the gain carries over' in text
+    assert 'Not there any more' in text
