@@ -14,8 +14,6 @@ from remaster_ros.core.discovery_confirm import confirm
 from remaster_ros.core.errors import InputError
 from remaster_ros.storage.discovery_results import read_discovery, save_discovery
 
-sys.path.insert(0, str(Path(__file__).parent.parent / 'core'))
-
 
 def bent(session):
     return at_joint(2, 1.5e-3 * np.sin(session.measurements.q[:, 1]))
