@@ -3,7 +3,7 @@
 #                 (OUT=folder SEED=n ARGS='--full' are handed on)
 #   make test     the tests (PYTEST='-k name' is handed on)
 #   make check    lint, types, layers; CI runs this and make test
-#   make bench    the benchmarks
+#   make bench    the benchmarks, small (BENCH='bench_speed …' chooses, FULL=1 for all sizes)
 #   make docs     docs/parameters.md from the code
 #   make faults   the tables of docs/faults.md from what the tests observe
 # The first of them makes a virtual environment. With ROS 2 Jazzy sourced its rclpy is used and the
@@ -50,9 +50,26 @@ check: $(VENV)/installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(VENV)/installed
-	@for script in $(wildcard benchmarks/bench_*.py); do \
-		echo "== $$script"; $(BIN)/python $$script || exit 1; done
+# Small sizes, some ten minutes on two idle cores; FULL=1 takes those of benchmarks/RESULTS.md, an
+# hour. BENCH='bench_speed …' chooses. Those that need hours or root have their commands in RESULTS.md.
+BENCH ?= bench_real_data bench_seeds bench_exactness bench_calibration bench_speed bench_scaling \
+	bench_peers paper_tables
+SMALL_bench_seeds := --seeds 2
+SMALL_paper_tables := --steps 10000
+FULL_bench_calibration := --sessions 1000 --record build/calibration.jsonl
+FULL_bench_exactness := --gold 1300000 --draws 60000
+FULL_bench_speed := --full
+FULL_bench_scaling := --sizes 50 173 1000 10000 100000
+FULL_bench_peers := --seeds 10
+FULL_paper_tables := --out docs/paper.md
+bench: $(VENV)/bench-installed
+	@mkdir -p build
+	@$(foreach name,$(BENCH),echo "== $(name)" && OMP_NUM_THREADS=1 $(BIN)/python \
+		benchmarks/$(name).py $(if $(FULL),$(FULL_$(name)),$(SMALL_$(name))) &&) true
+
+$(VENV)/bench-installed: $(VENV)/installed
+	$(BIN)/python -m pip install -qq -c $(CONSTRAINTS) --no-build-isolation -e '.[bench]'
+	@touch $@
 
 docs: $(VENV)/installed
 	$(BIN)/python docs/make_parameters.py
@@ -66,5 +83,5 @@ format: $(VENV)/installed
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf .venv .venv-ros build install log *.egg-info
+	rm -rf .venv .venv-ros .venv-bench build install log *.egg-info
 	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -95,6 +95,8 @@ setup(
             'colcon-common-extensions',
             *JUDGES,
         ],
+        # What the benchmarks compare with; figaroh and pybotics get environments of their own.
+        'bench': ['emcee>=3.1', 'numpyro>=0.15', 'jax>=0.4.30'],
         'check': ['ruff', 'mypy', 'types-PyYAML', 'import-linter'],
     },
     zip_safe=False,
