@@ -201,10 +201,12 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     chosen = [index[name] for name in cell.parameters]
     draws = discovery.fit.theta_draws[..., chosen].reshape(-1, len(chosen))
     draws = draws[:: max(1, len(draws) // 400)]
-    effect = columns.values @ solution.parameters[where] / ARC_MINUTE
-    spread = (columns.values @ draws.T / ARC_MINUTE).std(axis=1)
-    # A curve's mean is a zero-offset.
-    level = float(effect[data.rows.source].mean()) if cell.form in ('free', 'sin/cos') else 0.0
+    values = columns.values
+    if cell.form in ('free', 'sin/cos'):
+        # A curve's mean is a zero-offset.
+        values = values - values[data.rows.source].mean(axis=0)
+    effect = values @ solution.parameters[where] / ARC_MINUTE
+    spread = (values @ draws.T / ARC_MINUTE).std(axis=1)
     motion = data.scene.jacobian[:, :, columns.at]
     left = data.unexplained(solution)
     # What is left, as an angle of this joint: only where the marker is far from its axis.
@@ -212,10 +214,10 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     far = np.isin(np.arange(len(x)), data.rows.source) & (square > 0.1 * np.median(square))
     angle = np.sum(motion * left, axis=1)[far] / square[far] / ARC_MINUTE
     shown = slice(None, None, max(1, int(far.sum()) // SCATTER_POINTS))
-    points = (effect[far] - level + angle)[shown]
+    points = (effect[far] + angle)[shown]
     ax.plot(x[far][shown], points, '.', color=BEFORE, markersize=2.5, alpha=0.6)
     order = np.argsort(x)
-    line, band = effect[order] - level, 2.0 * spread[order]
+    line, band = effect[order], 2.0 * spread[order]
     ax.fill_between(x[order], line - band, line + band, color=AFTER, alpha=0.25, linewidth=0)
     ax.plot(x[order], line, color=AFTER, linewidth=1.3)
     limit = np.quantile(np.abs(points), 0.99)
