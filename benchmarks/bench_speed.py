@@ -162,7 +162,7 @@ def by_emcee(model: PaperModel, steps: int) -> Speed:
         sampler.run_mcmc(start, steps, skip_initial_state_check=True)
         seconds = time.process_time() - began
         chain = sampler.get_chain(discard=steps // 10)
-        tau = float(np.max(emcee.autocorr.integrated_time(chain, tol=20)))
+        tau = float(np.max(emcee.autocorr.integrated_time(chain, tol=10)))
         note = f'{WALKERS} walkers, {steps} steps, {name}, autocorrelation time {tau:.0f}'
         found = Speed('emcee', WALKERS * steps / tau, seconds, note)
         best = found if best is None or found.rate > best.rate else best
@@ -235,8 +235,8 @@ def main() -> None:
     posterior = product_states(model, mode, run.draws).reshape(-1, DIMENSION)
     others = {
         'paper': paper(model, posterior, 24, 200_000 if args.full else 20_000),
-        'emcee': by_emcee(model, 5000 if args.full else 1500),
-        'nuts': by_nuts(model, 2000 if args.full else 500),
+        'emcee': by_emcee(model, 5000 if args.full else 2000),
+        'nuts': by_nuts(model, 2000 if args.full else 400),
     }
     rows = [
         (speed.name, f'{speed.rate:.3g}', _ratio(alone, speed, WANTED.get(key)), speed.note)
