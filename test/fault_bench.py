@@ -176,7 +176,11 @@ class Bench:
             if self._due(node):
                 self._send(node, lambda s=sensor: self.presence.says(s, True, '', self.t))
         if self._due('recorder') and bridge:
-            absent = self.presence.absent(self.t)
+            absent = {
+                name: why
+                for name, why in self.presence.absent(self.t).items()
+                if self.require in ('all', name)
+            }
             word = '; '.join(f'{name}: {why}' for name, why in absent.items())
             if word:
                 self.note(f'waiting for {word}')

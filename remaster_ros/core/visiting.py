@@ -33,8 +33,6 @@ LAG_S = 0.25
 """An arm that is not further from its trajectory than it goes in this time follows it, s."""
 EARLY_S = 0.125
 """An arm that stands so long before its trajectory ends has been stopped, s."""
-REACTION_WALL_S = 0.5
-"""Wall time that a command may take to reach the robot and be seen in its reports, s."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +108,8 @@ class VisitRules:
         Longest silence of planner, recorder or robot (wall time).
     stall_s
         An arm that stands for so long and not at its target will not get there (robot time).
+    reaction_s
+        A command may take so long to reach the robot and be seen in its reports (wall time).
     attempts
         How often a command that the robot did not take is given.
     failures_in_a_row
@@ -121,6 +121,7 @@ class VisitRules:
     answer_timeout_s: float = 180.0
     heartbeat_s: float = 3.0
     stall_s: float = 1.0
+    reaction_s: float = 0.5
     attempts: int = 2
     failures_in_a_row: int = 3
 
@@ -362,7 +363,7 @@ class Visitor:
             return [Settled(visit.solution, seen.stamp, detector.mean, motion_s, settle_s)]
         distance = float(np.max(np.abs(seen.q - visit.move.end)))
         stood_s = min(seen.time - seen.stands_since, under_way_s)
-        reacted = wall_s - visit.sent_wall > REACTION_WALL_S
+        reacted = wall_s - visit.sent_wall > rules.reaction_s
         if distance > rules.settle.arrive_tolerance and stood_s >= rules.stall_s and reacted:
             return self._stalled(visit, seen, distance)
         if seen.time > visit.deadline:

@@ -271,6 +271,13 @@ class Demo:
 
             self._wait(complete, 3600.0, 'the collection to complete')
         self.console.print(self.node.planned)
+        recorder = self.node.summaries['recorder']
+        waited = [
+            f'{key.removeprefix("waited_s_")} {value} s'
+            for key, value in recorder.items()
+            if key.startswith('waited_s_')
+        ]
+        self.console.print(f'the arm stood waiting for {", ".join(waited)} (world time)')
 
     def close(self) -> None:
         """End every process and remove the hidden World."""

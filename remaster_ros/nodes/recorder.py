@@ -280,7 +280,14 @@ class Recorder(RemasterNode):
         self._take(q, seconds(message.header.stamp), solution, pose)
 
     def _registered(self) -> str:
-        return 'yes' if self.registrar.complete else 'no'
+        """Whether every sensor that the arm waits for is registered, in a word."""
+        known = [name in self.registrar.T_R_N for name in self._wanted()]
+        enough = any(known) if self.p.require == 'any' else all(known)
+        return 'yes' if enough else 'no'
+
+    def _wanted(self) -> list[str]:
+        """Return the sensors that the arm waits for, or for one of them."""
+        return [name for name in self.cell.sensors if self.p.require in ('all', 'any', name)]
 
     def _take(
         self,
@@ -314,8 +321,7 @@ class Recorder(RemasterNode):
 
     def _waiting_for(self, absent: Mapping[str, str]) -> str:
         """Name the required sensors that are not there, and why; '' if the arm may go on."""
-        sensors = self.cell.sensors
-        wanted = [name for name in sensors if self.p.require in ('all', 'any', name)]
+        wanted = self._wanted()
         gone = [name for name in wanted if name in absent]
         if not gone or (self.p.require == 'any' and len(gone) < len(wanted)):
             return ''
@@ -438,6 +444,8 @@ class Recorder(RemasterNode):
         if not self.logbook.closed:
             self.logbook.close(exit_status)
             self._bag.close()
+            waited = ', '.join(f'{name} {s:.1f} s' for name, s in self._waited_s.items())
+            self.get_logger().info(f'the arm stood waiting for {waited}')
             self.status.publish()
 
     def close(self) -> None:

@@ -86,6 +86,13 @@ class Parameters:
         low=0.2,
         high=60.0,
     )
+    reaction_s: float = parameter(
+        2.0,
+        'how long a command may take to be seen in joint_states, wall time',
+        unit='s',
+        low=0.1,
+        high=60.0,
+    )
     emergency_stop_topic: str = parameter(
         '', "std_msgs/Bool, true while the robot's own safety stops it; empty where there is none"
     )
@@ -135,6 +142,7 @@ class RobotBridge(RemasterNode):
             answer_timeout_s=p.answer_timeout_s,
             heartbeat_s=p.heartbeat_s,
             stall_s=p.stall_s,
+            reaction_s=p.reaction_s,
         )
 
     # What comes in

@@ -198,6 +198,23 @@ def break_bridge(bench: Bench, kind: str) -> None:
         bench._take(0, bench.t, bench.solutions[0] * np.nan)
 
 
+@pytest.mark.parametrize(('require', 'waits'), [('all', True), ('mocap', False), ('any', False)])
+def test_the_arm_waits_for_a_dead_sensor_only_where_it_is_required(tmp_path, require, waits):
+    """The tracker's node dies for good: with `all` the arm stands, else the bar is enough."""
+    bench = Bench(tmp_path, require=require)
+    bench.node = Node('laser_tracker_markers', 'off', faulty=True)
+    bench.presence.says('tracker', True, '', bench.t)
+    assert bench.run(60.0, bench.done) == (not waits)
+    bench.check()
+    if waits:
+        assert bench.reasons == ['waiting for tracker: its node has been silent for 3 s']
+        assert bench.speed() < 1e-3
+    else:
+        assert all(set(readings) == {'mocap'} for readings in bench.recorded.values())
+        assert set(bench.recorded) == {0, 1, 2}
+    bench.close()
+
+
 # The devices at their wires
 
 

@@ -728,10 +728,10 @@ def test_the_stall_needs_wall_time_too():
     late = []
     rig.obey = lambda waypoints: late.append(waypoints) or ()
     rig.plan([0.5, 0.5])
-    rig.run(0.8 * rig.rate * visiting.REACTION_WALL_S)
+    rig.run(0.8 * rig.rate * RULES.reaction_s)
     assert not rig.said(Halted)
     assert len(rig.said(Drive)) == 1
-    rig.run(0.3 * rig.rate * visiting.REACTION_WALL_S, lambda: len(rig.said(Drive)) == 2)
+    rig.run(0.3 * rig.rate * RULES.reaction_s, lambda: len(rig.said(Drive)) == 2)
 
 
 # To the bit: times and angles that binary numbers have exactly
