@@ -581,14 +581,14 @@ def test_a_recorder_that_says_nothing_loses_the_configuration_and_not_the_run(ri
 # Commanded as measured
 
 
-def copying(low=(-1.0, -2.0), high=(1.0, 2.0)):
+def copying(low=(-1.0, -2.0), high=(1.0, 2.0), home=HOME):
     """Return a visitor in front of a robot that reports what it was commanded, and its answer."""
     limits = MotionLimits(('a', 'b'), np.array(low), np.array(high), LIMITS.velocity)
     visitor = Visitor(limits, RULES)
     visitor.planner_says('running', 0.0)
     visitor.recorder_says('', 0.0)
     visitor.plan(np.array([[0.5, 0.5]]), 0.0)
-    actions, q, t = [], HOME, 0.0
+    actions, q, t = [], home, 0.0
     while t < 3.0 and not any(isinstance(action, Halted) for action in actions):
         t += 0.1
         for action in visitor.report(t, q, t):
@@ -621,9 +621,10 @@ def test_the_probe_goes_inward(bounds):
     np.testing.assert_allclose(np.abs(end - HOME), 1e-6, rtol=1e-6)
 
 
-def test_the_probe_of_a_joint_without_limits():
-    probe = copying((-np.inf, -np.inf), (np.inf, np.inf))[0]
-    np.testing.assert_allclose(probe.waypoints[-1].q, HOME, rtol=0, atol=1.01e-6)
+@pytest.mark.parametrize('side', [1.0, -1.0])
+def test_the_probe_of_a_joint_without_limits_goes_towards_zero(side):
+    probe = copying((-np.inf, -np.inf), (np.inf, np.inf), side * HOME)[0]
+    np.testing.assert_allclose(probe.waypoints[-1].q, side * (HOME - 1e-6), rtol=0, atol=1e-12)
 
 
 def test_a_robot_that_measures_is_probed_once_and_for_a_moment():
@@ -755,9 +756,10 @@ class Exact:
         self.visitor.planner_says('running', self.wall)
         self.visitor.recorder_says('', self.wall)
         self.visitor.plan(np.array([[0.75, 0.5], [0.5, 0.5]]), self.wall)
-        odd = np.add(AT, [0.0, 2.0**-20])
+        odd, self.drove = np.add(AT, [0.0, 2.0**-20]), []
         for i in range(40):
-            self.report(0.125, AT if i % 2 else odd)
+            if any(isinstance(a, Drive) for a in self.report(0.125, AT if i % 2 else odd)):
+                self.drove.append(self.t)
             if [a.solution for a in self.said if isinstance(a, Drive)] == [visiting.PROBE, 0]:
                 break
         self.sent = self.t
@@ -773,7 +775,10 @@ class Exact:
 
 
 def test_the_first_move_after_the_probe_is_as_fast_as_it_may():
+    """And comes with the first report after the second that the probe takes, and half a one."""
     exact = Exact()
+    probe, first = exact.drove
+    assert first - probe == 1.625
     move = exact.visitor._visit.move
     assert move.duration_s == 1.5
     np.testing.assert_array_equal(move.end, [0.75, 0.5])
@@ -813,6 +818,14 @@ def test_at_the_tolerance_of_arrival_it_has_arrived(beside, reason):
         assert first.reason.startswith(reason)
     else:
         assert isinstance(first, Settled)
+
+
+def test_an_arm_at_the_tolerance_of_arrival_is_not_stalled():
+    rules = VisitRules(settle=SettleRules(4.0, 2.0**-8, 2.0**-12), stall_s=1.0)
+    exact = Exact(rules)
+    for i in range(60):
+        exact.report(0.125, [0.75 - 2.0**-8 if i > 11 else 0.3 + i * 0.02, 0.5])
+    assert isinstance(exact.said[0], Settled)
 
 
 @pytest.mark.parametrize(('off', 'taken'), [(2.0**-8, False), (2.0**-7, True)])
