@@ -37,6 +37,11 @@ def centers(knots: FloatArray) -> FloatArray:
 
 
 def roughness(count: int) -> FloatArray:
-    """Return the penalty on second differences of m coefficients, with a small ridge, (m, m)."""
+    """Return the penalty on m coefficients, (m, m): second differences, their mean, a small ridge.
+
+    What is constant in a free form is another parameter's already, a zero-offset's or a
+    registration's: the penalty on the mean leaves it there.
+    """
     differences = np.diff(np.eye(count), n=2, axis=0)
-    return differences.T @ differences + RIDGE * np.eye(count)
+    mean = np.full((count, count), 1.0 / count)
+    return differences.T @ differences + mean + RIDGE * np.eye(count)
