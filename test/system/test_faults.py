@@ -16,7 +16,7 @@ from remaster_ros.core.chain import SerialChain
 from remaster_ros.fakes.faults import inject
 from remaster_ros.storage.session import read_session
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 class Listener:
@@ -128,7 +128,7 @@ def test_one_fault_after_the_other_and_the_run_completes(start, client, tmp_path
     )
     inject(world, {})
 
-    listener.until(lambda: demo.poll() is not None, 300, 'the demo to end')
+    listener.until(lambda: demo.poll() is not None, 600, 'the demo to end')
     assert demo.returncode == 0, demo.stderr.read()
     # No wrong observation: each against the truth that the demo opened at its end.
     truth = yaml.safe_load((out / 'truth.yaml').read_text())
