@@ -1,0 +1,170 @@
+"""Where obvious methods name the wrong cause: two kinds of session of the hidden world.
+
+    python benchmarks/wrong_causes.py [--seeds 10] [--figure docs/figures/wrong_causes.svg]
+
+*Greedy*: of all causes the one whose effect correlates best with the residuals, all rows alike.
+*Full DH*: every link offset and axis tilt by least squares; the most significant is to blame.
+Neither looks at noise that a pose shares, at groups, at how many were tried, at other causes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / 'test'))
+
+from hidden_tours import world  # noqa: E402
+from hidden_world import Noise  # noqa: E402
+
+from remaster_ros.core.discovery import Findings, find_causes  # noqa: E402
+from remaster_ros.core.discovery_noise import Residuals  # noqa: E402
+from remaster_ros.core.effects.cell import Cell  # noqa: E402
+from remaster_ros.core.effects.registry import EFFECTS  # noqa: E402
+from remaster_ros.fakes.effects import HiddenEffect  # noqa: E402
+
+NOISE = Noise(0.08e-3, 0.1e-3)
+HIDDEN = {
+    'sag': HiddenEffect('joint_compliance', (2, 4), np.array([3e-5, 5e-5])),
+    'depth': HiddenEffect(
+        'sensor_scale', (), np.array([2e-3]), {'form': 'depth', 'sensor': 'mocap'}
+    ),
+}
+TRUTH = {'sag': 'joint_compliance [2, 4]', 'depth': 'sensor_scale'}
+
+
+def searched(kind: str, seed: int) -> Findings:
+    """Make a session with one thing hidden, and search it."""
+    rng = np.random.default_rng([seed, 5])
+    session, _ = world('iiwa7', rng).measure([HIDDEN[kind]], NOISE, rng)
+    return find_causes(session, rng=rng, progress=lambda stage, share: None)
+
+
+def ours(found: Findings) -> str:
+    return ' + '.join(_named(e.name, e.joints) for e in found.effects) or 'nothing'
+
+
+def greedy(data: Residuals) -> str:
+    """Name the cell with the largest correlation, sine and cosine counting as one."""
+    base, errors = _flat(data)
+    left = errors - base @ (base.T @ errors)
+    best, name = 0.0, ''
+    for effect in EFFECTS.values():
+        if effect.name in ('marker_offset', 'joint_error_curve') or effect.needs(data.scene):
+            continue
+        for cell in effect.cells(data.scene):
+            if cell.size > 2:
+                continue
+            columns = _columns(data, cell, base)
+            explained = np.linalg.norm(np.linalg.qr(columns)[0].T @ left)
+            if explained > best:
+                best, name = float(explained), _named(cell.name, cell.joints)
+                if cell.name == 'unnamed':
+                    name += f' ({cell.place} by {cell.driver})'
+    return name
+
+
+def full_dh(data: Residuals) -> str:
+    """Fit all of the geometry; name the link parameter with the largest t."""
+    base, errors = _flat(data)
+    cells = [
+        cell
+        for name in ('link_length', 'joint_axis_tilt')
+        for cell in EFFECTS[name].cells(data.scene)
+        if cell.size == 1
+    ]
+    kept: list[Cell] = []
+    columns = np.zeros((len(base), 0))
+    for cell in cells:
+        new = _columns(data, cell, base)
+        rest = new - columns @ np.linalg.lstsq(columns, new, rcond=None)[0] if kept else new
+        if np.linalg.norm(rest) > 1e-2:
+            kept.append(cell)
+            columns = np.concatenate((columns, new), axis=1)
+    left = errors - base @ (base.T @ errors)
+    inverse = np.linalg.inv(columns.T @ columns)
+    t = (inverse @ columns.T @ left) / np.sqrt(np.diag(inverse))
+    worst = kept[int(np.argmax(np.abs(t)))]
+    return _named(worst.name, worst.joints)
+
+
+def _flat(data: Residuals) -> tuple[np.ndarray, np.ndarray]:
+    base = np.linalg.qr(data.base.reshape(3 * len(data), -1))[0]
+    return base, data.errors.ravel()
+
+
+def _columns(data: Residuals, cell: Cell, base: np.ndarray) -> np.ndarray:
+    columns = data.columns([cell])[data.rows.source].reshape(3 * len(data), -1)
+    left = columns - base @ (base.T @ columns)
+    norm, before = np.linalg.norm(left, axis=0), np.linalg.norm(columns, axis=0)
+    # What is absorbed is rounding: it explains nothing.
+    return left * np.where(norm > 1e-4 * before, 1.0 / np.maximum(norm, 1e-30), 0.0)
+
+
+def _named(name: str, joints: tuple[int, ...]) -> str:
+    return f'{name} {list(joints)}' if joints else name
+
+
+def draw(kind: str, found: Findings, path: Path) -> None:
+    """Draw what the two stories leave, against the torque, or the depth, that tells them apart."""
+    from matplotlib.figure import Figure
+
+    data = found.residuals
+    scene, rows = data.scene, data.rows.source
+    figure = Figure(figsize=(8.4, 2.6), layout='constrained')
+    axes = figure.subplots(1, 2, sharey=True)
+    left = data.unexplained(found.selection.empty)[rows]
+    after = data.unexplained(found.selection.solution)[rows]
+    if kind == 'sag':
+        motion = scene.jacobian[rows]
+        length = np.linalg.norm(motion, axis=1)
+        parts = [
+            (scene.gravity_torque[rows, j], j, f'gravity torque on joint {j + 1} (N m)')
+            for j in (1, 3)
+        ]
+        for ax, (x, j, label) in zip(axes, parts, strict=True):
+            for errors, color, name in ((left, '#e07b39', 'before'), (after, '#3b82c4', 'after')):
+                along = 1e3 * np.sum(motion[:, :, j] * errors, axis=1) / length[:, j]
+                ax.plot(x, along, '.', color=color, markersize=3, label=name)
+            ax.set_xlabel(label)
+        axes[0].set_ylabel('error along the joint (mm)')
+    else:
+        depth = np.einsum('nji,nj->ni', scene.sensor_turn[rows], left)
+        gone = np.einsum('nji,nj->ni', scene.sensor_turn[rows], after)
+        places = (scene.in_sensor[rows, 2], scene.range_m[rows])
+        labels = ('depth in the sensor frame (m)', 'distance from the sensor (m)')
+        for ax, x, label in zip(axes, places, labels, strict=True):
+            ax.plot(x, 1e3 * depth[:, 2], '.', color='#e07b39', markersize=3, label='before')
+            ax.plot(x, 1e3 * gone[:, 2], '.', color='#3b82c4', markersize=3, label='after')
+            ax.set_xlabel(label)
+        axes[0].set_ylabel('error in depth (mm)')
+    axes[0].legend(frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path.with_name(f'{path.stem}_{kind}.svg'), metadata={'Date': None})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or '').partition('\n')[0])
+    parser.add_argument('--seeds', type=int, default=10)
+    parser.add_argument('--figure', type=Path, help='write two figures, of the first seed each')
+    args = parser.parse_args()
+    for kind, truth in TRUTH.items():
+        right = {'greedy': 0, 'full DH': 0, 'remaster discover': 0}
+        for seed in range(args.seeds):
+            found = searched(kind, seed)
+            data = found.residuals
+            answers = dict(zip(right, (greedy(data), full_dh(data), ours(found)), strict=True))
+            for method, answer in answers.items():
+                right[method] += answer == truth
+            print(f'{kind} {seed}: truth {truth}: {answers}', flush=True)
+            if seed == 0 and args.figure:
+                draw(kind, found, args.figure)
+        print(f'{kind}: named right in {right} of {args.seeds}', flush=True)
+
+
+if __name__ == '__main__':
+    main()
