@@ -106,10 +106,10 @@ class Run:
         self.log.close()
 
 
-def judge(out: Path, seen: set[str]) -> dict[str, Any]:
+def judge(out: Path, seen: set[str], truth: dict[str, Any] | None = None) -> dict[str, Any]:
     """Count what was lost, twice or wrong in the folder of a demo that has ended.
 
-    `seen` are the rows that were ever on the disk.
+    `seen` are the rows that were ever on the disk; `truth` is what the demo opens at its very end.
     """
     folder = out / 'session'
     try:
@@ -134,8 +134,9 @@ def judge(out: Path, seen: set[str]) -> dict[str, Any]:
         'wrong': 0,
     }
     truth_path = out / 'truth.yaml'
-    if truth_path.exists():
+    if truth is None and truth_path.exists():
         truth = yaml.safe_load(truth_path.read_text())
+    if truth is not None:
         result['wrong'] = wrong_pairs(session, truth)
     fit_path = out / 'fit' / 'fit.json'
     if fit_path.exists():
