@@ -118,6 +118,7 @@ def nodes(
         **{name: {'world': str(world)} for name in (*SENSORS[:2], 'fake_robot')},
         'pose_planner': {
             'seed': args.seed,
+            'session': str(out / 'session'),
             'optimization_candidates': args.candidates,
             'validation_candidates': args.candidates,
         },
