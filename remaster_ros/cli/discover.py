@@ -10,7 +10,12 @@ import numpy as np
 
 from remaster_ros.cli.console import progress_bar, say
 from remaster_ros.core.discovery import Discovery, discover_session
-from remaster_ros.core.discovery_confirm import Confirmation, confirm, share_in_words
+from remaster_ros.core.discovery_confirm import (
+    Confirmation,
+    confirm,
+    require_same_cell,
+    share_in_words,
+)
 from remaster_ros.storage.discovery_results import save_discovery
 from remaster_ros.storage.results import prepare_folder
 from remaster_ros.storage.session import read_session
@@ -32,6 +37,9 @@ def run(args: argparse.Namespace) -> int:
     """Search, extend, measure the gain, write, and say in a few lines what came out."""
     session = read_session(args.session)
     other = None if args.confirm is None else read_session(args.confirm)
+    if other is not None:
+        # Not after the long search.
+        require_same_cell(session, other)
     prepare_folder(args.out)
     with progress_bar(args.quiet) as progress:
         found = discover_session(

@@ -58,8 +58,8 @@ def confirm(discovery: Discovery, session: Session) -> Confirmation:
     InsufficientDataError
         Data that do not allow a fit.
     """
+    require_same_cell(discovery.fit.session, session)
     problem = Problem.of(session)
-    _require_same_cell(discovery, problem)
     found = estimate(problem)
     before = _left(discovery, found, discovery.offsets_before[0], ())
     after = _left(discovery, found, discovery.fit.joint_offsets, discovery.groups)
@@ -137,24 +137,31 @@ def _left(
     return left - columns @ step
 
 
-def _require_same_cell(discovery: Discovery, problem: Problem) -> None:
-    chain, scene = discovery.residuals.scene.chain, discovery.residuals.scene
-    if chain.joint_names != problem.chain.joint_names:
+def require_same_cell(session: Session, other: Session) -> None:
+    """Refuse to compare sessions of different robots, sensors or markers.
+
+    Raises
+    ------
+    InputError
+        Says what differs.
+    """
+    mine, theirs = Problem.of(session), Problem.of(other)
+    if mine.chain.joint_names != theirs.chain.joint_names:
         raise InputError(
             f'the other session is of another robot: its joints are '
-            f'{", ".join(problem.chain.joint_names)}, not {", ".join(chain.joint_names)}'
+            f'{", ".join(theirs.chain.joint_names)}, not {", ".join(mine.chain.joint_names)}'
         )
-    if not np.allclose(chain.T_fixed, problem.chain.T_fixed, atol=1e-6):
+    if not np.allclose(mine.chain.T_fixed, theirs.chain.T_fixed, atol=1e-6):
         raise InputError(
             "the other session's URDF has another geometry; confirm with the same arm"
         )
-    for kind, mine, theirs in (
-        ('sensors', scene.sensor_names, problem.sensor_names),
-        ('markers', scene.marker_names, problem.marker_names),
+    for kind, own, others in (
+        ('sensors', mine.sensor_names, theirs.sensor_names),
+        ('markers', mine.marker_names, theirs.marker_names),
     ):
-        if mine != theirs:
+        if own != others:
             raise InputError(
-                f'the other session has the {kind} {", ".join(theirs)}, not {", ".join(mine)}; '
+                f'the other session has the {kind} {", ".join(others)}, not {", ".join(own)}; '
                 'confirm with a session of the same cell'
             )
 
