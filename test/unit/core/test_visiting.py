@@ -621,6 +621,13 @@ def test_the_probe_goes_inward(bounds):
     np.testing.assert_allclose(np.abs(end - HOME), 1e-6, rtol=1e-6)
 
 
+@pytest.mark.parametrize(('place', 'way'), [(0.4, 1), (0.5, 1), (0.6, -1)])
+def test_the_probe_goes_towards_the_middle(place, way):
+    home = np.full(2, place)
+    probe = copying((0.0, 0.0), (1.0, 1.0), home)[0]
+    np.testing.assert_allclose(probe.waypoints[-1].q, home + way * 1e-6, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize('side', [1.0, -1.0])
 def test_the_probe_of_a_joint_without_limits_goes_towards_zero(side):
     probe = copying((-np.inf, -np.inf), (np.inf, np.inf), side * HOME)[0]
