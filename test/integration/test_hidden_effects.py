@@ -1,0 +1,109 @@
+"""Is what a world of its own hides found: its name, its joint, its size; and nothing else?
+
+Effect, joint, size and sign are drawn; sizes are eight times what the best possible test needs to
+find the effect in 90 % of sessions. benchmarks/bench_discovery.py does the same with hundreds of
+sessions, and small sizes too. Seeds are fixed, so that a failure is the same for everyone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hidden_judge import judge
+from hidden_sessions import NOISES, Recipe, another_session, held_out_noise_m, hidden_session
+
+from remaster_ros.core.discovery import Discovery, discover_session
+from remaster_ros.core.discovery_confirm import confirm
+from remaster_ros.fakes.effects import NAMED
+
+# Half a minute on a quiet machine.
+pytestmark = pytest.mark.timeout(1200)
+
+CLEAR = 8.0
+SEED = 20
+
+
+def discovered(recipe: Recipe) -> tuple[Discovery, object]:
+    """Hide, discover; print what a failure needs."""
+    hidden = hidden_session(recipe)
+    found = discover_session(hidden.session, rng=np.random.default_rng(recipe.seed))
+    print(recipe)
+    print('hidden:', *(str(effect) for effect in hidden.truth.effects), sep='\n  ')
+    for effect in found.effects:
+        print('found:', effect.name, effect.joints, effect.parameters, effect.confusable_with)
+    return found, hidden
+
+
+def test_single_effects_are_named_with_joint_and_size() -> None:
+    """Eight of the sixteen, drawn with everything else.
+
+    Of sessions like these the benchmark has 95 % right, names and sizes: two misses or more in
+    eight would come with 6 % of seeds.
+    """
+    print(f'seed {SEED}')
+    rng = np.random.default_rng(SEED)
+    misses, excess = [], []
+    for i, kind in enumerate(rng.permutation(list(NAMED))[:8]):
+        recipe = Recipe(
+            seed=SEED + i,
+            kinds=(str(kind),),
+            multiple=CLEAR,
+            robot=('iiwa7', 'six')[i % 2],
+            sensors=(('mocap',), ('mocap', 'tracker'))[i // 2 % 2],
+            noise=tuple(NOISES)[i // 2 % 4],
+            outliers=i % 3 == 0,
+        )
+        found, hidden = discovered(recipe)
+        judgement = judge(hidden.world, hidden.truth, found)
+        print(judgement)
+        if not judgement.named_right or judgement.size_right is False:
+            misses.append((kind, judgement))
+        excess.append(found.gain.held_out_rms_after_m / held_out_noise_m(hidden))
+    assert len(misses) <= 1, misses
+    # What is left is the noise; a drift has to be extrapolated to the poses held out, which come
+    # last, and costs some more.
+    print('held-out error / noise:', np.round(excess, 3))
+    assert np.median(excess) < 1.05
+    assert np.max(excess) < 1.2
+
+
+@pytest.mark.parametrize('noise', NOISES)
+def test_nothing_is_named_where_nothing_is(noise: str) -> None:
+    """Outliers in every second session. Of such sessions 2 % may claim something."""
+    i = list(NOISES).index(noise)
+    recipe = Recipe(
+        seed=SEED + i,
+        robot=('iiwa7', 'six')[i % 2],
+        sensors=('mocap', 'tracker'),
+        noise=noise,
+        outliers=i % 2 == 0,
+        held_out_outliers=i % 2 == 0,
+    )
+    found, _ = discovered(recipe)
+    assert found.verdict == 'none'
+    assert not found.effects
+
+
+def test_two_effects_at_once() -> None:
+    """Two joints that sag, where the greedy choice is a coupling, and backlash beside."""
+    found, hidden = discovered(
+        Recipe(SEED, ('joint_compliance', 'backlash'), CLEAR, sensors=('mocap', 'tracker'))
+    )
+    judgement = judge(hidden.world, hidden.truth, found)
+    assert judgement.named_right, judgement
+    assert judgement.size_right, judgement
+
+
+def test_causes_carry_over_to_a_session_of_the_same_arm_until_they_are_removed() -> None:
+    recipe = Recipe(SEED, ('encoder_eccentricity',), CLEAR)
+    found, first = discovered(recipe)
+    assert found.effects
+    other = Recipe(SEED + 1)
+    same = confirm(found, another_session(first, other, first.truth.effects).session)
+    repaired = confirm(found, another_session(first, other, ()).session)
+    print(same, repaired, sep='\n')
+    assert same.confirmed
+    assert same.rms_after_m < same.rms_before_m
+    assert not repaired.confirmed
+    # Frozen causes of an arm that no longer has them make its errors worse.
+    assert repaired.rms_after_m > repaired.rms_before_m
