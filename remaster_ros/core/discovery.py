@@ -36,6 +36,8 @@ from remaster_ros.core.sampling import Progress, silent
 from remaster_ros.core.types import BoolArray, FloatArray, Session
 
 Verdict = Literal['effects', 'none', 'undetermined']
+# A cause with this share of the gain is one of the leaders.
+LEADING_SHARE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +125,8 @@ def discover_session(
     )
     effects = tuple(effect.sampled(fit) for effect in findings.effects)
     verdict: Verdict = 'effects' if effects else 'none'
-    if any(effect.tied for effect in effects):
+    # A tie over a small remainder does not put the rest in doubt.
+    if any(effect.tied and (effect.share or 0.0) > LEADING_SHARE for effect in effects):
         verdict = 'undetermined'
     return Discovery(
         verdict=verdict,

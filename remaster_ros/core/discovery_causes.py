@@ -155,7 +155,7 @@ def _described(
         # It came in exchange for what had passed.
         p_values = [max(step.p_value for step in selection.steps)]
     alike: tuple[LookAlike, ...] = ()
-    if without is not None and len(group) == 1 and first.penalty is None:
+    if without is not None and len(group) == 1:
         alike = _look_alikes(data, solution, without, catalogue, first)
     effect = FoundEffect(
         name=first.name,
@@ -176,7 +176,7 @@ def _described(
 
 
 def _joints(group: Sequence[Cell]) -> tuple[int, ...]:
-    if len(group) == 1:
+    if len({cell.joints for cell in group}) == 1:
         return group[0].joints
     return tuple(sorted({joint for cell in group for joint in cell.joints}))
 

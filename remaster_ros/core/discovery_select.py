@@ -334,7 +334,7 @@ def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
     for cell in cells:
         key: tuple[str, ...] = (cell.name, cell.driver, cell.form, cell.subject)
         if cell.name in ('unnamed', 'joint_coupling', 'gear_periodic'):
-            key += (str(cell.joints), cell.variant)
+            key += (str(cell.joints), cell.variant if cell.name == 'unnamed' else '')
         groups.setdefault(key, []).append(cell)
     return [tuple(group) for group in groups.values()]
 

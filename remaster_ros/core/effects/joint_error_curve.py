@@ -13,6 +13,8 @@ from remaster_ros.core.types import FloatArray
 
 # The finest: gearbox errors have structure down to a few degrees; finer overfits any session.
 FINEST_KNOTS = np.radians(4.0)
+# A shape with a name that explains as much is the better answer.
+RARITY = 10
 # Below this many configurations per knot the curve is coarser.
 ROWS_PER_KNOT = 6.0
 
@@ -45,7 +47,7 @@ def cells(scene: Scene) -> Iterator[Cell]:
             parameters=tuple(f'curve_{joint}_at_{angle:+.1f}deg' for angle in angles),
             unit=EFFECT.unit,
             columns=columns,
-            drawn_from=scene.joints,
+            drawn_from=RARITY * scene.joints,
             penalty=roughness(len(angles)),
         )
 
