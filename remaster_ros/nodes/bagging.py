@@ -9,14 +9,16 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 
 from remaster_ros.core.errors import InputError
-from remaster_ros.nodes.status import LATCHED, RELIABLE, TOPIC
+from remaster_ros.nodes.status import LATCHED, TOPIC
 from remaster_ros.storage.bag_writer import BagWriter
 
+DEEP = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
+"""What a busy recorder has not yet taken is kept for it: seconds of the fastest stream."""
 STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 BEGAN = 'began'
 """The event by which a bag says that its recorder was started (again)."""
@@ -69,7 +71,7 @@ class BagRecorder:
         kind: Any,
         topic: str,
         receive: Callable[[Any], None] | None = None,
-        qos: QoSProfile = RELIABLE,
+        qos: QoSProfile = DEEP,
     ) -> None:
         """Record `topic`; call `receive` with each decoded message, if given."""
         module = kind.__module__.split('.')[0]

@@ -152,9 +152,10 @@ class Recorder(RemasterNode):
         self._trouble = ''
         self._announcements = Announcements(self.chain.joint_names)
         self._taking: _Taking | None = None
+        self._due: deque[tuple[FloatArray, float, int, Announced]] = deque(maxlen=100)
         # Topics come in no common order: what belongs to a dwell may be here before /settled is.
-        self._recent_joints: deque[tuple[float, FloatArray]] = deque(maxlen=500)
-        self._recent_readings: deque[tuple[str, MarkerReading]] = deque(maxlen=500)
+        self._recent_joints: deque[tuple[float, FloatArray]] = deque(maxlen=4000)
+        self._recent_readings: deque[tuple[str, MarkerReading]] = deque(maxlen=4000)
         self._q: FloatArray | None = None
         self._now = 0.0
         self._from_q: FloatArray | None = None
@@ -236,6 +237,7 @@ class Recorder(RemasterNode):
         elif (event.node, event.event) == ('recorder', BEGAN):
             # From a bag: that recorder was started anew here, and knew of no reading under way.
             self._taking = None
+            self._due.clear()
         elif (event.node, event.event) == ('robot_bridge', 'stopped'):
             # On its way: nobody knows what it will come from next.
             self._from_q = None
@@ -244,7 +246,7 @@ class Recorder(RemasterNode):
         if 'sensor' in values:
             ready = values.get('ready') == 'yes'
             self._presence.says(values['sensor'], ready, message, time.monotonic())
-        if node == 'pose_planner' and self._taking is None:
+        if node == 'pose_planner' and self._taking is None and not self._due:
             state = values.get('state')
             if state == 'complete':
                 self._close('complete')
@@ -268,16 +270,27 @@ class Recorder(RemasterNode):
             self.counts['settled_unknown'] += 1
             self._trouble = 'settled at no joint solution of an announced pose'
             return
-        if self.logbook.closed or not self.logbook.follow(pose.plan):
-            self._trouble = 'settled, but the session is closed, or was begun with another plan'
-            return
-        known = self.logbook.result(pose.pose, pose.ids[solution])
-        if known:
-            self._report(
-                pose.stamp, solution, known, 'recorded before', registered=self._registered()
-            )
-            return
-        self._take(q, seconds(message.header.stamp), solution, pose)
+        # The bridge waits for an answer, but a bag at ten times the speed does not: what is read
+        # now is finished first, by the stamps of its own messages.
+        self._due.append((q, seconds(message.header.stamp), solution, pose))
+        self._take_next()
+
+    def _take_next(self) -> None:
+        """Begin the reading that is due, unless one is under way."""
+        while self._due and self._taking is None:
+            q, settled_s, solution, pose = self._due.popleft()
+            if self.logbook.closed or not self.logbook.follow(pose.plan):
+                self._trouble = (
+                    'settled, but the session is closed, or was begun with another plan'
+                )
+                continue
+            known = self.logbook.result(pose.pose, pose.ids[solution])
+            if known:
+                self._report(
+                    pose.stamp, solution, known, 'recorded before', registered=self._registered()
+                )
+                continue
+            self._take(q, settled_s, solution, pose)
 
     def _registered(self) -> str:
         """Whether every sensor that the arm waits for is registered, in a word."""
@@ -314,6 +327,7 @@ class Recorder(RemasterNode):
             self._shots.look(self._taking.pairing, absent)
             self._taking.pairing.give_up(self._now, absent, self._presence.words)
             self._finish_if_complete()
+        self._take_next()
         waiting_for = self._waiting_for(absent)
         if bool(waiting_for) != self._was_waiting:
             self._was_waiting = bool(waiting_for)
@@ -362,6 +376,7 @@ class Recorder(RemasterNode):
             measuring_s=f'{last - taking.pairing.settled_stamp_s:.6f}',
             **{f'waited_s_{name}': f'{waited:.3f}' for name, waited in waited_s.items()},
         )
+        self._take_next()
 
     def _judged(self, item: PairedReading | Rejection) -> PairedReading | Rejection:
         if isinstance(item, Rejection):
@@ -378,7 +393,9 @@ class Recorder(RemasterNode):
             reason=reason,
             readings=good,
             from_q=taking.from_q,
-            temperatures_c=[self._temperature_c(reading.stamp_s) for reading in good],
+            # Not that of this very reading: a topic of its own, it may come after the point, and
+            # a replay must write what the recording wrote.
+            temperatures_c=[self._temperature_c(taking.pairing.settled_stamp_s)] * len(good),
         )
 
     def _report(self, stamp: str, solution: int, result: str, why: str, **values: str) -> None:

@@ -195,7 +195,7 @@ def test_a_session_is_never_overwritten(session: Path) -> None:
         (('simulate', 'out', '--seed', -1), '--seed: -1 is less than 0'),
         (('simulate', 'out', '--sensors', 'sonar'), "no sensor 'sonar' in the cell"),
         (('simulate', 'out', '--robot', 'nix'), 'nix: no such file; --robot takes a URDF file'),
-        (('simulate', 'out', '--cell', 'nix'), 'nix.yaml: cannot read the cell file'),
+        (('simulate', 'out', '--cell', 'nix'), 'nix.yaml: no such file; name a cell file'),
         (('simulate', 'out', '--tip-link', 'nix'), 'nix'),
         (('fit', 'session'), 'required: --out'),
         (('fit', 'session', '--out', 'o', '--chains', 1), '--chains: 1 is less than 2'),
