@@ -6,12 +6,15 @@ cut or be zeros (test/crash_states.py). After each: the session is read as it is
 times with a crash in the recovery too, recovered again, gone on with and completed, and held to
 what its writer had acknowledged (test/session_crashes.py).
 
-    python benchmarks/bench_crash_states.py [--states 12000] [--processes N]
+A life that is done is written down, so that the next run goes on where this one stopped.
+
+    python benchmarks/bench_crash_states.py [--states 12000] [--processes N] [--out FILE]
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import os
 import random
@@ -57,15 +60,28 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--states', type=int, default=12_000, help='at least so many states')
     parser.add_argument('--processes', type=int, default=os.cpu_count())
+    parser.add_argument('--out', type=Path, default=Path('crash_states.jsonl'))
     args = parser.parse_args()
+    known = (
+        {life[0]: life for life in map(json.loads, args.out.read_text().splitlines())}
+        if args.out.exists()
+        else {}
+    )
     total: Counter[str] = Counter()
     failures: list[str] = []
     began = time.monotonic()
     print('  seed  operations  states so far  nothing yet  whole  dropped  failures')
-    with ProcessPoolExecutor(args.processes) as pool:
-        # A life has some hundred operations; the surplus is not asked for.
-        for seed, operations, found, failed in pool.map(one_life, range(args.states // 250 + 1)):
-            total += found
+    with args.out.open('a') as file, ProcessPoolExecutor(args.processes) as pool:
+        # A life has some hundred operations.
+        seeds = range(args.states // 350 + 1)
+        fresh = pool.map(one_life, [seed for seed in seeds if seed not in known])
+        for seed in seeds:
+            life = known.get(seed) or next(fresh)
+            if seed not in known:
+                file.write(json.dumps(life) + '\n')
+                file.flush()
+            _, operations, found, failed = life
+            total.update(found)
             failures += failed
             print(
                 f'{seed:6d} {operations:11d} {total.total() + len(failures):14d} '
@@ -81,7 +97,7 @@ def main() -> int:
         f'{len(failures)} lost or changed something acknowledged, or did not settle; '
         f'{total["dropped"]} dropped what was being written, and said so'
     )
-    return 1 if failures else 0
+    return 1 if failures or states < args.states else 0
 
 
 if __name__ == '__main__':
