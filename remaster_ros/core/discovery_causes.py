@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from remaster_ros.core.discovery_evidence import Solution, solve
+from remaster_ros.core.discovery_families import grouped, log_prior
 from remaster_ros.core.discovery_gain import shares
 from remaster_ros.core.discovery_noise import Residuals
 from remaster_ros.core.discovery_screen import Catalogue, screen
-from remaster_ros.core.discovery_select import Selection, grouped, log_prior
+from remaster_ros.core.discovery_select import Selection
 from remaster_ros.core.effects.cell import Cell
 from remaster_ros.core.effects.registry import EFFECTS
 from remaster_ros.core.effects.scene import Scene

@@ -17,10 +17,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from remaster_ros.core.discovery_evidence import Solution, solve
-from remaster_ros.core.discovery_noise import Noise, Residuals
+from remaster_ros.core.discovery_families import (
+    FAMILIES,
+    family_of,
+    grouped,
+    log_prior,
+    relatives,
+)
+from remaster_ros.core.discovery_noise import Residuals
 from remaster_ros.core.discovery_screen import Catalogue, Screening, screen
+from remaster_ros.core.discovery_worth import held_out_error, worth_of
 from remaster_ros.core.effects.cell import Cell
-from remaster_ros.core.types import FloatArray, IntArray
+from remaster_ros.core.types import FloatArray
 
 # Family-wise error of one round.
 SIGNIFICANCE = 0.01
@@ -36,16 +44,8 @@ MOST_EXCHANGED = 6
 MOST_MERGED = 4
 # So many cells of one family are a family.
 WHOLE = 3
-# Physical causes that strike all joints or links of an arm alike.
-FAMILIES: tuple[tuple[str, ...], ...] = (
-    ('joint_compliance',),
-    ('encoder_eccentricity',),
-    ('encoder_scale',),
-    ('backlash',),
-    ('settling',),
-    ('link_length', 'joint_axis_tilt'),
-    ('joint_error_curve',),
-)
+# A cell whose loss would cost this much evidence need not be tested by itself.
+BEYOND_DOUBT = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,25 +76,6 @@ class Selection:
     solution: Solution
     steps: tuple[Step, ...]
     rejected: Step | None
-
-
-def log_prior(cells: Sequence[Cell], catalogue: Sequence[Cell]) -> float:
-    """Return the log prior probability of a set: cell by cell, or by whole families.
-
-    Cells of a family come together more often than each by its own chance: given the family, each
-    of its members is in or out.
-    """
-    total = 0.0
-    rest = list(cells)
-    for family in FAMILIES:
-        mine = [cell for cell in rest if cell.name in family]
-        if not mine:
-            continue
-        rest = [cell for cell in rest if cell.name not in family]
-        members = len({(cell.name, cell.joints) for cell in catalogue if cell.name in family})
-        alone = -sum(np.log(cell.drawn_from) for cell in mine)
-        total += max(alone, -members * np.log(2.0))
-    return float(total - sum(np.log(cell.drawn_from) for cell in rest))
 
 
 @dataclass(eq=False)
@@ -144,7 +125,9 @@ class Search:
             proposal = self.propose(solution, screening)
             if proposal is None or proposal[0].log_evidence <= solution.log_evidence:
                 break
-            candidate, p_value = proposal
+            candidate, p_value = self.earned(proposal[0]), proposal[1]
+            if candidate.log_evidence <= solution.log_evidence:
+                break
             share = self.held_out_share(solution, candidate)
             new = tuple(cell for cell in candidate.cells if cell not in solution.cells)
             step = Step(new, p_value, share, candidate.log_evidence - solution.log_evidence)
@@ -152,7 +135,8 @@ class Search:
                 rejected = step
                 break
             steps.append(step)
-            solution = self._judged(self.keep_what_pays(self.exchange(self.prune(candidate))))
+            solution = self.exchange(self.prune(candidate))
+            solution = self._judged(self.earned(self.keep_what_pays(solution)))
         empty = self.fit(())
         assert empty is not None
         return Selection(empty, solution, tuple(steps), rejected)
@@ -243,7 +227,7 @@ class Search:
                 if among is not None and cell not in among:
                     worth.append(np.inf)
                     continue
-                worth.append(_worth(solution, cell, where, price))
+                worth.append(worth_of(solution, cell, where, price))
             order = np.argsort(worth)
             for index in order[:2]:
                 # Wald's estimate of the loss chooses; the evidence itself decides.
@@ -273,7 +257,7 @@ class Search:
         """Return the best fit with one cell, or two, replaced by one other; None if none gains."""
         best = None
         # A family found as a whole stays one: part of it looks like many other things.
-        loose = [cell for cell in solution.cells if self._relatives(solution, cell) < WHOLE]
+        loose = [cell for cell in solution.cells if relatives(solution.cells, cell) < WHOLE]
         removed = [{cell} for cell in loose]
         if len(loose) <= MOST_MERGED:
             removed += [set(pair) for pair in itertools.combinations(loose, 2)]
@@ -286,13 +270,6 @@ class Search:
             return None
         return best
 
-    def _relatives(self, solution: Solution, cell: Cell) -> int:
-        """Return how many cells of a cell's family are in the set."""
-        for family in FAMILIES:
-            if cell.name in family:
-                return sum(other.name in family for other in solution.cells)
-        return 1
-
     def keep_what_pays(self, solution: Solution) -> Solution:
         """Drop the causes without which poses left out are predicted better."""
         for group in grouped(solution.cells):
@@ -303,6 +280,48 @@ class Search:
             if without is not None and self.held_out_share(without, solution) < 0.0:
                 solution = without
         return solution
+
+    def earned(self, solution: Solution) -> Solution:
+        """Drop, the weakest first, the members of families that do not pay by themselves.
+
+        A family passes its tests as a whole. Each member has still to raise the evidence, to
+        predict poses left out, and to beat the best of its family on surrogate residuals.
+        """
+        price = np.log(3.0 * len(self.data))
+        tested: set[Cell] = set()
+        while True:
+            weak = [
+                (worth, index)
+                for index, (cell, where) in enumerate(
+                    zip(solution.cells, solution.slices(), strict=True)
+                )
+                if cell not in tested
+                and relatives(solution.cells, cell) > 1
+                and (worth := worth_of(solution, cell, where, price)) < BEYOND_DOUBT
+            ]
+            if not weak:
+                return solution
+            _, index = min(weak)
+            cell = solution.cells[index]
+            tested.add(cell)
+            rest = (*solution.cells[:index], *solution.cells[index + 1 :])
+            without = self.fit(rest, solution)
+            if without is not None and not self._pays(cell, without, solution):
+                solution = without
+
+    def _pays(self, cell: Cell, without: Solution, solution: Solution) -> bool:
+        """Does a cell pass the tests of a step, among those of its family?"""
+        if solution.log_evidence <= without.log_evidence:
+            return False
+        if self.held_out_share(without, solution) <= 0.0:
+            return False
+        family = family_of(cell)
+        chosen = np.array([other.name in family for other in self.catalogue.cells])
+        screening = screen(
+            self.data, self.catalogue, without, rng=self.rng, draws=DRAWS, chosen=chosen
+        )
+        own = [other.key == cell.key for other in self.catalogue.cells].index(True)
+        return screening.p_value(float(screening.score[own])) <= SIGNIFICANCE
 
     def replacements(self, solution: Solution, cells: set[Cell], count: int) -> list[Solution]:
         """Return fits with the best other cells in the place of these, best first."""
@@ -328,17 +347,6 @@ class Search:
         return float(1.0 - after.sum() / before.sum())
 
 
-def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
-    """Return the cells of each cause together, in the order of their first."""
-    groups: dict[tuple[str, ...], list[Cell]] = {}
-    for cell in cells:
-        key: tuple[str, ...] = (cell.name, cell.driver, cell.form, cell.subject)
-        if cell.name in ('unnamed', 'joint_coupling', 'gear_periodic'):
-            key += (str(cell.joints), cell.variant if cell.name == 'unnamed' else '')
-        groups.setdefault(key, []).append(cell)
-    return [tuple(group) for group in groups.values()]
-
-
 # A member of a family that the others explain to this share of its size is another name for them.
 FAMILY_ABSORBED = 1e-3
 
@@ -346,53 +354,3 @@ FAMILY_ABSORBED = 1e-3
 def _unit(columns: FloatArray) -> FloatArray:
     norm = np.linalg.norm(columns, axis=0)
     return columns / np.where(norm > 0.0, norm, 1.0)
-
-
-def _worth(solution: Solution, cell: Cell, where: slice, price: float) -> float:
-    """Estimate how much log evidence would be lost without a cell."""
-    values, covariance = solution.parameters[where], solution.covariance[where, where]
-    drop = 0.5 * values @ np.linalg.solve(covariance, values)
-    if cell.penalty is None:
-        return float(drop - 0.5 * cell.size * price)
-    return float(drop - 0.5 * cell.size)
-
-
-def held_out_error(
-    data: Residuals, solution: Solution, noise: Noise, fold_of_pose: IntArray
-) -> FloatArray:
-    """Return each pose's squared error, in units of the noise, by the fit to other poses.
-
-    Parameters
-    ----------
-    data
-        The residuals.
-    solution
-        Which cells, with which smoothness.
-    noise
-        The noise to fit and to judge by.
-    fold_of_pose
-        Poses with the same number are left out together, (poses,).
-    """
-    columns = data.columns(solution.cells)[data.rows.source]
-    joined = np.concatenate((data.base, columns, data.errors[:, :, None]), axis=2)
-    white = data.whitened(joined, noise).reshape(3 * len(data), -1)
-    scale = np.linalg.norm(white, axis=0)
-    scale[-1] = 1.0
-    scale[scale == 0.0] = 1.0
-    white /= scale
-    p, size = data.base.shape[2], white.shape[1] - 1
-    prior = np.zeros((size, size))
-    prior[p:, p:] = solution.prior_precision()
-    prior /= np.outer(scale[:-1], scale[:-1])
-    fold = np.repeat(fold_of_pose[data.pose_of_row], 3)
-    total = white.T @ white
-    total[:-1, :-1] += prior + 1e-12 * np.eye(size)
-    errors = np.empty(len(white))
-    for index in np.unique(fold):
-        out = white[fold == index]
-        kept = total - out.T @ out
-        beta = np.linalg.solve(kept[:-1, :-1], kept[:-1, -1])
-        errors[fold == index] = out[:, -1] - out[:, :-1] @ beta
-    square = np.add.reduceat(errors**2, np.arange(0, len(errors), 3))
-    by_pose: FloatArray = np.bincount(data.pose_of_row, square).astype(float)
-    return by_pose

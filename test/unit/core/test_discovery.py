@@ -12,7 +12,7 @@ from remaster_ros.core.discovery import Findings, discover_session, find_causes
 from remaster_ros.core.discovery_confirm import confirm
 from remaster_ros.core.discovery_evidence import Strata, _System, solve
 from remaster_ros.core.discovery_screen import Catalogue, screen
-from remaster_ros.core.discovery_select import held_out_error
+from remaster_ros.core.discovery_worth import held_out_error
 from remaster_ros.core.effects.registry import EFFECTS
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.types import Session
