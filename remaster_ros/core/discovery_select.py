@@ -44,6 +44,8 @@ MOST_EXCHANGED = 6
 MOST_MERGED = 4
 # So many cells of one family are a family.
 WHOLE = 3
+# A member of a family has to raise the evidence by this: a free form of no size costs nothing.
+MEMBER = 1.0
 # A cell whose loss would cost this much evidence need not be tested by itself.
 BEYOND_DOUBT = 20.0
 
@@ -285,7 +287,7 @@ class Search:
         """Drop, the weakest first, the members of families that do not pay by themselves.
 
         A family passes its tests as a whole. Each member has still to raise the evidence, to
-        predict poses left out, and to beat the best of its family on surrogate residuals.
+        predict poses left out, and to beat itself on surrogate residuals.
         """
         price = np.log(3.0 * len(self.data))
         tested: set[Cell] = set()
@@ -310,18 +312,16 @@ class Search:
                 solution = without
 
     def _pays(self, cell: Cell, without: Solution, solution: Solution) -> bool:
-        """Does a cell pass the tests of a step, among those of its family?"""
-        if solution.log_evidence <= without.log_evidence:
+        """Does a cell pass the tests of a step by itself?"""
+        if solution.log_evidence - without.log_evidence < MEMBER:
             return False
         if self.held_out_share(without, solution) <= 0.0:
             return False
-        family = family_of(cell)
-        chosen = np.array([other.name in family for other in self.catalogue.cells])
+        own = np.array([other.key == cell.key for other in self.catalogue.cells])
         screening = screen(
-            self.data, self.catalogue, without, rng=self.rng, draws=DRAWS, chosen=chosen
+            self.data, self.catalogue, without, rng=self.rng, draws=DRAWS, chosen=own
         )
-        own = [other.key == cell.key for other in self.catalogue.cells].index(True)
-        return screening.p_value(float(screening.score[own])) <= SIGNIFICANCE
+        return screening.p_value(float(screening.score[own][0])) <= SIGNIFICANCE
 
     def replacements(self, solution: Solution, cells: set[Cell], count: int) -> list[Solution]:
         """Return fits with the best other cells in the place of these, best first."""
