@@ -27,7 +27,7 @@ TAIL_WIDENING = 1.3
 
 
 # Draws at a time: more fall out of the processor's cache.
-BLOCK = 256
+BLOCK = 1024
 
 
 def linearise(posterior: Posterior, z: FloatArray) -> Linearisation:

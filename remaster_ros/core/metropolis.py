@@ -13,8 +13,10 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from remaster_ros.core.types import FloatArray
+from remaster_ros.core.types import FloatArray, IntArray
 
+# Proposals evaluated between two reports of progress.
+REPORTED = 2000
 LogDensity = Callable[[FloatArray], FloatArray]
 
 
@@ -80,7 +82,9 @@ class StudentT:
 
     def log_density(self, points: FloatArray) -> FloatArray:
         """Return the normalised log density of points (..., d), (...)."""
-        whitened = np.linalg.solve(self.factor, (points - self.mean)[..., None])[..., 0]
+        shape = points.shape
+        flat = (points - self.mean).reshape(-1, shape[-1])
+        whitened = np.linalg.solve(self.factor, flat.T).T.reshape(shape)
         log_root = float(np.sum(np.log(np.diag(self.factor))))
         return log_student_t(np.sum(whitened**2, axis=-1), len(self.mean), self.freedom) - log_root
 
@@ -129,7 +133,7 @@ def independence_sampler(
     length = warm_up + draws
     points, log_proposal = proposal.sample(chains * length, rng)
     log_target = np.empty(chains * length)
-    blocks = np.array_split(np.arange(chains * length), max(1, chains * length // 500))
+    blocks = np.array_split(np.arange(chains * length), max(1, chains * length // REPORTED))
     for done, block in enumerate(blocks, start=1):
         log_target[block] = log_density(points[block])
         if progress is not None:
@@ -146,18 +150,28 @@ def independence_sampler(
     return Chains(path[:, warm_up:], float(accepted[:, warm_up:].mean()), path)
 
 
-def _walk(log_weight: FloatArray, log_uniform: FloatArray, current: float) -> list[int]:
-    """Return which proposal the chain is at after each step; -1 is the start.
+def _walk(log_weight: FloatArray, log_uniform: FloatArray, current: float) -> IntArray:
+    """Return which proposal the chain is at after each step, (n,); -1 is the start.
 
-    Plain numbers in a plain loop: nothing here is worth an array.
+    After a step that was taken the next is judged against its neighbour, all of these at once; only
+    what follows a refusal is walked through, step by step.
     """
-    here, path = -1, []
-    for step, (weight, uniform) in enumerate(
-        zip(log_weight.tolist(), log_uniform.tolist(), strict=True)
-    ):
-        if uniform < weight - current:
-            here, current = step, weight
-        path.append(here)
+    path = np.arange(len(log_weight))
+    with np.errstate(invalid='ignore'):
+        # From nowhere to nowhere is no step.
+        taken = log_uniform < np.diff(log_weight, prepend=current)
+    weight, uniform = log_weight.tolist(), log_uniform.tolist()
+    done = 0
+    for refused in np.flatnonzero(~taken).tolist():
+        if refused < done:
+            continue
+        held = weight[refused - 1] if refused > 0 else current
+        done = refused + 1
+        while done < len(weight) and not uniform[done] < weight[done] - held:
+            done += 1
+        path[refused:done] = refused - 1
+        # The step that ended the wait was taken.
+        done += 1
     return path
 
 

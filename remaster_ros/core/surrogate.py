@@ -24,9 +24,9 @@ from remaster_ros.core.types import BoolArray, FloatArray, IntArray
 
 # Products of parameters that move the errors by less than this many standard deviations, in the
 # norm over all observations, a posterior standard deviation away from the mode.
-NEGLIGIBLE = 1e-5
+NEGLIGIBLE = 1e-4
 # Proposals evaluated at a time: more fall out of the processor's cache.
-BLOCK = 512
+BLOCK = 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +40,9 @@ class _Part:
     first, second
         The products that matter, as indices of free parameters, (p,) each.
     cells
-        Indices of the noise model's cells; empty for priors, whose weight is 1.
+        One of the noise model's cells for each variance; empty for priors, whose weight is 1.
     straight
-        Products of linear with all features by cell, (cells or 1, l + 1, l + 1 + p).
+        Products of linear with all features by variance, (cells or 1, l + 1, l + 1 + p).
     curved
         Products of the products by channel at the mode's noise, with that channel's index.
     """
@@ -87,22 +87,21 @@ class Surrogate:
 
     def _log_density(self, points: FloatArray) -> FloatArray:
         posterior, f = self.posterior, len(self.posterior.free)
-        step, eta = points[:, :f] - self.centre[:f], points[:, f:]
+        # Features by rows: what is picked and multiplied then lies together in memory.
+        step, eta = (self.centre[:f] - points[:, :f]).T.copy(), points[:, f:]
         variances = posterior.variances(eta)
         value = posterior.log_noise_prior(eta) - 0.5 * np.log(variances) @ posterior.freedom
-        ones = np.ones((len(points), 1))
+        one = np.ones((1, len(points)))
         for part in self._parts:
-            line = np.concatenate((-step[:, part.linear], ones), axis=1)
-            product = -step[:, part.first] * step[:, part.second]
-            feature = np.concatenate((line, product), axis=1)
-            forms = np.stack(
-                [np.einsum('ni,ni->n', line @ gram, feature) for gram in part.straight], axis=1
-            )
+            line = np.concatenate((step[part.linear], one))
+            product = -step[part.first] * step[part.second]
+            feature = np.concatenate((line, product))
+            forms = np.einsum('cln,ln->nc', part.straight @ feature, line)
             if len(part.cells) > 0:
                 forms /= variances[:, part.cells]
             value -= 0.5 * forms.sum(axis=1)
             for channel, gram in part.curved:
-                form = np.einsum('ni,ni->n', product @ gram, product)
+                form = np.einsum('pn,pn->n', gram @ product, product)
                 if channel >= 0:
                     form *= np.exp(2.0 * (self.centre[f + channel] - eta[:, channel]))
                 value -= 0.5 * form
@@ -165,13 +164,21 @@ def _part(
     straight = np.concatenate(
         (grams[np.ix_(cells, line, line)], 2.0 * grams[np.ix_(cells, line, bent)]), axis=2
     )
+    # Without a part common to a pose the cells of a channel have one variance.
+    alike: dict[tuple[int, int], list[int]] = {}
+    for place, cell in enumerate(cells):
+        channel = posterior.cells[cell].channel
+        size = posterior.cells[cell].size if channel in posterior.separable else 0
+        alike.setdefault((channel, size), []).append(place)
+    summed = np.array([straight[places].sum(axis=0) for places in alike.values()])
+    chief = cells[[places[0] for places in alike.values()]]
     curved: dict[int, FloatArray] = {}
     for cell in cells:
         channel = posterior.cells[cell].channel
         gram = grams[np.ix_([cell], bent, bent)][0] / variances[cell]
         curved[channel] = curved.get(channel, 0.0) + gram
     products = tuple(curved.items()) if len(bent) > 0 else ()
-    return _Part(linear, first[chosen], second[chosen], cells, straight, products)
+    return _Part(linear, first[chosen], second[chosen], chief, summed, products)
 
 
 def _prior_part(mode: Mode, width: FloatArray) -> list[_Part]:

@@ -11,7 +11,12 @@ import pytest
 from scipy import stats
 
 from remaster_ros.core.convergence import ess_bulk
-from remaster_ros.core.metropolis import StudentT, independence_sampler, random_walk_sampler
+from remaster_ros.core.metropolis import (
+    StudentT,
+    _walk,
+    independence_sampler,
+    random_walk_sampler,
+)
 
 COVARIANCE = np.array([[2.0, 0.9], [0.9, 1.0]])
 
@@ -45,6 +50,24 @@ def test_student_t_is_scipys() -> None:
     np.testing.assert_allclose(density, judge.logpdf(points))
     squares = np.sum(np.linalg.solve(ours.factor, (points - ours.mean).T) ** 2, axis=0)
     assert stats.kstest(squares / 2.0, stats.f(2, 4.0).cdf).pvalue > 1e-3
+
+
+@pytest.mark.parametrize('share', [0.02, 0.5, 0.98])
+def test_walk_is_hastings_rule_step_by_step(share: float) -> None:
+    """Against the rule as it is written; a share of the proposals has no density at all."""
+    rng = np.random.default_rng(11)
+    for length in (1, 2, 50, 500):
+        for current in (-np.inf, 0.3):
+            weight = np.where(rng.random(length) < share, -np.inf, rng.standard_normal(length))
+            uniform = np.log(rng.random(length))
+            here, held, path = -1, current, []
+            for step in range(length):
+                # A state without density is left for any that has one.
+                nowhere = np.isneginf(weight[step])
+                if not nowhere and uniform[step] < weight[step] - held:
+                    here, held = step, weight[step]
+                path.append(here)
+            assert _walk(weight, uniform, current).tolist() == path
 
 
 def test_independent_proposals_sample_a_skewed_target() -> None:
