@@ -20,7 +20,8 @@ from remaster_ros.core.result import FitResult
 
 # Look-alikes within this of the evidence are named; within the other, the leaders tie.
 CONFUSABLE = 5.0
-TIED = 1.0
+# Odds of twenty to one are no proof.
+TIED = 3.0
 SHORTLIST = 10
 # The screening keeps the noise fixed, which costs it this much of the evidence.
 SCREENING_ERROR = 5.0
@@ -168,12 +169,29 @@ def _described(
         p_value=float(min(p_values)),
         log_evidence_gain=float(gain),
         confusable_with=alike,
-        cause=in_words(group, data.scene),
+        cause=in_words(group, data.scene) + _also_called(alike),
         size_m=_size(data, solution, group),
         share=share,
         tied=any(not other.same and other.log_evidence_gain > gain - TIED for other in alike),
     )
     return effect
+
+
+def _also_called(alike: Sequence[LookAlike]) -> str:
+    """Say which other names the same displacement has; '' where it has none."""
+    names = [
+        f'{other.name.replace("_", " ")} of {_listed(other.joints)}'
+        if other.joints
+        else other.name.replace('_', ' ')
+        for other in alike
+        if other.same
+    ]
+    if not names:
+        return ''
+    return (
+        f' Exactly the same errors come from {" or ".join(names)}: no measurement of this marker '
+        'tells them apart, and either name corrects the arm.'
+    )
 
 
 def _joints(group: Sequence[Cell]) -> tuple[int, ...]:

@@ -32,6 +32,8 @@ from remaster_ros.core.types import FloatArray, IntArray
 ABSORBED = 1e-4
 # Of the noise and smoothness coordinates, which are logarithms.
 STEPS = 60
+# Where the slope in these units falls below this, L is within its square of the maximum.
+SLOPE = 0.03
 _LARGE = 18.0
 
 
@@ -162,8 +164,12 @@ def solve(
     free = np.array([cell.penalty is None for cell in cells for _ in cell.parameters], dtype=bool)
     if np.any(scale[free] == 0.0):
         return None
-    # Splines where no data are have nothing but their penalty.
-    scale[scale == 0.0] = np.max(scale, initial=1.0)
+    # The penalty compares neighbours: one unit for all of a cell's splines, also for those at the
+    # edge, of which the data see nothing but rounding.
+    edges = np.cumsum([0, *(cell.size for cell in cells)])
+    for cell, (first, last) in zip(cells, itertools.pairwise(edges), strict=True):
+        if cell.penalty is not None:
+            scale[first:last] = np.max(scale[first:last]) or 1.0
     p = data.base.shape[2]
     unit = np.concatenate((np.ones(p), scale))
     strata = Strata.of(data, np.concatenate((data.base, columns / scale), axis=2))
@@ -286,15 +292,22 @@ class _System:
 
     def solution(self, start: Solution | None, prior: float) -> Solution:
         eta, bounds = self._start(start)
+        # In units of about their own standard deviations: L has a curvature near 1 everywhere.
+        unit = self._curvature() ** -0.5
+
+        def scaled(x: FloatArray) -> tuple[float, FloatArray]:
+            value, gradient = self.evaluate(unit * x)
+            return value, unit * gradient
+
         best = minimize(
-            self.evaluate,
-            eta,
+            scaled,
+            eta / unit,
             jac=True,
             method='L-BFGS-B',
-            bounds=bounds,
-            options={'maxiter': STEPS, 'ftol': 1e-8, 'gtol': 1e-2},
+            bounds=np.array(bounds) / unit[:, None],
+            options={'maxiter': STEPS, 'ftol': 1e-9, 'gtol': SLOPE},
         )
-        eta = best.x
+        eta = unit * best.x
         noise = self.noise(eta)
         weights = self.strata.weights(noise)
         factors = np.exp(eta[len(eta) - len(self.penalised) :])
@@ -331,6 +344,14 @@ class _System:
             value += 0.5 * (len(penalty) * np.log(factor) + np.linalg.slogdet(penalty)[1])
             value -= 0.5 * factor * beta[where] @ penalty @ beta[where]
         return float(value)
+
+    def _curvature(self) -> FloatArray:
+        """Return about what the second derivatives of −L by eta are."""
+        sensor, size, count = self.strata.sensor, self.strata.size, self.strata.count
+        rows = [2.0 * np.sum(count[sensor == s]) for s in range(self.data.sensors)]
+        poses = [0.5 * np.sum(count[(sensor == s) & (size > 0)]) for s in self.separable]
+        smooth = [len(penalty) / 6.0 for penalty in self.penalties]
+        return np.array([*rows, *poses, *smooth])
 
     def _start(self, start: Solution | None) -> tuple[FloatArray, list[tuple[float, float]]]:
         noise = self.data.noise if start is None else start.noise

@@ -20,15 +20,10 @@ FAMILIES: tuple[tuple[str, ...], ...] = (
 )
 
 
-def family_of(cell: Cell) -> tuple[str, ...]:
-    """Return the names of the cells that come together with a cell: its own where none does."""
-    return next((family for family in FAMILIES if cell.name in family), (cell.name,))
-
-
 def relatives(cells: Sequence[Cell], cell: Cell) -> int:
     """Return how many of the cells are of a cell's family; 1 where it has none."""
-    family = family_of(cell)
-    return sum(other.name in family for other in cells) if family in FAMILIES else 1
+    family = next((family for family in FAMILIES if cell.name in family), ())
+    return max(1, sum(other.name in family for other in cells))
 
 
 def log_prior(cells: Sequence[Cell], catalogue: Sequence[Cell]) -> float:

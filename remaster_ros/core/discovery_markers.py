@@ -21,6 +21,8 @@ from remaster_ros.core.types import BoolArray, FloatArray
 SIGNIFICANCE = 0.002
 # A direction counts where the data know it this many times better than the session, in variance.
 KNOWN_BETTER = 4.0
+# An axis of the tool with this share in directions that the data cannot see is said to be hidden.
+HIDDEN = 0.1
 
 
 def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple[FoundEffect, ...]:
@@ -55,7 +57,8 @@ def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple
         inverse = axes[:, seen] / values[seen] @ axes[:, seen].T
         by_data = inverse @ pull
         covariance = inverse + _unseen(by_data, problem.markers[index], axes, seen)
-        effects.append(_effect(name, by_data, covariance, p_value, square, int(seen.sum())))
+        blind = np.sum(axes[:, ~seen] ** 2, axis=1) > HIDDEN
+        effects.append(_effect(name, by_data, covariance, blind, p_value, square, int(seen.sum())))
     return tuple(effects)
 
 
@@ -88,11 +91,19 @@ def _effect(
     name: str,
     moved: FloatArray,
     covariance: FloatArray,
+    blind: BoolArray,
     p_value: float,
     square: float,
     rank: int,
 ) -> FoundEffect:
     effect = EFFECTS['marker_offset']
+    cause = effect.sentence.format(subject=name)
+    if blind.any():
+        unseen = ' and '.join(axis for axis, hidden in zip('xyz', blind, strict=True) if hidden)
+        cause += (
+            f' How far along {unseen} of the tool these poses tell only in part: '
+            'around the last axis it trades with the zero-offset.'
+        )
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return FoundEffect(
         name=effect.name,
@@ -107,6 +118,6 @@ def _effect(
         p_value=p_value,
         log_evidence_gain=0.5 * (square - rank),
         confusable_with=(),
-        cause=effect.sentence.format(subject=name),
+        cause=cause,
         size_m=float(np.linalg.norm(moved)),
     )

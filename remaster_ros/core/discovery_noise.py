@@ -146,6 +146,11 @@ class Residuals:
         return len(self.scene.sensor_names)
 
     @cached_property
+    def _displacements(self) -> dict[Cell, FloatArray]:
+        """What `columns` has computed so far: a search fits the same few cells again and again."""
+        return {}
+
+    @cached_property
     def separable(self) -> BoolArray:
         """Where the pose-common part can be told apart, (sensors,)."""
         several = self.rows.group_sensor[self.rows.group_size > 1]
@@ -164,7 +169,10 @@ class Residuals:
 
     def columns(self, cells: Sequence[Cell]) -> FloatArray:
         """Return what a unit of each parameter displaces in every row of the session."""
-        parts = [cell.columns(self.scene).displacement(self.scene) for cell in cells]
+        for cell in cells:
+            if cell not in self._displacements:
+                self._displacements[cell] = cell.columns(self.scene).displacement(self.scene)
+        parts = [self._displacements[cell] for cell in cells]
         return np.concatenate([np.zeros((len(self.scene), 3, 0)), *parts], axis=2)
 
     def unexplained(self, fit: Fit) -> FloatArray:

@@ -17,13 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from remaster_ros.core.discovery_evidence import Solution, solve
-from remaster_ros.core.discovery_families import (
-    FAMILIES,
-    family_of,
-    grouped,
-    log_prior,
-    relatives,
-)
+from remaster_ros.core.discovery_families import FAMILIES, grouped, log_prior, relatives
 from remaster_ros.core.discovery_noise import Residuals
 from remaster_ros.core.discovery_screen import Catalogue, Screening, screen
 from remaster_ros.core.discovery_worth import held_out_error, worth_of
@@ -113,6 +107,8 @@ class Search:
         self.catalogue = Catalogue.of(data, self.cells)
         order = self.rng.permutation(data.poses)
         self._fold_of_pose = order % min(FOLDS, data.poses)
+        # The larger set is compared with many smaller ones in turn.
+        self._last_held_out: tuple[Solution | None, float] = None, np.nan
 
     def run(self, given: Solution | None = None) -> Selection:
         """Search until nothing passes both tests."""
@@ -342,9 +338,11 @@ class Search:
 
     def held_out_share(self, smaller: Solution, larger: Solution) -> float:
         """Return the share of the squared error on poses left out that the larger set saves."""
+        if self._last_held_out[0] is not larger:
+            after = held_out_error(self.data, larger, larger.noise, self._fold_of_pose)
+            self._last_held_out = larger, float(after.sum())
         before = held_out_error(self.data, smaller, larger.noise, self._fold_of_pose)
-        after = held_out_error(self.data, larger, larger.noise, self._fold_of_pose)
-        return float(1.0 - after.sum() / before.sum())
+        return float(1.0 - self._last_held_out[1] / before.sum())
 
 
 # A member of a family that the others explain to this share of its size is another name for them.

@@ -10,6 +10,9 @@ from remaster_ros.core.effects.cell import Cell, Columns, Effect, displaced
 from remaster_ros.core.effects.scene import Scene
 from remaster_ros.core.types import FloatArray
 
+# No lens bends lengths about the sensor's origin, and over most rooms it looks like a plain scale.
+SPHERE_RARITY = 20
+
 
 def cells(scene: Scene) -> Iterator[Cell]:
     """Each sensor: radial about its z axis, in metres or in field angle, or about its origin."""
@@ -35,7 +38,9 @@ def cells(scene: Scene) -> Iterator[Cell]:
                 parameters=tuple(f'{kind}_{axis}_{name}' for axis in axes) or (f'{kind}_{name}',),
                 unit='1/m' if axes else ('m/m' if 'angle' in variant else '1/m^2'),
                 columns=columns,
-                drawn_from=4 * len(scene.sensor_names),
+                drawn_from=4
+                * len(scene.sensor_names)
+                * (SPHERE_RARITY if variant == 'radial sphere' else 1),
                 variant=variant,
                 subject=name,
             )
