@@ -143,7 +143,7 @@ def live(root: Path, seed: int, configurations: int = 8) -> Life:
                 status = 'stopped'
                 mark()
             if fate < 0.3:
-                writer._release()
+                writer.release()
                 plan.close()
                 writer = SessionWriter(root / 'new' / 'session', session_header(), resume=True)
                 plan = Journal(root / 'new' / 'session' / PLAN)

@@ -22,6 +22,10 @@ class InputError(RemasterError):
     """Bad input or wrong usage: names the file, row, field or device, and the remedy."""
 
 
+class DiskError(InputError):
+    """The disk does not take what is to be written; it may once there is room."""
+
+
 class InsufficientDataError(RemasterError):
     """The data do not allow an answer; says why, and what to measure."""
 

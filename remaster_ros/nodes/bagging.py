@@ -13,7 +13,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 
-from remaster_ros.core.errors import InputError
+from remaster_ros.core.errors import DiskError, InputError
 from remaster_ros.nodes.status import LATCHED, TOPIC
 from remaster_ros.storage.bag_writer import BagWriter
 
@@ -39,12 +39,15 @@ class BagRecorder:
     ----------
     notes
         What a user should know of the bag as it was found.
+    dropped
+        Messages that found no room, neither on the disk nor in memory.
     """
 
     def __init__(self, node: Node, folder: Path | None) -> None:
         self._node, self._folder = node, folder
         self._writer: BagWriter | None = None
         self.notes: list[str] = []
+        self.dropped = 0
         self.reopen()
 
     def reopen(self) -> None:
@@ -63,8 +66,12 @@ class BagRecorder:
         self._write(TOPIC, STATUS_TYPE, serialize_message(DiagnosticArray(status=[status])))
 
     def _write(self, topic: str, type_name: str, data: bytes) -> None:
-        if self._writer is not None:
+        if self._writer is None:
+            return
+        try:
             self._writer.write(topic, type_name, data, self._node.get_clock().now().nanoseconds)
+        except DiskError:
+            self.dropped += 1
 
     def subscribe(
         self,
@@ -95,10 +102,16 @@ class BagRecorder:
         self.subscribe(JointState, '/remaster/joint_offsets_std', qos=LATCHED)
 
     def close(self) -> None:
-        """Close the bag; messages that come later are not recorded."""
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
+        """Close the bag; messages that come later are not recorded.
+
+        Where the disk does not take its end, it stays as that of a killed recorder.
+        """
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            try:
+                writer.close()
+            except DiskError as error:
+                self._node.get_logger().warning(f'{error}; `remaster recover` finishes the bag')
 
 
 def _free(folder: Path) -> Path:

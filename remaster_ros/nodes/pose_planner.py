@@ -42,6 +42,8 @@ from remaster_ros.storage.plan_book import PlanBook
 PEERS = ('robot_bridge', 'recorder')
 ANNOUNCE_WALL_S = 5.0
 """Who does not know an announcement so long after it has missed it, wall time."""
+RETRY_WALL_S = 1.0
+"""How often a full disk is tried again, wall time."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ class PosePlanner(RemasterNode):
         self._peers: dict[str, _Peer] = {}
         # Stamp of each announcement of the open pose -> its solutions, in the order announced.
         self._announced: dict[str, tuple[int, ...]] = {}
-        self._stamp, self._published_wall = '', 0.0
+        self._stamp, self._published_wall, self._tried_wall = '', 0.0, 0.0
         # Which start of each peer was there to hear it.
         self._told: dict[str, str] = {}
         self._resume()
@@ -266,6 +268,8 @@ class PosePlanner(RemasterNode):
     def _step(self) -> None:
         """Publish the next pose once every solution of the last one has its outcome."""
         self.book.stay_alive()
+        if self.book.trouble and not self._is_written():
+            return
         if self.state != 'running' or self._q is None or not self._heard():
             return
         if not self._is_cleared():
@@ -283,9 +287,20 @@ class PosePlanner(RemasterNode):
             self.get_logger().error(str(error))
             return
         if stop is not None:
-            self._announced = {}
+            self._announced, self._stamp = {}, ''
             self.book.open_stop(stop)
-            self._publish(stop)
+            if not self.book.trouble:
+                self._publish(stop)
+
+    def _is_written(self) -> bool:
+        """Whether the disk takes what it did not take before; looked at once a second."""
+        now = time.monotonic()
+        if now - self._tried_wall < RETRY_WALL_S:
+            return False
+        self._tried_wall = now
+        self.book.write_out()
+        self.status.publish()
+        return not self.book.trouble
 
     def _check_session(self) -> None:
         """Refuse to add another plan's poses to a session."""
@@ -435,9 +450,10 @@ class PosePlanner(RemasterNode):
 
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
         tour, outcomes = self.book.tour, self.book.outcomes
+        full = f'waiting for room on the disk: {self.book.trouble}' if self.book.trouble else ''
         dropped = tour.dropped if tour and self.phase != REGISTRATION else {}
         values = {
-            'state': self.state,
+            'state': 'held' if full and self.state == 'running' else self.state,
             'phase': self.phase,
             'robot': 'silent' if self._q is None else 'heard',
             'poses_done': tour.visited if tour else 0,
@@ -448,8 +464,9 @@ class PosePlanner(RemasterNode):
             **{f'outcome_{name}': count for name, count in sorted(outcomes.items())},
             **{f'dropped_{name}': count for name, count in sorted(dropped.items())},
         }
-        level = 'error' if self.state == 'failed' else 'warn' if self._why else 'ok'
-        return level, self._why or self.state, values
+        why = full or self._why
+        level = 'error' if self.state == 'failed' else 'warn' if why else 'ok'
+        return level, why or self.state, values
 
     def close(self) -> None:
         """Tell the bridge to stop: nobody plans any more."""

@@ -1,7 +1,8 @@
 """Pair settled joints with marker readings; write the session and the bag; register the sensors.
 
 What becomes of each configuration is said as an event on /remaster/status, after its observations
-are on disk; the bridge moves on only then.
+are on disk; the bridge moves on only then. While the disk is full the arm is held, and what is to
+be written is kept and tried again.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +24,8 @@ from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from remaster_ros.core.errors import InputError
-from remaster_ros.core.pairing import PairedReading, Pairing, Rejection, SensorRules
+from remaster_ros.core.errors import DiskError, InputError
+from remaster_ros.core.pairing import PairedReading, Pairing, Rejection
 from remaster_ros.core.plausibility import Plausibility
 from remaster_ros.core.presence import Presence
 from remaster_ros.core.tour import REGISTRATION
@@ -31,64 +33,23 @@ from remaster_ros.core.types import FloatArray, MarkerReading, Measurements, Ses
 from remaster_ros.nodes.announcements import Announced, Announcements
 from remaster_ros.nodes.bagging import BEGAN, BagRecorder
 from remaster_ros.nodes.messages import JointOrder, seconds, temperature_topic
-from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.parameters import declare
+from remaster_ros.nodes.recorder_parameters import Parameters, sensor_rules
 from remaster_ros.nodes.registering import Registrar
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.shots import Shots
 from remaster_ros.nodes.status import TOPIC as STATUS
 from remaster_ros.nodes.status import Event, Status, receiver
-from remaster_ros.storage.cell import Cell, read_cell
+from remaster_ros.storage.cell import read_cell
 from remaster_ros.storage.logbook import Logbook
 from remaster_ros.storage.session_writer import ExitStatus
 
 TEMPERATURE_S = 600.0
 """A temperature older than this says nothing of a reading, s."""
+RETRY_S = 1.0
+"""How often a full disk is tried again, s of wall time."""
 BY_HAND = -1_000_000
 """The number of poses that a user drove to for a registration: no planner's."""
-
-
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the recorder."""
-
-    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
-    session: str = parameter(
-        'session', 'folder of the session: new, empty, or of an unfinished one, which goes on'
-    )
-    bag: bool = parameter(True, 'record a rosbag2 (MCAP) of the raw topics into session/bag')
-    call_measure: bool = parameter(
-        True, 'call the measure service of single-shot sensors; false when a bag is replayed'
-    )
-    dwell_s: float = parameter(0.5, 'how long a stream is averaged', unit='s', low=0.01, high=60.0)
-    min_samples: int = parameter(5, 'fewest samples in the dwell', low=1)
-    max_std_m: float = parameter(
-        0.5e-3, 'largest standard deviation over the dwell', unit='m', low=1e-6, high=0.1
-    )
-    motion_tolerance: float = parameter(
-        5e-4, 'largest joint movement during a reading', unit='rad', low=1e-7, high=0.01
-    )
-    stream_timeout_s: float = parameter(
-        3.0, 'how long after the dwell a stream may stay out', unit='s', low=0.1, high=600.0
-    )
-    shot_timeout_s: float = parameter(
-        60.0, 'how long after settling a single shot may stay out', unit='s', low=0.1, high=3600.0
-    )
-    settle_s: float = parameter(
-        3.0, 'settle time of the bridge, noted in the session', unit='s', low=0.1, high=60.0
-    )
-    require: str = parameter(
-        'all', "whom the arm waits for at each configuration: all, any, or a sensor's name"
-    )
-    heartbeat_s: float = parameter(
-        3.0, 'longest silence of a sensor node, wall time', unit='s', low=0.5, high=60.0
-    )
-    max_deviation_m: float = parameter(
-        0.05,
-        'a reading further than this from where the robot has the marker is of another one',
-        unit='m',
-        low=1e-3,
-        high=5.0,
-    )
 
 
 @dataclass
@@ -100,22 +61,6 @@ class _Taking:
     pose: Announced
     from_q: FloatArray | None
     future: Future | None = None
-
-
-def sensor_rules(cell: Cell, p: Parameters) -> tuple[SensorRules, ...]:
-    """Return how each sensor of the cell is read."""
-    return tuple(
-        SensorRules(
-            sensor=name,
-            marker=sensor.marker,
-            single_shot=sensor.single_shot,
-            dwell_s=p.dwell_s,
-            min_samples=p.min_samples,
-            max_std_m=p.max_std_m,
-            timeout_s=p.shot_timeout_s if sensor.single_shot else p.stream_timeout_s,
-        )
-        for name, sensor in cell.sensors.items()
-    )
 
 
 class Recorder(RemasterNode):
@@ -161,6 +106,9 @@ class Recorder(RemasterNode):
         self._from_q: FloatArray | None = None
         self._temperatures: deque[tuple[float, float]] = deque(maxlen=500)
         self._was_waiting = False
+        # What the disk did not take yet, why, and when that was.
+        self._unwritten: Callable[[], object] | None = None
+        self._full, self._tried = '', 0.0
         self.registrar = Registrar(self, self.cell, self.chain)
         markers = {name: np.array(position) for name, position in self.cell.markers.items()}
         self._plausibility = Plausibility(self.chain, markers, self.p.max_deviation_m)
@@ -234,6 +182,9 @@ class Recorder(RemasterNode):
     def _on_event(self, event: Event) -> None:
         if (event.node, event.event) == ('pose_planner', 'pose'):
             self._announcements.hear_pose(event.values)
+            if self._unwritten is None and not self.logbook.closed:
+                # Before the arm gets there: it is held where there is no room.
+                self._keep(partial(self.logbook.follow, event.values.get('plan', '')))
         elif (event.node, event.event) == ('recorder', BEGAN):
             # From a bag: that recorder was started anew here, and knew of no reading under way.
             self._taking = None
@@ -246,15 +197,14 @@ class Recorder(RemasterNode):
         if 'sensor' in values:
             ready = values.get('ready') == 'yes'
             self._presence.says(values['sensor'], ready, message, time.monotonic())
-        if node == 'pose_planner' and self._taking is None and not self._due:
+        if node == 'pose_planner' and not self._busy() and not self._due:
             state = values.get('state')
             if state == 'complete':
-                self._close('complete')
+                self._keep(partial(self._close, 'complete'))
             elif state == 'stopped' and self.logbook.observations:
-                self._close('stopped')
+                self._keep(partial(self._close, 'stopped'))
             elif state == 'running' and self.logbook.closed == 'stopped':
-                self.logbook.reopen()
-                self._bag.reopen()
+                self._keep(self._reopen)
 
     # A configuration
 
@@ -277,7 +227,7 @@ class Recorder(RemasterNode):
 
     def _take_next(self) -> None:
         """Begin the reading that is due, unless one is under way."""
-        while self._due and self._taking is None:
+        while self._due and not self._busy():
             q, settled_s, solution, pose = self._due.popleft()
             if self.logbook.closed or not self.logbook.follow(pose.plan):
                 self._trouble = (
@@ -323,6 +273,8 @@ class Recorder(RemasterNode):
     def _look(self) -> None:
         """Ask, give up, and say at once when a required sensor goes or comes back."""
         absent = self._presence.absent(time.monotonic())
+        if self._unwritten is not None and time.monotonic() - self._tried > RETRY_S:
+            self._keep(self._unwritten)
         if self._taking is not None:
             self._shots.look(self._taking.pairing, absent)
             self._taking.pairing.give_up(self._now, absent, self._presence.words)
@@ -334,7 +286,9 @@ class Recorder(RemasterNode):
             self.status.publish()
 
     def _waiting_for(self, absent: Mapping[str, str]) -> str:
-        """Name the required sensors that are not there, and why; '' if the arm may go on."""
+        """Say what is missing, and why: room on the disk, required sensors; '' if nothing is."""
+        if self._full:
+            return f'room on the disk: {self._full}'
         wanted = self._wanted()
         gone = [name for name in wanted if name in absent]
         if not gone or (self.p.require == 'any' and len(gone) < len(wanted)):
@@ -357,6 +311,16 @@ class Recorder(RemasterNode):
             self.counts[f'{rejection.sensor}_{rejection.reason}'] += 1
         for reading in good:
             self.counts[f'{reading.sensor}_accepted'] += 1
+        self._keep(partial(self._write_down, taking, good, bad, waited_s))
+
+    def _write_down(
+        self,
+        taking: _Taking,
+        good: list[PairedReading],
+        bad: list[Rejection],
+        waited_s: Mapping[str, float],
+    ) -> None:
+        """Write what became of a configuration; then, and only then, say it."""
         why = '; '.join(f'{r.sensor}: {r.reason}: {r.detail}' for r in bad)
         missed = [item for item in bad if item.reason not in ('not_waited', 'absent')]
         result = 'rejected' if not good else 'partial' if missed else 'recorded'
@@ -415,7 +379,7 @@ class Recorder(RemasterNode):
 
     async def _on_register(self, request: Trigger.Request, response: Trigger.Response) -> Any:
         """Take the point where the arm stands now; the third point completes the registration."""
-        if self._taking is not None:
+        if self._busy():
             response.message = 'a reading is under way; try again when it is done'
             return response
         if self._q is None:
@@ -435,7 +399,7 @@ class Recorder(RemasterNode):
     # State
 
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
-        state = 'closed' if self.logbook.closed else 'measuring' if self._taking else 'waiting'
+        state = 'closed' if self.logbook.closed else 'measuring' if self._busy() else 'waiting'
         now, sensors = time.monotonic(), self.cell.sensors
         waiting_for = self._waiting_for(self._presence.absent(now))
         trouble = self._trouble or (f'waiting for {waiting_for}' if waiting_for else '')
@@ -453,9 +417,32 @@ class Recorder(RemasterNode):
             'waiting_for': waiting_for,
             **{f'waited_s_{name}': f'{s:.1f}' for name, s in self._waited_s.items()},
             **{f'read_age_s_{n}': f'{self._presence.read_age_s(n, now):.1f}' for n in sensors},
+            'bag_dropped': self._bag.dropped,
             **dict(sorted(self.counts.items())),
         }
         return ('warn' if trouble else 'ok'), trouble or state, values
+
+    # The disk
+
+    def _busy(self) -> bool:
+        """Whether a configuration is being read or written down."""
+        return self._taking is not None or self._unwritten is not None
+
+    def _keep(self, write: Callable[[], object]) -> None:
+        """Write; where the disk does not take it, hold the arm and try again later."""
+        self._unwritten, self._tried = None, time.monotonic()
+        try:
+            write()
+        except DiskError as error:
+            if not self._full:
+                self.get_logger().error(f'the arm is held: {error}')
+            self._unwritten, self._full = write, str(error)
+        else:
+            self._full = ''
+
+    def _reopen(self) -> None:
+        self.logbook.reopen()
+        self._bag.reopen()
 
     def _close(self, exit_status: ExitStatus) -> None:
         if not self.logbook.closed:
@@ -469,7 +456,10 @@ class Recorder(RemasterNode):
         """Close the session; what is recorded so far stays readable."""
         if self._taking is not None and self._taking.future is not None:
             self._taking.future.cancel()
-        self._close('stopped')
+        try:
+            self._close('stopped')
+        except DiskError as error:
+            self.get_logger().error(f'{error}; `remaster recover` finishes the session')
 
 
 def main(args: list[str] | None = None) -> int:

@@ -12,12 +12,11 @@ import os
 from collections.abc import Collection
 from pathlib import Path
 from types import TracebackType
-from typing import IO
 
 from mcap.writer import CompressionType, Writer
 
 from remaster_ros import __version__
-from remaster_ros.core.errors import InputError
+from remaster_ros.core.errors import DiskError, InputError
 from remaster_ros.storage.bag import LATCHED_TOPICS, BagReader
 from remaster_ros.storage.bag_metadata import (
     METADATA_FILE,
@@ -27,6 +26,7 @@ from remaster_ros.storage.bag_metadata import (
     qos_text,
 )
 from remaster_ros.storage.files import (
+    PatientFile,
     cannot_write,
     make_new_folder,
     remove_leftovers,
@@ -36,9 +36,14 @@ from remaster_ros.storage.files import (
 from remaster_ros.storage.manifest import add_to_manifest, read_manifest
 from remaster_ros.storage.message_definitions import definition_of
 
+WAITING_LIMIT = 64 * 1024**2
+"""So many bytes that a full disk does not take are kept in memory; later messages are refused."""
+
 
 class BagWriter:
     """Write a rosbag2 folder; what `write` returned from survives a kill of this process.
+
+    While the disk is full, messages are kept in memory and written when there is room.
 
     Parameters
     ----------
@@ -81,13 +86,11 @@ class BagWriter:
         self._path = self.folder / name
         self._own = FileMetadata(name)
         self._files.append(self._own)
-        try:
-            self._file: IO[bytes] | None = self._path.open('xb')
-        except OSError as error:
-            raise cannot_write(self._path, error) from None
+        self._file: PatientFile | None = PatientFile(self._path)
         try:
             self._writer = Writer(
-                self._file,
+                # It asks for no more than write and tell.
+                self._file,  # type: ignore[arg-type]
                 compression=CompressionType.NONE,
                 use_chunking=False,
                 enable_data_crcs=True,
@@ -95,11 +98,10 @@ class BagWriter:
             self._writer.start('ros2', f'remaster_ros-{__version__}')
             self._file.flush()
             self._write_metadata()
-        except BaseException as error:
+        except BaseException:
             self._file.close()
-            if isinstance(error, OSError):
-                raise cannot_write(self._path, error) from None
             raise
+        self._metadata_waits = False
 
     def _learn(self, reader: BagReader) -> None:
         """Take over what the files so far hold."""
@@ -132,33 +134,33 @@ class BagWriter:
         ------
         InputError
             The message type is not one of ROS 2 Jazzy's, a topic changes its type, the stamp is
-            no time, the bag is closed, or the disk does not take it.
+            no time, or the bag is closed.
+        DiskError
+            So much waits for the disk already that this message is not kept.
         """
         if self._file is None:
             raise InputError(f'{self.folder}: the bag is closed; start a new one')
         if not 0 <= stamp_ns < 2**63:
             raise InputError(f'{topic}: {stamp_ns} ns is no time stamp; give ns since the epoch')
-        try:
-            if topic not in self._channels:
-                self._add_topic(topic, msgtype)
-            metadata = self._topics[topic]
-            if metadata.msgtype != msgtype:
-                raise InputError(
-                    f'{topic}: {msgtype} after {metadata.msgtype}; a topic has one type'
-                )
-            if not self._own.count and stamp_ns < self._last_ns:
-                self._shift_ns = self._last_ns + 10**9 - stamp_ns
-            self._last_ns = max(self._last_ns, stamp_ns + self._shift_ns)
-            self._writer.add_message(
-                channel_id=self._channels[topic],
-                log_time=self._last_ns,
-                data=cdr,
-                publish_time=stamp_ns,
-                sequence=metadata.count % 2**32,
-            )
+        if self._file.waiting > WAITING_LIMIT:
             self._file.flush()
-        except OSError as error:
-            raise cannot_write(self._path, error) from None
+        if topic not in self._channels:
+            self._add_topic(topic, msgtype)
+        metadata = self._topics[topic]
+        if metadata.msgtype != msgtype:
+            raise InputError(f'{topic}: {msgtype} after {metadata.msgtype}; a topic has one type')
+        if not self._own.count and stamp_ns < self._last_ns:
+            self._shift_ns = self._last_ns + 10**9 - stamp_ns
+        self._last_ns = max(self._last_ns, stamp_ns + self._shift_ns)
+        self._writer.add_message(
+            channel_id=self._channels[topic],
+            log_time=self._last_ns,
+            data=cdr,
+            publish_time=stamp_ns,
+            sequence=metadata.count % 2**32,
+        )
+        if self._metadata_waits and not self._file.waiting:
+            self._list_topics()
         metadata.count += 1
         self._own.add(self._last_ns)
 
@@ -167,17 +169,15 @@ class BagWriter:
 
         Raises
         ------
-        InputError
+        DiskError
             The disk does not take it; what was written before remains readable.
         """
         if self._file is None:
             return
         file, self._file = self._file, None
+        self._writer.finish()
+        file.close()
         try:
-            with file:
-                self._writer.finish()
-                file.flush()
-                os.fsync(file.fileno())
             sync_folder(self.folder)
         except OSError as error:
             raise cannot_write(self._path, error) from None
@@ -213,8 +213,15 @@ class BagWriter:
                 'topic_type_hash': type_hash,
             },
         )
-        # A player takes the topics from here, also those of a bag whose writer was killed.
-        self._write_metadata()
+        self._list_topics()
+
+    def _list_topics(self) -> None:
+        """A player takes the topics from here, also those of a bag whose writer was killed."""
+        try:
+            self._write_metadata()
+            self._metadata_waits = False
+        except DiskError:
+            self._metadata_waits = True
 
     def _write_metadata(self) -> None:
         text = metadata_text(self._files, list(self._topics.values()))

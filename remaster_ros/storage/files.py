@@ -6,7 +6,7 @@ import contextlib
 import os
 from pathlib import Path
 
-from remaster_ros.core.errors import InputError
+from remaster_ros.core.errors import DiskError, InputError
 
 
 def read_limited(path: Path, limit: int, missing: str) -> bytes:
@@ -150,7 +150,7 @@ class AppendFile:
 
         Raises
         ------
-        InputError
+        DiskError
             The disk does not take it; the file ends as before. Where the disk does not take
             that either, the file is closed: nobody knows how it ends until it is read again.
         """
@@ -182,6 +182,68 @@ class AppendFile:
             self._descriptor = None
 
 
+class PatientFile:
+    """A new file that holds in memory what a full disk does not take, and writes it later.
+
+    What `write` returned from survives a kill of this process unless it is `waiting`.
+
+    Parameters
+    ----------
+    path
+        The file, which must not be there yet.
+
+    Raises
+    ------
+    DiskError
+        It cannot be made.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._waiting = bytearray()
+        self._given = 0
+        try:
+            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL
+            self._descriptor = os.open(path, flags, 0o666)
+        except OSError as error:
+            raise cannot_write(path, error) from None
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that the disk has not taken yet."""
+        return len(self._waiting)
+
+    def write(self, data: bytes) -> int:
+        """Take a piece."""
+        self._waiting += data
+        self._given += len(data)
+        with contextlib.suppress(DiskError):
+            self.flush()
+        return len(data)
+
+    def tell(self) -> int:
+        """Return how many bytes were taken."""
+        return self._given
+
+    def flush(self) -> None:
+        """Write what waits; `DiskError` where some of it has to wait on."""
+        try:
+            while self._waiting:
+                del self._waiting[: os.write(self._descriptor, self._waiting)]
+        except OSError as error:
+            raise cannot_write(self.path, error) from None
+
+    def close(self) -> None:
+        """Write what waits, durable on return; `DiskError` where the disk does not take it."""
+        try:
+            self.flush()
+            os.fsync(self._descriptor)
+        except OSError as error:
+            raise cannot_write(self.path, error) from None
+        finally:
+            os.close(self._descriptor)
+
+
 def write_all(descriptor: int, data: bytes) -> None:
     """Write all of `data`, however many calls the system takes for it."""
     written = 0
@@ -198,9 +260,9 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def cannot_write(path: Path, error: OSError) -> InputError:
+def cannot_write(path: Path, error: OSError) -> DiskError:
     """Return the error that says why a file or folder cannot be written, and the remedy."""
-    return InputError(
+    return DiskError(
         f'{path}: cannot be written ({reason(error)}); '
         'name a folder you may write to, with free space'
     )

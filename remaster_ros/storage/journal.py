@@ -75,6 +75,7 @@ class Journal:
             self.lost = torn_words(path, len(self.records), torn)
             if torn:
                 self._file.truncate(size)
+            self._before = self._file.size
         except BaseException:
             self._file.close()
             raise
@@ -94,11 +95,17 @@ class Journal:
 
         Raises
         ------
-        InputError
+        DiskError
             The disk does not take it; the file is as it was before.
         """
+        self._before = self._file.size
         self._file.append(format_record(record))
         self.records.append(record)
+
+    def take_back(self) -> None:
+        """Cut off the record that was appended last; `InputError` where that is not possible."""
+        self._file.truncate(self._before)
+        self.records.pop()
 
     def touch(self) -> None:
         """Renew the file's time of change, as a sign of life; it need not last."""

@@ -158,6 +158,11 @@ class Logbook:
             What was accepted, and the temperature with each, degrees Celsius, None if unknown.
         from_q
             Where the arm came from, rad, (k,); None if unknown.
+
+        Raises
+        ------
+        DiskError
+            The disk does not take it; try again when there is room.
         """
         record: Record = {
             'kind': 'configuration',
@@ -212,15 +217,16 @@ class Logbook:
         last_s = self._writer.last_stamp_s
         if last_s is None or stamp_s + self._shift_s >= last_s:
             return
-        self._shift_s = last_s + SHIFT_S - stamp_s
-        self._append({'kind': 'shift', 'shift_s': self._shift_s})
+        shift_s = last_s + SHIFT_S - stamp_s
+        self._append({'kind': 'shift', 'shift_s': shift_s})
+        self._shift_s = shift_s
         self.notes.append(f'the clock ran backwards: stamps are shifted by {self._shift_s:.3f} s')
 
     def close(self, exit_status: ExitStatus) -> None:
-        """Close the session; closing again does nothing."""
+        """Close the session; closing again does nothing. `DiskError` where it remains open."""
         if not self.closed and self._writer is not None:
-            self.closed = exit_status
             self._writer.close(exit_status)
+            self.closed = exit_status
 
 
 def is_complete(folder: Path) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.errors import InputError
+from remaster_ros.core.errors import DiskError, InputError
 from remaster_ros.core.planning import Plan, PlannedPose
 from remaster_ros.core.tour import REGISTRATION, Stop, Tour
 from remaster_ros.storage.files import make_folder, reason
@@ -30,6 +30,8 @@ ALIVE_S = 1.0
 
 class PlanBook:
     """Keep what a planner must not forget; what a method returned from is on the disk.
+
+    Unless `trouble` says that the disk is full: then it is kept until `write_out` succeeds.
 
     Parameters
     ----------
@@ -54,6 +56,8 @@ class PlanBook:
         For how long no planner has been running, s.
     lost
         What a crash has cut off, in words; '' where nothing was.
+    trouble
+        Why something is not on the disk yet; '' where everything is.
 
     Raises
     ------
@@ -66,7 +70,8 @@ class PlanBook:
         self.path = folder / PLAN
         self._settings, self._chain = dict(settings), chain
         self._journal: Journal | None = None
-        self.id = self.state = self.lost = ''
+        self.id = self.state = self.lost = self.trouble = ''
+        self._unwritten: deque[Record] = deque()
         self.tour: Tour | None = None
         self.stop: Stop | None = None
         self.outcomes: Counter[str] = Counter()
@@ -145,7 +150,18 @@ class PlanBook:
         if self._journal is None:
             make_folder(self.path.parent)
             self._journal = self._open()
-        self._journal.append(record)
+        self._unwritten.append(record)
+        self.write_out()
+
+    def write_out(self) -> None:
+        """Write what the disk has not taken yet; `trouble` says whether it does now."""
+        try:
+            while self._unwritten and self._journal is not None:
+                self._journal.append(self._unwritten[0])
+                self._unwritten.popleft()
+            self.trouble = ''
+        except DiskError as error:
+            self.trouble = str(error)
 
     def begin(self, tour: Tour) -> None:
         """Remember a new tour."""

@@ -92,7 +92,10 @@ def _finish_session(folder: Path, recovery: Recovery) -> None:
     )
     writer = SessionWriter(folder, session, resume=True, even_complete=True)
     _note(recovery, writer.lost)
-    writer.close(header.exit_status or 'aborted')
+    try:
+        writer.close(header.exit_status or 'aborted')
+    finally:
+        writer.release()
 
 
 def _note(recovery: Recovery, lost: str) -> None:

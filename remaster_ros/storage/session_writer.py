@@ -129,7 +129,7 @@ class SessionWriter:
                 self._reopen(even_complete)
             self._restore()
         except BaseException:
-            self._release()
+            self.release()
             raise
 
     @property
@@ -253,8 +253,9 @@ class SessionWriter:
         Raises
         ------
         InputError
-            An observation breaks the format (and nothing is written), the writer is closed, or
-            the disk does not take it.
+            An observation breaks the format (and nothing is written), or the writer is closed.
+        DiskError
+            The disk does not take it; try again when there is room.
         """
         if self._closed:
             raise InputError(f'{self.folder}: the session is closed; start a new one')
@@ -268,8 +269,11 @@ class SessionWriter:
         try:
             self._rows.append(''.join(f'{row}\n' for row in rows).encode())
         except InputError:
-            # The journal is ahead: only opening the session again brings the two together.
-            self._release()
+            try:
+                self._journal.take_back()
+            except InputError:
+                # It is ahead now: only opening the session again brings the two together.
+                self.release()
             raise
         for key in keys:
             self._accept(key)
@@ -302,19 +306,19 @@ class SessionWriter:
 
         Raises
         ------
-        InputError
-            A file cannot be written; the session remains readable, as aborted.
+        DiskError
+            The disk does not take it; try again when there is room. Until then the session
+            remains readable, as aborted or without checksums.
         """
         if self._closed:
             return
-        try:
-            write_atomically(self.folder / HEADER, with_exit_status(self._text, exit_status))
-            write_manifest(self.folder, (HEADER, URDF, ROWS, JOURNAL))
-        finally:
-            # Behind the checksums: nobody else may write as long as they are not there.
-            self._release()
+        write_atomically(self.folder / HEADER, with_exit_status(self._text, exit_status))
+        write_manifest(self.folder, (HEADER, URDF, ROWS, JOURNAL))
+        # Behind the checksums: nobody else may write as long as they are not there.
+        self.release()
 
-    def _release(self) -> None:
+    def release(self) -> None:
+        """Let others go on with the session as it is on the disk, closed or not."""
         self._closed = True
         self._rows.close()
         self._journal.close()
@@ -328,7 +332,10 @@ class SessionWriter:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self.close('complete' if kind is None else 'aborted')
+        try:
+            self.close('complete' if kind is None else 'aborted')
+        finally:
+            self.release()
 
 
 def with_exit_status(text: str, exit_status: str) -> str:

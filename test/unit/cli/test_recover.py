@@ -18,7 +18,7 @@ def killed(tmp_path):
     writer = SessionWriter(tmp_path / 's', session_header())
     for number, group in enumerate(make_observations(1, 4)):
         writer.record({'kind': 'configuration', 'number': number}, group)
-    writer._release()
+    writer.release()
     return tmp_path / 's'
 
 

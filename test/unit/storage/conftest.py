@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -122,3 +125,26 @@ def fit_result() -> FitResult:
         outlier_share=0.02,
     )
     return fit_session(session, rng=rng, draws=500)
+
+
+@pytest.fixture
+def full_disk(monkeypatch):
+    """Return a context in which the disk takes `room` bytes, and then no more."""
+
+    @contextmanager
+    def full(room=0):
+        write, left = os.write, room
+
+        def limited(descriptor, data):
+            nonlocal left
+            if not left:
+                raise OSError(errno.ENOSPC, 'No space left on device')
+            written = write(descriptor, bytes(data[:left]))
+            left -= written
+            return written
+
+        with monkeypatch.context() as patch:
+            patch.setattr(os, 'write', limited)
+            yield
+
+    return full

@@ -20,7 +20,8 @@ from rosbags.rosbag2 import Reader, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
 
-from remaster_ros.core.errors import InputError
+from remaster_ros.core.errors import DiskError, InputError
+from remaster_ros.storage import bag_writer
 from remaster_ros.storage.bag import BagReader
 from remaster_ros.storage.bag_metadata import METADATA_FILE
 from remaster_ros.storage.bag_writer import BagWriter, recover_bag
@@ -330,6 +331,24 @@ def test_a_clock_set_back_leaves_a_bag_in_order(tmp_path):
     assert [m.stamp_ns for m in read] == [second[3], second[3], third[3]]
     with AnyReader([tmp_path / 'bag']) as reader:
         assert len(list(reader.messages())) == 3
+
+
+def test_a_full_disk_delays_messages_until_memory_is_full_too(tmp_path, full_disk, monkeypatch):
+    monkeypatch.setattr(bag_writer, 'WAITING_LIMIT', 3000)
+    given = list(messages())
+    with BagWriter(tmp_path / 'bag') as writer:
+        part(writer, 0, 2)
+        with full_disk(room=100):
+            with pytest.raises(DiskError, match='No space left'):
+                part(writer, 2, 39)
+            kept = writer._own.count
+        writer.write(*given[-1])
+    assert 10 < kept < 39
+    reader = BagReader(tmp_path / 'bag')
+    assert reader.complete
+    assert list(reader) == [*given[:kept], given[-1]]
+    with AnyReader([tmp_path / 'bag']) as whole:
+        assert {connection.topic for connection in whole.connections} == set(TOPICS)
 
 
 def part(writer, first, last):

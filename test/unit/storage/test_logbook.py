@@ -40,7 +40,7 @@ def test_a_recorder_started_again_knows_what_it_decided(session, tmp_path):
     write(book, 0, 3, [reading('mocap', 9.0), reading('tracker', 8.0)])
     write(book, 0, 1, [], result='rejected', temperatures_c=[])
     write(book, 0, 2, [reading('mocap', 11.0)], result='partial', temperatures_c=[None])
-    book._writer._release()  # killed
+    book._writer.release()  # killed
 
     book = Logbook(tmp_path, session)
     assert 'after 3 observations' in book.notes[0]

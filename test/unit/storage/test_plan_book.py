@@ -142,3 +142,23 @@ def test_a_torn_line_is_dropped_and_a_damaged_one_refused(chain, tmp_path):
     book.path.write_bytes(whole.replace(b'"stop"', b'"step"', 1))
     with pytest.raises(InputError, match='line 4: damaged'):
         PlanBook(tmp_path, SETTINGS, chain)
+
+
+def test_what_a_full_disk_does_not_take_is_kept(chain, tmp_path, full_disk):
+    book = PlanBook(tmp_path, SETTINGS, chain)
+    book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
+    stop = book.tour.next(np.zeros(len(chain)))
+    with full_disk():
+        book.open_stop(stop)
+        book.outcome(stop.ids[0], 'recorded')
+        assert 'No space left' in book.trouble
+        book.write_out()
+        assert 'No space left' in book.trouble
+    book.write_out()
+    assert not book.trouble
+    left = book.stop.ids
+    book.close()
+    book = PlanBook(tmp_path, SETTINGS, chain)
+    assert book.stop.ids == left == stop.ids[1:]
+    assert book.outcomes['recorded'] == 1
+    book.close()

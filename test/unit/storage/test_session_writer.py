@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import signal
 import subprocess
@@ -13,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from remaster_ros.core.errors import InputError
+from remaster_ros.core.errors import DiskError, InputError
 from remaster_ros.core.types import Observation
 from remaster_ros.storage.session import read_session, write_session
 from remaster_ros.storage.session_writer import SessionWriter
@@ -112,24 +111,26 @@ def test_a_wrong_observation_is_refused_and_not_written(session, tmp_path):
     assert len(read_session(tmp_path / 's').measurements) == 2
 
 
-def test_a_full_disk_costs_only_the_observation_being_written(session, tmp_path, monkeypatch):
+def test_a_full_disk_costs_nothing(session, tmp_path, full_disk):
+    """Wherever it is full, in the journal or behind it, the same is written when there is room."""
+    folder = tmp_path / 's'
     first, second, *_ = observations(session)
-    write = os.write
-    with SessionWriter(tmp_path / 's', session) as writer:
-        writer.append(first)
-
-        def full(descriptor, data):
-            if len(data) < 60:
-                raise OSError(errno.ENOSPC, 'No space left on device')
-            return write(descriptor, data[:60])
-
-        with monkeypatch.context() as patch:
-            patch.setattr(os, 'write', full)
-            with pytest.raises(InputError, match='No space left'):
-                writer.append(second)
-        assert len(read_session(tmp_path / 's').measurements) == 1
-        writer.append(second)
-    assert len(read_session(tmp_path / 's').measurements) == 2
+    writer = SessionWriter(folder, session)
+    writer.append(first)
+    journal = (folder / 'journal.jsonl').stat().st_size
+    for room in (0, 60, journal, journal + 60):
+        with full_disk(room), pytest.raises(DiskError, match='No space left'):
+            writer.append(second)
+        assert len(read_session(folder).measurements) == 1
+        assert (folder / 'journal.jsonl').stat().st_size == journal
+    writer.append(second)
+    with full_disk(), pytest.raises(DiskError, match='No space left'):
+        writer.close('complete')
+    assert read_session(folder).exit_status == 'aborted'
+    writer.close('complete')
+    session = read_session(folder)
+    assert session.exit_status == 'complete'
+    assert len(session.measurements) == 2
 
 
 def test_a_folder_with_files_is_refused(session, tmp_path):
@@ -182,7 +183,7 @@ def test_a_killed_session_is_gone_on_with(session, tmp_path):
     assert not writer.resumed
     writer.record({'kind': 'configuration', 'pose': 0}, rows[:2])
     writer.record({'kind': 'note', 'text': 'größer'})
-    writer._release()
+    writer.release()
     writer = resumed(session, tmp_path / 's')
     assert writer.resumed
     assert (writer.observations, writer.configurations) == (2, 1)
@@ -226,7 +227,7 @@ def test_a_session_is_written_by_one_process(session, tmp_path):
 def test_another_session_is_not_gone_on_with(session, tmp_path, change, problem):
     writer = SessionWriter(tmp_path / 's', session)
     writer.append(next(observations(session)))
-    writer._release()
+    writer.release()
     before = {p.name: p.read_bytes() for p in (tmp_path / 's').iterdir()}
     with pytest.raises(InputError, match=problem):
         resumed(replace(session, **change), tmp_path / 's')
@@ -247,7 +248,7 @@ def test_rows_that_were_changed_by_hand_are_not_gone_on_with(session, tmp_path):
     writer = SessionWriter(tmp_path / 's', session)
     for observation in observations(session):
         writer.append(observation)
-    writer._release()
+    writer.release()
     path = tmp_path / 's' / 'observations.csv'
     lines = path.read_text().split('\n')
     lines[3] = lines[3].replace('sir', 'smr')

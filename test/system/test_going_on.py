@@ -1,0 +1,164 @@
+"""Nodes without the demo around them: whom the arm waits for, and a disk that fills up."""
+
+import resource
+import socket
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from conftest import ROOT, call, node_arguments, wait_until
+
+from remaster_ros.core import transforms
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.fakes.faults import inject
+from remaster_ros.fakes.setup import make_world
+from remaster_ros.nodes.demo import free_ports
+from remaster_ros.storage.bag import BagReader
+from remaster_ros.storage.cell import read_cell
+from remaster_ros.storage.journal import read_journal
+from remaster_ros.storage.session import read_session
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
+
+SEED = 11
+
+
+class Cell:
+    """A small collection of real nodes on fake devices, and what they say."""
+
+    def __init__(self, start, client, folder, require, sensors):
+        from remaster_ros.nodes.status import listen
+
+        self.client, self.folder, self.session = client, folder, folder / 'session'
+        print('seed', SEED)
+        self.world = make_world(folder / 'world', read_cell('demo'), SEED, 10.0)
+        self.said, self.messages, self.results = {}, {}, []
+        listen(client, self._event, self._summary)
+        command, data, tracker = free_ports(
+            socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM
+        )
+        own = {
+            'fake_robot': {'world': folder / 'world'},
+            'pose_planner': {
+                'session': self.session,
+                'optimization_candidates': 2,
+                'validation_candidates': 1,
+                'registration_candidates': 6,
+            },
+            'robot_bridge': {},
+            'recorder': {'session': self.session, 'require': require},
+        }
+        if 'mocap' in sensors:
+            ports = {'command_port': command, 'data_port': data}
+            own['fake_optitrack'] = {'world': folder / 'world', **ports}
+            own['optitrack_markers'] = ports
+        if 'tracker' in sensors:
+            own['fake_laser_tracker'] = {'world': folder / 'world', 'port': tracker}
+            own['laser_tracker_markers'] = {'port': tracker}
+        common = ROOT / 'config' / 'fake.yaml'
+        self.nodes = {
+            # By the node's name, which in the file counts more than none.
+            name: start(
+                f'remaster_ros.nodes.{name}',
+                *node_arguments(common, **{f'{name}:{key}': v for key, v in values.items()}),
+            )
+            for name, values in own.items()
+        }
+        self.until(lambda: self.said.get('pose_planner', {}).get('robot') == 'heard', 'the robot')
+        response = call(client, '/remaster/collect')
+        assert response.success, response.message
+
+    def _summary(self, node, message, values):
+        self.said[node], self.messages[node] = values, message
+
+    def _event(self, event):
+        if (event.node, event.event) == ('recorder', 'configuration'):
+            self.results.append(event.values['result'])
+
+    def until(self, condition, what, timeout_s=60):
+        def turn():
+            for _ in range(20):
+                self.client.spin_some()
+            for name, process in self.nodes.items():
+                assert process.poll() is None, (name, process.communicate())
+            return condition()
+
+        try:
+            wait_until(turn, timeout_s, what)
+        except AssertionError:
+            print(self.messages, self.said)
+            raise
+
+    def recorder(self, key):
+        return self.said.get('recorder', {}).get(key, '')
+
+    def complete(self):
+        self.until(lambda: self.recorder('exit_status') == 'complete', 'the end')
+        return read_session(self.session)
+
+    def check(self, session):
+        """Each row once, and where the truth has its marker."""
+        chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+        m, truth = session.measurements, self.world.truth
+        for index, name in enumerate(session.sensor_names):
+            sensor, mine = truth.sensors[name], m.sensor == index
+            marker_R = chain.positions(m.q[mine], sensor.marker, truth.joint_offsets)
+            expected = transforms.apply(transforms.inverse(sensor.T_R_N), marker_R)
+            assert np.all(np.linalg.norm(m.position[mine] - expected, axis=1) < 0.4e-3), name
+        pairs = list(zip(m.configuration.tolist(), m.sensor.tolist()))
+        assert len(set(pairs)) == len(pairs)
+        tours = [r for r in read_journal(self.session / 'plan.jsonl').records if 'plans' in r]
+        planned = sum(len(p['solutions']) for s in tours[-1]['plans'].values() for p in s['poses'])
+        assert len(set(m.configuration.tolist())) == planned > 3
+
+
+@contextmanager
+def no_room(process):
+    """Nothing that this process writes can become longer, as on a full disk."""
+    before = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (1, before[1]))
+    try:
+        yield
+    finally:
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, before)
+
+
+def test_one_required_sensor_is_enough_and_a_full_disk_is_waited_for(start, client, tmp_path):
+    """The tracker is not there at all; then recorder and planner have no room to write."""
+    cell = Cell(start, client, tmp_path, 'mocap', ['mocap'])
+    cell.until(lambda: cell.results.count('recorded') > 4, 'the first configurations')
+
+    with no_room(cell.nodes['recorder']):
+        cell.until(lambda: 'room on the disk' in cell.recorder('waiting_for'), 'the reason')
+        assert 'journal.jsonl: cannot be written' in cell.recorder('waiting_for')
+        acknowledged = len(cell.results)
+        held = f'waiting for {cell.recorder("waiting_for")}'
+        cell.until(lambda: cell.messages['robot_bridge'] == held, 'the bridge')
+        recorded = len(read_session(cell.session).measurements)
+        assert recorded == int(cell.recorder('observations'))
+        assert len(cell.results) == acknowledged
+    cell.until(lambda: len(cell.results) > acknowledged, 'the next configuration')
+    with no_room(cell.nodes['pose_planner']):
+        cell.until(lambda: 'room on the disk' in cell.messages['pose_planner'], 'the reason')
+        cell.until(lambda: cell.messages['robot_bridge'] == 'planner is held', 'the bridge')
+
+    session = cell.complete()
+    cell.check(session)
+    assert cell.recorder('waiting_for') == ''
+    assert session.sensor_names == ('mocap', 'tracker')
+    assert set(session.measurements.sensor.tolist()) == {0}
+    assert cell.recorder('bag_dropped') == '0'
+    # Also what came while there was no room.
+    settled = [m for m in BagReader(cell.session / 'bag') if m.topic == '/remaster/settled']
+    assert len(settled) >= len(cell.results)
+
+
+def test_any_sensor_is_enough(start, client, tmp_path):
+    """The bar stops for good in the middle: the tracker alone goes on, and nobody waits."""
+    cell = Cell(start, client, tmp_path, 'any', ['mocap', 'tracker'])
+    cell.until(lambda: int(cell.recorder('observations') or 0) > 1, 'the first configurations')
+    inject(tmp_path / 'world', {'mocap': {'off': 1}})
+    session = cell.complete()
+    cell.check(session)
+    assert set(session.measurements.sensor.tolist()) == {0, 1}
+    assert session.measurements.sensor[-1] == 1
