@@ -142,6 +142,7 @@ def _fast(
         z_mean=posterior.parameters(run.draws.reshape(-1, posterior.size).mean(axis=0)),
         sigma=sigma,
         pose_sigma=pose_sigma,
+        total_noise=posterior.total_noise(run.draws[..., len(posterior.free) :]),
         by_direction=_by_direction(posterior, run.draws[..., len(posterior.free) :]),
         trace=readable(run.trace),
         draws=readable(run.draws),

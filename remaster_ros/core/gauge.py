@@ -15,7 +15,7 @@ import numpy as np
 
 from remaster_ros.core.errors import InsufficientDataError
 from remaster_ros.core.model import Model, Rows
-from remaster_ros.core.posterior import Prior, prior_rows
+from remaster_ros.core.priors import Prior, prior_rows
 from remaster_ros.core.start import robust_spread
 from remaster_ros.core.types import BoolArray, FloatArray, IntArray
 

@@ -88,13 +88,12 @@ def accuracy_with_offsets(
     predicted_after = predicted_rows(problem, model, given.z)
     predictive = None
     if joint_offsets_std is not None:
-        sigma, pose_sigma = found.posterior.noise(given.eta)
         predictive = Predictive(
             model=model,
             before=found.before.z,
             after=given.z,
             draws=_draws(found, given, joint_offsets_std, rng),
-            sigma=np.tile(np.hypot(sigma, pose_sigma), (DRAWS, 1)),
+            sigma=np.tile(found.posterior.total_noise(given.eta), (DRAWS, 1, 1)),
         )
     accuracy = accuracy_of(
         problem.measurements,

@@ -153,8 +153,8 @@ def independence_sampler(
 def _walk(log_weight: FloatArray, log_uniform: FloatArray, current: float) -> IntArray:
     """Return which proposal the chain is at after each step, (n,); -1 is the start.
 
-    After a step that was taken the next is judged against its neighbour, all of these at once; only
-    what follows a refusal is walked through, step by step.
+    After a step that was taken the next is judged against its neighbour, all of these at once;
+    only what follows a refusal is walked through, step by step.
     """
     path = np.arange(len(log_weight))
     with np.errstate(invalid='ignore'):

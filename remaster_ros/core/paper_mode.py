@@ -20,7 +20,8 @@ from remaster_ros.core.gauge import Gauge, find_gauge
 from remaster_ros.core.laplace import find_mode
 from remaster_ros.core.metropolis import Chains, random_walk_sampler
 from remaster_ros.core.model import Model, Rows
-from remaster_ros.core.posterior import TIGHTEST_PRIOR, Posterior
+from remaster_ros.core.posterior import Posterior
+from remaster_ros.core.priors import TIGHTEST_PRIOR
 from remaster_ros.core.result import Sampled
 from remaster_ros.core.start import referenced, register
 from remaster_ros.core.transforms import inverse, transform
@@ -206,6 +207,7 @@ def fit_paper(
         z_mean=model.pinned(middle),
         sigma=sigma,
         pose_sigma=np.zeros_like(sigma),
+        total_noise=np.repeat(sigma[..., None], 2, axis=-1),
         trace=np.concatenate((trace[..., fitted], trace_sigma), axis=-1),
         draws=np.concatenate((x[..., fitted], sigma), axis=-1),
         names=names,

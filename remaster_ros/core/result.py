@@ -189,6 +189,8 @@ class Sampled:
         Its mean, joints that nothing tells at 0, (size,).
     sigma, pose_sigma
         Noise of each sensor, m, (chains, draws, sensors).
+    total_noise
+        Both together, along and across the line of sight, m, (chains, draws, sensors, 2).
     trace, draws
         What moved, in the order of ``names`` and in readable units, (chains, ..., p).
     names
@@ -222,6 +224,7 @@ class Sampled:
     z_mean: FloatArray
     sigma: FloatArray
     pose_sigma: FloatArray
+    total_noise: FloatArray
     trace: FloatArray
     draws: FloatArray
     names: tuple[str, ...]
@@ -397,13 +400,12 @@ def _accuracy(
     rng: np.random.Generator,
 ) -> dict[str, Any]:
     """Compute the metrics on the fitted rows and on all of the validation rows."""
-    sensors = sampled.sigma.shape[-1]
     predictive = Predictive(
         model=sampled.model,
         before=sampled.z_before,
         after=sampled.z_mean,
         draws=sampled.z.reshape(-1, sampled.model.size),
-        sigma=np.hypot(sampled.sigma, sampled.pose_sigma).reshape(-1, sensors),
+        sigma=sampled.total_noise.reshape(-1, *sampled.total_noise.shape[2:]),
     )
     splits = {
         'optimization': np.setdiff1d(problem.fitted, left_rows),

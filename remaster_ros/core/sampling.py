@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from remaster_ros.core import convergence
-from remaster_ros.core.laplace import LaplaceProposal, Mode
+from remaster_ros.core.laplace import Mode
 from remaster_ros.core.metropolis import (
     Chains,
     LogDensity,
@@ -18,6 +18,7 @@ from remaster_ros.core.metropolis import (
     independence_sampler,
     random_walk_sampler,
 )
+from remaster_ros.core.proposal import LaplaceProposal
 from remaster_ros.core.surrogate import Surrogate
 from remaster_ros.core.types import FloatArray
 

@@ -56,7 +56,8 @@ class Predictive:
     draws
         Pinned parameters of the posterior's draws, (draws, size).
     sigma
-        Noise per axis of each draw and sensor, all its parts together, m, (draws, sensors).
+        Noise of each draw and sensor, all its parts together, m, (draws, sensors, 2): along the
+        line of sight, and per axis across it.
     """
 
     model: Model
@@ -154,14 +155,15 @@ def _block(
 ) -> tuple[Distances, Distances]:
     model, draws = predictive.model, predictive.draws[taken]
     sensor = rows.group_sensor[rows.group_of_row]
-    noise = predictive.sigma[taken][:, sensor, None] * rng.standard_normal(
-        (len(taken), len(rows), 3)
-    )
+    predicted = model.predict(predictive.after, rows)
+    sight = predicted - model.reference[sensor, :3, 3]
+    sight /= np.linalg.norm(sight, axis=1)[:, None]
+    along, across = np.moveaxis(predictive.sigma[taken][:, sensor], -1, 0)
+    raw = rng.standard_normal((len(taken), len(rows), 3))
+    deeper = (along - across) * np.einsum('dni,ni->dn', raw, sight)
+    noise = across[..., None] * raw + deeper[..., None] * sight
     invariant = _distances(
-        model.predict(predictive.before, rows),
-        model.predict(predictive.after, rows),
-        model.predict(draws, rows),
-        noise,
+        model.predict(predictive.before, rows), predicted, model.predict(draws, rows), noise
     )
     markers = model.markers(model.natural(predictive.after))[rows.marker]
     before, after = (

@@ -20,7 +20,12 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from remaster_ros.core.errors import RemasterError
-from remaster_ros.core.fit import fit_session
+from remaster_ros.core.fit import (
+    COARSEST_PRECISION,
+    FINEST_PRECISION,
+    PRECISION,
+    fit_session,
+)
 from remaster_ros.core.types import FloatArray
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
@@ -41,6 +46,12 @@ class Parameters:
     )
     sampler: str = parameter('fast', 'which sampler', choices=('fast', 'paper'))
     chains: int = parameter(4, 'number of chains', low=2, high=64)
+    precision: float = parameter(
+        PRECISION,
+        'wanted Monte Carlo error of every mean, in standard deviations of its parameter',
+        low=FINEST_PRECISION,
+        high=COARSEST_PRECISION,
+    )
     prior: str = parameter('', 'YAML file of what is known before a fit; empty for nothing')
     seed: int = parameter(0, 'seed of the sampler', low=0)
     figures: bool = parameter(True, 'write figures and the report')
@@ -95,6 +106,7 @@ class Optimizer(RemasterNode):
             rng=np.random.default_rng(self.p.seed),
             sampler='paper' if self.p.sampler == 'paper' else 'fast',
             chains=self.p.chains,
+            precision=self.p.precision,
             progress=self._progress,
             clock=time.perf_counter,
             priors=read_priors(self.p.prior) if self.p.prior else None,

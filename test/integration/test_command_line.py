@@ -169,6 +169,26 @@ def test_the_fit_does_not_read_the_truth(made: Path, tmp_path: Path) -> None:
     assert without == with_truth
 
 
+def test_priors_and_a_precision_are_taken(made: Path, tmp_path: Path) -> None:
+    usual = json.loads((made / 'fit/fit.json').read_text(encoding='utf-8'))
+    priors = tmp_path / 'priors.yaml'
+    priors.write_text('joint_offsets: {joint_1: {mean_deg: 0.1, std_deg: 0.05}}\n')
+    fitted = fit(
+        made / 'session', tmp_path / 'fit', '--prior', priors, '--precision', 0.04, '--chains', 3
+    )
+    # The data say nothing of joint 1: the posterior is the prior, to five standard errors.
+    first = fitted['joint_offsets'][0]
+    assert first['mean_deg'] == pytest.approx(0.1, abs=5 * 0.04 * 0.05)
+    assert first['std_deg'] == pytest.approx(0.05, rel=0.15)
+    assert 'joint_1' in fitted['gauge'][0]['fixed_by']
+    assert usual['joint_offsets'][0]['std_deg'] > 100.0
+    sampler = fitted['sampler']
+    assert sampler['chains'] == 3
+    assert sampler['precision'] <= sampler['precision_wanted'] == 0.04
+    assert '4 % wanted' in sampler['message']
+    assert usual['sampler']['precision'] <= usual['sampler']['precision_wanted'] == 0.02
+
+
 def test_accuracy_on_the_own_session_and_on_another(made: Path, tmp_path: Path) -> None:
     offsets = ('--offsets', made / 'fit/fit.json')
     out = tmp_path / 'new' / 'accuracy.json'

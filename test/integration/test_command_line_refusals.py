@@ -139,6 +139,22 @@ def test_an_empty_session(session: Path) -> None:
     assert 'no observations below the header' in refusal(*fit(session))
 
 
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('markers: {nose: {position_m: [0, 0, 0], std_m: 1e-3}}', "prior on marker 'nose'"),
+        ('joint_offsets: {joint_1: {mean_deg: 0.1, std_deg: 0}}', 'joint_1.std_deg is 0'),
+        ('joint_offsets: [', 'priors.yaml'),
+    ],
+)
+def test_priors_that_cannot_be(text: str, words: str, good: Path, tmp_path: Path) -> None:
+    priors = tmp_path / 'priors.yaml'
+    priors.write_text(text)
+    out = tmp_path / 'out'
+    assert words in refusal('fit', good / 'session', '--out', out, '--prior', priors)
+    assert not (out / 'fit.json').exists()
+
+
 def test_data_that_allow_no_answer_end_with_1(session: Path) -> None:
     """Two poses: not bad input, but no registration either."""
 
@@ -199,6 +215,7 @@ def test_a_session_is_never_overwritten(session: Path) -> None:
         (('simulate', 'out', '--tip-link', 'nix'), 'nix'),
         (('fit', 'session'), 'required: --out'),
         (('fit', 'session', '--out', 'o', '--chains', 1), '--chains: 1 is less than 2'),
+        (('fit', 'session', '--out', 'o', '--precision', 3), '--precision: 3 is more than 0.1'),
         (('fit', 'session', '--out', 'o', '--sampler', 'slow'), "invalid choice: 'slow'"),
         (('fit', 'session', '--out', 'o', '--fast'), 'unrecognized arguments: --fast'),
         (('demo', '--rate', 'nan'), '--rate: nan is not a finite number'),

@@ -12,9 +12,11 @@ from scipy.stats import kstest, multivariate_normal
 from remaster_ros.core import sampling
 from remaster_ros.core.errors import InsufficientDataError
 from remaster_ros.core.estimate import Problem, estimate
-from remaster_ros.core.laplace import LaplaceProposal, find_mode
+from remaster_ros.core.laplace import find_mode
 from remaster_ros.core.metropolis import random_walk_sampler
-from remaster_ros.core.posterior import RESOLUTION_M, base_prior, marker_prior
+from remaster_ros.core.posterior import RESOLUTION_M
+from remaster_ros.core.priors import base_prior, marker_prior
+from remaster_ros.core.proposal import LaplaceProposal
 from remaster_ros.core.sampling import sample_posterior
 from remaster_ros.core.transforms import quaternion_xyzw
 from remaster_ros.core.types import BasePrior

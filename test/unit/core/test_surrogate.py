@@ -12,7 +12,8 @@ from scipy.stats import ks_2samp
 from remaster_ros.core import sampling
 from remaster_ros.core.estimate import Problem, estimate
 from remaster_ros.core.fit import fit_session
-from remaster_ros.core.laplace import LaplaceProposal, find_mode
+from remaster_ros.core.laplace import find_mode
+from remaster_ros.core.proposal import LaplaceProposal
 from remaster_ros.core.sampling import sample_posterior
 from remaster_ros.core.surrogate import Surrogate, _bent_pairs, _second_derivatives
 

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from remaster_ros.core.result import NoiseEstimate
 from remaster_ros.core.transforms import apply
 from remaster_ros.storage.report import report_html, verdict
 from remaster_ros.storage.results import save_fit
@@ -220,6 +221,17 @@ def test_a_session_without_validation_has_a_report(fit_result):
     html = report_html(result, {})
     assert 'not proven' in html
     assert 'No observation was left out' in html
+
+
+def test_noise_along_the_line_of_sight_has_rows_of_its_own(fit_result):
+    name = next(iter(fit_result.noise))
+    part = NoiseEstimate(0.0123e-3, 1e-6, None, None)
+    noise = replace(fit_result.noise[name], directions={'along': part, 'across': part})
+    plain = report_html(fit_result, {})
+    assert 'line of sight' not in plain
+    html = report_html(replace(fit_result, noise={**fit_result.noise, name: noise}), {})
+    assert 'along the line of sight' in html
+    assert html.count('0.0123') == 2
 
 
 def test_error_vectors_lead_from_the_measured_to_the_modelled_marker(fit_result):
