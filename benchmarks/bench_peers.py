@@ -34,14 +34,15 @@ from paper_model import rigid_fit
 from remaster_ros.core.fit import fit_session
 from remaster_ros.core.types import FloatArray, Session
 
-# What pip is told, step by step.
+# What pip is told, step by step; every version is pinned in a file beside the peer's script.
 PEERS = {
-    'pybotics': [['pybotics==3.1.2', 'numpy==1.26.4', 'scipy==1.13.1']],
+    'pybotics': [[]],
     'figaroh': [
-        ['setuptools<80', 'wheel', 'numpy', 'cvxopt'],
-        ['--no-build-isolation', 'figaroh==1.0.2'],
+        ['setuptools==79.0.1', 'wheel==0.45.1', 'numpy', 'cvxopt'],
+        ['--no-build-isolation'],
     ],
 }
+SCRIPTS = Path(__file__).parent / 'peers'
 NOISE_M = (0.1e-3, 0.2e-3)
 JOINTS = slice(1, 6)
 
@@ -99,15 +100,19 @@ def peer_python(name: str, envs: Path) -> Path:
     python = folder / 'bin' / 'python'
     if not (folder / 'installed').is_file():
         subprocess.run([sys.executable, '-m', 'venv', '--clear', str(folder)], check=True)
-        for packages in PEERS[name]:
-            subprocess.run([str(python), '-m', 'pip', 'install', '-q', *packages], check=True)
+        pins = str(SCRIPTS / f'{name}.txt')
+        for step in PEERS[name][:-1]:
+            command = [str(python), '-m', 'pip', 'install', '-q', '-c', pins, *step]
+            subprocess.run(command, check=True)
+        command = [str(python), '-m', 'pip', 'install', '-q', *PEERS[name][-1], '-r', pins]
+        subprocess.run(command, check=True)
         (folder / 'installed').touch()
     return python
 
 
 def by_peer(name: str, python: Path, folder: Path) -> dict[str, Any]:
     """Run a peer's script in its environment; return what it prints."""
-    script = Path(__file__).parent / 'peers' / f'fit_{name}.py'
+    script = SCRIPTS / f'fit_{name}.py'
     answer = subprocess.run(
         [str(python), '-W', 'ignore', str(script), str(folder)],
         check=False,
