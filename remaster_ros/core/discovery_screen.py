@@ -195,10 +195,7 @@ class _Projection:
         extra = np.concatenate((np.zeros((len(root), data.base.shape[2])), root), axis=1)
         stacked = np.concatenate((white, extra))
         scale = np.linalg.norm(stacked, axis=0)
-        left, singular, _ = np.linalg.svd(stacked / scale, full_matrices=False)
-        left = left[:, singular > 1e-9 * singular[0]]
-        self.rows = len(white)
-        self.top = left[: self.rows]
+        self.top = np.linalg.qr(stacked / scale)[0][: len(white)]
         self.single = self.top.astype(np.float32)
 
     def residual(self, values: FloatArray) -> FloatArray:

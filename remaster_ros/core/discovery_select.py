@@ -26,7 +26,10 @@ from remaster_ros.core.types import FloatArray
 
 # Family-wise error of one round.
 SIGNIFICANCE = 0.01
-DRAWS = 400
+DRAWS = 300
+# Error of keeping a member of a family that has passed as a whole.
+SIGNIFICANCE_OF_ONE = 0.05
+DRAWS_OF_ONE = 200
 SHORTLIST = 8
 ROUNDS = 8
 FOLDS = 10
@@ -315,9 +318,9 @@ class Search:
             return False
         own = np.array([other.key == cell.key for other in self.catalogue.cells])
         screening = screen(
-            self.data, self.catalogue, without, rng=self.rng, draws=DRAWS, chosen=own
+            self.data, self.catalogue, without, rng=self.rng, draws=DRAWS_OF_ONE, chosen=own
         )
-        return screening.p_value(float(screening.score[own][0])) <= SIGNIFICANCE
+        return screening.p_value(float(screening.score[own][0])) <= SIGNIFICANCE_OF_ONE
 
     def replacements(self, solution: Solution, cells: set[Cell], count: int) -> list[Solution]:
         """Return fits with the best other cells in the place of these, best first."""
