@@ -225,7 +225,7 @@ class Bench:
             if not self._alive(node) or not self.world.line_of_sight(name, self.t):
                 continue
             place = self.world.marker_in_sensor(name, self.t) + self.rng.normal(0, 3e-5, 3)
-            if self.is_faulty(node, 'stuck', 'wrong', 'garbage'):
+            if self.is_faulty(node, 'wrong', 'garbage', 'stray', 'frozen'):
                 place = self._spoil(node, name, place)
             else:
                 self.last_reading[name] = place
@@ -236,9 +236,14 @@ class Bench:
             self._finish(pairing)
 
     def _spoil(self, node: str, name: str, place: np.ndarray) -> np.ndarray:
-        if self.is_faulty(node, 'garbage'):
+        kind = self.node.kind
+        if kind == 'garbage':
             return place * np.nan
-        return place + np.array([0.2, 0, 0]) if self.is_faulty(node, 'wrong') else place
+        if kind == 'wrong':
+            return place + np.array([0.2, 0, 0])
+        # A stray that stands where the marker was last seen, or that reading again and again.
+        stands = self.last_reading[name]
+        return stands + (self.rng.normal(0, 3e-5, 3) if kind == 'stray' else 0.0)
 
     def _read(self, name: str, reading: MarkerReading) -> None:
         if not np.all(np.isfinite(reading.position)):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from remaster_ros.core.errors import InputError, InsufficientDataError
 from remaster_ros.core.transforms import apply, transform
@@ -13,6 +15,8 @@ MINIMUM_POINTS = 3
 # Points that stray from their best line by less than this share of their spread along it leave
 # the turn about that line to the noise.
 MINIMUM_WIDTH = 0.02
+TRIED_POINTS = 20
+"""Of so many points every three are tried for agreement."""
 
 
 def register_points(points_R: ArrayLike, points_N: ArrayLike) -> tuple[FloatArray, float]:
@@ -65,6 +69,58 @@ def register_points(points_R: ArrayLike, points_N: ArrayLike) -> tuple[FloatArra
     T_R_N = transform(rotation, center_R - rotation @ center_N)
     distances = np.linalg.norm(apply(T_R_N, points_N) - points_R, axis=1)
     return T_R_N, float(np.sqrt(np.mean(distances**2)))
+
+
+def register_agreeing(
+    points_R: ArrayLike, points_N: ArrayLike, allowed_m: float
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Register by the points that agree: one may be that of a stray taken for the marker.
+
+    Of every three points the frame is computed; that with which most points agree is refined by
+    all of these.
+
+    Parameters
+    ----------
+    points_R, points_N
+        As of `register_points`.
+    allowed_m
+        A point further than this from where the others have it does not agree, m.
+
+    Returns
+    -------
+    T_R_N : ndarray
+        The sensor frame in R, (4, 4).
+    agree : ndarray of bool
+        Which points were used, (n,).
+
+    Raises
+    ------
+    InputError, InsufficientDataError
+        As `register_points`; and where no three points, or less than most of them, agree.
+    """
+    points_R, points_N = np.asarray(points_R, dtype=float), np.asarray(points_N, dtype=float)
+    # Whatever is wrong with all of them together is said as such.
+    register_points(points_R, points_N)
+    best, best_key, closest = np.zeros(len(points_R), bool), (0, 0.0), np.inf
+    for triple in combinations(range(min(len(points_R), TRIED_POINTS)), MINIMUM_POINTS):
+        three = list(triple)
+        try:
+            T_R_N, rms = register_points(points_R[three], points_N[three])
+        except InsufficientDataError:
+            continue
+        off = np.linalg.norm(apply(T_R_N, points_N) - points_R, axis=1)
+        closest = min(closest, float(off[three].max()))
+        agree = off <= allowed_m
+        key = (int(agree.sum()), -rms)
+        if agree[three].all() and key > best_key:
+            best, best_key = agree, key
+    if 2 * best_key[0] <= len(points_R):
+        raise InsufficientDataError(
+            f'registration: of {len(points_R)} points too few agree with the robot (the best '
+            f'three are {1e3 * closest:.0f} mm off, allowed {1e3 * allowed_m:.0f} mm): a stray '
+            'taken for the marker, or a marker that the cell has elsewhere; measure more'
+        )
+    return register_points(points_R[best], points_N[best])[0], best
 
 
 def _require_width(points: FloatArray, whose: str) -> None:

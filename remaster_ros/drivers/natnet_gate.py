@@ -28,6 +28,8 @@ RESTART_S = 1.0
 """A frame time further back than this is a restarted stream too."""
 MAX_AGE_S = 10.0
 """A reading that claims to be older when it is sent has stamps of another clock."""
+FROZEN_FRAMES = 10
+"""So many readings in a row that are the same to the last bit are no measurements."""
 JUMP_MARGIN_M = 0.005
 """Far above any noise; what a marker may move between frames beyond `max_speed_m_s`."""
 
@@ -54,6 +56,8 @@ class Dropped(StrEnum):
     UNLABELLED = 'unlabelled'
     OCCLUDED = 'occluded'
     MODEL_FILLED = 'model_filled'
+    FROZEN = 'frozen'
+    """The same to the last bit in one frame after the other: no measurement."""
     JUMP = 'jump'
     """Further from the last reading than the marker could have moved."""
     IMPLAUSIBLE = 'implausible'
@@ -166,6 +170,7 @@ class MarkerGate:
         self._last_number: int | None = None
         self._last_timestamp = -math.inf
         self._last_reading: MarkerSample | None = None
+        self._repeats = 0
         self.forget_assets()
 
     @property
@@ -225,7 +230,7 @@ class MarkerGate:
         found = self._order(frame) or self._find(frame)
         if isinstance(found, LabeledMarker):
             reading = _sample(frame, found, received_s, ticks_per_s)
-            found = _implausible(reading) or self._jump(reading) or found
+            found = _implausible(reading) or self._jump(reading) or self._frozen(reading) or found
         if isinstance(found, Dropped):
             self.dropped[found] += 1
             self.last_reason = found
@@ -294,6 +299,12 @@ class MarkerGate:
         if moved > JUMP_MARGIN_M + self._choice.max_speed_m_s * elapsed:
             return Dropped.JUMP
         return None
+
+    def _frozen(self, reading: MarkerSample) -> Dropped | None:
+        last = self._last_reading
+        same = last is not None and np.array_equal(reading.position, last.position)
+        self._repeats = self._repeats + 1 if same else 0
+        return Dropped.FROZEN if self._repeats >= FROZEN_FRAMES else None
 
 
 def _implausible(reading: MarkerSample) -> Dropped | None:

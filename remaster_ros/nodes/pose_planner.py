@@ -378,8 +378,9 @@ class PosePlanner(RemasterNode):
         stop = self.book.tour.next(q)
         if stop is None:
             raise InsufficientDataError(
-                f'no registration of {", ".join(missing)} after {self.book.tour.visited} poses; '
-                'the recorder counts why readings were rejected'
+                f'no registration of {", ".join(missing)} after {self.book.tour.visited} poses '
+                f'({self._peers["recorder"].values.get("registration")}); the recorder counts why '
+                'readings were rejected'
             )
         return stop
 

@@ -109,7 +109,7 @@ class Recorder(RemasterNode):
         # What the disk did not take yet, why, and when that was.
         self._unwritten: Callable[[], object] | None = None
         self._full, self._tried = '', 0.0
-        self.registrar = Registrar(self, self.cell, self.chain)
+        self.registrar = Registrar(self, self.cell, self.chain, self.p.max_deviation_m / 2)
         markers = {name: np.array(position) for name, position in self.cell.markers.items()}
         self._plausibility = Plausibility(self.chain, markers, self.p.max_deviation_m)
         recording = self.p.bag and not self.logbook.closed
@@ -413,6 +413,7 @@ class Recorder(RemasterNode):
             'pose': '' if pose is None else pose.stamp,
             'plan': self.logbook.plan_id,
             'decided': self.logbook.decided(),
+            'registration': self.registrar.describe(),
             'require': self.p.require,
             'waiting_for': waiting_for,
             **{f'waited_s_{name}': f'{s:.1f}' for name, s in self._waited_s.items()},

@@ -9,7 +9,7 @@ from rclpy.node import Node
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.errors import InsufficientDataError
 from remaster_ros.core.pairing import PairedReading
-from remaster_ros.core.registration import register_points
+from remaster_ros.core.registration import register_agreeing
 from remaster_ros.core.types import FloatArray
 from remaster_ros.nodes.messages import transform_message
 from remaster_ros.nodes.status import LATCHED
@@ -27,15 +27,18 @@ class Registrar:
         The node that publishes.
     cell, chain
         The sensors and their markers, and the arm.
+    allowed_m
+        A point that is off by more is not used, m.
     """
 
-    def __init__(self, node: Node, cell: Cell, chain: SerialChain) -> None:
+    def __init__(self, node: Node, cell: Cell, chain: SerialChain, allowed_m: float) -> None:
         self._node, self._cell, self._chain = node, cell, chain
+        self._allowed_m = allowed_m
         self._points: dict[str, list[tuple[FloatArray, FloatArray]]] = {
             n: [] for n in cell.sensors
         }
         self.T_R_N: dict[str, FloatArray] = {}
-        self._note = ''
+        self._notes: dict[str, str] = {}
         self._publisher = node.create_publisher(
             TransformStamped, '/remaster/registration', LATCHED
         )
@@ -56,17 +59,18 @@ class Registrar:
                 continue
             robot, measured = (np.array(side) for side in zip(*points))
             try:
-                T_R_N, rms = register_points(robot, measured)
+                T_R_N, agree = register_agreeing(robot, measured, self._allowed_m)
             except InsufficientDataError as error:
-                self._note = f'{reading.sensor}: {error}'
-                self._node.get_logger().warning(self._note)
+                self._notes[reading.sensor] = f'{reading.sensor}: {error}'
+                self._node.get_logger().warning(self._notes[reading.sensor])
                 continue
+            self._notes.pop(reading.sensor, None)
             self.T_R_N[reading.sensor] = T_R_N
             message = transform_message(self._chain.base_link, reading.sensor, T_R_N)
             message.header.stamp = self._node.get_clock().now().to_msg()
             self._publisher.publish(message)
             self._node.get_logger().info(
-                f'{reading.sensor} registered by {len(points)} points, rms {1e3 * rms:.2f} mm'
+                f'{reading.sensor} registered by {np.sum(agree)} of {len(points)} points'
             )
 
     def describe(self) -> str:
@@ -74,4 +78,4 @@ class Registrar:
         parts = [
             f'{name}: point {len(points)} of {POINTS}' for name, points in self._points.items()
         ]
-        return '; '.join(parts) + (f'; {self._note}' if self._note else '')
+        return '; '.join([*parts, *self._notes.values()])

@@ -21,7 +21,9 @@ import pytest
 import tracker_world
 from fault_bench import NODES, SENSOR_OF, Bench, Node
 
-from remaster_ros.core.errors import DeviceError, InputError
+from remaster_ros.core import transforms
+from remaster_ros.core.errors import DeviceError, InputError, InsufficientDataError
+from remaster_ros.core.registration import register_agreeing
 from remaster_ros.core.visiting import Visitor
 from remaster_ros.drivers.laser_tracker import LaserTrackerClient, LaserTrackerSettings
 from remaster_ros.drivers.natnet import MarkerChoice, NatNetClient, NatNetSettings
@@ -190,6 +192,43 @@ def test_node(bench, name, kind):
     observe(name, kind, tell(bench))
 
 
+@pytest.mark.parametrize(
+    ('node', 'kind', 'fault'),
+    [
+        ('optitrack_markers', 'stray', 'OptiTrack: marker swapped with a stray'),
+        ('laser_tracker_markers', 'stray', 'laser tracker: locked on another reflector'),
+        ('laser_tracker_markers', 'frozen', 'laser tracker: the same reading again and again'),
+    ],
+)
+def test_a_marker_that_is_another_or_frozen_is_no_observation(bench, node, kind, fault):
+    under_way(bench)
+    bench.node = Node(node, kind, faulty=True)
+    assert bench.run(60.0, lambda: len(bench.recorded) == 2)
+    bench.node = Node()
+    assert SENSOR_OF[node] not in bench.recorded[1]
+    observe('named', fault, tell(bench))
+
+
+def test_a_stray_during_the_registration(bench):
+    """At the second of three points a stray is taken for the marker; a fourth point decides."""
+    rng, truth = np.random.default_rng(4), bench.world.truth
+    sensor = truth.sensors['mocap']
+    turns = np.array([[0.0] * 7, [0.5, 0.2] + [0.0] * 5, [-0.3, 0.4] + [0.0] * 5, [0.2] * 7])
+    q = bench.world.start_q + turns
+    model_R = fault_bench.CHAIN.positions(q, np.array(fault_bench.CELL.markers['sir']))
+    marker_R = fault_bench.CHAIN.positions(q, sensor.marker, truth.joint_offsets)
+    seen = transforms.apply(transforms.inverse(sensor.T_R_N), marker_R)
+    seen = seen + rng.normal(0, 3e-5, seen.shape)
+    seen[1] = seen[0] + [0.1, 0.0, 0.0]
+    with pytest.raises(InsufficientDataError) as refusal:
+        register_agreeing(model_R[:3], seen[:3], 0.025)
+    T_R_N, agree = register_agreeing(model_R, seen, 0.025)
+    assert agree.tolist() == [True, False, True, True]
+    assert np.linalg.norm(T_R_N[:3, 3] - sensor.T_R_N[:3, 3]) < 0.05
+    text = f'{refusal.value}; the next point decides, and the stray is left out'
+    observe('named', 'OptiTrack: marker swapped with a stray at the registration', text)
+
+
 def break_bridge(bench: Bench, kind: str) -> None:
     """What the others see of a bridge that does not do its part."""
     if kind == 'wrong':
@@ -231,6 +270,7 @@ MOCAP = {
 NAMED_MOCAP = {
     'marker occluded': {'occluded': 1},
     'marker model-filled': {'filled': 1},
+    'marker frozen': {'frozen': 1},
     'marker jumping': {'jumping': 1},
     'stream stopped': {'stopped': 1},
     'stream restarted': {'renumbered': 1},

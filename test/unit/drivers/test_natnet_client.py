@@ -309,7 +309,8 @@ class Peer:
 
     def frame(self, **fields):
         self.number += 1
-        marker = LabeledMarker(1 << 16 | 1, (0.5, 0.25, 2.0), 0.01, 0x0A, 1e-4)
+        position = (0.5 + 1e-6 * self.number, 0.25, 2.0)
+        marker = LabeledMarker(1 << 16 | 1, position, 0.01, 0x0A, 1e-4)
         return Frame(self.number, self.number / 100, (marker,), **fields)
 
 
@@ -349,7 +350,7 @@ def test_no_datagram_ends_the_thread(peer_and_client):
 
     assert eventually(takes_good_ones)
     for sample in client.samples:
-        np.testing.assert_array_equal(sample.position, [0.5, 0.25, 2.0])
+        np.testing.assert_allclose(sample.position, [0.5, 0.25, 2.0], atol=0.01)
 
 
 def test_another_address_is_counted_and_never_believed(peer_and_client):

@@ -54,6 +54,14 @@ def test_without_a_mid_exposure_clock_the_frame_time_remains():
     assert math.isnan(old.residual_m)
 
 
+def test_a_marker_that_repeats_itself_to_the_last_bit_is_frozen():
+    gate, admit = gate_for()
+    taken = [admit(frame(number, marker())) is not None for number in range(1, 31)]
+    assert taken == [True] * 10 + [False] * 20
+    assert gate.dropped[Dropped.FROZEN] == 20
+    assert admit(frame(31, marker(x=0.5 + 1e-7))) is not None
+
+
 @pytest.mark.parametrize(
     ('bad', 'reason'),
     [
