@@ -67,6 +67,9 @@ class _Executor(MultiThreadedExecutor):
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Stop executing callbacks and wait for their end."""
         self._executor.shutdown(wait=True, cancel_futures=True)
+        # What was in the queue never runs; without this Python complains of each of them.
+        for task, _, _ in self._tasks:
+            task.cancel()
         return super().shutdown(timeout_sec)
 
 

@@ -1,6 +1,8 @@
 """A node that cannot work says so in one line and ends with status 2."""
 
 import socket
+import subprocess
+import sys
 
 import pytest
 from conftest import node_arguments
@@ -93,3 +95,34 @@ def test_a_port_in_use(start, tmp_path, fake):
 
 def test_a_bag_that_is_not_there(start, tmp_path):
     assert str(tmp_path / 'none') in refuse(start, 'replay', bag=tmp_path / 'none')
+
+
+QUEUED = """
+import sys, time
+from rclpy.callback_groups import ReentrantCallbackGroup
+from remaster_ros.nodes.running import RemasterNode, run
+
+class Busy(RemasterNode):
+    def __init__(self):
+        super().__init__('busy')
+        for _ in range(6):
+            self.create_timer(0.01, self.work, callback_group=ReentrantCallbackGroup())
+
+    def work(self):
+        time.sleep(0.5)
+        self.finished = True
+
+sys.exit(run(Busy, threads=2))
+"""
+
+
+def test_a_node_that_ends_while_callbacks_are_queued_says_nothing(ros_environment):
+    done = subprocess.run(
+        [sys.executable, '-c', QUEUED],
+        env=ros_environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, '')
