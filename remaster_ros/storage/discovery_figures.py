@@ -10,6 +10,7 @@ import matplotlib
 import numpy as np
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from remaster_ros.core.discovery import Discovery
 from remaster_ros.core.effects.cell import Cell
@@ -60,6 +61,7 @@ def gain(discovery: Discovery) -> Figure:
     left.set_title('Held-out poses' if held_out.any() else 'Fitted poses')
     left.set_xlabel('3-D error (mm)')
     left.set_ylabel('observations')
+    left.yaxis.get_major_locator().set_params(integer=True)
     left.legend(loc='upper left')
 
     parts, names = [], []
@@ -85,11 +87,12 @@ def gain(discovery: Discovery) -> Figure:
             )
     right.set_xticks(
         np.concatenate((x - 0.2, x + 0.2)).tolist(),
-        [f'{n}\ncommon to pose' for n in names] + [f'{n}\nwithin pose' for n in names],
+        [f'{n}\nshared' for n in names] + [f'{n}\nwithin' for n in names],
     )
     right.set_ylabel('RMS per axis (mm)')
-    right.set_title('What the poses share')
-    right.legend(loc='upper right')
+    right.set_ylim(0.0, 1.3 * float(values.max()))
+    right.set_title('Errors shared by a pose, and within')
+    right.legend(loc='upper right', ncols=2)
     return figure
 
 
@@ -107,11 +110,24 @@ def drivers(discovery: Discovery) -> Figure:
     shown = [True, scene.has_gravity, scene.has_approach, scene.has_time, scene.has_temperature]
     kept = [pair for pair, show in zip(by_joint, shown, strict=True) if show]
     joints = scene.joints
-    figure = Figure(figsize=(WIDTH_IN, 1.05 * len(kept) + 0.5), layout='constrained')
+    height = 1.05 * len(kept) + 0.6
+    figure = Figure(figsize=(WIDTH_IN, height))
+    # Fixed margins: to find them for so many panels takes longer than to draw them.
     axes = figure.subplots(len(kept), joints, squeeze=False, sharey=True)
+    figure.subplots_adjust(
+        left=0.07,
+        right=0.995,
+        bottom=0.4 / height,
+        top=1.0 - 0.38 / height,
+        hspace=0.7,
+        wspace=0.1,
+    )
     motion = scene.jacobian[rows]
     length = np.maximum(np.linalg.norm(motion, axis=1), 1e-6)
-    for fit, color in ((selection.empty, BEFORE), (selection.solution, AFTER)):
+    fits = [(selection.empty, BEFORE, 'before')]
+    if discovery.groups:
+        fits.append((selection.solution, AFTER, 'after'))
+    for fit, color, _ in fits:
         left = data.unexplained(fit)[rows]
         along = 1e3 * np.einsum('nij,ni->nj', motion, left) / length
         for row, (_, value) in enumerate(kept):
@@ -121,12 +137,19 @@ def drivers(discovery: Discovery) -> Figure:
     for row, (label, _) in enumerate(kept):
         for joint in range(joints):
             ax = axes[row, joint]
-            ax.axhline(0.0, color=INK, linewidth=0.5)
             ax.tick_params(labelsize=5.5, length=2)
+            ax.xaxis.get_major_locator().set_params(nbins=3)
+            if ax.has_data():
+                ax.axhline(0.0, color=INK, linewidth=0.5)
+            else:
+                ax.set_xticks([])
+                ax.text(0.5, 0.5, 'constant', transform=ax.transAxes, ha='center', fontsize=5.5)
             if row == 0:
                 ax.set_title(f'joint {joint + 1}', fontsize=7.5)
         axes[row, joints // 2].set_xlabel(label, fontsize=7)
     figure.supylabel('mean error along the motion of the joint (mm)', fontsize=7.5)
+    handles = [Line2D([], [], color=color, marker='.', label=label) for _, color, label in fits]
+    figure.legend(handles=handles, loc='upper right', ncols=2, fontsize=7, frameon=False)
     return figure
 
 
@@ -215,13 +238,36 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     angle = np.sum(motion * left, axis=1)[far] / square[far] / ARC_MINUTE
     shown = slice(None, None, max(1, int(far.sum()) // SCATTER_POINTS))
     points = (effect[far] + angle)[shown]
-    ax.plot(x[far][shown], points, '.', color=BEFORE, markersize=2.5, alpha=0.6)
-    order = np.argsort(x)
-    line, band = effect[order], 2.0 * spread[order]
-    ax.fill_between(x[order], line - band, line + band, color=AFTER, alpha=0.25, linewidth=0)
-    ax.plot(x[order], line, color=AFTER, linewidth=1.3)
+    if cell.driver.startswith('approach'):
+        _sides(ax, x, effect, 2.0 * spread, (x[far][shown], points))
+    else:
+        ax.plot(x[far][shown], points, '.', color=BEFORE, markersize=2.5, alpha=0.6)
+        order = np.argsort(x)
+        line, band = effect[order], 2.0 * spread[order]
+        ax.fill_between(x[order], line - band, line + band, color=AFTER, alpha=0.25, linewidth=0)
+        ax.plot(x[order], line, color=AFTER, linewidth=1.3)
     limit = np.quantile(np.abs(points), 0.99)
     ax.set_ylim(-1.2 * limit, 1.2 * limit)
     ax.set_xlabel(label)
     ax.set_ylabel('arc minutes')
     ax.set_title(f'joint {cell.joints[0]}: {cell.name.replace("_", " ")}')
+
+
+def _sides(
+    ax: Axes,
+    x: FloatArray,
+    effect: FloatArray,
+    band: FloatArray,
+    shown: tuple[FloatArray, FloatArray],
+) -> None:
+    """Draw a step: the points of each side spread out, and the step's level beside them."""
+    places, points = shown
+    spread_out = places + 0.3 * np.linspace(-1.0, 1.0, len(places))
+    ax.plot(spread_out, points, '.', color=BEFORE, markersize=2.5, alpha=0.6)
+    for side in (-1.0, 1.0):
+        if np.any(x == side):
+            level, width = float(effect[x == side][0]), float(band[x == side][0])
+            span = [side - 0.4, side + 0.4]
+            ax.fill_between(span, level - width, level + width, color=AFTER, alpha=0.25)
+            ax.plot(span, [level, level], color=AFTER, linewidth=1.3)
+    ax.set_xticks([-1.0, 1.0], ['from above', 'from below'])
