@@ -16,7 +16,7 @@ from remaster_ros.storage.discovery_results import read_discovery, save_discover
 
 
 def bent(session):
-    return at_joint(2, 1.5e-3 * np.sin(session.measurements.q[:, 1]))
+    return at_joint(2, 1.5e-3 * np.sin(2.0 * session.measurements.q[:, 1]))
 
 
 @pytest.fixture(scope='module')
@@ -52,7 +52,7 @@ def test_the_report_needs_nothing_else_and_says_the_cause(saved):
     page = (folder / 'report.html').read_text()
     assert not re.findall(r'(?:src|href)="(?!#)[^"]', page)
     assert found.effects[0].cause in page
-    assert 'sin1_2' in page
+    assert 'sin2_2' in page
     for name in ('gain', 'drivers', 'causes'):
         ElementTree.parse(folder / 'figures' / f'{name}.svg')
 
