@@ -3,14 +3,16 @@
 Each run is `remaster demo` at the highest clock rate: real nodes, real DDS, real sockets; what is
 killed is started again as a supervisor would. The session is held to what was ever on the disk,
 to the plan, and to the opened truth; the fit to that of the undisturbed run of the same seed.
-Results are kept a line per run, and runs that are there already are not done again.
+Each seed is run once undisturbed and some times with other kills. Results are kept a line per run,
+and runs that are there already are not done again.
 
-    python benchmarks/bench_kills.py [--kills 200] [--per-run 5] [--out kills.jsonl]
+    python benchmarks/bench_kills.py [--kills 200] [--per-run 8] [--turns 5] [--out kills.jsonl]
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import random
@@ -182,14 +184,18 @@ def largest_z(a: dict[str, Any], b: dict[str, Any]) -> float:
     return max((abs(x[0] - y[0]) / np.hypot(x[1], y[1]) for x, y in both), default=np.nan)
 
 
-def one(folder: Path, seed: int, kills: int, args: argparse.Namespace) -> dict[str, Any]:
-    run = Run(folder / f'seed_{seed}_kills_{kills}', seed, args.candidates, args.rate)
+def one(folder: Path, seed: int, turn: int, args: argparse.Namespace) -> dict[str, Any]:
+    """Run a demo, undisturbed in turn 0."""
+    run = Run(folder / f'seed_{seed}_turn_{turn}', seed, args.candidates, args.rate)
     began = time.monotonic()
-    run.watch(random.Random(f'kills {seed}'), kills, args.mean_s, args.timeout_s)
+    kills = args.per_run if turn else 0
+    run.watch(random.Random(f'kills {seed} {turn}'), kills, args.mean_s, args.timeout_s)
     return {
         'seed': seed,
-        'kills': kills,
+        'turn': turn,
         'candidates': args.candidates,
+        'rate': args.rate,
+        'load': os.getloadavg()[0],
         'seconds': round(time.monotonic() - began, 1),
         'status': run.process.returncode,
         'killed': run.killed,
@@ -200,11 +206,13 @@ def one(folder: Path, seed: int, kills: int, args: argparse.Namespace) -> dict[s
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--kills', type=int, default=200, help='in all')
-    parser.add_argument('--per-run', type=int, default=5, help='kills in a run')
-    parser.add_argument('--candidates', type=int, default=8)
+    parser.add_argument('--per-run', type=int, default=8, help='kills in a run, if it lasts')
+    parser.add_argument('--turns', type=int, default=5, help='disturbed runs of each seed')
+    parser.add_argument('--candidates', type=int, default=10)
     parser.add_argument('--rate', type=float, default=20.0, help='world time over wall time')
-    parser.add_argument('--mean-s', type=float, default=6.0, help='wall time between kills')
-    parser.add_argument('--timeout-s', type=float, default=900.0, help='wall time of a run')
+    parser.add_argument('--mean-s', type=float, default=4.0, help='wall time between kills')
+    parser.add_argument('--timeout-s', type=float, default=600.0, help='wall time of a run')
+    parser.add_argument('--until', default='', help='HH:MM after which no run is begun')
     parser.add_argument('--out', type=Path, default=Path('kills.jsonl'))
     parser.add_argument('--keep', type=Path, help='keep the runs in this folder')
     args = parser.parse_args()
@@ -213,36 +221,34 @@ def main() -> int:
         if (args.out.exists())
         else []
     )
-    print(' seed  kills  rows  configurations  lost  twice  wrong  largest z  status  seconds')
+    known = {(run['seed'], run['turn']): run for run in done}
+    print(
+        ' seed turn  kills  rows  configurations  lost  twice  wrong  largest z  status  seconds'
+    )
     failed = total = 0
     with tempfile.TemporaryDirectory() as name:
         folder = args.keep or Path(name)
         folder.mkdir(parents=True, exist_ok=True)
-        for seed in range(1, 1 + -(-args.kills // args.per_run)):
-            pair = {}
-            for kills in (0, args.per_run):
-                known = [r for r in done if (r['seed'], r['kills']) == (seed, kills)]
-                pair[kills] = known[0] if known else one(folder, seed, kills, args)
-                if not known:
-                    with args.out.open('a') as file:
-                        file.write(json.dumps(pair[kills]) + '\n')
-            clean, run = pair[0], pair[args.per_run]
+        for seed, turn in ((s, t) for s in itertools.count(1) for t in range(args.turns + 1)):
+            if total >= args.kills or (args.until and time.strftime('%H:%M') >= args.until):
+                break
+            if (seed, turn) not in known:
+                known[seed, turn] = one(folder, seed, turn, args)
+                with args.out.open('a') as file:
+                    file.write(json.dumps(known[seed, turn]) + '\n')
+            run, clean = known[seed, turn], known[seed, 0]
             z = largest_z(clean.get('offsets', {}), run.get('offsets', {}))
             total += len(run['killed'])
+            good = not (run['status'] or run['lost'] or run['twice'] or run['wrong'])
+            good = good and z < 4.0 and run['exit_status'] == 'complete'
+            good = good and run['configurations'] == run['planned_configurations']
+            failed += not good
             print(
-                f'{seed:5d} {len(run["killed"]):6d} {run["rows"]:5d} '
+                f'{seed:5d} {turn:4d} {len(run["killed"]):6d} {run["rows"]:5d} '
                 f'{run["configurations"]:7d}/{run["planned_configurations"]:<7d} {run["lost"]:4d} '
-                f'{run["twice"]:6d} {run["wrong"]:6d} {z:10.2f} {run["status"]:7d} '
-                f'{run["seconds"]:8.1f}  {" ".join(run["killed"])}',
+                f'{run["twice"]:6d} {run["wrong"]:6d} {z:10.2f} {run["status"]:6d} '
+                f'{run["seconds"]:8.1f}  {" ".join(run["killed"])}{"" if good else "  FAILED"}',
                 flush=True,
-            )
-            failed += bool(
-                run['status']
-                or run['lost']
-                or run['twice']
-                or run['wrong']
-                or not z < 4.0
-                or run['exit_status'] != 'complete'
             )
     print(f'{total} kills; {failed} runs with something lost, twice, wrong or incomplete')
     return 1 if failed else 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 
 class Presence:
@@ -14,6 +14,9 @@ class Presence:
         Their names.
     heartbeat_s
         A sensor that was heard and then is silent for longer is absent, s.
+    streams
+        Those that read all the time. One whose node was started (again) is absent until a reading
+        has come: what it publishes may find its way later than what it says.
 
     Attributes
     ----------
@@ -23,25 +26,58 @@ class Presence:
         How often each sensor's node has been heard; none where it never was.
     """
 
-    def __init__(self, sensors: Iterable[str], heartbeat_s: float) -> None:
-        self._heartbeat_s = heartbeat_s
+    def __init__(
+        self, sensors: Iterable[str], heartbeat_s: float, streams: Collection[str] = ()
+    ) -> None:
+        self._heartbeat_s, self._streams = heartbeat_s, streams
+        self._started: dict[str, str] = {}
+        self._new: set[str] = set()
         self._heard: dict[str, float] = {}
         self._trouble: dict[str, str] = {}
         self._read: dict[str, float] = {}
         self.readings = dict.fromkeys(sensors, 0)
         self.words: dict[str, int] = {}
 
-    def says(self, sensor: str, ready: bool, message: str, now_s: float) -> None:
-        """Take the word of a sensor's node; `message` says what is wrong if it is not ready."""
-        if sensor in self.readings:
-            self._heard[sensor] = now_s
-            self.words[sensor] = self.words.get(sensor, 0) + 1
-            self._trouble[sensor] = '' if ready else message or 'not ready'
+    def says(
+        self,
+        sensor: str,
+        ready: bool,
+        message: str,
+        now_s: float,
+        started: str = '',
+        hidden: bool = False,
+    ) -> None:
+        """Take the word of a sensor's node.
+
+        Parameters
+        ----------
+        sensor
+            Its name; a stranger's word is not heard.
+        ready, message
+            Whether it can measure, and what is wrong if not.
+        now_s
+            Now, s.
+        started
+            Tells one start of the node from the next; '' where it does not say.
+        hidden
+            It does not see its marker: no reading will come before the arm has moved on.
+        """
+        if sensor not in self.readings:
+            return
+        self._heard[sensor] = now_s
+        self.words[sensor] = self.words.get(sensor, 0) + 1
+        self._trouble[sensor] = '' if ready else message or 'not ready'
+        if sensor in self._streams and started != self._started.get(sensor, ''):
+            self._new.add(sensor)
+        self._started[sensor] = started
+        if hidden:
+            self._new.discard(sensor)
 
     def reads(self, sensor: str, now_s: float) -> None:
         """Take note of a reading."""
         self.readings[sensor] += 1
         self._read[sensor] = now_s
+        self._new.discard(sensor)
 
     def read_age_s(self, sensor: str, now_s: float) -> float:
         """Time since the last reading, s; infinite if there was none."""
@@ -58,4 +94,6 @@ class Presence:
                 why[name] = f'its node has been silent for {self._heartbeat_s:g} s'
             elif self._trouble[name]:
                 why[name] = self._trouble[name]
+            elif name in self._new:
+                why[name] = 'no reading since its node was started'
         return why

@@ -279,13 +279,14 @@ def _no_marker(status: StreamStatus) -> Diagnosis:
         return Diagnosis('rigid_body' if status.marker_id is not None else 'marker', text)
     if reason == Dropped.NOT_LIVE:
         return Diagnosis('silence', 'Motive plays a recording: switch it to Live mode')
+    if reason == Dropped.FROZEN:
+        text = f'{name} is at the same place to the last bit in every frame: restart streaming'
+        return Diagnosis('silence', f'{text} in Motive')
     texts = {
         Dropped.OCCLUDED: f'{name} is hidden from the cameras',
         Dropped.MODEL_FILLED: f'{name} is hidden from the cameras; Motive guesses where it is',
         Dropped.AMBIGUOUS: f'{name} is not the only one in view: remove or mask reflections',
         Dropped.UNLABELLED: f'{name} belongs to no rigid body: check marker_id',
-        Dropped.FROZEN: f'{name} is at the same place to the last bit in every frame: restart '
-        f'streaming in Motive',
         Dropped.JUMP: f'{name} jumps about: look for reflections that are taken for it',
         Dropped.IMPLAUSIBLE: f'{name} is nowhere that a bar sees, or its stamps are not of one '
         f'clock: restart streaming in Motive',

@@ -77,7 +77,8 @@ class Recorder(RemasterNode):
                 f'recorder: parameter require is {self.p.require!r}; it must be all, any or one '
                 f'of {", ".join(self.cell.sensors)}'
             )
-        self._presence = Presence(self.cell.sensors, self.p.heartbeat_s)
+        streams = [name for name, sensor in self.cell.sensors.items() if not sensor.single_shot]
+        self._presence = Presence(self.cell.sensors, self.p.heartbeat_s, streams)
         self._waited_s = dict.fromkeys(self.cell.sensors, 0.0)
         self._order = JointOrder(self.chain.joint_names)
         folder = Path(self.p.session)
@@ -195,8 +196,14 @@ class Recorder(RemasterNode):
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
         if 'sensor' in values:
-            ready = values.get('ready') == 'yes'
-            self._presence.says(values['sensor'], ready, message, time.monotonic())
+            self._presence.says(
+                values['sensor'],
+                values.get('ready') == 'yes',
+                message,
+                time.monotonic(),
+                values.get('started', ''),
+                hidden=values.get('fault') == 'marker',
+            )
         if node == 'pose_planner' and not self._busy() and not self._due:
             state = values.get('state')
             if state == 'complete':

@@ -28,3 +28,21 @@ def test_readings_are_counted_and_dated():
     presence.reads('mocap', 6.0)
     assert presence.readings == {'mocap': 2}
     assert presence.read_age_s('mocap', 6.5) == 0.5
+
+
+def test_a_stream_whose_node_was_started_again_is_there_with_its_first_reading():
+    presence = Presence(['mocap', 'tracker'], 3.0, ['mocap'])
+    why = {'mocap': 'no reading since its node was started'}
+    for started in ('first', 'second'):
+        for sensor in ('mocap', 'tracker'):
+            presence.says(sensor, True, '', 10.0, started)
+        assert presence.absent(10.0) == why
+        presence.says('mocap', True, '', 10.5, started)
+        assert presence.absent(10.5) == why
+        presence.reads('mocap', 10.6)
+        assert presence.absent(10.6) == {}
+        presence.says('mocap', True, '', 11.0, started)
+        assert presence.absent(11.0) == {}
+    presence.says('mocap', True, '', 12.0, 'third')
+    presence.says('mocap', True, 'hidden', 12.5, 'third', hidden=True)
+    assert presence.absent(12.5) == {}, 'moving on shows it again'
