@@ -175,7 +175,8 @@ def main() -> None:
     todo = {name: recipe for name, recipe in wanted.items() if name not in done}
     if args.report:
         todo = {}
-    print(f'{len(wanted) - len(todo)} sessions known, {len(todo)} to run', flush=True)
+    ready = len(wanted.keys() & done.keys())
+    print(f'{ready} of {len(wanted)} sessions known, {len(todo)} to run', flush=True)
     # Ended from outside it ends its processes too.
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     fresh = multiprocessing.get_context('spawn')
