@@ -145,8 +145,9 @@ def independence_sampler(
     walks = [_walk(*chain) for chain in zip(log_weight, log_uniform, current, strict=True)]
     index = np.array(walks)
     accepted = np.diff(index, axis=1, prepend=-1) != 0
-    everyone = np.arange(chains)
-    path = np.where((index >= 0)[..., None], points[everyone[:, None], index], start[:, None])
+    path = np.take_along_axis(points, np.maximum(index, 0)[..., None], axis=1)
+    chain, unmoved = np.nonzero(index < 0)
+    path[chain, unmoved] = start[chain]
     return Chains(path[:, warm_up:], float(accepted[:, warm_up:].mean()), path)
 
 

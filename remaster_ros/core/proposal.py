@@ -82,24 +82,25 @@ class LaplaceProposal:
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Return points (count, d) of the posterior and their log density (count,)."""
-        # The folded coordinates have a mirrored half: |x| has the density of x and of -x together.
-        eta, _ = self._noise.sample(count, rng)
-        eta = self._fold(eta)
-        whitened = rng.standard_normal((count, len(self.root)))
-        tail = rng.random(count) < TAIL_SHARE
-        mixing = np.sqrt(rng.chisquare(TAIL_FREEDOM, count) / TAIL_FREEDOM)
-        whitened *= np.where(tail, TAIL_WIDENING / mixing, 1.0)[:, None]
-        points = np.empty((count, len(self.root)))
-        density = self._noise_density(eta)
+        points, density = np.empty((count, len(self.root) + len(self.basis))), np.empty(count)
         for start in range(0, count, BLOCK):
-            chosen = slice(start, start + BLOCK)
-            mean, log_diagonal, u = self._conditional(eta[chosen])
-            right = np.exp(log_diagonal) * whitened[chosen]
-            for share, lower in zip(u.T, self.lower, strict=True):
-                right += share[:, None] * (whitened[chosen] @ lower)
-            points[chosen] = mean + right @ self.root
-            density[chosen] += self._conditional_density(whitened[chosen], log_diagonal)
-        return np.concatenate((points, eta), axis=1), density
+            chosen = slice(start, min(start + BLOCK, count))
+            points[chosen], density[chosen] = self._sample(chosen.stop - start, rng)
+        return points, density
+
+    def _sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        # The folded coordinates have a mirrored half: |x| has the density of x and of -x together.
+        eta = self._fold(self._noise.sample(count, rng)[0])
+        whitened = rng.standard_normal((count, len(self.root)))
+        tail = np.flatnonzero(rng.random(count) < TAIL_SHARE)
+        mixing = np.sqrt(rng.chisquare(TAIL_FREEDOM, len(tail)) / TAIL_FREEDOM)
+        whitened[tail] *= (TAIL_WIDENING / mixing)[:, None]
+        mean, log_diagonal, u = self._conditional(eta)
+        right = np.exp(log_diagonal) * whitened
+        for share, lower in zip(u.T, self.lower, strict=True):
+            right += share[:, None] * (whitened @ lower)
+        points = np.concatenate((mean + right @ self.root, eta), axis=1)
+        return points, self._noise_density(eta) + self._conditional_density(whitened, log_diagonal)
 
     def log_density(self, points: FloatArray) -> FloatArray:
         """Return the normalised log density of points (n, d), (n,)."""

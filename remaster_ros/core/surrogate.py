@@ -21,11 +21,13 @@ from remaster_ros.core.model import Model, Rows
 from remaster_ros.core.posterior import Posterior
 from remaster_ros.core.priors import prior_rows
 from remaster_ros.core.transforms import rotation_vector_to_matrix
-from remaster_ros.core.types import BoolArray, FloatArray, IntArray
+from remaster_ros.core.types import FloatArray, IntArray
 
 # Products of parameters that move the errors by less than this many standard deviations, in the
 # norm over all observations, a posterior standard deviation away from the mode.
 NEGLIGIBLE = 1e-4
+# Of their products with each other, of fourth order, only those of larger ones count.
+NEGLIGIBLE_SQUARED = 1e-3
 # Proposals evaluated at a time: more fall out of the processor's cache.
 BLOCK = 2048
 
@@ -44,8 +46,10 @@ class _Part:
         One of the noise model's cells for each variance; empty for priors, whose weight is 1.
     straight
         Products of linear with all features by variance, (cells or 1, l + 1, l + 1 + p).
+    strong
+        Which of the products matter in products with each other too.
     curved
-        Products of the products by channel at the mode's noise, with that channel's index.
+        Products of these by channel at the mode's noise, with that channel's index.
     """
 
     linear: IntArray
@@ -53,6 +57,7 @@ class _Part:
     second: IntArray
     cells: IntArray
     straight: FloatArray
+    strong: IntArray
     curved: tuple[tuple[int, FloatArray], ...]
 
 
@@ -92,11 +97,12 @@ class Surrogate:
         step, eta = (self.centre[:f] - points[:, :f]).T.copy(), points[:, f:]
         variances = posterior.variances(eta)
         value = posterior.log_noise_prior(eta) - 0.5 * np.log(variances) @ posterior.freedom
-        one = np.ones((1, len(points)))
         for part in self._parts:
-            line = np.concatenate((step[part.linear], one))
-            product = -step[part.first] * step[part.second]
-            feature = np.concatenate((line, product))
+            count = len(part.linear) + 1
+            feature = np.empty((count + len(part.first), len(points)))
+            feature[: count - 1], feature[count - 1] = step[part.linear], 1.0
+            np.multiply(-step[part.first], step[part.second], out=feature[count:])
+            line, product = feature[:count], feature[count + part.strong]
             forms = np.einsum('cln,ln->nc', part.straight @ feature, line)
             if len(part.cells) > 0:
                 forms /= variances[:, part.cells]
@@ -143,8 +149,8 @@ def _data_parts(mode: Mode, width: FloatArray) -> list[_Part]:
         )
         size = np.sum(np.diagonal(grams[cells], axis1=1, axis2=2) / variances[cells, None], axis=0)
         linear = np.flatnonzero(size[:f] > 0.0)
-        chosen = np.sqrt(size[f + 1 :]) * width[first] * width[second] > NEGLIGIBLE
-        parts.append(_part(posterior, grams, variances, linear, first, second, chosen, cells))
+        moved = np.sqrt(size[f + 1 :]) * width[first] * width[second]
+        parts.append(_part(posterior, grams, variances, linear, first, second, moved, cells))
     return parts
 
 
@@ -155,11 +161,13 @@ def _part(
     linear: IntArray,
     first: IntArray,
     second: IntArray,
-    chosen: BoolArray,
+    moved: FloatArray,
     cells: IntArray,
 ) -> _Part:
-    """Cut the matrices of some cells to the features that matter."""
+    """Cut the matrices of some cells to the features that matter, by how much they move."""
     f = len(posterior.free)
+    chosen = moved > NEGLIGIBLE
+    strong = np.flatnonzero(moved[chosen] > NEGLIGIBLE_SQUARED)
     line = np.append(linear, f)
     bent = f + 1 + np.flatnonzero(chosen)
     straight = np.concatenate(
@@ -176,10 +184,10 @@ def _part(
     curved: dict[int, FloatArray] = {}
     for cell in cells:
         channel = posterior.cells[cell].channel
-        gram = grams[np.ix_([cell], bent, bent)][0] / variances[cell]
+        gram = grams[np.ix_([cell], bent[strong], bent[strong])][0] / variances[cell]
         curved[channel] = curved.get(channel, 0.0) + gram
-    products = tuple(curved.items()) if len(bent) > 0 else ()
-    return _Part(linear, first[chosen], second[chosen], chief, summed, products)
+    products = tuple(curved.items()) if len(strong) > 0 else ()
+    return _Part(linear, first[chosen], second[chosen], chief, summed, strong, products)
 
 
 def _prior_part(mode: Mode, width: FloatArray) -> list[_Part]:
@@ -193,7 +201,7 @@ def _prior_part(mode: Mode, width: FloatArray) -> list[_Part]:
         first = second = np.zeros(0, dtype=np.int64)
     everything = np.arange(f)
     if len(first) == 0:
-        return [_Part(everything, first, second, first, linearisation.prior[None], ())]
+        return [_Part(everything, first, second, first, linearisation.prior[None], first, ())]
 
     # Steps of a share of each parameter's width, at least of what differences resolve.
     h = np.maximum(width, 1e-4)
@@ -220,8 +228,9 @@ def _prior_part(mode: Mode, width: FloatArray) -> list[_Part]:
     line[:, f] = values[-1]
     straight = np.concatenate((linearisation.prior, 2.0 * line.T @ bent.T), axis=1)
     none = np.zeros(0, dtype=np.int64)
-    curved = ((-1, bent @ bent.T),) if np.any(chosen) else ()
-    return [_Part(everything, first[chosen], second[chosen], none, straight[None], curved)]
+    strong = np.flatnonzero(size[chosen] > NEGLIGIBLE_SQUARED)
+    curved = ((-1, bent[strong] @ bent[strong].T),) if len(strong) > 0 else ()
+    return [_Part(everything, first[chosen], second[chosen], none, straight[None], strong, curved)]
 
 
 def _bent_pairs(model: Model, free: IntArray) -> list[tuple[int, int]]:
