@@ -107,6 +107,8 @@ class Recorder(RemasterNode):
         self._from_q: FloatArray | None = None
         self._temperatures: deque[tuple[float, float]] = deque(maxlen=500)
         self._was_waiting = False
+        # Settled where no announced pose has a solution (yet): joints, rad, and when.
+        self._unknown: tuple[FloatArray, float] | None = None
         # What the disk did not take yet, why, and when that was.
         self._unwritten: Callable[[], object] | None = None
         self._full, self._tried = '', 0.0
@@ -223,14 +225,31 @@ class Recorder(RemasterNode):
             return
         pose, solution = self._announcements.now, self._announcements.which(q)
         if pose is None or solution is None:
-            # The planner sees by the summary what is not known here, and announces it again.
+            # The planner sees by the summary what is not known here, and announces it again. Or it
+            # is on its way: topics overtake each other.
+            self._unknown = q, seconds(message.header.stamp)
             self.counts['settled_unknown'] += 1
             self._trouble = 'settled at no joint solution of an announced pose'
             return
+        self._unknown = None
         # The bridge waits for an answer, but a bag at ten times the speed does not: what is read
         # now is finished first, by the stamps of its own messages.
         self._due.append((q, seconds(message.header.stamp), solution, pose))
         self._take_next()
+
+    def _look_again(self) -> None:
+        """Take up a settled configuration that was not known, if the arm still stands there."""
+        pose = self._announcements.now
+        if self._unknown is None or pose is None:
+            return
+        q, settled_s = self._unknown
+        since = [joints for stamp_s, joints in self._recent_joints if stamp_s > settled_s]
+        stands = all(np.max(np.abs(joints - q)) <= self.p.motion_tolerance for joints in since)
+        solution = self._announcements.which(q) if stands else None
+        if solution is not None:
+            self._due.append((q, settled_s, solution, pose))
+        if solution is not None or not stands:
+            self._unknown = None
 
     def _take_next(self) -> None:
         """Begin the reading that is due, unless one is under way."""
@@ -286,6 +305,7 @@ class Recorder(RemasterNode):
             self._shots.look(self._taking.pairing, absent)
             self._taking.pairing.give_up(self._now, absent, self._presence.words)
             self._finish_if_complete()
+        self._look_again()
         self._take_next()
         waiting_for = self._waiting_for(absent)
         if bool(waiting_for) != self._was_waiting:

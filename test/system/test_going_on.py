@@ -162,3 +162,65 @@ def test_any_sensor_is_enough(start, client, tmp_path):
     cell.check(session)
     assert set(session.measurements.sensor.tolist()) == {0, 1}
     assert session.measurements.sensor[-1] == 1
+
+
+def test_a_settled_arm_is_read_though_its_pose_is_heard_of_later(start, client, tmp_path):
+    """Topics overtake each other: /remaster/settled comes before what the planner announced."""
+    from geometry_msgs.msg import PointStamped
+    from sensor_msgs.msg import JointState
+    from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+    from remaster_ros.nodes.messages import stamp_key
+    from remaster_ros.nodes.status import RELIABLE, Status, listen
+
+    cell = read_cell('demo')
+    names, rng = cell.chain().joint_names, np.random.default_rng(SEED)
+    print('seed', SEED)
+    q = np.array([0.0, 0.3, 0.0, 1.0, 0.0, 0.5, 0.0])
+    heard, counts = [], {}
+    listen(client, heard.append, lambda node, message, values: counts.update(values))
+    publishers = {
+        topic: client.create_publisher(kind, topic, RELIABLE)
+        for topic, kind in (
+            ('/joint_states', JointState),
+            ('/remaster/settled', JointState),
+            ('/remaster/joint_solutions', JointTrajectory),
+            (cell.sensors['mocap'].topic, PointStamped),
+        )
+    }
+    start(
+        'remaster_ros.nodes.recorder',
+        *node_arguments(session=tmp_path / 'session', require='mocap', call_measure=False),
+    )
+
+    def joints():
+        message = JointState(name=list(names), position=(q + rng.normal(0, 1e-6, 7)).tolist())
+        message.header.stamp = client.get_clock().now().to_msg()
+        return message
+
+    def live():
+        publishers['/joint_states'].publish(joints())
+        point = PointStamped()
+        point.header.stamp = client.get_clock().now().to_msg()
+        point.point.x, point.point.y, point.point.z = rng.normal(2.0, 1e-5, 3)
+        publishers[cell.sensors['mocap'].topic].publish(point)
+        client.spin_some()
+
+    def until(condition, what):
+        wait_until(lambda: live() or condition(), 60, what)
+
+    until(lambda: counts.get('read_age_s_mocap', 'inf') == '0.0', 'the recorder')
+    publishers['/remaster/settled'].publish(joints())
+    until(lambda: counts.get('settled_unknown') == '1', 'a pose that nobody knows')
+    solutions = JointTrajectory(joint_names=list(names))
+    solutions.header.stamp = client.get_clock().now().to_msg()
+    solutions.points = [JointTrajectoryPoint(positions=q.tolist())]
+    publishers['/remaster/joint_solutions'].publish(solutions)
+    status = Status(client, lambda: ('ok', '', {}))
+    until(lambda: client.count_subscribers('/remaster/status') > 1, 'the status')
+    stamp = stamp_key(solutions.header.stamp)
+    values = {'pose': 0, 'split': 'optimization', 'solutions': 1, 'ids': '0', 'plan': 'p'}
+    status._send('pose_planner: pose', 'ok', '', {**values, 'stamp': stamp})
+    until(lambda: any(event.event == 'configuration' for event in heard), 'its end')
+    (end,) = (event for event in heard if event.event == 'configuration')
+    assert (end.values['stamp'], end.values['result']) == (stamp, 'recorded'), end
