@@ -46,7 +46,8 @@ from common import OPTIMIZATION, experiment, in_parallel, machine, progress, tab
 from scipy.stats import binom, chi2, kstest
 
 from remaster_ros.core.estimate import Estimate, Problem, estimate
-from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.model import Model
+from remaster_ros.core.rows import Rows
 from remaster_ros.core.sampling import sample_posterior
 from remaster_ros.core.simulation import Truth
 from remaster_ros.core.transforms import inverse

@@ -25,7 +25,7 @@ from common import table
 from scipy.stats import chi2, kurtosis
 
 from remaster_ros.core.estimate import Problem, estimate
-from remaster_ros.core.model import Rows
+from remaster_ros.core.rows import Rows
 from remaster_ros.core.sampling import sample_posterior
 from remaster_ros.core.types import FloatArray
 from remaster_ros.storage.session import read_session

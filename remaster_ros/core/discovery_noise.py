@@ -19,8 +19,8 @@ from remaster_ros.core.effects.cell import Cell
 from remaster_ros.core.effects.scene import Scene
 from remaster_ros.core.estimate import Estimate
 from remaster_ros.core.laplace import Mode
-from remaster_ros.core.model import Rows
 from remaster_ros.core.outliers import robust_noise
+from remaster_ros.core.rows import Rows
 from remaster_ros.core.types import BoolArray, FloatArray, IntArray
 
 # Directions of the offsets model below this share of the largest are its gauge.

@@ -12,10 +12,11 @@ from remaster_ros.core.errors import InputError, InsufficientDataError
 from remaster_ros.core.extension import Extension
 from remaster_ros.core.gauge import Gauge, find_gauge
 from remaster_ros.core.laplace import Mode, find_mode
-from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.model import Model
 from remaster_ros.core.outliers import Judgement, find_outliers
 from remaster_ros.core.posterior import Posterior
 from remaster_ros.core.priors import Prior, base_prior, marker_prior, offset_prior
+from remaster_ros.core.rows import Rows
 from remaster_ros.core.start import robust_start
 from remaster_ros.core.types import (
     BasePrior,

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from remaster_ros.core.errors import InsufficientDataError
-from remaster_ros.core.model import Rows
 from remaster_ros.core.posterior import RESOLUTION_M, Posterior
 from remaster_ros.core.priors import prior_rows
+from remaster_ros.core.rows import Rows
 from remaster_ros.core.types import FloatArray
 
 

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from remaster_ros.core.errors import InsufficientDataError
-from remaster_ros.core.model import Rows
 from remaster_ros.core.posterior import RESOLUTION_M
+from remaster_ros.core.rows import Rows
 from remaster_ros.core.types import BoolArray, FloatArray
 
 # A row is left out from this probability on.

@@ -19,10 +19,11 @@ from remaster_ros.core.estimate import Problem
 from remaster_ros.core.gauge import Gauge, find_gauge
 from remaster_ros.core.laplace import find_mode
 from remaster_ros.core.metropolis import Chains, random_walk_sampler
-from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.model import Model
 from remaster_ros.core.posterior import Posterior
 from remaster_ros.core.priors import TIGHTEST_PRIOR
 from remaster_ros.core.result import Sampled
+from remaster_ros.core.rows import Rows
 from remaster_ros.core.start import referenced, register
 from remaster_ros.core.transforms import inverse, transform
 from remaster_ros.core.types import FloatArray, IntArray, Measurements

@@ -28,8 +28,9 @@ from functools import cached_property
 
 import numpy as np
 
-from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.model import Model
 from remaster_ros.core.priors import Prior
+from remaster_ros.core.rows import Rows
 from remaster_ros.core.types import BoolArray, FloatArray, IntArray
 
 # No sensor of this kind resolves better than 0.1 µm; keeps noise-free (simulated) data proper.

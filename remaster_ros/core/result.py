@@ -13,7 +13,8 @@ from remaster_ros.core.accuracy import accuracy_of
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.estimate import Problem
 from remaster_ros.core.gauge import Gauge, GaugeDirection
-from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.model import Model
+from remaster_ros.core.rows import Rows
 from remaster_ros.core.sampling import R_HAT_LIMIT
 from remaster_ros.core.theoretical import Predictive
 from remaster_ros.core.transforms import apply, inverse, matrix_to_rotation_vector

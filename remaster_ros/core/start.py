@@ -12,10 +12,11 @@ from dataclasses import replace
 import numpy as np
 
 from remaster_ros.core.errors import InsufficientDataError
-from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.model import Model
 from remaster_ros.core.posterior import RESOLUTION_M
 from remaster_ros.core.priors import TIGHTEST_PRIOR, Prior, prior_rows
 from remaster_ros.core.registration import register_points
+from remaster_ros.core.rows import Rows
 from remaster_ros.core.transforms import apply
 from remaster_ros.core.types import FloatArray, IntArray, Measurements
 

@@ -17,9 +17,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from remaster_ros.core.laplace import Mode
-from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.model import Model
 from remaster_ros.core.posterior import Posterior
 from remaster_ros.core.priors import prior_rows
+from remaster_ros.core.rows import Rows
 from remaster_ros.core.transforms import rotation_vector_to_matrix
 from remaster_ros.core.types import FloatArray, IntArray
 

@@ -22,7 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from remaster_ros.core.model import Model, Rows
+from remaster_ros.core.model import Model
+from remaster_ros.core.rows import Rows
 from remaster_ros.core.types import FloatArray, IntArray, Measurements
 
 RANDOM_CONFIGURATIONS = 1000

@@ -9,7 +9,8 @@ import pytest
 from calibration_scenes import CHAIN, scene
 
 from remaster_ros.core.extension import Extension
-from remaster_ros.core.model import Model, Rows, predict_in_sensor
+from remaster_ros.core.model import Model, predict_in_sensor
+from remaster_ros.core.rows import Rows
 from remaster_ros.core.transforms import apply, rotation_vector_to_matrix, transform
 
 

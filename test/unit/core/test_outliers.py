@@ -7,7 +7,6 @@ import pytest
 from scipy.stats import chi
 
 from remaster_ros.core.errors import InsufficientDataError
-from remaster_ros.core.model import Rows
 from remaster_ros.core.outliers import (
     CERTAIN,
     find_outliers,
@@ -15,6 +14,7 @@ from remaster_ros.core.outliers import (
     judge,
     robust_noise,
 )
+from remaster_ros.core.rows import Rows
 
 SIGMA, POSE_SIGMA = 0.2e-3, 0.8e-3
 

@@ -11,8 +11,8 @@ from remaster_ros.core.errors import InputError
 from remaster_ros.core.estimate import Problem
 from remaster_ros.core.fit import fit_session
 from remaster_ros.core.metropolis import random_walk_sampler
-from remaster_ros.core.model import Rows
 from remaster_ros.core.paper_mode import HALF_WIDTH, PaperPosterior, paper_posterior
+from remaster_ros.core.rows import Rows
 from remaster_ros.core.transforms import apply, inverse, transform
 
 
