@@ -152,13 +152,18 @@ def _null_space(
         derivative[span] /= spread
     flat = derivative.reshape(-1, model.size)
     scale = np.linalg.norm(flat, axis=0)
-    scale = np.where(scale > ROUNDING * scale.max(), scale, scale.max())
+    # What the data do not see at all is measured by its prior, else by what they see best.
+    unseen = np.full(model.size, scale.max())
+    if model.extension is not None:
+        known = np.sqrt(np.diag(model.extension.prior_precision))
+        unseen[model.core :] = np.where(known > 0.0, known, scale.max())
+    scale = np.where(scale > ROUNDING * scale.max(), scale, unseen)
     triangle: FloatArray = np.asarray(np.linalg.qr(flat / scale, mode='r'))
     _, singular, vectors = np.linalg.svd(triangle, full_matrices=True)
     singular = np.append(singular, np.zeros(len(vectors) - len(singular)))
-    unseen = singular < ROUNDING * singular[0]
+    null = singular < ROUNDING * singular[0]
 
-    basis, pivots = _reduce((vectors[unseen] / scale).T, scale, _kinds(model))
+    basis, pivots = _reduce((vectors[null] / scale).T, scale, _kinds(model))
     # A prior on effects counts as data for what is nearly unseen: it is what keeps them apart.
     root = np.zeros((len(model.extension_root), model.size))
     root[:, model.core :] = model.extension_root

@@ -204,9 +204,13 @@ class Model:
         """W with W theta standard normal by the extension's prior, (rank, m)."""
         if self.extension is None:
             return np.zeros((0, 0))
-        values, vectors = np.linalg.eigh(self.extension.prior_precision)
+        # In units of each parameter's own: those of rad and of m/s differ by ten decades.
+        precision = self.extension.prior_precision
+        unit = np.sqrt(np.diag(precision))
+        unit = np.where(unit > 0.0, unit, 1.0)
+        values, vectors = np.linalg.eigh(precision / np.outer(unit, unit))
         kept = values > 1e-12 * values.max(initial=0.0)
-        root: FloatArray = np.sqrt(values[kept])[:, None] * vectors[:, kept].T
+        root: FloatArray = np.sqrt(values[kept])[:, None] * vectors[:, kept].T * unit
         return root
 
     @cached_property

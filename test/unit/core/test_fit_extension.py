@@ -75,6 +75,26 @@ def test_a_prior_on_effects_pulls_them_to_zero(sagging) -> None:
     assert np.all(np.abs(theta) < [1e-7, 1e-7, 1e-5])
 
 
+def test_what_only_its_prior_knows_is_as_wide_as_the_prior(sagging) -> None:
+    """A spline beyond the data, beside an effect whose unit is six decades smaller."""
+    session, extension = sagging
+    nothing = np.zeros_like(extension.joint[:, :, :1])
+    drift = 1e6 * extension.displacement[:, :, 2:] * session.measurements.q[:, None, 1:2]
+    beyond = replace(
+        extension,
+        names=(*extension.names, 'edge', 'drift'),
+        units=(*extension.units, 'rad', 'm/s'),
+        joint=np.concatenate((extension.joint, nothing, nothing), axis=2),
+        displacement=np.concatenate((extension.displacement, 0.0 * drift, drift), axis=2),
+        theta0=np.zeros(5),
+        prior_precision=np.diag([1e4**2, 1e4**2, 0.0, 3e-4**-2, 1e-9**-2]),
+    )
+    result = fit_session(session, rng=np.random.default_rng(2), draws=800, extension=beyond)
+    # 3,000 effective draws: a std to 1.3 %, six times that.
+    assert result.theta_std[3] == pytest.approx(3e-4, rel=0.08)
+    assert not any('edge' in direction.fixed_by for direction in result.gauge)
+
+
 def test_an_effect_that_is_a_zero_offset_in_disguise_is_held_and_named(sagging) -> None:
     session, extension = sagging
     joint = extension.joint.copy()
