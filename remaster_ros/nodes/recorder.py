@@ -34,6 +34,7 @@ from remaster_ros.nodes.announcements import Announced, Announcements
 from remaster_ros.nodes.bagging import BEGAN, BagRecorder
 from remaster_ros.nodes.messages import JointOrder, seconds, temperature_topic
 from remaster_ros.nodes.parameters import declare
+from remaster_ros.nodes.patience import Patience
 from remaster_ros.nodes.recorder_parameters import Parameters, sensor_rules
 from remaster_ros.nodes.registering import Registrar
 from remaster_ros.nodes.running import RemasterNode, run
@@ -46,8 +47,6 @@ from remaster_ros.storage.session_writer import ExitStatus
 
 TEMPERATURE_S = 600.0
 """A temperature older than this says nothing of a reading, s."""
-RETRY_S = 1.0
-"""How often a full disk is tried again, s of wall time."""
 BY_HAND = -1_000_000
 """The number of poses that a user drove to for a registration: no planner's."""
 
@@ -109,9 +108,7 @@ class Recorder(RemasterNode):
         self._was_waiting = False
         # Settled where no announced pose has a solution (yet): joints, rad, and when.
         self._unknown: tuple[FloatArray, float] | None = None
-        # What the disk did not take yet, why, and when that was.
-        self._unwritten: Callable[[], object] | None = None
-        self._full, self._tried = '', 0.0
+        self._disk = Patience(lambda why: self.get_logger().error(f'the arm is held: {why}'))
         self.registrar = Registrar(self, self.cell, self.chain, self.p.max_deviation_m / 2)
         markers = {name: np.array(position) for name, position in self.cell.markers.items()}
         self._plausibility = Plausibility(self.chain, markers, self.p.max_deviation_m)
@@ -185,9 +182,9 @@ class Recorder(RemasterNode):
     def _on_event(self, event: Event) -> None:
         if (event.node, event.event) == ('pose_planner', 'pose'):
             self._announcements.hear_pose(event.values)
-            if self._unwritten is None and not self.logbook.closed:
+            if not self._disk.full and not self.logbook.closed:
                 # Before the arm gets there: it is held where there is no room.
-                self._keep(partial(self.logbook.follow, event.values.get('plan', '')))
+                self._disk.write(partial(self.logbook.follow, event.values.get('plan', '')))
         elif (event.node, event.event) == ('recorder', BEGAN):
             # From a bag: that recorder was started anew here, and knew of no reading under way.
             self._taking = None
@@ -209,11 +206,11 @@ class Recorder(RemasterNode):
         if node == 'pose_planner' and not self._busy() and not self._due:
             state = values.get('state')
             if state == 'complete':
-                self._keep(partial(self._close, 'complete'))
+                self._disk.write(partial(self._close, 'complete'))
             elif state == 'stopped' and self.logbook.observations:
-                self._keep(partial(self._close, 'stopped'))
+                self._disk.write(partial(self._close, 'stopped'))
             elif state == 'running' and self.logbook.closed == 'stopped':
-                self._keep(self._reopen)
+                self._disk.write(self._reopen)
 
     # A configuration
 
@@ -299,8 +296,7 @@ class Recorder(RemasterNode):
     def _look(self) -> None:
         """Ask, give up, and say at once when a required sensor goes or comes back."""
         absent = self._presence.absent(time.monotonic())
-        if self._unwritten is not None and time.monotonic() - self._tried > RETRY_S:
-            self._keep(self._unwritten)
+        self._disk.look()
         if self._taking is not None:
             self._shots.look(self._taking.pairing, absent)
             self._taking.pairing.give_up(self._now, absent, self._presence.words)
@@ -314,8 +310,8 @@ class Recorder(RemasterNode):
 
     def _waiting_for(self, absent: Mapping[str, str]) -> str:
         """Say what is missing, and why: room on the disk, required sensors; '' if nothing is."""
-        if self._full:
-            return f'room on the disk: {self._full}'
+        if self._disk.full:
+            return f'room on the disk: {self._disk.full}'
         wanted = self._wanted()
         gone = [name for name in wanted if name in absent]
         if not gone or (self.p.require == 'any' and len(gone) < len(wanted)):
@@ -338,7 +334,7 @@ class Recorder(RemasterNode):
             self.counts[f'{rejection.sensor}_{rejection.reason}'] += 1
         for reading in good:
             self.counts[f'{reading.sensor}_accepted'] += 1
-        self._keep(partial(self._write_down, taking, good, bad, waited_s))
+        self._disk.write(partial(self._write_down, taking, good, bad, waited_s))
 
     def _write_down(
         self,
@@ -454,19 +450,7 @@ class Recorder(RemasterNode):
 
     def _busy(self) -> bool:
         """Whether a configuration is being read or written down."""
-        return self._taking is not None or self._unwritten is not None
-
-    def _keep(self, write: Callable[[], object]) -> None:
-        """Write; where the disk does not take it, hold the arm and try again later."""
-        self._unwritten, self._tried = None, time.monotonic()
-        try:
-            write()
-        except DiskError as error:
-            if not self._full:
-                self.get_logger().error(f'the arm is held: {error}')
-            self._unwritten, self._full = write, str(error)
-        else:
-            self._full = ''
+        return self._taking is not None or bool(self._disk.full)
 
     def _reopen(self) -> None:
         self.logbook.reopen()

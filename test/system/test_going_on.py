@@ -75,7 +75,7 @@ class Cell:
         if (event.node, event.event) == ('recorder', 'configuration'):
             self.results.append(event.values['result'])
 
-    def until(self, condition, what, timeout_s=60):
+    def until(self, condition, what, timeout_s=120):
         def turn():
             for _ in range(20):
                 self.client.spin_some()
