@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from hidden_oracle import Oracle
-from hidden_tours import world
+from hidden_tours import CANDIDATES, visits, world
 from hidden_world import HiddenTruth, HiddenWorld, Noise
 
 from remaster_ros.core.types import Session
@@ -73,7 +73,7 @@ class HiddenSession:
 def hidden_session(recipe: Recipe) -> HiddenSession:
     """Make the session of a recipe; the same recipe gives the same session."""
     rng = np.random.default_rng([recipe.seed, 7])
-    hidden = world(recipe.robot, rng, sensors=recipe.sensors)
+    hidden = _world(recipe, rng)
     noise = replace(
         NOISES[recipe.noise],
         outlier_share=OUTLIER_SHARE if recipe.outliers else 0.0,
@@ -95,6 +95,13 @@ def hidden_session(recipe: Recipe) -> HiddenSession:
     return HiddenSession(session, hidden, truth, tuple(best))
 
 
+def _world(recipe: Recipe, rng: np.random.Generator) -> HiddenWorld:
+    """Draw a world in which a session has some 350 observations to fit, of one sensor or two."""
+    rounds = 2 // len(recipe.sensors)
+    tour = visits(recipe.robot, int(rng.integers(8)), rounds * CANDIDATES[recipe.robot])
+    return world(recipe.robot, rng, sensors=recipe.sensors, tour=tour)
+
+
 def another_session(
     first: HiddenSession, recipe: Recipe, effects: Sequence[HiddenEffect]
 ) -> HiddenSession:
@@ -110,7 +117,7 @@ def another_session(
         What else is wrong with the arm now.
     """
     rng = np.random.default_rng([recipe.seed, 9])
-    hidden = world(recipe.robot, rng, sensors=recipe.sensors)
+    hidden = _world(recipe, rng)
     hidden.joint_offsets = first.world.joint_offsets
     session, truth = hidden.measure(effects, NOISES[recipe.noise], rng)
     return HiddenSession(session, hidden, truth, ())

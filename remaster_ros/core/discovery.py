@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from remaster_ros.core.discovery_causes import FoundEffect, describe
-from remaster_ros.core.discovery_evidence import Solution
+from remaster_ros.core.discovery_evidence import Solution, solve
 from remaster_ros.core.discovery_extend import extension_of
 from remaster_ros.core.discovery_gain import (
     Gain,
@@ -22,7 +22,7 @@ from remaster_ros.core.discovery_gain import (
     noise_by_range,
     pose_common_fraction,
 )
-from remaster_ros.core.discovery_markers import moved_markers
+from remaster_ros.core.discovery_markers import loosened, moved_markers
 from remaster_ros.core.discovery_noise import Residuals
 from remaster_ros.core.discovery_select import Search, Selection
 from remaster_ros.core.effects.cell import Cell
@@ -122,6 +122,7 @@ def discover_session(
         session,
         rng=rng,
         clock=clock,
+        priors=loosened(session, findings.effects),
         precision=PRECISION,
         extension=extension_of(residuals, solution) if solution.cells else None,
         progress=lambda _, share: report('sampling the extended model', share),
@@ -134,12 +135,12 @@ def discover_session(
     return Discovery(
         verdict=verdict,
         effects=effects,
-        gain=gain_of(findings.estimate, solution, fit, rng),
+        gain=gain_of(findings.before, solution, fit, rng),
         pose_common_fraction=pose_common_fraction(solution),
         noise_by_range=noise_by_range(residuals, solution),
         outliers=fit.left_out,
         untestable=findings.untestable,
-        offsets_before=_offsets(findings.estimate),
+        offsets_before=_offsets(findings.before),
         groups=findings.groups,
         selection=findings.selection,
         residuals=residuals,
@@ -149,9 +150,12 @@ def discover_session(
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What is found before anything is sampled; fields as in `Discovery`."""
+    """What is found before anything is sampled; fields as in `Discovery`.
 
-    estimate: Estimate
+    ``before`` is the fit of the session as it is, without any effect.
+    """
+
+    before: Estimate
     residuals: Residuals
     selection: Selection
     groups: tuple[tuple[Cell, ...], ...]
@@ -162,9 +166,14 @@ class Findings:
 def find_causes(session: Session, *, rng: np.random.Generator, progress: Progress) -> Findings:
     """Search a session for causes; see `discover_session`."""
     progress('offsets', 0.0)
-    problem = Problem.of(session)
-    found = estimate(problem)
+    before = found = estimate(Problem.of(session))
     residuals = Residuals.of(found)
+    bare = solve(residuals, ())
+    moved = moved_markers(found, residuals, bare) if bare is not None else ()
+    if moved:
+        # A marker that is pulled to where it is not leaves errors for other causes to explain.
+        found = estimate(Problem.of(session, loosened(session, moved)))
+        residuals = Residuals.of(found)
     untestable = {
         name: why for name, effect in EFFECTS.items() if (why := effect.needs(residuals.scene))
     }
@@ -187,7 +196,7 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         residuals, selection, cells, lambda share: progress('comparing look-alikes', share)
     )
     effects += moved_markers(found, residuals, selection.solution)
-    return Findings(found, residuals, selection, groups, effects, untestable)
+    return Findings(before, residuals, selection, groups, effects, untestable)
 
 
 def _offsets(found: Estimate) -> tuple[FloatArray, FloatArray]:

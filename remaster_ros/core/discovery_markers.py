@@ -7,6 +7,8 @@ to s per axis gives u = I (d̂ − nominal) ~ N(0, I + s² I²) if the session i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.stats import chi2
 
@@ -15,8 +17,11 @@ from remaster_ros.core.discovery_evidence import Solution
 from remaster_ros.core.discovery_noise import Residuals
 from remaster_ros.core.effects.registry import EFFECTS
 from remaster_ros.core.estimate import Estimate
-from remaster_ros.core.types import BoolArray, FloatArray
+from remaster_ros.core.types import BoolArray, FloatArray, Priors, Session
 
+MARKER_OFFSET = 'marker_offset'
+# What the prior pulled back is further off than the fit says.
+FURTHER = 3.0
 # Family-wise error over all markers.
 SIGNIFICANCE = 0.002
 # A direction counts where the data know it this many times better than the session, in variance.
@@ -62,6 +67,25 @@ def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple
     return tuple(effects)
 
 
+def loosened(session: Session, moved: Sequence[FoundEffect]) -> Priors | None:
+    """Return priors that let markers go as far as they were found to be; None if none has moved.
+
+    Parameters
+    ----------
+    session
+        What says where they should be.
+    moved
+        As `moved_markers` returns them; other effects count for nothing.
+    """
+    places = {}
+    for effect in moved:
+        if effect.name == MARKER_OFFSET:
+            name = effect.parameters[0].name.removeprefix('x_')
+            std = float(np.hypot(session.marker_std_m, FURTHER * (effect.size_m or 0.0)))
+            places[name] = (session.markers[name], std)
+    return Priors(markers=places) if places else None
+
+
 def _unseen(moved: FloatArray, place: FloatArray, axes: FloatArray, seen: BoolArray) -> FloatArray:
     """Return the covariance due to directions that the data cannot see, m², (3, 3).
 
@@ -96,7 +120,7 @@ def _effect(
     square: float,
     rank: int,
 ) -> FoundEffect:
-    effect = EFFECTS['marker_offset']
+    effect = EFFECTS[MARKER_OFFSET]
     cause = effect.sentence.format(subject=name)
     if blind.any():
         unseen = ' and '.join(axis for axis, hidden in zip('xyz', blind, strict=True) if hidden)

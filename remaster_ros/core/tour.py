@@ -51,16 +51,19 @@ class Stop:
 
 
 class Tour:
-    """Poses by proximity to where the arm is, one split after the other.
+    """Poses by proximity to where the arm is, those to fit and those held out among each other.
+
+    So what drifts or warms up meanwhile is met by both, and not extrapolated from the one to the
+    other; and a collection that ends early has some of both.
 
     Parameters
     ----------
     chain
         The arm.
     plans
-        Split -> its plan, in the order in which the splits are visited.
+        Split -> its plan.
     in_order
-        Visit the poses as they come instead of the nearest first.
+        Visit the poses as they come, split by split, instead of the nearest first.
     one_solution
         Visit only the nearest solution of each pose.
     """
@@ -89,18 +92,18 @@ class Tour:
 
     def next(self, q: FloatArray) -> Stop | None:
         """Return the next stop for an arm at joint positions `q` (rad, (k,)); None at the end."""
-        for split, left in self._left.items():
-            if not left:
-                continue
-            poses = self.plans[split].poses
-            here = self._chain.forward(q)[:3, 3]
-            distances = [np.linalg.norm(poses[i].T_R_T[:3, 3] - here) for i in left]
-            index = left[0 if self.in_order else int(np.argmin(distances))]
-            order = order_solutions(poses[index].solutions, q, self._chain.velocity_limits)
-            if self.one_solution:
-                order = order[:1]
-            return self.go_to(split, index, [int(number) for number in order])
-        return None
+        left = [(split, index) for split, indices in self._left.items() for index in indices]
+        if not left:
+            return None
+        here = self._chain.forward(q)[:3, 3]
+        places = [self.plans[split].poses[index].T_R_T[:3, 3] for split, index in left]
+        distances = np.linalg.norm(np.array(places) - here, axis=1)
+        split, index = left[0 if self.in_order else int(np.argmin(distances))]
+        solutions = self.plans[split].poses[index].solutions
+        order = order_solutions(solutions, q, self._chain.velocity_limits)
+        if self.one_solution:
+            order = order[:1]
+        return self.go_to(split, index, [int(number) for number in order])
 
     def go_to(self, split: str, index: int, ids: Sequence[int]) -> Stop:
         """Return the stop at one planned pose with these of its solutions, and count it visited.

@@ -10,6 +10,9 @@ from remaster_ros.core.effects.cell import Cell, Columns, Effect, displaced
 from remaster_ros.core.effects.scene import Scene
 from remaster_ros.core.types import FloatArray
 
+# Growth with time is rarer by so much where the temperature is recorded.
+BESIDE_TEMPERATURE = 50
+
 
 def cells(scene: Scene) -> Iterator[Cell]:
     """The whole arm, and each link, in proportion to warming and to time."""
@@ -39,8 +42,10 @@ def cells(scene: Scene) -> Iterator[Cell]:
                 parameters=(f'growth_{joints[0]}' if joints else 'growth',),
                 unit=unit,
                 columns=columns,
-                # The whole arm first: that one link alone grows is rare.
-                drawn_from=2 if not joints else 4 * len(parts),
+                # The whole arm first: that one link alone grows is rare. And where the
+                # temperature is known, what time explains beyond it is hardly growth.
+                drawn_from=(2 if not joints else 4 * len(parts))
+                * (BESIDE_TEMPERATURE if driver == 'time' and len(drivers) > 1 else 1),
             )
 
 
