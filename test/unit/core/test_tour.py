@@ -1,4 +1,4 @@
-"""The order of a collection: proximity, splits among each other, registration by the widest triangle."""
+"""The order of a collection: proximity, splits mixed, registration by the widest triangle."""
 
 import numpy as np
 import pytest
