@@ -34,7 +34,7 @@ def test_killed_nodes_cost_nothing(start, tmp_path):
     out = tmp_path / 'out'
     demo = start(
         'remaster_ros.cli.main', 'demo', '--out', out, '--candidates', '4', '--no-figures',
-        '--seed', SEED,
+        '--seed', SEED, '--rate', '20',
     )  # fmt: skip
     path = out / 'session' / 'observations.csv'
     seen = set()
@@ -66,7 +66,7 @@ def test_killed_nodes_cost_nothing(start, tmp_path):
     demo.send_signal(signal.SIGINT)
     demo.communicate(timeout=30)
     rows()
-    truth = make_world(tmp_path / 'world', read_cell('demo'), SEED, 10.0).truth
+    truth = make_world(tmp_path / 'world', read_cell('demo'), SEED, 20.0).truth
     result = judge(out, seen, truth.to_dict())
     assert result['exit_status'] == 'complete'
     assert (result['lost'], result['twice'], result['wrong']) == (0, 0, 0)
