@@ -40,6 +40,10 @@ from remaster_ros.nodes.status import RELIABLE, Event, Status, listen
 from remaster_ros.storage.cell import read_cell
 from remaster_ros.storage.results import joint_offsets_rad, read_fit
 
+COMMANDS = '/joint_trajectory_controller/joint_trajectory'
+MATCHED_WALL_S = 0.5
+"""So much later than ours the controller's side of a DDS match may come."""
+
 
 @dataclass(frozen=True)
 class Parameters:
@@ -111,9 +115,9 @@ class RobotBridge(RemasterNode):
         self._pose_stamp = ''
         self._settled_wall = time.monotonic()
         self.counts = {'commanded': 0, 'settled': 0, 'failed': 0, 'stopped': 0}
-        self._controller = self.create_publisher(
-            JointTrajectory, '/joint_trajectory_controller/joint_trajectory', RELIABLE
-        )
+        self._controller = self.create_publisher(JointTrajectory, COMMANDS, RELIABLE)
+        # Since when a controller listens; a command before that would be lost.
+        self._listened_wall: float | None = None
         self._settled = self.create_publisher(JointState, '/remaster/settled', RELIABLE)
         self.status = Status(self, self._summary)
         self.create_subscription(JointState, '/joint_states', self._on_joint_state, RELIABLE)
@@ -177,6 +181,9 @@ class RobotBridge(RemasterNode):
 
     def _on_joint_state(self, message: JointState) -> None:
         now = time.monotonic()
+        if self._listened_wall is None or now - self._listened_wall < MATCHED_WALL_S:
+            self._do(self._visitor.unreadable(f'no controller listens to {COMMANDS}', now))
+            return
         try:
             q = self._order.positions(message)
         except InputError as error:
@@ -188,6 +195,10 @@ class RobotBridge(RemasterNode):
         self._do(self._visitor.emergency(message.data, time.monotonic()))
 
     def _watch(self) -> None:
+        if not self._controller.get_subscription_count():
+            self._listened_wall = None
+        elif self._listened_wall is None:
+            self._listened_wall = time.monotonic()
         self._do(self._visitor.tick(time.monotonic()))
 
     # What goes out

@@ -33,11 +33,27 @@ class Surroundings:
         self.solutions = client.create_publisher(
             JointTrajectory, '/remaster/joint_solutions', RELIABLE
         )
-        topic = '/joint_trajectory_controller/joint_trajectory'
-        client.create_subscription(JointTrajectory, topic, self._obey, RELIABLE)
+        self.listen()
         client.create_subscription(JointState, '/remaster/settled', self.settled.append, RELIABLE)
-        client.create_subscription(DiagnosticArray, TOPIC, receiver(self.events.append), RELIABLE)
+        self.summaries = {}
+        client.create_subscription(
+            DiagnosticArray, TOPIC, receiver(self.events.append, self._summary), RELIABLE
+        )
         self._spoken = 0.0
+
+    def _summary(self, node, message, values):
+        self.summaries[node] = message
+
+    def listen(self):
+        """Be a controller."""
+        from trajectory_msgs.msg import JointTrajectory
+
+        from remaster_ros.nodes.status import RELIABLE
+
+        topic = '/joint_trajectory_controller/joint_trajectory'
+        self.controller = self.client.create_subscription(
+            JointTrajectory, topic, self._obey, RELIABLE
+        )
 
     def _obey(self, message):
         columns = [list(message.joint_names).index(name) for name in CHAIN.joint_names]
@@ -151,3 +167,17 @@ def test_silence_holds_the_arm_and_speech_lets_it_go_on(around, silent):
     assert not around.commands
     around.talking.add(silent)
     around.until(lambda: around.settled, 30, 'the solution, once everyone is heard')
+
+
+def test_nothing_is_commanded_before_a_controller_listens(around):
+    """As after a restart of either: a command that nobody hears would count as one dropped."""
+    around.client.destroy_subscription(around.controller)
+    silent = 'no controller listens to'
+    around.until(lambda: silent in around.summaries.get('robot_bridge', ''), 30, 'the reason')
+    around.send([HOME + 0.1])
+    asked = time.monotonic()
+    around.until(lambda: time.monotonic() > asked + 1.0, 10, 'time')
+    assert not [event for event in around.events if event.event == 'commanded']
+    around.listen()
+    around.until(lambda: around.settled, 30, 'the solution')
+    assert len(around.commands) == 1
