@@ -9,7 +9,7 @@ import pytest
 from calibration_scenes import scene
 from scipy.stats import kstest, multivariate_normal
 
-from remaster_ros.core import sampling
+from remaster_ros.core import laplace, sampling
 from remaster_ros.core.errors import InsufficientDataError
 from remaster_ros.core.estimate import Problem, estimate
 from remaster_ros.core.laplace import find_mode
@@ -177,3 +177,16 @@ def test_a_parameter_without_information_is_an_error_not_a_crash(found) -> None:
     bare = replace(found.posterior, priors=(), free=np.arange(found.model.size))
     with pytest.raises(InsufficientDataError, match='hardly determine'):
         find_mode(bare)
+
+
+def test_steps_that_settle_slowly_are_near_enough_and_none_at_all_is_refused(monkeypatch) -> None:
+    posterior = estimate(Problem.of(scene(47, poses=12)[0])).posterior
+    usual = find_mode(posterior)
+    monkeypatch.setattr(laplace, 'SETTLED', 0.0)
+    near = find_mode(posterior)
+    std = np.sqrt(np.diag(usual.covariance))
+    off = near.z[posterior.free] - usual.z[posterior.free]
+    assert np.all(np.abs(off) < 1e-2 * std[: len(off)])
+    monkeypatch.setattr(laplace, 'NEAR_ENOUGH', 0.0)
+    with pytest.raises(InsufficientDataError, match='does not settle'):
+        find_mode(posterior)
