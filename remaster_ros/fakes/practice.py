@@ -63,10 +63,15 @@ def plan_tour(
 
 
 def visit(tour: Tour, chain: SerialChain) -> dict[str, list[FloatArray]]:
-    """Return each split's joint solutions, (m, k) per pose, in the order of the visits."""
+    """Return each split's joint solutions, (m, k) per pose, in the order of the visits.
+
+    A simulated session goes from one split to the other, each nearest first.
+    """
     visits: dict[str, list[FloatArray]] = {'optimization': [], 'validation': []}
     q = np.clip(np.zeros(len(chain)), chain.lower, chain.upper)
-    while (stop := tour.next(q)) is not None:
-        visits[stop.split].append(stop.solutions)
-        q = stop.solutions[-1]
+    for split, plan in tour.plans.items():
+        part = Tour(chain, {split: plan})
+        while (stop := part.next(q)) is not None:
+            visits[split].append(stop.solutions)
+            q = stop.solutions[-1]
     return visits

@@ -114,8 +114,13 @@ def test_one_fault_after_the_other_and_the_run_completes(start, client, tmp_path
 
     listener.moves()
     inject(world, {'robot': {'estop': 1}})
-    # On its way, or before it had begun: halted in both cases.
-    listener.says('pose_planner', 'the robot ')
+    # On its way, before it had begun, or between the two: halted in each case.
+    reasons = 'the robot ', 'configurations not reached'
+    listener.until(
+        lambda: any(text in listener.summaries.get('pose_planner', '') for text in reasons),
+        90,
+        'a halt',
+    )
     inject(world, {})
     listener.stands()
     assert call(client, '/remaster/collect').success

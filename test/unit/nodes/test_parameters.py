@@ -15,8 +15,9 @@ from remaster_ros.nodes.parameters import check
 pytestmark = pytest.mark.ros
 
 CONFIG = Path(__file__).parents[3] / 'config'
+# A node has its parameters in its own file, or in one beside it.
 NODES = sorted(
-    path.stem
+    path.stem.removesuffix('_parameters')
     for path in (Path(__file__).parents[3] / 'remaster_ros' / 'nodes').glob('*.py')
     if 'class Parameters' in path.read_text()
 )
