@@ -8,20 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from remaster_ros.core import convergence
 from remaster_ros.core.accuracy import accuracy_of
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.estimate import Problem
 from remaster_ros.core.gauge import Gauge, GaugeDirection
 from remaster_ros.core.model import Model
 from remaster_ros.core.rows import Rows
-from remaster_ros.core.sampling import R_HAT_LIMIT
+from remaster_ros.core.sampler_info import SamplerInfo
 from remaster_ros.core.theoretical import Predictive
 from remaster_ros.core.transforms import apply, inverse, matrix_to_rotation_vector
 from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Session
 
-# Effective draws enough for two digits of a 95 % interval.
-ESS_LIMIT = 400.0
 # An offset that a prior tells counts as known up to so many times what the data leave the others.
 AS_GOOD_AS_SEEN = 2.0
 # Of an angle that nothing is known of: uniform over the turn.
@@ -42,51 +39,6 @@ class NoiseEstimate:
     pose_sigma_m: float | None
     pose_sigma_std_m: float | None
     directions: Mapping[str, NoiseEstimate] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class SamplerInfo:
-    """How the draws were made and whether they can be believed.
-
-    Attributes
-    ----------
-    name
-        Which sampler, in words.
-    chains, draws
-        Number of chains, and of draws kept of each.
-    acceptance_rate
-        Share of proposals taken.
-    r_hat, ess_bulk, ess_tail
-        Per parameter of `FitResult.parameter_names`, (p,).
-    precision, precision_wanted
-        Largest Monte Carlo error of a mean over its parameter's standard deviation, reached and
-        asked for; None where a number of draws was asked for instead.
-    log_density_error, checked
-        Largest difference of the density that was sampled from the exact one, on so many of the
-        draws; NaN and 0 where the exact one was sampled.
-    seconds
-        By the clock passed in; NaN without one.
-    converged
-        Every R-hat at most 1.01 and every effective sample size at least what the precision
-        takes, 400 where none was asked for.
-    message
-        The verdict in words.
-    """
-
-    name: str
-    chains: int
-    draws: int
-    acceptance_rate: float
-    r_hat: FloatArray
-    ess_bulk: FloatArray
-    ess_tail: FloatArray
-    precision: float
-    precision_wanted: float | None
-    log_density_error: float
-    checked: int
-    seconds: float
-    converged: bool
-    message: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,7 +251,16 @@ def build_result(
         marker_positions=dict(zip(markers, model.markers(x_after), strict=True)),
         marker_std_m=dict(zip(markers, marker_draws.std(axis=0, ddof=1), strict=True)),
         noise=_noise(sampled, sensors),
-        sampler=_sampler_info(sampled, seconds),
+        sampler=SamplerInfo.of(
+            sampled.draws,
+            sampled.names,
+            name=sampled.name,
+            acceptance_rate=sampled.acceptance_rate,
+            wanted=sampled.precision,
+            log_density_error=sampled.log_density_error,
+            checked=sampled.checked,
+            seconds=seconds,
+        ),
         T_R_N_before=dict(zip(sensors, model.T_R_N(x_before), strict=True)),
         marker_positions_before=dict(zip(markers, model.markers(x_before), strict=True)),
         residuals_before=measurements.position - predicted_before,
@@ -353,42 +314,6 @@ def _noise_estimate(sigma: FloatArray, pose: FloatArray, known: bool) -> NoiseEs
         std_m=float(sigma.std(ddof=1)),
         pose_sigma_m=float(pose.mean()) if known else None,
         pose_sigma_std_m=float(pose.std(ddof=1)) if known else None,
-    )
-
-
-def _sampler_info(sampled: Sampled, seconds: float) -> SamplerInfo:
-    r_hat = convergence.r_hat(sampled.draws)
-    bulk, tail = convergence.ess_bulk(sampled.draws), convergence.ess_tail(sampled.draws)
-    worst, least = float(np.max(r_hat)), float(np.min(np.minimum(bulk, tail)))
-    wanted = sampled.precision
-    enough = ESS_LIMIT if wanted is None else wanted**-2
-    converged = worst <= R_HAT_LIMIT and least >= enough
-    precision = 1.0 / np.sqrt(least)
-    figures = (
-        f'R-hat up to {worst:.3f} ({sampled.names[int(np.argmax(r_hat))]}), '
-        f'at least {least:.0f} effective draws, every mean within {100 * precision:.1f} % of its '
-        'standard deviation'
-    )
-    if wanted is not None:
-        figures += f' ({100 * wanted:g} % wanted)'
-    verdict = 'converged' if converged else 'NOT converged'
-    if not converged and wanted is not None:
-        verdict += f' within {sampled.draws.shape[1]} draws a chain'
-    return SamplerInfo(
-        name=sampled.name,
-        chains=sampled.draws.shape[0],
-        draws=sampled.draws.shape[1],
-        acceptance_rate=sampled.acceptance_rate,
-        r_hat=r_hat,
-        ess_bulk=bulk,
-        ess_tail=tail,
-        precision=float(precision),
-        precision_wanted=wanted,
-        log_density_error=sampled.log_density_error,
-        checked=sampled.checked,
-        seconds=seconds,
-        converged=converged,
-        message=f'{verdict}: {figures}',
     )
 
 

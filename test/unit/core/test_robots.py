@@ -1,9 +1,9 @@
 """The robots in config/robots, against the team's table and pinocchio."""
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from remaster_ros.core.chain import SerialChain
@@ -72,10 +72,7 @@ def test_names_and_masses(robot):
 
 
 @pytest.mark.parametrize('robot', ROBOTS)
-@pytest.mark.skipif(not importlib.util.find_spec('pinocchio'), reason='needs: pip install pin')
 def test_pinocchio_reads_the_same_robot(robot):
-    import pinocchio as pin
-
     text, chain = read(robot)
     model = pin.buildModelFromXML(text)
     data = model.createData()
