@@ -9,7 +9,10 @@ The p-value of the best cell is the share of surrogate residuals whose best cell
 scores as high: the family-wise error is held whatever the number of cells and their likeness
 (Westfall & Young 1993). Surrogates of two kinds, and the larger p-value counts: signs of whole
 poses flipped at random, which holds for any symmetric noise independent between poses, of any
-spread (Winkler et al. 2014); and draws from the fitted noise, exact where that is Gaussian.
+spread (Winkler et al. 2014); and draws from the fitted noise, exact where that is Gaussian. A
+handful of poses has too few patterns of signs to tell anything (8 give 128, one of which is what
+was seen): there the whitened rows are flipped one by one, under the noise model's word that they
+are independent.
 """
 
 from __future__ import annotations
@@ -26,6 +29,8 @@ from remaster_ros.core.effects.cell import Cell
 from remaster_ros.core.types import BoolArray, FloatArray, IntArray
 
 CHUNK = 1024
+# With fewer, flips of whole poses meet the observed pattern, or its like, by chance.
+FEWEST_POSES = 12
 # Smoothness tried for free forms: penalty over data, in the trace.
 SMOOTHNESS = (0.1, 1.0, 10.0)
 # Directions of a cell that the others explain to this share of its variance are dropped.
@@ -212,8 +217,9 @@ def _surrogates(
     rng: np.random.Generator,
 ) -> FloatArray:
     """Return residuals with flipped poses, and drawn ones, (3n, 2 draws)."""
-    signs = rng.integers(0, 2, (data.poses, draws)) * 2.0 - 1.0
-    flipped = observed * np.repeat(signs[data.pose_of_row], 3, axis=0)
+    unit = data.pose_of_row if data.poses >= FEWEST_POSES else np.arange(len(data))
+    signs = rng.integers(0, 2, (int(unit.max()) + 1, draws)) * 2.0 - 1.0
+    flipped = observed * np.repeat(signs[unit], 3, axis=0)
     drawn = rng.standard_normal((len(observed), draws))
     return project.residual(np.concatenate((flipped, drawn), axis=1))
 
