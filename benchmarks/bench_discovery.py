@@ -43,8 +43,10 @@ from remaster_ros.fakes.effects import NAMED, UNNAMED  # noqa: E402
 
 ROBOTS = ('iiwa7', 'six')
 SENSORS = (('mocap',), ('mocap', 'tracker'))
-GROUPS = {'single': 24, 'pair': 60, 'unnamed': 12, 'null': 300}
-"""Group -> sessions (of each kind, for single and unnamed)."""
+GROUPS = {'single': 24, 'pair': 60, 'unnamed': 12, 'null': 300, 'few': 150}
+"""Group -> sessions (of each kind, for single and unnamed); few: nothing hidden, few poses."""
+FEW = (10, 13, 16)
+"""Candidates of the sessions with few poses."""
 
 
 def recipes(group: str, count: int) -> Iterator[tuple[str, Recipe]]:
@@ -68,8 +70,9 @@ def recipes(group: str, count: int) -> Iterator[tuple[str, Recipe]]:
                     robot=ROBOTS[i % 2],
                     sensors=SENSORS[(i // 2) % 2],
                     noise=tuple(NOISES)[(i // 4) % 4],
-                    outliers=bool(rng.random() < 0.5),
+                    outliers=bool(rng.random() < 0.5) and group != 'few',
                     held_out_outliers=group == 'null',
+                    candidates=FEW[i % 3] if group == 'few' else None,
                 ),
             )
 

@@ -35,8 +35,9 @@ def report(lines: Iterable[dict[str, Any]]) -> None:
                 f'{group}: {len(times)} sessions, {len(failed)} failed; {np.median(times):.1f} s '
                 f'(median), {max(times):.1f} s (most) of CPU each'
             )
-    if groups['null']:
-        report_null(groups['null'])
+    for group in ('null', 'few'):
+        if groups[group]:
+            report_null(groups[group])
     if groups['single']:
         report_single(groups['single'])
         report_confusion(groups['single'])
@@ -48,8 +49,9 @@ def report(lines: Iterable[dict[str, Any]]) -> None:
 
 def report_null(lines: list[dict[str, Any]]) -> None:
     claims = [line for line in lines if line['named']]
+    rows = [line['rows'] for line in lines]
     print(
-        f'\nNothing hidden: {len(claims)} claims in {len(lines)} sessions '
+        f'\nNothing hidden, {min(rows)} to {max(rows)} observations: {len(claims)} claims in {len(lines)} sessions '
         f'({_percent(len(claims), len(lines))}; the limit is {CLAIMS:.0%})'
     )
     for key in ('noise', 'outliers', 'robot', 'sensors'):

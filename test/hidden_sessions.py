@@ -44,6 +44,8 @@ class Recipe:
         See `hidden_tours.world` and `NOISES`.
     outliers, held_out_outliers
         Whether 3 % of the rows to fit, and of those held out, are gross errors.
+    candidates
+        Poses drawn, of which about half can be reached; None for some 350 observations to fit.
     """
 
     seed: int
@@ -55,6 +57,7 @@ class Recipe:
     noise: str = 'independent'
     outliers: bool = False
     held_out_outliers: bool = False
+    candidates: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +99,10 @@ def hidden_session(recipe: Recipe) -> HiddenSession:
 
 
 def _world(recipe: Recipe, rng: np.random.Generator) -> HiddenWorld:
-    """Draw a world in which a session has some 350 observations to fit, of one sensor or two."""
+    """Draw a world; as a rule its sessions have some 350 observations to fit, whatever sees."""
     rounds = 2 // len(recipe.sensors)
-    tour = visits(recipe.robot, int(rng.integers(8)), rounds * CANDIDATES[recipe.robot])
+    candidates = recipe.candidates or rounds * CANDIDATES[recipe.robot]
+    tour = visits(recipe.robot, int(rng.integers(8)), candidates)
     return world(recipe.robot, rng, sensors=recipe.sensors, tour=tour)
 
 
