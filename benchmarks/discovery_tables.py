@@ -51,7 +51,8 @@ def report_null(lines: list[dict[str, Any]]) -> None:
     claims = [line for line in lines if line['named']]
     rows = [line['rows'] for line in lines]
     print(
-        f'\nNothing hidden, {min(rows)} to {max(rows)} observations: {len(claims)} claims in {len(lines)} sessions '
+        f'\nNothing hidden, {min(rows)} to {max(rows)} observations: '
+        f'{len(claims)} claims in {len(lines)} sessions '
         f'({_percent(len(claims), len(lines))}; the limit is {CLAIMS:.0%})'
     )
     for key in ('noise', 'outliers', 'robot', 'sensors'):

@@ -13,8 +13,8 @@ from remaster_ros.core.discovery import Discovery, discover_session
 from remaster_ros.core.discovery_confirm import (
     Confirmation,
     confirm,
+    in_words,
     require_same_cell,
-    share_in_words,
 )
 from remaster_ros.storage.discovery_results import save_discovery
 from remaster_ros.storage.results import prepare_folder
@@ -85,8 +85,5 @@ def summary(found: Discovery, confirmation: Confirmation | None = None) -> str:
             f'{1e3 * confirmation.rms_after_m:.3f} mm with the frozen causes; '
             f'{100 * confirmation.carried_over:.0f} % of the gain carries over'
         )
-        lines += [
-            share_in_words(effect, share)
-            for effect, share in zip(found.effects, confirmation.effects, strict=False)
-        ]
+        lines += in_words(found, confirmation)
     return '\n'.join(lines)

@@ -39,6 +39,12 @@ class Confirmation:
         The same share for each cause alone, in the order of the discovery.
     confirmed
         More than half of the gain carries over.
+    rms_own_m
+        RMS where the other session's own zero-offsets are fitted, with or without the causes,
+        whichever is less.
+    same_offsets
+        Whether the zero-offsets found do nearly as well there as its own. If not, that is another
+        arm, or it was mastered anew in between.
     """
 
     rms_before_m: float
@@ -46,6 +52,12 @@ class Confirmation:
     carried_over: float
     effects: tuple[float, ...]
     confirmed: bool
+    rms_own_m: float
+    same_offsets: bool
+
+
+# Zero-offsets with which a session's error is so many times that with its own are not its own.
+OTHER_OFFSETS = 1.5
 
 
 def confirm(discovery: Discovery, session: Session) -> Confirmation:
@@ -61,16 +73,21 @@ def confirm(discovery: Discovery, session: Session) -> Confirmation:
     require_same_cell(discovery.fit.session, session)
     problem = Problem.of(session)
     found = estimate(problem)
+    offsets = discovery.fit.joint_offsets
     before = _left(discovery, found, discovery.offsets_before[0], ())
-    after = _left(discovery, found, discovery.fit.joint_offsets, discovery.groups)
+    after = _left(discovery, found, offsets, discovery.groups)
+    cured = _left(discovery, found, offsets, ())
+    own = [_left(discovery, found, None, groups) for groups in ((), discovery.groups)]
     rows = problem.measurements.is_validation
     if not rows.any():
         rows = np.isin(np.arange(len(rows)), found.kept)
     base, best = rms(before, rows), rms(after, rows)
-    own = _own_gain(discovery)
-    alone = tuple(_alone(discovery, found, group, base, rows) for group in discovery.groups)
-    carried = (base**2 - best**2) / own if own > 0.0 else 0.0
-    return Confirmation(base, best, float(carried), alone, bool(carried > 0.5))
+    gain = _own_gain(discovery)
+    alone = tuple(_alone(discovery, found, group, best, rows) for group in discovery.groups)
+    carried = float((base**2 - best**2) / gain) if gain > 0.0 else 0.0
+    rms_own = min(rms(left, rows) for left in own)
+    same = min(base, best, rms(cured, rows)) < OTHER_OFFSETS * rms_own
+    return Confirmation(base, best, carried, alone, same and carried > 0.5, rms_own, same)
 
 
 def _own_gain(discovery: Discovery) -> float:
@@ -89,7 +106,7 @@ def _alone(
     discovery: Discovery,
     found: Estimate,
     group: tuple[Cell, ...],
-    base: float,
+    best: float,
     rows: BoolArray,
 ) -> float:
     """Return the share of a cause's own gain that it alone carries over."""
@@ -107,28 +124,30 @@ def _alone(
     )
     others = tuple(other for other in discovery.groups if other is not group)
     offsets = discovery.fit.joint_offsets
-    lost = (
-        rms(_left(discovery, found, offsets, others), rows) ** 2
-        - rms(_left(discovery, found, offsets, discovery.groups), rows) ** 2
-    )
+    lost = rms(_left(discovery, found, offsets, others), rows) ** 2 - best**2
     return float(lost / own) if own > 0.0 else 0.0
 
 
 def _left(
     discovery: Discovery,
     found: Estimate,
-    joint_offsets: FloatArray,
+    joint_offsets: FloatArray | None,
     groups: Sequence[tuple[Cell, ...]],
 ) -> FloatArray:
-    """Return the errors of every row with offsets and causes held, m, (n, 3)."""
-    held = hold_offsets(found.mode, joint_offsets)
-    data = Residuals.at(found, held)
-    joints = found.model.joints
+    """Return the errors of every row with causes held, m, (n, 3).
+
+    Offsets (rad, (k,)) are held too, or, where None, refitted with registration and markers.
+    """
+    if joint_offsets is None:
+        data, joints = Residuals.at(found, found.mode), 0
+    else:
+        data = Residuals.at(found, hold_offsets(found.mode, joint_offsets))
+        joints = found.model.joints
     values = dict(zip(discovery.fit.theta_names, discovery.fit.theta, strict=True))
     cells = [cell for group in groups for cell in group]
     theta = np.array([values[name] for cell in cells for name in cell.parameters])
     left = data.full_errors - data.columns(cells) @ theta
-    # Registration and markers again: a small step, so linear.
+    # What is not held again: a small step, so linear.
     columns = data.full_jacobian[:, :, joints:]
     white = data.whitened(columns[data.rows.source], data.noise).reshape(3 * len(data), -1)
     target = data.whitened(left[data.rows.source], data.noise).ravel()
@@ -166,8 +185,22 @@ def require_same_cell(session: Session, other: Session) -> None:
             )
 
 
-def share_in_words(effect: FoundEffect, share: float) -> str:
-    """Say how a cause did in the other session."""
+def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
+    """Say how each cause did in the other session, or why that session cannot tell."""
+    if not confirmation.same_offsets:
+        least = min(confirmation.rms_before_m, confirmation.rms_after_m)
+        return [
+            f'The zero-offsets found here are not those of the other session: '
+            f'{1e3 * least:.3f} mm with them, {1e3 * confirmation.rms_own_m:.3f} mm with its own. '
+            'That is another arm, or it was mastered anew in between: nothing is confirmed.'
+        ]
+    return [
+        _share_in_words(effect, share)
+        for effect, share in zip(discovery.effects, confirmation.effects, strict=False)
+    ]
+
+
+def _share_in_words(effect: FoundEffect, share: float) -> str:
     if not np.isfinite(share):
         return f'{effect.cause} The other session cannot tell.'
     if share > 0.5:

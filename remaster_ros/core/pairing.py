@@ -177,27 +177,31 @@ class Pairing:
         """
         passed = max(now_s - self._looked_s, 0.0)
         self._looked_s = now_s
-        self._listen(words or {}, passed)
         for name in absent:
             if name in self.rules and self.is_required(name):
-                self._excused_s[name] += max(passed, self._silent_s[name])
+                self._excused_s[name] += self._silent_s[name] + passed
                 self._silent_s[name] = 0.0
             elif name in self.rules:
                 self._set(Rejection(name, 'absent', 'it is not there, and not required'))
+        self._listen(words or {}, passed, absent)
         for name, rules in self.rules.items():
             allowed = self._allowed_s(rules)
             unsure = self.is_required(name) and self._silent_s[name] > 0.0
             if now_s > self.settled_stamp_s + allowed and not unsure:
                 self._set(self._late(rules, allowed))
 
-    def _listen(self, words: Mapping[str, int], passed_s: float) -> None:
-        """Add up how long each sensor's node has said nothing."""
+    def _listen(self, words: Mapping[str, int], passed_s: float, absent: Collection[str]) -> None:
+        """Add up how long each sensor's node has said nothing that is not excused yet."""
         for name in self.rules:
-            if name in words and words[name] == self._words.get(name):
+            if name in words and words[name] == self._words.get(name) and name not in absent:
                 self._silent_s[name] += passed_s
             else:
                 self._silent_s[name] = 0.0
         self._words = dict(words)
+
+    def has_reading(self, sensor: str) -> bool:
+        """Whether anything of a sensor has come."""
+        return bool(self._readings[sensor])
 
     def is_required(self, sensor: str) -> bool:
         """Whether the arm waits for this sensor."""

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
+BACK_S = 1.0
+"""What a node that was started again publishes may find its way so much later than its word, s."""
+
 
 class Presence:
     """Follow the signs of life of sensors.
@@ -17,6 +20,9 @@ class Presence:
     streams
         Those that read all the time. One whose node was started (again) is absent until a reading
         has come: what it publishes may find its way later than what it says.
+    since_s
+        When listening began, s: for one heartbeat from then a required sensor may be there though
+        it has not been heard. As a rule, long ago.
 
     Attributes
     ----------
@@ -27,10 +33,15 @@ class Presence:
     """
 
     def __init__(
-        self, sensors: Iterable[str], heartbeat_s: float, streams: Collection[str] = ()
+        self,
+        sensors: Iterable[str],
+        heartbeat_s: float,
+        streams: Collection[str] = (),
+        since_s: float = float('-inf'),
     ) -> None:
-        self._heartbeat_s, self._streams = heartbeat_s, streams
+        self._heartbeat_s, self._streams, self._since_s = heartbeat_s, streams, since_s
         self._started: dict[str, str] = {}
+        self._back: dict[str, float] = {}
         self._new: set[str] = set()
         self._heard: dict[str, float] = {}
         self._trouble: dict[str, str] = {}
@@ -67,8 +78,11 @@ class Presence:
         self._heard[sensor] = now_s
         self.words[sensor] = self.words.get(sensor, 0) + 1
         self._trouble[sensor] = '' if ready else message or 'not ready'
-        if sensor in self._streams and started != self._started.get(sensor, ''):
+        before = self._started.get(sensor, '')
+        if sensor in self._streams and started != before:
             self._new.add(sensor)
+        elif started and before and started != before:
+            self._back[sensor] = now_s
         self._started[sensor] = started
         if hidden:
             self._new.discard(sensor)
@@ -83,17 +97,34 @@ class Presence:
         """Time since the last reading, s; infinite if there was none."""
         return now_s - self._read.get(sensor, float('-inf'))
 
-    def absent(self, now_s: float) -> dict[str, str]:
+    def absent(self, now_s: float, required: Collection[str] = ()) -> dict[str, str]:
         """Return why, for each sensor that is not there.
 
-        A sensor that never said anything is none of them: a bag may hold readings alone.
+        A sensor that never said anything is none of them: a bag may hold readings alone. But as
+        long as that means nothing yet, one that is ``required`` is.
         """
         why = {}
-        for name, heard in self._heard.items():
-            if now_s - heard > self._heartbeat_s:
-                why[name] = f'its node has been silent for {self._heartbeat_s:g} s'
-            elif self._trouble[name]:
-                why[name] = self._trouble[name]
-            elif name in self._new:
-                why[name] = 'no reading since its node was started'
+        for name in self.readings:
+            reason = self._why(name, now_s)
+            if not reason and name in required:
+                reason = self._why_unsure(name, now_s)
+            if reason:
+                why[name] = reason
         return why
+
+    def _why(self, name: str, now_s: float) -> str:
+        if name not in self._heard:
+            return ''
+        if now_s - self._heard[name] > self._heartbeat_s:
+            return f'its node has been silent for {self._heartbeat_s:g} s'
+        if name in self._new:
+            return self._trouble[name] or 'no reading since its node was started'
+        return self._trouble[name]
+
+    def _why_unsure(self, name: str, now_s: float) -> str:
+        unheard = name not in self._heard and name not in self._read
+        if unheard and now_s - self._since_s < self._heartbeat_s:
+            return 'its node has not been heard yet'
+        if now_s - self._back.get(name, float('-inf')) < BACK_S:
+            return 'its node has just been started again'
+        return ''

@@ -77,7 +77,9 @@ class Recorder(RemasterNode):
                 f'of {", ".join(self.cell.sensors)}'
             )
         streams = [name for name, sensor in self.cell.sensors.items() if not sensor.single_shot]
-        self._presence = Presence(self.cell.sensors, self.p.heartbeat_s, streams)
+        self._presence = Presence(
+            self.cell.sensors, self.p.heartbeat_s, streams, since_s=time.monotonic()
+        )
         self._waited_s = dict.fromkeys(self.cell.sensors, 0.0)
         self._order = JointOrder(self.chain.joint_names)
         folder = Path(self.p.session)
@@ -275,6 +277,10 @@ class Recorder(RemasterNode):
         """Return the sensors that the arm waits for, or for one of them."""
         return [name for name in self.cell.sensors if self.p.require in ('all', 'any', name)]
 
+    def _absent(self) -> dict[str, str]:
+        """Return why, for each sensor that is not there (`Presence.absent`)."""
+        return self._presence.absent(time.monotonic(), self._wanted())
+
     def _take(
         self,
         q: FloatArray,
@@ -291,11 +297,11 @@ class Recorder(RemasterNode):
             pairing.add_joint_state(stamp_s, recent)
         for sensor, reading in self._recent_readings:
             pairing.add_reading(sensor, reading)
-        self._shots.look(pairing, self._presence.absent(time.monotonic()))
+        self._shots.look(pairing, self._absent())
 
     def _look(self) -> None:
         """Ask, give up, and say at once when a required sensor goes or comes back."""
-        absent = self._presence.absent(time.monotonic())
+        absent = self._absent()
         self._disk.look()
         if self._taking is not None:
             self._shots.look(self._taking.pairing, absent)
@@ -424,7 +430,7 @@ class Recorder(RemasterNode):
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
         state = 'closed' if self.logbook.closed else 'measuring' if self._busy() else 'waiting'
         now, sensors = time.monotonic(), self.cell.sensors
-        waiting_for = self._waiting_for(self._presence.absent(now))
+        waiting_for = self._waiting_for(self._absent())
         trouble = self._trouble or (f'waiting for {waiting_for}' if waiting_for else '')
         pose = self._announcements.now
         values = {

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from remaster_ros.core.discovery import Discovery
-from remaster_ros.core.discovery_confirm import Confirmation, share_in_words
+from remaster_ros.core.discovery_confirm import Confirmation, in_words
 from remaster_ros.core.effects.registry import EFFECTS
 from remaster_ros.storage.discovery_figures import draw_discovery
 from remaster_ros.storage.files import make_folder, write_atomically
@@ -55,12 +55,7 @@ def write_discovery_report(
             equations={name: effect.equation for name, effect in EFFECTS.items()},
             sources={name: effect.source for name, effect in EFFECTS.items()},
             most_parameters=MOST_PARAMETERS,
-            confirmed=[
-                share_in_words(effect, share)
-                for effect, share in zip(
-                    discovery.effects, confirmation.effects if confirmation else (), strict=False
-                )
-            ],
+            confirmed=in_words(discovery, confirmation) if confirmation else (),
             drawings={name: inlined(name, text) for name, text in drawings.items()},
         ),
     )

@@ -120,6 +120,8 @@ def discovery_to_dict(
         content['confirmation'] = {
             'rms_before_m': confirmation.rms_before_m,
             'rms_after_m': confirmation.rms_after_m,
+            'rms_own_m': confirmation.rms_own_m,
+            'same_offsets': confirmation.same_offsets,
             'carried_over': confirmation.carried_over,
             'confirmed': confirmation.confirmed,
             'effects': [

@@ -47,6 +47,6 @@ def test_nothing_found_and_what_cannot_be_tested_are_said():
 
 def test_a_cause_that_was_cured_is_not_confirmed():
     session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {})
-    text = summary(session, Confirmation(0.3e-3, 0.9e-3, -0.9, (-0.9,), False))
+    text = summary(session, Confirmation(0.3e-3, 0.9e-3, -0.9, (-0.9,), False, 0.2e-3, True))
     assert '-90 % of the gain carries over' in text
     assert 'Not there any more' in text

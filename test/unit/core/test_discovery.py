@@ -9,7 +9,7 @@ from calibration_scenes import CHAIN
 from discovery_scenes import at_joint, residuals_of, session_with
 
 from remaster_ros.core.discovery import Findings, discover_session, find_causes
-from remaster_ros.core.discovery_confirm import confirm
+from remaster_ros.core.discovery_confirm import confirm, in_words
 from remaster_ros.core.discovery_evidence import Strata, _System, solve
 from remaster_ros.core.discovery_screen import Catalogue, screen
 from remaster_ros.core.discovery_worth import held_out_error
@@ -151,6 +151,19 @@ def test_causes_are_confirmed_in_another_session_of_the_arm_and_missed_when_cure
     assert not cured.confirmed
     assert cured.carried_over < 0.0
     assert cured.rms_after_m > cured.rms_before_m
+    assert same.same_offsets
+    assert cured.same_offsets
+
+
+def test_another_arm_of_the_same_model_is_not_taken_for_this_one():
+    found = discover_session(sagging_session(), rng=np.random.default_rng(0))
+    # The seed makes the arm: other zero-offsets, and the same joints give way.
+    other = confirm(found, session_with(27, sagging))
+    assert not other.same_offsets
+    assert not other.confirmed
+    assert other.rms_after_m > 3.0 * other.rms_own_m
+    (line,) = in_words(found, other)
+    assert 'another arm, or it was mastered anew' in line
 
 
 def test_another_robot_cannot_confirm():

@@ -252,6 +252,18 @@ def test_a_silence_that_is_longer_than_the_time_out_decides_nothing():
     assert pairing.decided['mocap'].reason == 'stale'
 
 
+def test_a_silence_that_ends_with_a_new_start_of_its_node_is_excused():
+    """It died and is back before the heartbeat (here 18 s) was over; the time-out is 2.5 s."""
+    pairing = Pairing(10.0, Q, (STREAM,))
+    for stamp in np.arange(10.0, 25.0, 0.1):
+        pairing.give_up(stamp, set(), {'mocap': 7})
+    pairing.give_up(25.0, {'mocap'}, {'mocap': 8})
+    pairing.give_up(27.4, set(), {'mocap': 9})
+    assert not pairing.decided, 'its time begins when it is back'
+    pairing.give_up(27.7, set(), {'mocap': 10})
+    assert pairing.decided['mocap'].reason == 'stale'
+
+
 def test_an_absent_sensor_that_is_not_required_is_left_out_at_once():
     pairing = Pairing(10.0, Q, (STREAM, SHOT), require='mocap')
     pairing.give_up(10.1, {'tracker', 'another'})

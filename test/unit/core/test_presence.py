@@ -46,3 +46,27 @@ def test_a_stream_whose_node_was_started_again_is_there_with_its_first_reading()
     presence.says('mocap', True, '', 12.0, 'third')
     presence.says('mocap', True, 'hidden', 12.5, 'third', hidden=True)
     assert presence.absent(12.5) == {}, 'moving on shows it again'
+
+
+def test_what_has_not_been_heard_yet_is_absent_for_a_heartbeat_where_it_is_required():
+    presence = Presence(['mocap', 'tracker'], 3.0, since_s=10.0)
+    presence.reads('tracker', 10.1)
+    assert presence.absent(12.9) == {}, 'one that is not required is not given up for that'
+    unheard = {'mocap': 'its node has not been heard yet'}
+    assert presence.absent(12.9, ['mocap', 'tracker']) == unheard
+    assert presence.absent(13.0, ['mocap', 'tracker']) == {}, 'a bag of readings without status'
+    presence.says('mocap', True, '', 11.0)
+    assert presence.absent(11.0, ['mocap', 'tracker']) == {}
+
+
+def test_an_instrument_whose_node_was_started_again_needs_a_moment_where_it_is_required():
+    presence = Presence(['tracker'], 3.0)
+    presence.says('tracker', True, '', 10.0, 'first')
+    assert presence.absent(10.0, ['tracker']) == {}
+    presence.says('tracker', True, '', 11.0, 'second')
+    presence.says('tracker', True, '', 11.5, 'second')
+    assert presence.absent(11.9) == {}
+    assert presence.absent(11.9, ['tracker']) == {
+        'tracker': 'its node has just been started again'
+    }
+    assert presence.absent(12.0, ['tracker']) == {}
