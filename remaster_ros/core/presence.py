@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
+UNHEARD_S = 10.0
+"""A node that has not been heard at all may still be starting for so long, s."""
 BACK_S = 1.0
 """What a node that was started again publishes may find its way so much later than its word, s."""
 
@@ -21,7 +23,7 @@ class Presence:
         Those that read all the time. One whose node was started (again) is absent until a reading
         has come: what it publishes may find its way later than what it says.
     since_s
-        When listening began, s: for one heartbeat from then a required sensor may be there though
+        When listening began, s: for `UNHEARD_S` from then a required sensor may be there though
         it has not been heard. As a rule, long ago.
 
     Attributes
@@ -123,7 +125,7 @@ class Presence:
 
     def _why_unsure(self, name: str, now_s: float) -> str:
         unheard = name not in self._heard and name not in self._read
-        if unheard and now_s - self._since_s < self._heartbeat_s:
+        if unheard and now_s - self._since_s < UNHEARD_S:
             return 'its node has not been heard yet'
         if now_s - self._back.get(name, float('-inf')) < BACK_S:
             return 'its node has just been started again'

@@ -231,6 +231,9 @@ class LaserTrackerMarkers(RemasterNode):
 
     def _on_measure(self, request: Trigger.Request, response: Trigger.Response) -> Any:
         """One measurement; the point is published before the answer goes out."""
+        if self.clock_trouble:
+            response.message = self.clock_trouble
+            return response
         if self._state != 'ready':
             response.message = f'the laser tracker is {self._state}: {self._trouble}'
             return response
@@ -286,18 +289,20 @@ class LaserTrackerMarkers(RemasterNode):
         raise failure
 
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
-        level = 'ok' if not self._trouble else 'warn' if self._state == 'ready' else 'error'
+        trouble = self.clock_trouble or self._trouble
+        measures = self._state == 'ready' and self.tracker.connected and not self.clock_trouble
+        level = 'ok' if not trouble else 'warn' if self._state == 'ready' else 'error'
         values: dict[str, Any] = {
             'sensor': self.p.sensor,
-            'ready': 'yes' if self._state == 'ready' and self.tracker.connected else 'no',
+            'ready': 'yes' if measures else 'no',
             'state': self._state,
-            'trouble': self._trouble,
+            'trouble': trouble,
             'lock': self.tracker.status.value,
             **self.tracker.counts,
         }
         if self._temperature_c is not None:
             values['temperature_c'] = self._temperature_c
-        return level, self._trouble or self._state, values
+        return level, trouble or self._state, values
 
     def close(self) -> None:
         """Let the instrument go."""

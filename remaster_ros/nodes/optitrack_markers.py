@@ -111,6 +111,9 @@ class OptiTrackMarkers(RemasterNode):
 
     def _publish(self, sample: MarkerSample) -> None:
         """Publish a reading with its time of capture; called in the client's thread."""
+        if sample.received_s <= 0.0:
+            # A simulated clock that has not been heard yet: nobody can say when this was.
+            return
         message = PointStamped()
         captured = self._clock_mapping.capture_time(
             sample.timestamp_s, sample.age_s, sample.received_s
@@ -124,19 +127,20 @@ class OptiTrackMarkers(RemasterNode):
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
         status = self.client.status()
         diagnosis = self.client.diagnosis()
+        trouble = self.clock_trouble or diagnosis.message
         # A hidden marker is no reason to stop the arm: moving on shows it again.
-        ready = diagnosis.fault in ('none', 'marker')
+        ready = diagnosis.fault in ('none', 'marker') and not self.clock_trouble
         values = {
             'sensor': self.p.sensor,
             'ready': 'yes' if ready else 'no',
             'fault': diagnosis.fault,
-            'trouble': diagnosis.message,
+            'trouble': trouble,
             'frames': status.frames,
             'published': self.published,
             'lost': status.lost,
             **{f'dropped_{reason}': count for reason, count in status.dropped.items()},
         }
-        return ('ok' if not diagnosis.message else 'error'), diagnosis.message or 'ok', values
+        return ('error' if trouble else 'ok'), trouble or 'ok', values
 
     def close(self) -> None:
         """Say goodbye to the server."""

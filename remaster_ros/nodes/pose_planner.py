@@ -328,6 +328,9 @@ class PosePlanner(RemasterNode):
 
     def _heard(self) -> bool:
         """Whether bridge and recorder are there for the next pose; DDS takes its time to match."""
+        if self.clock_trouble:
+            self._why = self.clock_trouble
+            return False
         if self._solutions.get_subscription_count() >= 2 and len(self._peers) == len(PEERS):
             if self._matched_wall is None:
                 self._matched_wall = time.monotonic()

@@ -57,6 +57,12 @@ class RemasterNode(Node):
         """Time of the node's clock, s; simulated where use_sim_time is set."""
         return self.get_clock().now().nanoseconds * 1e-9
 
+    @property
+    def clock_trouble(self) -> str:
+        """Why the node's clock says nothing: a simulated one that has not been heard; ''."""
+        known = self.get_clock().now().nanoseconds > 0
+        return '' if known else 'the simulated clock has not been heard: who publishes /clock?'
+
     def close(self) -> None:
         """Finish: files closed, threads joined. Called once, before the node is destroyed."""
 

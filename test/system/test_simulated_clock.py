@@ -1,0 +1,111 @@
+"""A sensor's node with a simulated clock that nobody publishes yet says so, and stamps nothing.
+
+A node that is started again in a running simulation hears the clock late; what it measured until
+then would be stamped with the beginning of time.
+"""
+
+import socket
+
+import pytest
+from conftest import call, node_arguments, wait_until
+
+from remaster_ros.fakes.setup import make_world
+from remaster_ros.nodes.demo import free_ports
+from remaster_ros.storage.cell import read_cell
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
+
+TIME_S = 5000
+
+
+@pytest.fixture
+def said(client):
+    """Return the last summary of each node: its message and values."""
+    from remaster_ros.nodes.status import listen
+
+    summaries = {}
+    listen(
+        client,
+        lambda event: None,
+        lambda node, message, values: summaries.update({node: (message, values)}),
+    )
+    return summaries
+
+
+@pytest.fixture
+def world(tmp_path):
+    make_world(tmp_path / 'world', read_cell('demo'), 3, 1.0)
+    return tmp_path / 'world'
+
+
+def tick(client, publisher, seconds):
+    from rosgraph_msgs.msg import Clock
+
+    message = Clock()
+    message.clock.sec = TIME_S + int(seconds)
+    message.clock.nanosec = int(1e9 * (seconds % 1.0))
+    publisher.publish(message)
+    client.spin_some()
+
+
+def until_it_says(client, said, node, ready, words, turn=lambda: None):
+    def heard():
+        turn()
+        client.spin_some()
+        message, values = said.get(node, ('', {}))
+        return values.get('ready') == ready and words in message
+
+    wait_until(heard, 60, f'{node} to say {words!r}')
+
+
+def follow_the_clock(client, said, node):
+    """Check what a node says before there is a clock, and when there is one."""
+    from rosgraph_msgs.msg import Clock
+
+    until_it_says(client, said, node, 'no', 'who publishes /clock?')
+    clock, ticks = client.create_publisher(Clock, '/clock', 10), iter(range(10**6))
+
+    def turn():
+        tick(client, clock, 0.02 * next(ticks))
+
+    until_it_says(client, said, node, 'yes', '', turn)
+    return turn
+
+
+def test_the_laser_tracker_measures_nothing_without_it(start, client, said, world):
+    (port,) = free_ports(socket.SOCK_STREAM)
+    start(
+        'remaster_ros.nodes.fake_laser_tracker',
+        *node_arguments(world=world, port=port, warm_up_s=0.0),
+    )
+    node = 'laser_tracker_markers'
+    start(
+        f'remaster_ros.nodes.{node}',
+        *node_arguments(use_sim_time=True, host='127.0.0.1', port=port),
+    )
+    until_it_says(client, said, node, 'no', '')
+    response = call(client, '/laser_tracker/measure')
+    assert not response.success
+    assert 'who publishes /clock?' in response.message
+    follow_the_clock(client, said, node)
+
+
+def test_the_bar_publishes_nothing_without_it(start, client, said, world):
+    from geometry_msgs.msg import PointStamped
+
+    stamps = []
+    client.create_subscription(
+        PointStamped,
+        '/optitrack/marker',
+        lambda message: stamps.append(message.header.stamp.sec),
+        10,
+    )
+    command, data = free_ports(socket.SOCK_DGRAM, socket.SOCK_DGRAM)
+    ports = {'command_port': command, 'data_port': data}
+    start('remaster_ros.nodes.fake_optitrack', *node_arguments(world=world, **ports))
+    node = 'optitrack_markers'
+    address = {'server': '127.0.0.1', 'local_interface': '127.0.0.1'}
+    start(f'remaster_ros.nodes.{node}', *node_arguments(use_sim_time=True, **address, **ports))
+    turn = follow_the_clock(client, said, node)
+    wait_until(lambda: turn() or stamps, 30, 'a reading')
+    assert min(stamps) >= TIME_S - 1
