@@ -18,7 +18,7 @@ from remaster_ros.core.metropolis import (
     independence_sampler,
     random_walk_sampler,
 )
-from remaster_ros.core.proposal import LaplaceProposal
+from remaster_ros.core.proposal import FactorisedProposal, LaplaceProposal
 from remaster_ros.core.surrogate import Surrogate
 from remaster_ros.core.types import FloatArray
 
@@ -35,6 +35,10 @@ ALLOWANCE = 100_000
 # Below this share of proposals taken the proposal is adapted to a random walk's draws; should
 # that not help, a random walk is what remains.
 POOR_ACCEPTANCE = 0.15
+# Where independent draws by the interpolated proposal are worth less than this share of themselves
+# it is factorised for every draw; so many draws tell.
+POOR_WEIGHTS = 0.5
+TRIAL_DRAWS = 1000
 # In tens of dimensions a Student t of few degrees of freedom hardly ever hits the bulk.
 ADAPTED_FREEDOM = 15.0
 PILOT_CHAINS = 32
@@ -133,7 +137,11 @@ def sample_posterior(
     """
     posterior = mode.linearisation.posterior
     length = Length(draws, precision)
+    surrogate = Surrogate.of(mode)
     laplace = LaplaceProposal.of(mode)
+    factorised = _weight_share(laplace, surrogate.log_density, rng.spawn(1)[0]) < POOR_WEIGHTS
+    if factorised:
+        laplace = FactorisedProposal.of(mode)
     starts = laplace.dispersed(chains, rng)
 
     def independent(target: LogDensity, proposal: Proposal, start: FloatArray) -> Chains:
@@ -151,9 +159,10 @@ def sample_posterior(
 
         return _long_enough(more, start, length, quantities, POOR_ACCEPTANCE)
 
-    surrogate = Surrogate.of(mode)
     run = independent(surrogate.log_density, laplace, starts)
     name = 'independence Metropolis-Hastings, Laplace proposal'
+    if factorised:
+        name += ' factorised for every draw'
     checked = max(20, min(CHECKED_DRAWS, CHECKED_ROWS // len(posterior.rows)))
     points = run.draws.reshape(-1, posterior.size)
     points = points[rng.choice(len(points), min(checked, len(points)), replace=False)]
@@ -162,6 +171,16 @@ def sample_posterior(
         run, name = _exact(mode, laplace, starts, independent, length, quantities, rng, report)
         return Sampling(run, name)
     return Sampling(run._replace(log_density_error=error, checked=len(points)), name)
+
+
+def _weight_share(
+    proposal: LaplaceProposal, log_density: LogDensity, rng: np.random.Generator
+) -> float:
+    """Return what share of independent draws their importance weights are worth (Kish 1965)."""
+    points, log_proposal = proposal.sample(TRIAL_DRAWS, rng)
+    log_weight = log_density(points) - log_proposal
+    weight = np.exp(log_weight - log_weight.max())
+    return float(np.sum(weight) ** 2 / np.sum(weight**2) / len(weight))
 
 
 def _exact(

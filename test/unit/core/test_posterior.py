@@ -16,7 +16,7 @@ from remaster_ros.core.laplace import find_mode
 from remaster_ros.core.metropolis import random_walk_sampler
 from remaster_ros.core.posterior import RESOLUTION_M
 from remaster_ros.core.priors import base_prior, marker_prior
-from remaster_ros.core.proposal import LaplaceProposal
+from remaster_ros.core.proposal import FactorisedProposal, LaplaceProposal
 from remaster_ros.core.sampling import sample_posterior
 from remaster_ros.core.transforms import quaternion_xyzw
 from remaster_ros.core.types import BasePrior
@@ -78,8 +78,9 @@ def test_linearised_posterior_is_nearly_the_exact_one(found) -> None:
     assert np.std(difference) < 0.05
 
 
-def test_proposal_reports_the_density_it_samples_from(found) -> None:
-    proposal = LaplaceProposal.of(found.mode)
+@pytest.mark.parametrize('kind', [LaplaceProposal, FactorisedProposal])
+def test_proposal_reports_the_density_it_samples_from(found, kind) -> None:
+    proposal = kind.of(found.mode)
     points, density = proposal.sample(50, np.random.default_rng(3))
     np.testing.assert_allclose(proposal.log_density(points), density)
     assert np.all(points[:, -2:] >= 0.0)
@@ -96,6 +97,19 @@ def test_mode_is_where_the_exact_density_peaks(found) -> None:
             beside = top.copy()
             beside[index] += sign * std
             assert posterior.log_density(beside[None])[0] < value
+
+
+@pytest.mark.parametrize('seed', [60, 61])
+def test_few_poses_do_not_take_long_chains(seed) -> None:
+    """Five poses, two sensors, noise by direction: the part common to a pose reaches far up."""
+    session, _ = scene(seed, poses=5, sensor_count=2, pose_sigma_m=0.1e-3)
+    found = estimate(Problem.of(session))
+    p = found.posterior
+    mode = find_mode(type(p).of(p.model, p.rows, p.priors, p.free, found.mode.z, split=(0, 1)))
+    run, name = sample_posterior(mode, chains=4, rng=np.random.default_rng(seed))
+    assert 'factorised for every draw' in name
+    # 100,000 did not suffice in such a session.
+    assert run.draws.shape[1] < 12_000
 
 
 def test_the_draws_do_not_depend_on_the_proposal() -> None:
