@@ -18,30 +18,24 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from geometry_msgs.msg import PoseStamped, TransformStamped
+from geometry_msgs.msg import TransformStamped
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from remaster_ros.core import transforms
-from remaster_ros.core.collision import ArmCapsules
 from remaster_ros.core.errors import InputError, InsufficientDataError, RemasterError
-from remaster_ros.core.inverse import InverseKinematics
-from remaster_ros.core.planning import Plan, candidate_poses, plan_poses
-from remaster_ros.core.tour import REGISTRATION, Stop, Tour, registration_tour
+from remaster_ros.core.tour import REGISTRATION, Stop
 from remaster_ros.core.types import FloatArray
+from remaster_ros.nodes.announcing import Announcer
 from remaster_ros.nodes.clearance import Clearance
-from remaster_ros.nodes.messages import JointOrder, duration_of, stamp_key, transform_array
+from remaster_ros.nodes.messages import JointOrder, transform_array
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import LATCHED, RELIABLE, Event, Status, listen
+from remaster_ros.nodes.touring import TourPlanner
 from remaster_ros.storage.cell import read_cell
 from remaster_ros.storage.plan_book import PlanBook
 
-PEERS = ('robot_bridge', 'recorder')
-ANNOUNCE_WALL_S = 5.0
-"""Who does not know an announcement so long after it has missed it, wall time."""
 RETRY_WALL_S = 1.0
 """How often a full disk is tried again, wall time."""
 
@@ -77,14 +71,6 @@ class Parameters:
     )
 
 
-@dataclass(frozen=True)
-class _Peer:
-    """The last summary of a node that must know the pose under way."""
-
-    heard_wall: float
-    values: dict[str, str]
-
-
 class PosePlanner(RemasterNode):
     """See the module's text."""
 
@@ -97,22 +83,18 @@ class PosePlanner(RemasterNode):
         self._q: FloatArray | None = None
         self.T_R_N: dict[str, FloatArray] = {}
         self.state, self.phase, self._why = 'idle', REGISTRATION, ''
-        self._registered = self._described = False
-        self._matched_wall: float | None = None
-        self._inverse = InverseKinematics(self.chain, self.cell.held(self.chain))
-        self._arm = ArmCapsules(self.chain, self.cell.link_radius_m)
+        self._registered = self._described = self._resumed = False
+        counts = {
+            'optimization': self.p.optimization_candidates,
+            'validation': self.p.validation_candidates,
+            REGISTRATION: self.p.registration_candidates,
+        }
+        margin = np.deg2rad(self.p.limit_margin_deg)
+        self._tours = TourPlanner(self.cell, self.chain, counts, self.p.seed, margin)
         self.book = PlanBook(Path(self.p.session), self._settings(), self.chain)
-        self._peers: dict[str, _Peer] = {}
-        # Stamp of each announcement of the open pose -> its solutions, in the order announced.
-        self._announced: dict[str, tuple[int, ...]] = {}
-        self._stamp, self._published_wall, self._tried_wall = '', 0.0, 0.0
-        # Which start of each peer was there to hear it.
-        self._told: dict[str, str] = {}
+        self._tried_wall = 0.0
         self._resume()
-        self._poses = self.create_publisher(PoseStamped, '/remaster/target_pose', RELIABLE)
-        self._solutions = self.create_publisher(
-            JointTrajectory, '/remaster/joint_solutions', RELIABLE
-        )
+        self._announcer = Announcer(self, self.chain)
         self._joint_states: Subscription | None = self._listen_to_the_arm()
         self.create_subscription(JointState, '/remaster/settled', self._on_settled, RELIABLE)
         self.create_subscription(
@@ -142,6 +124,7 @@ class PosePlanner(RemasterNode):
         book = self.book
         if book.tour is None:
             return
+        self._resumed = book.tour.visited > 0
         if REGISTRATION not in book.tour.plans:
             self.phase = 'collection'
         if book.lost:
@@ -170,8 +153,7 @@ class PosePlanner(RemasterNode):
         if self.state in ('complete', 'failed'):
             response.message = f'the collection is {self.state}: {self._why or "start anew"}'
             return response
-        recorder = self._peers.get('recorder')
-        if recorder is not None and recorder.values.get('exit_status') == 'complete':
+        if self._announcer.says('recorder', 'exit_status') == 'complete':
             response.message = "the recorder's session is complete; give it a new folder"
             return response
         if self.state != 'running' and self._joint_states is None:
@@ -191,9 +173,7 @@ class PosePlanner(RemasterNode):
 
     def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Any:
         self._set_state('stopped')
-        self._solutions.publish(JointTrajectory(joint_names=list(self.chain.joint_names)))
-        # Whoever goes on announces what is left of the pose again.
-        self._stamp = ''
+        self._announcer.stop()
         response.success, response.message = True, 'stopped'
         return response
 
@@ -234,12 +214,13 @@ class PosePlanner(RemasterNode):
             ('recorder', 'configuration'),
             ('robot_bridge', 'failed'),
         )
-        ids = self._announced.get(event.values.get('stamp', '')) if final else None
+        ids = self._announcer.ids(event.values.get('stamp', '')) if final else None
         if ids is None or self.book.stop is None:
             return
         solution = ids[int(event.values['solution'])]
         result = event.values.get('result', 'failed')
-        if event.values['stamp'] != self._stamp and result not in ('recorded', 'partial'):
+        outdated = event.values['stamp'] != self._announcer.stamp
+        if outdated and result not in ('recorded', 'partial'):
             # It was announced again meanwhile, and will be visited again.
             return
         if solution in self.book.stop.ids:
@@ -249,9 +230,7 @@ class PosePlanner(RemasterNode):
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
         self._clearance.on_summary(node, message, values)
-        if node not in PEERS:
-            return
-        self._peers[node] = _Peer(time.monotonic(), values)
+        self._announcer.hear(node, values)
         stop = self.book.stop
         if node != 'recorder' or stop is None or self.state in ('complete', 'failed'):
             return
@@ -261,7 +240,7 @@ class PosePlanner(RemasterNode):
             for solution in map(int, solutions.split()):
                 if pose == str(stop.pose) and solution in stop.ids:
                     self.book.outcome(solution, 'recorded')
-                    self._stamp = ''
+                    self._announcer.stamp = ''
 
     # The tour
 
@@ -278,7 +257,7 @@ class PosePlanner(RemasterNode):
             self._check_session()
             stop = self.book.stop
             if stop is not None and stop.ids:
-                if self._is_lost():
+                if self._announcer.is_lost():
                     self._publish(stop)
                 return
             stop = self._next_stop(self._q)
@@ -287,7 +266,7 @@ class PosePlanner(RemasterNode):
             self.get_logger().error(str(error))
             return
         if stop is not None:
-            self._announced, self._stamp = {}, ''
+            self._announcer.close()
             self.book.open_stop(stop)
             if not self.book.trouble:
                 self._publish(stop)
@@ -304,49 +283,31 @@ class PosePlanner(RemasterNode):
 
     def _check_session(self) -> None:
         """Refuse to add another plan's poses to a session."""
-        values = self._peers['recorder'].values
-        theirs = values.get('plan', '')
-        if theirs not in ('', self.book.id) and values.get('observations') != '0':
+        theirs = self._announcer.says('recorder', 'plan')
+        observations = self._announcer.says('recorder', 'observations')
+        if theirs not in ('', self.book.id) and observations != '0':
+            session = self._announcer.says('recorder', 'session')
             raise InputError(
-                f'the session {values.get("session")} holds observations of another plan than '
+                f'the session {session} holds observations of another plan than '
                 f'{self.book.path}; give the planner the same session folder as the recorder, or '
                 'begin a new session'
             )
 
-    def _is_lost(self) -> bool:
-        """Whether the open pose is to be announced (again): somebody does not know it."""
-        if not self._stamp:
-            return True
-        if self._peers['recorder'].values.get('state') == 'measuring':
-            return False
-        missed_wall = self._published_wall + ANNOUNCE_WALL_S
-        return any(
-            peer.values.get('pose') != self._stamp
-            and (peer.values.get('started') != self._told[node] or peer.heard_wall > missed_wall)
-            for node, peer in self._peers.items()
-        )
-
     def _heard(self) -> bool:
-        """Whether bridge and recorder are there for the next pose; DDS takes its time to match."""
+        """Whether clock, bridge and recorder are there for the next pose."""
         if self.clock_trouble:
             self._why = self.clock_trouble
             return False
-        if self._solutions.get_subscription_count() >= 2 and len(self._peers) == len(PEERS):
-            if self._matched_wall is None:
-                self._matched_wall = time.monotonic()
-            # The other side of a match comes a little later than ours.
-            if time.monotonic() - self._matched_wall > 0.5:
-                self._why = ''
-                return True
-        else:
-            self._matched_wall = None
-            self._why = 'waiting for robot_bridge and recorder'
-        return False
+        matched = self._announcer.matched()
+        self._why = '' if matched else 'waiting for robot_bridge and recorder'
+        return matched
 
     def _is_cleared(self) -> bool:
         """Whether the preflight has been passed, once, before the first motion."""
         if not self._cleared:
-            findings = self._clearance.findings(seen_before=bool(self.T_R_N))
+            # No pose was begun before a preflight was passed.
+            seen_before = self._resumed or bool(self.T_R_N)
+            findings = self._clearance.findings(seen_before=seen_before)
             self._cleared = not findings
             self._why = f'preflight: {"; ".join(findings)}' if findings else ''
         return self._cleared
@@ -355,7 +316,7 @@ class PosePlanner(RemasterNode):
         if self.phase == REGISTRATION:
             return self._next_registration(q)
         if self.book.tour is None or REGISTRATION in self.book.tour.plans:
-            self.book.begin(self._plan_collection())
+            self.book.begin(self._tours.collection(self.T_R_N))
         assert self.book.tour is not None
         stop = self.book.tour.next(q)
         if stop is None:
@@ -372,85 +333,23 @@ class PosePlanner(RemasterNode):
             # The recorder said so; its transforms are on their way.
             return None
         if self.book.tour is None:
-            aim = np.array(self.cell.sensors[self.cell.aim_at].rough_position_m)
-            rough = {n: np.array(s.rough_position_m) for n, s in self.cell.sensors.items()}
-            plan = self._plan(REGISTRATION, self.p.registration_candidates, aim, rough)
-            markers = [np.array(self.cell.markers[s.marker]) for s in self.cell.sensors.values()]
-            self.book.begin(registration_tour(self.chain, plan, markers))
+            self.book.begin(self._tours.registration())
         assert self.book.tour is not None
         stop = self.book.tour.next(q)
         if stop is None:
             raise InsufficientDataError(
                 f'no registration of {", ".join(missing)} after {self.book.tour.visited} poses '
-                f'({self._peers["recorder"].values.get("registration")}); the recorder counts why '
+                f'({self._announcer.says("recorder", "registration")}); the recorder counts why '
                 'readings were rejected'
             )
         return stop
 
-    def _plan(
-        self, split: str, count: int, aim: FloatArray, sensors_R: dict[str, FloatArray]
-    ) -> Plan:
-        """Plan poses that face `aim` and that every sensor sees; positions in R, m, (3,)."""
-        # Each split has its own draws: the same plan, whatever was planned before a restart.
-        rng = np.random.default_rng([self.p.seed, *split.encode()])
-        sights = self.cell.lines_of_sight(sensors_R)
-        candidates = candidate_poses(count, self.cell.poses.ranges(), aim, rng)
-        margin = np.deg2rad(self.p.limit_margin_deg)
-        return plan_poses(self._inverse, self._arm, candidates, sights, margin)
-
-    def _plan_collection(self) -> Tour:
-        sensors = {name: T[:3, 3] for name, T in self.T_R_N.items()}
-        # A sensor that is not required may have no registration.
-        rough = np.array(self.cell.sensors[self.cell.aim_at].rough_position_m)
-        aim = sensors.get(self.cell.aim_at, rough)
-        counts = {
-            'optimization': self.p.optimization_candidates,
-            'validation': self.p.validation_candidates,
-        }
-        plans = {
-            split: self._plan(split, count, aim, sensors)
-            for split, count in counts.items()
-            if count
-        }
-        tour = Tour(self.chain, plans)
-        if not plans['optimization'].poses:
-            raise InsufficientDataError(f'{tour.describe()}: no pose is left to fit on')
-        return tour
-
     def _publish(self, stop: Stop) -> None:
-        stamp = self.get_clock().now().to_msg()
-        self._stamp, self._published_wall = stamp_key(stamp), time.monotonic()
-        self._announced[self._stamp] = stop.ids
-        self._told = {n: peer.values.get('started', '') for n, peer in self._peers.items()}
         tour = self.book.tour
         if tour is not None and self.phase != REGISTRATION and not self._described:
             self._described = True
             self.status.event('planned', tour.describe())
-        # The event goes first: the recorder must know the pose before the arm gets there.
-        self.status.event(
-            'pose',
-            f'pose {stop.pose} ({stop.split}): {len(stop.solutions)} solutions',
-            stamp=self._stamp,
-            pose=stop.pose,
-            split=stop.split,
-            solutions=len(stop.solutions),
-            ids=' '.join(map(str, stop.ids)),
-            plan=self.book.id,
-        )
-        pose = PoseStamped()
-        pose.header.stamp, pose.header.frame_id = stamp, self.chain.base_link
-        position, orientation = pose.pose.position, pose.pose.orientation
-        position.x, position.y, position.z = map(float, stop.T_R_T[:3, 3])
-        quaternion = transforms.quaternion_xyzw(stop.T_R_T[:3, :3])
-        orientation.x, orientation.y, orientation.z, orientation.w = map(float, quaternion)
-        self._poses.publish(pose)
-        message = JointTrajectory(joint_names=list(self.chain.joint_names))
-        message.header = pose.header
-        message.points = [
-            JointTrajectoryPoint(positions=q.tolist(), time_from_start=duration_of(i + 1.0))
-            for i, q in enumerate(stop.solutions)
-        ]
-        self._solutions.publish(message)
+        self._announcer.announce(stop, self.book.id, self.status)
 
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
         tour, outcomes = self.book.tour, self.book.outcomes

@@ -56,17 +56,22 @@ class Cell:
             own['fake_laser_tracker'] = {'world': folder / 'world', 'port': tracker}
             own['laser_tracker_markers'] = {'port': tracker}
         common = ROOT / 'config' / 'fake.yaml'
-        self.nodes = {
+
+        def begin(name):
             # By the node's name, which in the file counts more than none.
-            name: start(
-                f'remaster_ros.nodes.{name}',
-                *node_arguments(common, **{f'{name}:{key}': v for key, v in values.items()}),
-            )
-            for name, values in own.items()
-        }
+            values = {f'{name}:{key}': value for key, value in own[name].items()}
+            return start(f'remaster_ros.nodes.{name}', *node_arguments(common, **values))
+
+        self._begin = begin
+        self.nodes = {name: begin(name) for name in own}
         self.until(lambda: self.said.get('pose_planner', {}).get('robot') == 'heard', 'the robot')
         response = call(client, '/remaster/collect')
         assert response.success, response.message
+
+    def kill_and_start(self, name):
+        self.nodes[name].kill()
+        self.nodes[name].wait()
+        self.nodes[name] = self._begin(name)
 
     def _summary(self, node, message, values):
         self.said[node], self.messages[node] = values, message
@@ -162,6 +167,21 @@ def test_any_sensor_is_enough(start, client, tmp_path):
     cell.check(session)
     assert set(session.measurements.sensor.tolist()) == {0, 1}
     assert session.measurements.sensor[-1] == 1
+
+
+def test_a_collection_goes_on_where_the_tracker_does_not_see_its_marker(start, client, tmp_path):
+    """Planner and recorder die before the registration is complete, and the beam is broken.
+
+    Only the next pose can show the marker again: a preflight that waits for it waits for ever.
+    """
+    cell = Cell(start, client, tmp_path, 'all', ['mocap', 'tracker'])
+    cell.until(lambda: cell.results.count('recorded') == 1, 'the first registration pose')
+    inject(tmp_path / 'world', {'tracker': {'search_fails': 1}})
+    cell.kill_and_start('recorder')
+    cell.kill_and_start('pose_planner')
+    cell.until(lambda: 'partial' in cell.results, 'the next pose')
+    inject(tmp_path / 'world', {})
+    cell.check(cell.complete())
 
 
 def test_a_settled_arm_is_read_though_its_pose_is_heard_of_later(start, client, tmp_path):
