@@ -80,8 +80,10 @@ class WrongArm:
         self._stops.append(end)
         self._times.append(end_s)
         self._moves.append((start_s, end_s, before, self._deviation()))
-        # Nobody asks for times long gone.
+        # Nobody asks for times long gone; where nothing is wrong they leave no trace either.
         del self._moves[:-16]
+        if not self._effects:
+            del self._stops[:-2], self._times[:-2]
 
     def deviation(self, t: float) -> Deviation:
         """What is wrong at a time, one row."""
