@@ -345,6 +345,7 @@ class Visitor:
         """Say what becomes of the configuration that the arm is on its way to."""
         detector, rules, wall_s = visit.detector, self.rules, seen.wall
         under_way_s = seen.time - visit.sent
+        reacted = wall_s - visit.sent_wall > rules.reaction_s
         arrived = under_way_s > visit.move.duration_s + PROBE_WAIT_S
         settled = detector.update(seen.stamp, seen.q) == 'settled'
         if (arrived or settled) and np.array_equal(seen.q, visit.move.end):
@@ -363,7 +364,6 @@ class Visitor:
             return [Settled(visit.solution, seen.stamp, detector.mean, motion_s, settle_s)]
         distance = float(np.max(np.abs(seen.q - visit.move.end)))
         stood_s = min(seen.time - seen.stands_since, under_way_s)
-        reacted = wall_s - visit.sent_wall > rules.reaction_s
         if distance > rules.settle.arrive_tolerance and stood_s >= rules.stall_s and reacted:
             return self._stalled(visit, seen, distance)
         if seen.time > visit.deadline:
