@@ -185,7 +185,7 @@ class Visitor:
         # Why the arm must not move, by the word of each; '' if it may.
         self._words: dict[str, str] = {}
         self._failures = 0
-        self._probed = False
+        self._must_probe = True
         self._seen: _Seen | None = None
         self._begin(())
 
@@ -314,7 +314,7 @@ class Visitor:
             assert seen is not None
             target = self._solutions[self._next]
             outside = self.limits.outside(target)
-            if not self._probed:
+            if self._must_probe:
                 actions.append(self._drive(PROBE, self._probe(seen.q), wall_s))
             elif outside:
                 actions.append(Failed(self._next, outside))
@@ -353,7 +353,7 @@ class Visitor:
             return self._halt(f'{why}; switch the driver to measured positions', wall_s)
         if visit.solution == PROBE:
             if arrived:
-                self._visit, self._probed = None, True
+                self._visit, self._must_probe = None, False
             return []
         if settled:
             assert detector.still_since is not None

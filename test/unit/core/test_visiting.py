@@ -23,7 +23,7 @@ class Rig:
     `alter` changes what the arm reports, `obey` what becomes of a trajectory.
     """
 
-    def __init__(self, rules=RULES, wall_s=1000.0):
+    def __init__(self, rules=RULES, wall_s=1000.0, begun=True):
         self.visitor = Visitor(LIMITS, rules)
         self.t, self.wall = 50.0, wall_s
         self.arm = servo.Motion(self.t, HOME)
@@ -36,6 +36,8 @@ class Rig:
         self.stamp_shift = 0.0
         self.rate = 1.0
         self.spoken = -np.inf
+        if not begun:
+            return
         # The first move is the probe; then the arm settles where it stands.
         self.plan(HOME)
         self.run(10.0, lambda: self.said(Settled))
@@ -477,6 +479,14 @@ def test_an_arm_that_arrives_elsewhere_gives_up_this_configuration(rig, beside):
     rig.run(20.0, lambda: rig.said(Settled))
     assert rig.last(Settled).solution == 1
     assert not rig.said(Halted)
+
+
+def test_the_first_failures_of_all_are_counted_from_none():
+    rig = Rig(begun=False)
+    rig.alter = lambda t, q: np.add(q, [0.02, 0.0]) if rig.visitor.busy else q
+    rig.plan([0.5, 0.5], [0.2, 0.2], [0.4, 0.4], [0.1, 0.1])
+    rig.run(40.0, lambda: rig.said(Halted))
+    assert [f.solution for f in rig.said(Failed)] == [0, 1]
 
 
 def test_three_failures_in_a_row_halt_and_the_third_is_not_lost(rig):
