@@ -293,17 +293,16 @@ class Visitor:
 
     def _look(self, stamp_s: float, q: FloatArray, wall_s: float) -> _Seen:
         """Follow robot time, speed and standstill; a gap begins them anew."""
-        last = self._seen
-        if last is None:
-            return _Seen(q, q - q, stamp_s, wall_s, stamp_s, q, stamp_s)
-        passed = stamp_s - last.stamp
-        time = last.time + min(max(passed, 0.0), LONGEST_STEP_S)
-        if not 0.0 < passed <= LONGEST_STEP_S:
-            return _Seen(q, q - q, stamp_s, wall_s, time, q, time)
-        velocity = (q - last.q) / passed
-        if np.any(np.abs(q - last.stands_at) > self.rules.settle.still_tolerance):
-            return _Seen(q, velocity, stamp_s, wall_s, time, q, time)
-        return _Seen(q, velocity, stamp_s, wall_s, time, last.stands_at, last.stands_since)
+        last, time = self._seen, stamp_s
+        if last is not None:
+            passed = stamp_s - last.stamp
+            time = last.time + min(max(passed, 0.0), LONGEST_STEP_S)
+            if 0.0 < passed <= LONGEST_STEP_S:
+                velocity = (q - last.q) / passed
+                moved = np.abs(q - last.stands_at) > self.rules.settle.still_tolerance
+                stands = (q, time) if np.any(moved) else (last.stands_at, last.stands_since)
+                return _Seen(q, velocity, stamp_s, wall_s, time, *stands)
+        return _Seen(q, q - q, stamp_s, wall_s, time, q, time)
 
     def _go_on(self, wall_s: float) -> list[Action]:
         """Command the next solution of the pose, if the arm stands."""
