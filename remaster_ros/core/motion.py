@@ -17,6 +17,8 @@ BRAKE_S = 0.25
 STANDSTILL_S = 1.0
 """Within this time of a stop no joint moves faster than `STANDSTILL_RAD_S`, s."""
 STANDSTILL_RAD_S = 1e-3
+NO_CRUISE = 1.0 - 2.0**-20
+"""Ramps that take this share of the way have none between them: two waypoints need two times."""
 
 _UNKNOWN_VELOCITY = 1.0
 """Where a robot model has no velocity limit, rad/s: slow for any arm."""
@@ -65,7 +67,7 @@ class Move:
         way = self.end - self.start
         velocity, ramp = self.speed * way, 0.5 * RAMP_S * self.speed * way
         points = [Waypoint(RAMP_S, self.start + ramp, velocity)]
-        if self.cruise_s > 1e-6:
+        if self.speed * RAMP_S < NO_CRUISE:
             points.append(Waypoint(RAMP_S + self.cruise_s, self.end - ramp, velocity))
         points.append(Waypoint(self.duration_s, self.end, np.zeros_like(way)))
         return tuple(points)

@@ -34,6 +34,18 @@ class SettleRules:
     max_gap_s: float = 0.5
 
 
+@dataclass(frozen=True)
+class _Standstill:
+    """Reports between which no joint moved: first and last stamp (s), range and sum (rad)."""
+
+    since: float
+    last: float
+    low: FloatArray
+    high: FloatArray
+    total: FloatArray
+    count: int
+
+
 class SettleDetector:
     """Judge from reported joint positions whether the arm stands still at its target.
 
@@ -50,13 +62,8 @@ class SettleDetector:
     """
 
     def __init__(self, target: FloatArray, rules: SettleRules) -> None:
-        self.target = np.asarray(target, float)
-        self.rules = rules
-        self.still_since: float | None = None
-        self.last_stamp: float | None = None
-        self._low = self._high = self.target
-        self._sum = np.zeros_like(self.target)
-        self._count = 0
+        self.target, self.rules = target, rules
+        self._still: _Standstill | None = None
 
     def update(self, stamp: float, q: FloatArray) -> SettleState:
         """Take one report and return the state.
@@ -68,34 +75,32 @@ class SettleDetector:
         q
             Reported joint positions in the order of the target, rad, (k,).
         """
-        backwards_or_gap = self.last_stamp is not None and not (
-            0.0 <= stamp - self.last_stamp <= self.rules.max_gap_s
-        )
-        self.last_stamp = stamp
         if not np.all(np.isfinite(q)):
-            self.still_since = None
+            self._still = None
             return 'moving'
-        low, high = np.minimum(self._low, q), np.maximum(self._high, q)
-        if (
-            self.still_since is None
-            or backwards_or_gap
-            or np.any(high - low > self.rules.still_tolerance)
-        ):
-            self.still_since = stamp
-            low = high = np.array(q, float)
-            self._sum = np.zeros_like(low)
-            self._count = 0
-        self._low, self._high = low, high
-        self._sum = self._sum + q
-        self._count += 1
-        if stamp == self.still_since:
-            return 'moving'
-        waited = stamp - self.still_since >= self.rules.settle_s
+        still = self._still = self._goes_on(stamp, q) or _Standstill(stamp, stamp, q, q, q, 1)
+        waited = stamp - still.since >= self.rules.settle_s
         if np.max(np.abs(q - self.target)) > self.rules.arrive_tolerance:
             return 'elsewhere' if waited else 'moving'
         return 'settled' if waited else 'settling'
 
+    def _goes_on(self, stamp: float, q: FloatArray) -> _Standstill | None:
+        """Return the standstill with another report; None if it has ended, or was not seen."""
+        still = self._still
+        if still is None or not 0.0 <= stamp - still.last <= self.rules.max_gap_s:
+            return None
+        low, high = np.minimum(still.low, q), np.maximum(still.high, q)
+        if np.any(high - low > self.rules.still_tolerance):
+            return None
+        return _Standstill(still.since, stamp, low, high, still.total + q, still.count + 1)
+
+    @property
+    def still_since(self) -> float | None:
+        """Stamp of the first report of the standstill, s; None if there is none."""
+        return None if self._still is None else self._still.since
+
     @property
     def mean(self) -> FloatArray:
         """Mean reported position since the arm stands still, rad, (k,)."""
-        return self._sum / max(self._count, 1)
+        assert self._still is not None
+        return self._still.total / self._still.count

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
 
-from remaster_ros.core.motion import BRAKE_S, RAMP_S, MotionLimits, Move
+from remaster_ros.core.motion import BRAKE_S, NO_CRUISE, RAMP_S, MotionLimits, Move
 
 LIMITS = MotionLimits(
     ('a', 'b'), np.array([-1.0, -2.0]), np.array([1.0, 2.0]), np.array([0.5, 1.0])
@@ -77,6 +77,13 @@ def sample(start, points, t):
     v = [np.zeros_like(start), *(point.velocity for point in points)]
     curve = CubicHermiteSpline(times, q, v)
     return curve(t), curve(t, 1), curve(t, 2)
+
+
+@pytest.mark.parametrize(('share', 'count'), [(1.0, 2), (NO_CRUISE, 2), (1.0 - 2.0**-19, 3)])
+def test_two_waypoints_are_never_at_the_same_time(share, count):
+    points = Move(np.zeros(2), np.ones(2), share / RAMP_S).waypoints()
+    assert len(points) == count
+    assert np.all(np.diff([point.time_s for point in points]) > 0.0)
 
 
 def test_no_joint_exceeds_its_velocity_and_the_slowest_uses_it():

@@ -71,6 +71,60 @@ def test_not_a_number_is_no_position():
     assert times[states.index('settled')] == pytest.approx(times[51] + 3.0, abs=0.03)
 
 
+# Numbers that are exact in binary, so that a boundary is one.
+EXACT = SettleRules(
+    settle_s=1.0, arrive_tolerance=2.0**-8, still_tolerance=2.0**-12, max_gap_s=0.5
+)
+AT = np.array([0.5, -1.0])
+
+
+def states_at(stamps, beside=None):
+    """States of a new detector; beside: distance of joint 1 from the target in each report."""
+    beside = np.zeros(len(stamps)) if beside is None else np.array(beside)
+    q = AT + np.outer(beside, [1.0, 0.0])
+    return feed(SettleDetector(AT, EXACT), stamps, q)
+
+
+def test_it_has_settled_when_the_time_is_over_and_not_before():
+    assert states_at([8.0, 8.5, 8.75, 9.0]) == ['settling', 'settling', 'settling', 'settled']
+
+
+def test_elsewhere_is_said_when_the_time_is_over_and_moving_before():
+    away = 2.0**-7
+    assert states_at([8.0, 8.5, 8.75, 9.0], [away] * 4) == [
+        'moving',
+        'moving',
+        'moving',
+        'elsewhere',
+    ]
+    assert states_at([8.0], [2.0**-8]) == ['settling'], 'the tolerance itself is at the target'
+
+
+@pytest.mark.parametrize(('gap', 'state'), [(0.5, 'settled'), (0.625, 'settling')])
+def test_the_longest_gap_is_still_seen(gap, state):
+    assert states_at([8.0, 8.5, 8.5 + gap, 9.125])[-1] == state
+
+
+@pytest.mark.parametrize(('back', 'state'), [(0.0, 'settled'), (0.125, 'settling')])
+def test_two_reports_of_one_time_are_no_jump_of_the_clock(back, state):
+    assert states_at([8.0, 8.5, 8.5 - back, 8.75, 9.0])[-1] == state
+
+
+@pytest.mark.parametrize(('moved', 'state'), [(2.0**-12, 'settled'), (2.0**-11, 'settling')])
+def test_what_counts_as_still(moved, state):
+    assert states_at([8.0, 8.5, 9.0], [0.0, moved, 0.0])[-1] == state
+
+
+def test_since_when_and_where():
+    detector = SettleDetector(AT, EXACT)
+    assert detector.still_since is None
+    feed(detector, [8.0, 8.25, 8.5], [AT, AT + 2.0**-13, AT + 2.0**-12])
+    assert detector.still_since == 8.0
+    np.testing.assert_array_equal(detector.mean, AT + 2.0**-13)
+    detector.update(8.75, np.array([np.nan, 0.0]))
+    assert detector.still_since is None
+
+
 def test_the_mean_is_over_the_standstill_only():
     detector = SettleDetector(TARGET, RULES)
     feed(detector, [0.0, 0.1], [TARGET - 0.1, TARGET - 0.05])
