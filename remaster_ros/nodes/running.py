@@ -21,10 +21,16 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 
 from remaster_ros.core.errors import InsufficientDataError, RemasterError
+from remaster_ros.nodes.locking import NameLock
 
 
 class RemasterNode(Node):
-    """A node that `run` can end.
+    """A node that `run` can end, and of whose name there is one in a ROS domain.
+
+    Raises
+    ------
+    InputError
+        Another process on this computer is that node.
 
     Attributes
     ----------
@@ -36,6 +42,15 @@ class RemasterNode(Node):
 
     failure: RemasterError | None = None
     finished = False
+
+    def __init__(self, node_name: str, **options: Any) -> None:
+        super().__init__(node_name, **options)
+        self._name_lock = NameLock(self.context.get_domain_id(), self.get_fully_qualified_name())
+
+    def destroy_node(self) -> None:
+        """As in rclpy; another process may be this node from then on."""
+        super().destroy_node()
+        self._name_lock.release()
 
     # rclpy gives every endpoint an event handler that only warns of QoS mismatches, and looks at
     # each of them for every message: half of what a message costs. All endpoints here are
