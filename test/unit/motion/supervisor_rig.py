@@ -3,7 +3,14 @@
 import numpy as np
 
 from remaster_ros.fakes import motion as servo
-from remaster_ros.motion.actions import CheckPath, Drive, PathAnswer, Settled, Stop, SupervisorRules
+from remaster_ros.motion.actions import (
+    CheckPath,
+    Drive,
+    PathAnswer,
+    Settled,
+    Stop,
+    SupervisorRules,
+)
 from remaster_ros.motion.arm_supervisor import ArmSupervisor
 from remaster_ros.motion.joint_reports import JointReport, JointReports
 from remaster_ros.motion.limits import MotionLimits
