@@ -20,6 +20,7 @@ from remaster_ros.core.errors import RemasterError
 from remaster_ros.core.types import FloatArray
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.path_check import FreePath, PointSpeeds
+from remaster_ros.motion.stopping import stop_on_line
 from remaster_ros.motion.trajectory import Trajectory, Waypoint, plan_trajectory
 
 START_RAD = 2e-3
@@ -134,7 +135,9 @@ class MotionGate:
         line = trajectory.lines[index]
         # In the rest after a line both times lie past its end.
         end_s = line.duration_s
-        stop = line.stop(min(low_since_s, end_s), min(since_s, end_s), self._under_way_limits)
+        stop = stop_on_line(
+            line, min(low_since_s, end_s), min(since_s, end_s), self._under_way_limits
+        )
         self._under_way = None
         return Admitted((stop,))
 
