@@ -30,7 +30,7 @@ LONGEST_S, LONGEST_SHARE = 4.0, 6.0
 """A stop takes no longer, s; or times the stretch, where that is longer."""
 TRIED = 80
 """So many times of a stop are tried."""
-PLACES = 9
+PLACES = 33
 """On so many places of the stretch a stop is looked at, and where the speed changes besides."""
 ROUNDS = 32
 """So often the interval of ends is halved that nobody passes."""
