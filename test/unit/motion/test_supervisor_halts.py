@@ -94,7 +94,7 @@ def test_a_robot_that_stops_on_its_way(rig):
     goes_on(rig)
 
 
-@pytest.mark.parametrize('when', [0.3, 0.8, 1.6, 2.4])
+@pytest.mark.parametrize('when', [0.3, 0.8, 1.6, 2.0])
 @pytest.mark.parametrize('stop', ['paused', 'plan'])
 def test_a_stop_after_an_emergency_stop_commands_nothing(rig, when, stop):
     """The arm stands somewhere on its path; where a stop would lead it is not."""
@@ -231,6 +231,7 @@ def test_reports_that_are_not_finite(rig):
     assert not rig.said(Stop)
     assert rig.supervisor.reports.refused['not_finite'] > 20
     rig.alter = lambda t, q: q
+    rig.run(1.0)
     goes_on(rig)
 
 
@@ -438,7 +439,8 @@ def test_a_robot_that_lags_is_waited_for(rig, lag):
 
 def test_a_robot_that_leaves_its_path(rig):
     rig.obey = lambda waypoints: [
-        dataclasses.replace(p, q=p.q + [0.0, 0.2 * (i == 0)]) for i, p in enumerate(waypoints)
+        dataclasses.replace(p, q=np.add(p.q, [0.0, 0.2 * (i == 0)]))
+        for i, p in enumerate(waypoints)
     ]
     rig.plan([0.9, -0.5])
     rig.run(20.0, lambda: rig.said(Halted))
@@ -637,7 +639,7 @@ def in_contact(rig, way_out=True):
 
     def answer(request):
         if np.max(np.abs(request.start - HOME)) < 0.1:
-            points = np.array([request.start, request.start + [0.3, 0.0]])
+            points = np.array([request.start, np.add(request.start, [0.3, 0.0])])
             path = FreePath(points, way_out=True) if way_out else None
             return PathAnswer(None, 'the tool is in the floor', at_start=True, way_out=path)
         return Rig._free(request)
@@ -730,7 +732,7 @@ def test_an_emergency_stop_on_a_way_out_halts(rig):
 
 def test_a_way_out_that_the_gate_refuses_halts(rig):
     def answer(request):
-        points = np.array([request.start, request.start + [3.0, 0.0]])
+        points = np.array([request.start, np.add(request.start, [3.0, 0.0])])
         return PathAnswer(None, 'the floor', at_start=True, way_out=FreePath(points, way_out=True))
 
     rig.answer_path = answer
