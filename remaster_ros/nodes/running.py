@@ -75,8 +75,12 @@ class RemasterNode(Node):
     @property
     def clock_trouble(self) -> str:
         """Why the node's clock says nothing: a simulated one that has not been heard; ''."""
-        known = self.get_clock().now().nanoseconds > 0
-        return '' if known else 'the simulated clock has not been heard: who publishes /clock?'
+        if self.get_clock().now().nanoseconds > 0:
+            return ''
+        topic = self.resolve_topic_name('/clock')
+        inside = self.get_namespace() != '/' and topic == '/clock'
+        hint = ' (that of a fake cell in this namespace: -r /clock:=clock)' if inside else ''
+        return f'the simulated clock has not been heard: who publishes {topic}?{hint}'
 
     def close(self) -> None:
         """Finish: files closed, threads joined. Called once, before the node is destroyed."""

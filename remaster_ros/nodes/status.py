@@ -1,4 +1,4 @@
-"""/remaster/status: every node's state, counts and reasons, and the events of a configuration.
+"""remaster/status: every node's state, counts and reasons, and the events of a configuration.
 
 A DiagnosticArray carries either a node's *summary* (name = the node; published twice a second and
 at each change; what rqt_robot_monitor shows) or an *event* (name = ``node: event``), by which the
@@ -22,7 +22,7 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.rivalry import Rivalry
 
-TOPIC = '/remaster/status'
+TOPIC = 'remaster/status'
 RELIABLE = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 JOINT_STATES = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Of subscribers of joint_states: it matches reliable and best-effort publishers alike, and keeps

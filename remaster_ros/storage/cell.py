@@ -38,7 +38,8 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     marker
         The marker it follows.
     topic
-        Where its readings are published (geometry_msgs/PointStamped, sensor frame).
+        Where its readings are published (geometry_msgs/PointStamped, sensor frame); relative to
+        the nodes' namespace, unless it begins with ``/``.
     rough_position_m
         Where it stands in the robot base, roughly.
     single_shot
