@@ -145,7 +145,7 @@ def _refuse_loops(links: Iterable[str], root: str, parent_joint: Mapping[str, Ur
 
 
 def _link(element: ElementTree.Element) -> UrdfLink:
-    name = _attribute(element, 'name', 'a link')
+    name = attribute(element, 'name', 'a link')
     where = f"link '{name}'"
     inertial = element.find('inertial')
     if inertial is None:
@@ -153,25 +153,25 @@ def _link(element: ElementTree.Element) -> UrdfLink:
     mass_element = inertial.find('mass')
     if mass_element is None:
         raise InputError(f'URDF: {where} has <inertial> without <mass>')
-    mass = _number(_attribute(mass_element, 'value', where), f'the mass of {where}')
+    mass = _number(attribute(mass_element, 'value', where), f'the mass of {where}')
     if mass < 0.0:
         raise InputError(f'URDF: the mass of {where} is {mass} kg; it cannot be negative')
-    return UrdfLink(name, mass, _origin(inertial, where)[:3, 3])
+    return UrdfLink(name, mass, origin_of(inertial, where)[:3, 3])
 
 
 def _joint(element: ElementTree.Element) -> UrdfJoint:
-    name = _attribute(element, 'name', 'a joint')
+    name = attribute(element, 'name', 'a joint')
     where = f"joint '{name}'"
     ends = {}
     for end in ('parent', 'child'):
         child = element.find(end)
         if child is None:
             raise InputError(f'URDF: {where} has no <{end}>')
-        ends[end] = _attribute(child, 'link', f'<{end}> of {where}')
+        ends[end] = attribute(child, 'link', f'<{end}> of {where}')
     axis_element = element.find('axis')
     axis = np.array([1.0, 0.0, 0.0])
     if axis_element is not None:
-        axis = _triple(_attribute(axis_element, 'xyz', where), f'the axis of {where}')
+        axis = numbers(attribute(axis_element, 'xyz', where), 3, f'the axis of {where}')
     length = math.hypot(*axis)
     if not 1e-6 < length < 1e6:
         raise InputError(f'URDF: the axis of {where} has length {length:g}; give a unit vector')
@@ -182,10 +182,10 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
         limits[key] = None if written is None else _number(written, f'{key} of {where}', _NO_LIMIT)
     return UrdfJoint(
         name=name,
-        kind=_attribute(element, 'type', where),
+        kind=attribute(element, 'type', where),
         parent=ends['parent'],
         child=ends['child'],
-        origin=_origin(element, where),
+        origin=origin_of(element, where),
         axis=axis / length,
         lower=limits['lower'],
         upper=limits['upper'],
@@ -194,26 +194,30 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
     )
 
 
-def _origin(element: ElementTree.Element, where: str) -> FloatArray:
+def origin_of(element: ElementTree.Element, where: str) -> FloatArray:
+    """Return the place that ``<origin>`` gives, (4, 4); the identity where there is none."""
     origin = element.find('origin')
     if origin is None:
         return np.eye(4)
-    xyz = _triple(origin.get('xyz', '0 0 0'), f'the origin xyz of {where}')
-    rpy = _triple(origin.get('rpy', '0 0 0'), f'the origin rpy of {where}')
+    xyz = numbers(origin.get('xyz', '0 0 0'), 3, f'the origin xyz of {where}')
+    rpy = numbers(origin.get('rpy', '0 0 0'), 3, f'the origin rpy of {where}')
     return transform(matrix_from_rpy(rpy), xyz)
 
 
-def _attribute(element: ElementTree.Element, key: str, where: str) -> str:
+def attribute(element: ElementTree.Element, key: str, where: str) -> str:
+    """Return an attribute that has to be there; `where` names its place in messages."""
     value = element.get(key, '')
     if not value:
         raise InputError(f"URDF: {where} has no attribute '{key}'")
     return value
 
 
-def _triple(text: str, what: str) -> FloatArray:
+def numbers(text: str, count: int, what: str) -> FloatArray:
+    """Return so many numbers, (count,); `what` names them in messages."""
     words = text.split()
-    if len(words) != 3:
-        raise InputError(f"URDF: {what} is '{text}'; three numbers are needed")
+    if len(words) != count:
+        needed = 'three numbers are needed' if count == 3 else f'{count} is needed'
+        raise InputError(f"URDF: {what} is '{text}'; {needed}")
     return np.array([_number(word, what) for word in words])
 
 

@@ -10,13 +10,11 @@ recorder were, it announces what is left of the pose again.
 
 from __future__ import annotations
 
-import hashlib
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.subscription import Subscription
@@ -111,7 +109,7 @@ class PosePlanner(RemasterNode):
         """Return what the plan depends on."""
         p = self.p
         return {
-            'cell': hashlib.sha256(msgspec.json.encode(self.cell)).hexdigest(),
+            'cell': self.cell.fingerprint(),
             'optimization_candidates': p.optimization_candidates,
             'validation_candidates': p.validation_candidates,
             'registration_candidates': p.registration_candidates,
