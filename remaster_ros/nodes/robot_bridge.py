@@ -74,7 +74,7 @@ class RobotBridge(RemasterNode):
         offsets = self._offsets(self.chain)
         model = cell.collision_model(self.chain, None if offsets is None else KNOWN_OFFSET_RAD)
         speeds = PointSpeeds(self.chain, model.extent_points)
-        self._acceleration = cell.accelerations(self.chain)
+        self._acceleration = cell.acceleration_limits(self.chain)
         self._limits = partial(self._make_limits, offsets)
         self._halt_file = HaltFile(self.get_fully_qualified_name())
         self.supervisor = ArmSupervisor(
