@@ -222,6 +222,7 @@ class ArmSupervisor:
             return self._doubt(self.reports.trouble, wall_s)
         self._doubted_wall = None
         gap = self._gap(report)
+        self._excuse_gap(report)
         self._seen = seen = Seen.after(self._seen, report, self.rules)
         actions: list[Action] = []
         visit = self._visit
@@ -371,6 +372,14 @@ class ArmSupervisor:
         return f'the robot was not observed for {gap:.1f} s' if too_long else ''
 
     # Inside: the arm
+
+    def _excuse_gap(self, report: JointReport) -> None:
+        """Give an arm that was not seen for a while as much longer to arrive."""
+        if self._seen is None or self._visit is None:
+            return
+        gap = report.stamp_s - self._seen.stamp
+        if gap > self.rules.settle.max_gap_s:
+            self._visit.deadline += gap
 
     # Inside: the next configuration
 
