@@ -161,7 +161,7 @@ def _refuse_loops(links: Iterable[str], root: str, parent_joint: Mapping[str, Ur
 
 
 def _link(element: ElementTree.Element) -> UrdfLink:
-    name = _attribute(element, 'name', 'a link')
+    name = attribute(element, 'name', 'a link')
     where = f"link '{name}'"
     inertial = element.find('inertial')
     if inertial is None:
@@ -169,22 +169,22 @@ def _link(element: ElementTree.Element) -> UrdfLink:
     mass_element = inertial.find('mass')
     if mass_element is None:
         raise InputError(f'URDF: {where} has <inertial> without <mass>')
-    mass = _number(_attribute(mass_element, 'value', where), f'the mass of {where}')
+    mass = _number(attribute(mass_element, 'value', where), f'the mass of {where}')
     if mass < 0.0:
         raise InputError(f'URDF: the mass of {where} is {mass} kg; it cannot be negative')
-    return UrdfLink(name, mass, _origin(inertial, where)[:3, 3])
+    return UrdfLink(name, mass, origin_of(inertial, where)[:3, 3])
 
 
 def _joint(element: ElementTree.Element) -> UrdfJoint:
-    name = _attribute(element, 'name', 'a joint')
+    name = attribute(element, 'name', 'a joint')
     where = f"joint '{name}'"
     ends = {}
     for end in ('parent', 'child'):
         child = element.find(end)
         if child is None:
             raise InputError(f'URDF: {where} has no <{end}>')
-        ends[end] = _attribute(child, 'link', f'<{end}> of {where}')
-    kind = _attribute(element, 'type', where)
+        ends[end] = attribute(child, 'link', f'<{end}> of {where}')
+    kind = attribute(element, 'type', where)
     limit = element.find('limit')
     limits: dict[str, float | None] = {}
     for key in ('lower', 'upper', 'velocity'):
@@ -196,7 +196,7 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
         kind=kind,
         parent=ends['parent'],
         child=ends['child'],
-        origin=_origin(element, where),
+        origin=origin_of(element, where),
         axis=_axis(element, kind, where),
         lower=limits['lower'],
         upper=limits['upper'],
@@ -223,33 +223,37 @@ def _axis(element: ElementTree.Element, kind: str, where: str) -> FloatArray:
     # CAD exporters write an axis of 0 0 0 where there is none to move about.
     if axis_element is None or kind in ('fixed', 'floating'):
         return np.array([1.0, 0.0, 0.0])
-    axis = _triple(_attribute(axis_element, 'xyz', where), f'the axis of {where}')
+    axis = numbers(attribute(axis_element, 'xyz', where), 3, f'the axis of {where}')
     length = math.hypot(*axis)
     if not 1e-6 < length < 1e6:
         raise InputError(f'URDF: the axis of {where} has length {length:g}; give a unit vector')
     return axis / length
 
 
-def _origin(element: ElementTree.Element, where: str) -> FloatArray:
+def origin_of(element: ElementTree.Element, where: str) -> FloatArray:
+    """Return the place that ``<origin>`` gives, (4, 4); the identity where there is none."""
     origin = element.find('origin')
     if origin is None:
         return np.eye(4)
-    xyz = _triple(origin.get('xyz', '0 0 0'), f'the origin xyz of {where}')
-    rpy = _triple(origin.get('rpy', '0 0 0'), f'the origin rpy of {where}')
+    xyz = numbers(origin.get('xyz', '0 0 0'), 3, f'the origin xyz of {where}')
+    rpy = numbers(origin.get('rpy', '0 0 0'), 3, f'the origin rpy of {where}')
     return transform(matrix_from_rpy(rpy), xyz)
 
 
-def _attribute(element: ElementTree.Element, key: str, where: str) -> str:
+def attribute(element: ElementTree.Element, key: str, where: str) -> str:
+    """Return an attribute that has to be there; `where` names its place in messages."""
     value = element.get(key, '')
     if not value:
         raise InputError(f"URDF: {where} has no attribute '{key}'")
     return value
 
 
-def _triple(text: str, what: str) -> FloatArray:
+def numbers(text: str, count: int, what: str) -> FloatArray:
+    """Return so many numbers, (count,); `what` names them in messages."""
     words = text.split()
-    if len(words) != 3:
-        raise InputError(f"URDF: {what} is '{text}'; three numbers are needed")
+    if len(words) != count:
+        needed = 'three numbers are needed' if count == 3 else f'{count} is needed'
+        raise InputError(f"URDF: {what} is '{text}'; {needed}")
     return np.array([_number(word, what) for word in words])
 
 

@@ -63,7 +63,9 @@ class BagRecorder:
             self._writer = BagWriter(self._folder)
         # First in each file, so that a replay forgets the reading that was under way before it.
         status = DiagnosticStatus(name=f'{self._node.get_name()}: {BEGAN}', message=BEGAN)
-        self._write(TOPIC, STATUS_TYPE, serialize_message(DiagnosticArray(status=[status])))
+        self._write(
+            name_in_bag(TOPIC), STATUS_TYPE, serialize_message(DiagnosticArray(status=[status]))
+        )
 
     def _write(self, topic: str, type_name: str, data: bytes) -> None:
         if self._writer is None:
@@ -80,13 +82,18 @@ class BagRecorder:
         receive: Callable[[Any], None] | None = None,
         qos: QoSProfile = DEEP,
     ) -> None:
-        """Record `topic`; call `receive` with each decoded message, if given."""
+        """Record `topic`; call `receive` with each decoded message, if given.
+
+        In the bag it has the name without this node's namespace, and as if it was not remapped: a
+        bag can be replayed in any namespace.
+        """
         module = kind.__module__.split('.')[0]
         type_name = f'{module}/msg/{kind.__name__}'
+        name = name_in_bag(topic)
 
         def take(data: bytes) -> None:
             # Raw, because serialising again can leave uninitialised bytes behind the message.
-            self._write(topic, type_name, data)
+            self._write(name, type_name, data)
             if receive is not None:
                 receive(deserialize_message(data, kind))
 
@@ -96,10 +103,10 @@ class BagRecorder:
         """Record the topics that the recorder itself has no use for."""
         if self._folder is None:
             return
-        self.subscribe(PoseStamped, '/remaster/target_pose')
-        self.subscribe(TransformStamped, '/remaster/registration', qos=LATCHED)
-        self.subscribe(JointState, '/remaster/joint_offsets', qos=LATCHED)
-        self.subscribe(JointState, '/remaster/joint_offsets_std', qos=LATCHED)
+        self.subscribe(PoseStamped, 'remaster/target_pose')
+        self.subscribe(TransformStamped, 'remaster/registration', qos=LATCHED)
+        self.subscribe(JointState, 'remaster/joint_offsets', qos=LATCHED)
+        self.subscribe(JointState, 'remaster/joint_offsets_std', qos=LATCHED)
 
     def close(self) -> None:
         """Close the bag; messages that come later are not recorded.
@@ -112,6 +119,11 @@ class BagRecorder:
                 writer.close()
             except DiskError as error:
                 self._node.get_logger().warning(f'{error}; `remaster recover` finishes the bag')
+
+
+def name_in_bag(topic: str) -> str:
+    """Return the name in bags of a topic as this package's code names it, relative or not."""
+    return f'/{topic.lstrip("/")}'
 
 
 def _free(folder: Path) -> Path:

@@ -68,12 +68,12 @@ class Optimizer(RemasterNode):
         self.p = declare(self, Parameters)
         self._state, self._ending = 'waiting', False
         self._busy = threading.Lock()
-        self._means = self.create_publisher(JointState, '/remaster/joint_offsets', LATCHED)
-        self._stds = self.create_publisher(JointState, '/remaster/joint_offsets_std', LATCHED)
+        self._means = self.create_publisher(JointState, 'remaster/joint_offsets', LATCHED)
+        self._stds = self.create_publisher(JointState, 'remaster/joint_offsets_std', LATCHED)
         # Groups of their own: status and clock go on while a fit takes its seconds.
         for service, work in (
-            ('/remaster/fit', self._fit),
-            ('/remaster/discover', self._discover),
+            ('remaster/fit', self._fit),
+            ('remaster/discover', self._discover),
         ):
             serve = partial(self._serve, work)
             group = MutuallyExclusiveCallbackGroup()

@@ -10,13 +10,11 @@ recorder were, it announces what is left of the pose again.
 
 from __future__ import annotations
 
-import hashlib
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.subscription import Subscription
@@ -31,7 +29,7 @@ from remaster_ros.nodes.clearance import Clearance
 from remaster_ros.nodes.messages import JointOrder, transform_array
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import LATCHED, RELIABLE, Event, Status, listen
+from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, Event, Status, listen
 from remaster_ros.nodes.touring import TourPlanner
 from remaster_ros.storage.cell import read_cell
 from remaster_ros.storage.plan_book import PlanBook
@@ -96,12 +94,12 @@ class PosePlanner(RemasterNode):
         self._resume()
         self._announcer = Announcer(self, self.chain)
         self._joint_states: Subscription | None = self._listen_to_the_arm()
-        self.create_subscription(JointState, '/remaster/settled', self._on_settled, RELIABLE)
+        self.create_subscription(JointState, 'remaster/settled', self._on_settled, RELIABLE)
         self.create_subscription(
-            TransformStamped, '/remaster/registration', self._on_registration, LATCHED
+            TransformStamped, 'remaster/registration', self._on_registration, LATCHED
         )
         for name in ('collect', 'pause', 'stop'):
-            self.create_service(Trigger, f'/remaster/{name}', getattr(self, f'_on_{name}'))
+            self.create_service(Trigger, f'remaster/{name}', getattr(self, f'_on_{name}'))
         self.status = Status(self, self._summary)
         self._clearance, self._cleared = Clearance(self, self.cell), False
         listen(self, self._on_event, self._on_summary)
@@ -111,7 +109,7 @@ class PosePlanner(RemasterNode):
         """Return what the plan depends on."""
         p = self.p
         return {
-            'cell': hashlib.sha256(msgspec.json.encode(self.cell)).hexdigest(),
+            'cell': self.cell.fingerprint(),
             'optimization_candidates': p.optimization_candidates,
             'validation_candidates': p.validation_candidates,
             'registration_candidates': p.registration_candidates,
@@ -186,7 +184,7 @@ class PosePlanner(RemasterNode):
 
     def _listen_to_the_arm(self) -> Subscription:
         return self.create_subscription(
-            JointState, '/joint_states', self._on_joint_state, RELIABLE
+            JointState, 'joint_states', self._on_joint_state, JOINT_STATES
         )
 
     def _on_joint_state(self, message: JointState) -> None:

@@ -39,8 +39,8 @@ from remaster_ros.nodes.recorder_parameters import Parameters, sensor_rules
 from remaster_ros.nodes.registering import Registrar
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.shots import Shots
+from remaster_ros.nodes.status import JOINT_STATES, Event, Status, receiver
 from remaster_ros.nodes.status import TOPIC as STATUS
-from remaster_ros.nodes.status import Event, Status, receiver
 from remaster_ros.storage.cell import read_cell
 from remaster_ros.storage.logbook import Logbook
 from remaster_ros.storage.session_writer import ExitStatus
@@ -117,7 +117,7 @@ class Recorder(RemasterNode):
         recording = self.p.bag and not self.logbook.closed
         self._bag = BagRecorder(self, folder / 'bag' if recording else None)
         self._subscribe()
-        self.create_service(Trigger, '/remaster/register', self._on_register)
+        self.create_service(Trigger, 'remaster/register', self._on_register)
         self.status = Status(self, self._summary)
         for note in (*self.logbook.notes, *self._bag.notes):
             self.get_logger().warning(note)
@@ -127,11 +127,11 @@ class Recorder(RemasterNode):
     def _subscribe(self) -> None:
         """Take each topic once, raw: into the bag as it came, then decoded."""
         bag = self._bag
-        bag.subscribe(JointState, '/joint_states', self._on_joint_state)
-        bag.subscribe(JointState, '/remaster/settled', self._on_settled)
+        bag.subscribe(JointState, 'joint_states', self._on_joint_state, JOINT_STATES)
+        bag.subscribe(JointState, 'remaster/settled', self._on_settled)
         announcements = self._announcements
-        bag.subscribe(JointTrajectory, '/remaster/joint_solutions', announcements.hear_solutions)
-        bag.subscribe(JointTrajectory, '/joint_trajectory_controller/joint_trajectory')
+        bag.subscribe(JointTrajectory, 'remaster/joint_solutions', announcements.hear_solutions)
+        bag.subscribe(JointTrajectory, 'joint_trajectory_controller/joint_trajectory')
         clients = {}
         for name, sensor in self.cell.sensors.items():
             bag.subscribe(PointStamped, sensor.topic, self._on_point(name))

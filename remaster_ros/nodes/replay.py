@@ -19,6 +19,8 @@ from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.storage.bag import LATCHED_TOPICS, BagReader
 
+CLOCK = '/clock'
+
 
 @dataclass(frozen=True)
 class Parameters:
@@ -45,13 +47,13 @@ class Replay(RemasterNode):
         self._reader = BagReader(folder / 'bag' if (folder / 'bag').is_dir() else folder)
         self._publishers_by_topic: dict[str, Publisher] = {}
         self._clock_publisher = (
-            self.create_publisher(ClockMessage, '/clock', 10) if self.p.publish_clock else None
+            self.create_publisher(ClockMessage, 'clock', 10) if self.p.publish_clock else None
         )
         self._ending = threading.Event()
         self._clock_sent = 0.0
         self.sent = 0
         for topic, type_name in self._reader.topics.items():
-            if topic != '/clock' or self._clock_publisher is None:
+            if topic != CLOCK or self._clock_publisher is None:
                 self._publishers_by_topic[topic] = self._publisher(topic, type_name)
         self._thread = threading.Thread(target=self._play, daemon=True)
         self._thread.start()
@@ -63,7 +65,8 @@ class Replay(RemasterNode):
             reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        return self.create_publisher(message_class(type_name), topic, qos)
+        # Relative: bags have names without a namespace.
+        return self.create_publisher(message_class(type_name), topic.lstrip('/'), qos)
 
     def _play(self) -> None:
         try:
@@ -81,6 +84,9 @@ class Replay(RemasterNode):
             self._ending.wait(1.0)
             return
         deadline = time.monotonic() + self.p.wait_s
+        publisher = self._publishers_by_topic.get(f'/{topic.lstrip("/")}')
+        # A topic of the bag is meant as the bag names it, whatever the namespace here.
+        topic = topic if publisher is None else publisher.topic_name
         while not self._ending.is_set() and self.count_subscribers(topic) == 0:
             if time.monotonic() > deadline:
                 raise InputError(f'replay: nobody subscribed to {topic} in {self.p.wait_s:g} s')

@@ -27,13 +27,19 @@ from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from remaster_ros.core.errors import InsufficientDataError, RemasterError
+from remaster_ros.nodes.locking import NameLock
 
 TRACEBACK = 'REMASTER_TRACEBACK'
 """Environment variable: also print where in this program a fault came from."""
 
 
 class RemasterNode(Node):
-    """A node that `run` can end.
+    """A node that `run` can end, and of whose name there is one in a ROS domain.
+
+    Raises
+    ------
+    InputError
+        Another process on this computer is that node.
 
     Attributes
     ----------
@@ -50,6 +56,15 @@ class RemasterNode(Node):
     failure: RemasterError | None = None
     finished = False
     outlives_faults = False
+
+    def __init__(self, node_name: str, **options: Any) -> None:
+        super().__init__(node_name, **options)
+        self._name_lock = NameLock(self.context.get_domain_id(), self.get_fully_qualified_name())
+
+    def destroy_node(self) -> None:
+        """As in rclpy; another process may be this node from then on."""
+        super().destroy_node()
+        self._name_lock.release()
 
     # rclpy gives every endpoint an event handler that only warns of QoS mismatches, and looks at
     # each of them for every message: half of what a message costs. All endpoints here are
@@ -98,8 +113,12 @@ class RemasterNode(Node):
     @property
     def clock_trouble(self) -> str:
         """Why the node's clock says nothing: a simulated one that has not been heard; ''."""
-        known = self.get_clock().now().nanoseconds > 0
-        return '' if known else 'the simulated clock has not been heard: who publishes /clock?'
+        if self.get_clock().now().nanoseconds > 0:
+            return ''
+        topic = self.resolve_topic_name('/clock')
+        inside = self.get_namespace() != '/' and topic == '/clock'
+        hint = ' (that of a fake cell in this namespace: -r /clock:=clock)' if inside else ''
+        return f'the simulated clock has not been heard: who publishes {topic}?{hint}'
 
     def close(self) -> None:
         """Finish: files closed, threads joined. Called once, before the node is destroyed."""

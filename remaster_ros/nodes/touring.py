@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.collision import ArmCapsules
 from remaster_ros.core.errors import InsufficientDataError
 from remaster_ros.core.inverse import InverseKinematics
 from remaster_ros.core.planning import Plan, candidate_poses, plan_poses
@@ -42,7 +41,7 @@ class TourPlanner:
         self._cell, self._chain = cell, chain
         self._counts, self._seed, self._margin = counts, seed, limit_margin
         self._inverse = InverseKinematics(chain, cell.held(chain))
-        self._arm = ArmCapsules(chain, cell.link_radius_m)
+        self._arm = cell.collision_model(chain)
 
     def registration(self) -> Tour:
         """Plan poses for the three-point registration, before sensors that stand somewhere."""
