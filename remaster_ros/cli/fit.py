@@ -103,6 +103,15 @@ def summary(result: FitResult) -> str:
             if sides['before'] and sides['after']:
                 before, after = sides['before']['mean_mm'], sides['after']['mean_mm']
                 lines.append(f'{split}, {metric}: {before:.3f} mm before, {after:.3f} mm after')
+    for check in result.noise_checks:
+        left = f'{1e3 * check.error_m:.3f} mm that are left'
+        if check.noise_error_m is None:
+            lines.append(f'{check.sensor}: nothing tells how much of the {left} is noise')
+        elif not check.explained:
+            lines.append(
+                f'{check.sensor}: noise ({1e3 * check.noise_error_m:.3f} mm) does not explain the '
+                f'{left}: other errors dominate; run "remaster discover"'
+            )
     lines.append(result.sampler.message)
     if result.left_out:
         rows = ', '.join(str(observation) for observation, _ in result.left_out)

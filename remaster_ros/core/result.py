@@ -13,6 +13,7 @@ from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.estimate import Problem
 from remaster_ros.core.gauge import Gauge, GaugeDirection
 from remaster_ros.core.model import Model
+from remaster_ros.core.noise_check import NoiseCheck, check_noise
 from remaster_ros.core.rows import Rows
 from remaster_ros.core.sampler_info import SamplerInfo
 from remaster_ros.core.theoretical import Predictive
@@ -87,6 +88,8 @@ class FitResult:
         The three metrics as fit.json has them.
     left_out
         (observation, reason) of every gross error.
+    noise_checks
+        Of every sensor: is what the fit leaves what noise explains?
     theta_names, theta_units
         Of the extension's m parameters; empty without one.
     theta, theta_std
@@ -121,6 +124,7 @@ class FitResult:
     residuals_after: FloatArray
     accuracy: Mapping[str, Any]
     left_out: tuple[tuple[int, str], ...]
+    noise_checks: tuple[NoiseCheck, ...]
     theta_names: tuple[str, ...]
     theta_units: tuple[str, ...]
     theta: FloatArray
@@ -231,6 +235,7 @@ def build_result(
     sensors, markers = problem.sensor_names, problem.marker_names
     marker_draws = model.markers(x_draws)
     left_rows = np.array([row for row, _ in sampled.left_out], dtype=np.int64)
+    residuals_after = measurements.position - predicted_after
     return FitResult(
         session=problem.session,
         chain=problem.chain,
@@ -264,9 +269,16 @@ def build_result(
         T_R_N_before=dict(zip(sensors, model.T_R_N(x_before), strict=True)),
         marker_positions_before=dict(zip(markers, model.markers(x_before), strict=True)),
         residuals_before=measurements.position - predicted_before,
-        residuals_after=measurements.position - predicted_after,
+        residuals_after=residuals_after,
         accuracy=_accuracy(problem, sampled, predicted_before, predicted_after, left_rows, rng),
         left_out=tuple((int(measurements.observation[row]), why) for row, why in sampled.left_out),
+        noise_checks=check_noise(
+            measurements,
+            sensors,
+            residuals_after,
+            measurements.observation[left_rows],
+            parameters=sum(not name.startswith('noise.') for name in sampled.names),
+        ),
         theta_names=model.extension.names if model.extension is not None else (),
         theta_units=model.extension.units if model.extension is not None else (),
         theta=model.theta(sampled.z_mean),
