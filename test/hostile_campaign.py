@@ -15,7 +15,7 @@ from hostile_outcomes import Outcome
 from hostile_scene import HOME, begin, bench_of, demo_body, target
 
 HALT_WITHIN_S = 4.0
-"""A halt that is not shown so long after the injection was not made, s: see `hostile_scene.FAST`."""
+"""A halt not shown so long after the injection was not made, s: see `hostile_scene.FAST`."""
 
 
 class Campaign:
