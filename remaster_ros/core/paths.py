@@ -73,6 +73,12 @@ def free_path(
     return None if grown is None else search.shortened(grown, rng)
 
 
+def is_straight_free(model: CollisionModel, start: FloatArray, end: FloatArray) -> bool:
+    """Whether the straight way is free, with the reserve where the start has it too."""
+    extra = RESERVE_M if model.free_mask(start[None], RESERVE_M)[0] else 0.0
+    return not model.path_trouble(np.array([start, end]), extra)
+
+
 def _intermediates(
     model: CollisionModel, start: FloatArray, end: FloatArray, hints: Sequence[FloatArray]
 ) -> Iterator[list[FloatArray]]:

@@ -11,6 +11,7 @@ recorder were, it announces what is left of the pose again.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,9 +31,9 @@ from remaster_ros.nodes.messages import JointOrder, transform_array
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, Event, Status, listen
-from remaster_ros.nodes.touring import TourPlanner
+from remaster_ros.nodes.touring import Background, TourPlanner
 from remaster_ros.storage.cell import read_cell
-from remaster_ros.storage.plan_book import PlanBook
+from remaster_ros.storage.plan_book import NO_FREE_PATH, PlanBook
 
 RETRY_WALL_S = 1.0
 """How often a full disk is tried again, wall time."""
@@ -89,7 +90,9 @@ class PosePlanner(RemasterNode):
         }
         margin = np.deg2rad(self.p.limit_margin_deg)
         self._tours = TourPlanner(self.cell, self.chain, counts, self.p.seed, margin)
-        self.book = PlanBook(Path(self.p.session), self._settings(), self.chain)
+        self._background = Background()
+        model = self._tours.model
+        self.book = PlanBook(Path(self.p.session), self._settings(), self.chain, model)
         self._tried_wall = 0.0
         self._resume()
         self._announcer = Announcer(self, self.chain)
@@ -256,7 +259,7 @@ class PosePlanner(RemasterNode):
             stop = self.book.stop
             if stop is not None and stop.ids:
                 if self._announcer.is_lost():
-                    self._publish(stop)
+                    self._go_on(stop, self._q)
                 return
             stop = self._next_stop(self._q)
         except RemasterError as error:
@@ -266,8 +269,33 @@ class PosePlanner(RemasterNode):
         if stop is not None:
             self._announcer.close()
             self.book.open_stop(stop)
-            if not self.book.trouble:
+            if stop.ids and not self.book.trouble:
                 self._publish(stop)
+
+    def _go_on(self, stop: Stop, q: FloatArray) -> None:
+        """Announce what is left of a stop, by ways that begin where the arm stands now."""
+        tour = self.book.tour
+        assert tour is not None
+        what = (tour, stop.split, stop.pose, stop.ids)
+        found = self._background.ask(what, q, lambda: tour.reroute(stop, q))
+        if found is not None:
+            self.book.reroute(found[0])
+            if found[0].ids and not self.book.trouble:
+                self._publish(found[0])
+
+    def _propose(self, q: FloatArray) -> tuple[Stop | None] | None:
+        """Return the next stop in a tuple, None in it at the end; None while it is planned."""
+        tour = self.book.tour
+        assert tour is not None
+        self._why = ''
+        standing = self._tours.model.trouble(q)
+        if standing:
+            self._why = f'the arm stands too near to something: {standing}; free it first'
+            return None
+        found = self._background.ask((tour, tour.visited), q, lambda: tour.propose(q))
+        if found is None or found[0] is None:
+            return found
+        return (tour.take(found[0]),)
 
     def _is_written(self) -> bool:
         """Whether the disk takes what it did not take before; looked at once a second."""
@@ -314,12 +342,15 @@ class PosePlanner(RemasterNode):
         if self.phase == REGISTRATION:
             return self._next_registration(q)
         if self.book.tour is None or REGISTRATION in self.book.tour.plans:
-            self.book.begin(self._tours.collection(self.T_R_N))
-        assert self.book.tour is not None
-        stop = self.book.tour.next(q)
-        if stop is None:
+            T_R_N = dict(self.T_R_N)
+            planned = self._background.ask('plan', q, lambda: self._tours.collection(T_R_N))
+            if planned is None:
+                return None
+            self.book.begin(planned[0])
+        proposed = self._propose(q)
+        if proposed == (None,):
             self._set_state('complete')
-        return stop
+        return None if proposed is None else proposed[0]
 
     def _next_registration(self, q: FloatArray) -> Stop | None:
         """Visit poses until the recorder has registered every sensor."""
@@ -331,16 +362,19 @@ class PosePlanner(RemasterNode):
             # The recorder said so; its transforms are on their way.
             return None
         if self.book.tour is None:
-            self.book.begin(self._tours.registration())
-        assert self.book.tour is not None
-        stop = self.book.tour.next(q)
-        if stop is None:
+            planned = self._background.ask('register', q, self._tours.registration)
+            if planned is None:
+                return None
+            self.book.begin(planned[0])
+        proposed = self._propose(q)
+        if proposed == (None,):
+            assert self.book.tour is not None
             raise InsufficientDataError(
                 f'no registration of {", ".join(missing)} after {self.book.tour.visited} poses '
                 f'({self._announcer.says("recorder", "registration")}); the recorder counts why '
                 'readings were rejected'
             )
-        return stop
+        return None if proposed is None else proposed[0]
 
     def _publish(self, stop: Stop) -> None:
         tour = self.book.tour
@@ -353,6 +387,9 @@ class PosePlanner(RemasterNode):
         tour, outcomes = self.book.tour, self.book.outcomes
         full = f'waiting for room on the disk: {self.book.trouble}' if self.book.trouble else ''
         dropped = tour.dropped if tour and self.phase != REGISTRATION else {}
+        collecting = tour is not None and self.phase != REGISTRATION
+        solutions = Counter(tour.dropped_solutions if tour and collecting else {})
+        solutions['no free path'] = outcomes[NO_FREE_PATH]
         values = {
             'state': 'held' if full and self.state == 'running' else self.state,
             'phase': self.phase,
@@ -364,6 +401,7 @@ class PosePlanner(RemasterNode):
             'plan': self.book.id,
             **{f'outcome_{name}': count for name, count in sorted(outcomes.items())},
             **{f'dropped_{name}': count for name, count in sorted(dropped.items())},
+            **{f'dropped_solutions_{name}': n for name, n in sorted(solutions.items())},
         }
         why = full or self._why
         level = 'error' if self.state == 'failed' else 'warn' if why else 'ok'
