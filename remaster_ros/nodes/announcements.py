@@ -146,38 +146,3 @@ class Announcements:
         if self.now is None or self._solutions is None:
             return None
         return nearest_solution(self._solutions, q)
-
-
-def waypoints_by_solution(
-    message: JointTrajectory, joint_names: Sequence[str]
-) -> dict[int, FloatArray]:
-    """Return what to go through on the way to each solution, from remaster/joint_waypoints.
-
-    Parameters
-    ----------
-    message
-        Each point's time_from_start has 1 + the number of the solution it leads to as seconds.
-    joint_names
-        The wanted order of joints.
-
-    Returns
-    -------
-    dict
-        Number of the solution -> joint positions in the order of the way, rad, (n, k).
-
-    Raises
-    ------
-    ValueError
-        A joint is missing, or a point has another number of positions.
-    """
-    names = list(message.joint_names)
-    if not message.points:
-        return {}
-    columns = [names.index(name) for name in joint_names]
-    found: dict[int, list[list[float]]] = {}
-    for point in message.points:
-        if len(point.positions) != len(names):
-            raise ValueError(f'{len(point.positions)} positions for {len(names)} joints')
-        solution = point.time_from_start.sec - 1
-        found.setdefault(solution, []).append([point.positions[c] for c in columns])
-    return {solution: np.array(points) for solution, points in found.items()}

@@ -31,7 +31,7 @@ EXECUTABLES = {
     'demo',
 }
 # Modules whose distribution has another name.
-DISTRIBUTION = {'yaml': 'pyyaml', 'markupsafe': 'jinja2', 'zstandard': 'mcap'}
+DISTRIBUTION = {'yaml': 'pyyaml', 'markupsafe': 'jinja2', 'zstandard': 'mcap', 'lz4': 'mcap'}
 # Brought by rclpy itself, as wheel and as Debian package.
 WITH_RCLPY = {'rcl_interfaces'}
 
