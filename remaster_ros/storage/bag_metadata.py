@@ -12,7 +12,7 @@ METADATA_FILE = 'metadata.yaml'
 # rosbag2 writes an empty bag's start, and QoS "for ever", as these.
 _NEVER_NS = 2**63 - 1
 LATCHED_DEPTH = 10
-"""How many messages of a latched topic a late joiner gets, as the nodes' own publishers have it."""
+"""How many messages of a latched topic a late joiner gets: as the nodes' publishers have it."""
 _FOREVER = {'sec': 9223372036, 'nsec': 854775807}
 
 
