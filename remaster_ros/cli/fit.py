@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import time
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from remaster_ros.core.fit import (
 from remaster_ros.storage.priors import read_priors
 from remaster_ros.storage.results import prepare_folder, save_fit
 from remaster_ros.storage.session import read_session
+
+log = logging.getLogger('remaster_ros')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,6 +81,8 @@ def run(args: argparse.Namespace) -> int:
         )
         progress('writing', 0.0)
         report = save_fit(result, args.out, figures=not args.no_figures)
+    for line in result.implausible:
+        log.warning('%s', line)
     say(args.quiet, summary(result))
     say(args.quiet, f'written: {report}')
     return 0

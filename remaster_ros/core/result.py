@@ -22,6 +22,9 @@ from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Session
 
 # An offset that a prior tells counts as known up to so many times what the data leave the others.
 AS_GOOD_AS_SEEN = 2.0
+# A mastering is off by tenths of a degree. More is a joint that has lost it, or joints, signs or a
+# robot model that are not those of the arm that was measured.
+LARGEST_OFFSET = np.radians(5.0)
 # Of an angle that nothing is known of: uniform over the turn.
 UNKNOWN_STD = np.pi / np.sqrt(3.0)
 
@@ -130,6 +133,19 @@ class FitResult:
     theta: FloatArray
     theta_std: FloatArray
     theta_draws: FloatArray
+
+    @property
+    def implausible(self) -> tuple[str, ...]:
+        """A line for each joint whose offset is told, and too large for one of mastering."""
+        return tuple(
+            f'{joint}: an offset of {np.degrees(offset):.2f} degrees is more than a mastering is '
+            f'off by ({np.degrees(LARGEST_OFFSET):.0f}); before it is used, check joint order, '
+            'signs and units of the session, and that the URDF is that of this arm'
+            for joint, offset, known in zip(
+                self.joint_names, self.joint_offsets, self.identifiable, strict=True
+            )
+            if known and abs(offset) > LARGEST_OFFSET
+        )
 
 
 @dataclass(frozen=True, eq=False)

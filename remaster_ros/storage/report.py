@@ -126,6 +126,10 @@ def verdict(result: FitResult) -> Verdict:
         headline = f'The offsets make it worse: the mean position error goes from {change}.'
 
     points = [_compared(check) for check in unexplained]
+    if result.implausible:
+        mood = 'bad'
+        headline += ' Do not apply the offsets yet: they are larger than a mastering is off by.'
+        points = [*result.implausible, *points]
     if not validated:
         mood = 'caution' if mood == 'good' else mood
         points.append(

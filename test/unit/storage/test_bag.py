@@ -23,7 +23,7 @@ from rosbags.typesys import Stores, get_typestore
 from remaster_ros.core.errors import DiskError, InputError
 from remaster_ros.storage import bag_writer
 from remaster_ros.storage.bag import BagReader
-from remaster_ros.storage.bag_metadata import METADATA_FILE
+from remaster_ros.storage.bag_metadata import LATCHED_DEPTH, METADATA_FILE
 from remaster_ros.storage.bag_writer import BagWriter, recover_bag
 from remaster_ros.storage.manifest import MANIFEST
 
@@ -116,10 +116,17 @@ def test_rosbags_reads_equal_values_and_the_latched_topics(bag):
             c.topic: [profile.durability.name for profile in c.ext.offered_qos_profiles]
             for c in reader.connections
         }
+        depths = {
+            c.topic: [profile.depth for profile in c.ext.offered_qos_profiles]
+            for c in reader.connections
+        }
         assert reader.message_count == 40
         assert reader.duration == 390_000_001
         assert all(c.digest == STORE.hash_rihs01(c.msgtype) for c in reader.connections)
     assert durability.pop('/remaster/joint_offsets') == ['TRANSIENT_LOCAL']
+    # Who joins a replay late gets what the node's own publisher would give: more than the last.
+    assert depths['/remaster/joint_offsets'] == [LATCHED_DEPTH]
+    assert LATCHED_DEPTH >= 2
     assert set(map(tuple, durability.values())) == {('VOLATILE',)}
 
 
