@@ -483,6 +483,10 @@ class CollisionModel:
         # At most what the bound says: the capsule around a body is wider than the body.
         return np.minimum(kept, self._most_kept[pairs])
 
+    def _extra(self, extra: float) -> FloatArray:
+        """Return what is kept on top, m, (P,): nothing where only contact counts."""
+        return np.where(self._contact_only, 0.0, extra)
+
     def _measure(self, placed: _Placed, row: int, pair: int, bound: float) -> float:
         """Return the distance of a pair, m, negative where it overlaps."""
         if self._is_exact[pair]:
@@ -507,11 +511,11 @@ class CollisionModel:
     ) -> tuple[list[Shortfall], FloatArray]:
         """Return shortfalls, and distances or lower bounds of them (n, P)."""
         bounds = self._lower_bounds(placed)
-        rows, pairs = np.nonzero(bounds < self._most_kept + extra)
+        rows, pairs = np.nonzero(bounds < self._most_kept + self._extra(extra))
         found: list[Shortfall] = []
         if not len(rows):
             return found, bounds
-        kept = self._kept(placed, rows, pairs) + extra
+        kept = self._kept(placed, rows, pairs) + self._extra(extra)[pairs]
         near = bounds[rows, pairs] < kept
         rows, pairs, kept = rows[near], pairs[near], kept[near]
         done: set[int] = set()
@@ -523,7 +527,7 @@ class CollisionModel:
             distance = self._measure(placed, row, pair, float(bounds[row, pair]))
             bounds[row, pair] = distance
             if distance < kept[n]:
-                found.append(Shortfall(row, pair, distance, float(kept[n] - extra)))
+                found.append(Shortfall(row, pair, distance, float(kept[n])))
                 done.add(row)
         return found, bounds
 
@@ -541,9 +545,7 @@ class CollisionModel:
             return found[0]
         # Where neither end of an interval excludes a pair, all of the interval is looked at.
         least = distances[:-1] + distances[1:] - np.diff(grid)[:, None] / steps * travel
-        is_open = least / 2 < self._most_kept + extra - np.where(
-            self._contact_only, 0.0, HALF_STEP_M
-        )
+        is_open = least / 2 < self._most_kept + self._extra(extra - HALF_STEP_M)
         for inside, pairs in self._openings(grid, is_open):
             found_here = self._look_closely(q[inside], pairs, travel / steps, extra)
             if found_here is not None:
@@ -573,10 +575,10 @@ class CollisionModel:
         """Check configurations next to each other (n, k), the pairs (n, P) that are open there."""
         placed = self._place(q)
         bounds = self._lower_bounds(placed)
-        rows, pairs = np.nonzero(is_open & (bounds < self._most_kept + extra))
+        rows, pairs = np.nonzero(is_open & (bounds < self._most_kept + self._extra(extra)))
         if not len(rows):
             return None
-        kept = self._kept(placed, rows, pairs) + extra
+        kept = self._kept(placed, rows, pairs) + self._extra(extra)[pairs]
         near = bounds[rows, pairs] < kept
         rows, pairs, kept = rows[near], pairs[near], kept[near]
         beyond = np.full(len(per_step), -1.0)
@@ -586,8 +588,8 @@ class CollisionModel:
                 continue
             distance = self._measure(placed, row, pair, float(bounds[row, pair]))
             if distance < kept[n]:
-                return Shortfall(row, pair, distance, float(kept[n] - extra))
+                return Shortfall(row, pair, distance, float(kept[n]))
             # So many checks further it cannot have come nearer than what is kept at most.
-            room = distance - self._most_kept[pair] - extra
+            room = distance - self._most_kept[pair] - self._extra(extra)[pair]
             beyond[pair] = row + room / max(per_step[pair], 1e-12)
         return None
