@@ -263,7 +263,7 @@ def test_neighbours_and_what_always_overlaps_are_left_out_and_named(lwr):
 
 
 def test_what_is_always_near_is_kept_from_touching_only():
-    """A collar 3 mm around the base: nearer than is kept in every configuration, and no contact."""
+    """A collar 3 mm above the base: nearer than is kept wherever it turns, and no contact."""
     chain = planar_arm(2, axis='0 0 1', limit=3.0)
     bodies = [
         Body('base', 0, cylinder(0.05, 0.1), at(0, 0, 0.05)),
