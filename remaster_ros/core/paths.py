@@ -19,7 +19,7 @@ MOST_CHECKS = 400
 """Segments checked for one path at most."""
 REACH_RAD = 0.6
 """How far a tree grows at a time, in its largest joint angle."""
-_SHORTCUTS = 25
+_SHORTCUTS = 10
 _POINT_COST = 0.2  # of looking at one configuration, in segments
 
 WAY_OUT_STEP_M = 0.004
