@@ -39,7 +39,7 @@ from remaster_ros.nodes.recorder_parameters import Parameters, sensor_rules
 from remaster_ros.nodes.registering import Registrar
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.shots import Shots
-from remaster_ros.nodes.status import JOINT_STATES, Event, Status, receiver
+from remaster_ros.nodes.status import JOINT_STATES, Event, Status, receiver, run_after
 from remaster_ros.nodes.status import TOPIC as STATUS
 from remaster_ros.storage.cell import read_cell
 from remaster_ros.storage.logbook import Logbook
@@ -108,6 +108,8 @@ class Recorder(RemasterNode):
         self._from_q: FloatArray | None = None
         self._temperatures: deque[tuple[float, float]] = deque(maxlen=500)
         self._was_waiting = False
+        # The token of the planner's run; in memory alone, so that it lives no longer than this.
+        self._run = ''
         # Settled where no announced pose has a solution (yet): joints, rad, and when.
         self._unknown: tuple[FloatArray, float] | None = None
         self._disk = Patience(lambda why: self.get_logger().error(f'the arm is held: {why}'))
@@ -205,6 +207,8 @@ class Recorder(RemasterNode):
                 values.get('started', ''),
                 hidden=values.get('fault') == 'marker',
             )
+        if node == 'pose_planner':
+            self._run = run_after(self._run, values)
         if node == 'pose_planner' and not self._busy() and not self._due:
             state = values.get('state')
             if state == 'complete':
@@ -441,6 +445,7 @@ class Recorder(RemasterNode):
             # By these the planner, or one that was started again, takes up where this one is.
             'pose': '' if pose is None else pose.stamp,
             'plan': self.logbook.plan_id,
+            'run': self._run,
             'decided': self.logbook.decided(),
             'registration': self.registrar.describe(),
             'require': self.p.require,

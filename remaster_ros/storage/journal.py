@@ -8,10 +8,8 @@ and the file is refused.
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import json
-import os
 import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -106,11 +104,6 @@ class Journal:
         """Cut off the record that was appended last; `InputError` where that is not possible."""
         self._file.truncate(self._before)
         self.records.pop()
-
-    def touch(self) -> None:
-        """Renew the file's time of change, as a sign of life; it need not last."""
-        with contextlib.suppress(OSError):
-            os.utime(self._file.descriptor)
 
     def close(self) -> None:
         """Close the file and let others open it; closing again does nothing."""
