@@ -2,6 +2,9 @@
 
 import numpy as np
 import pytest
+
+pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
+
 from hostile_arm import Command, HostileArm
 from hostile_judge import Judge, Rules, along
 from numpy.testing import assert_allclose
