@@ -11,6 +11,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
+import os
 import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
