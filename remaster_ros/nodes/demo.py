@@ -142,6 +142,9 @@ class Demo:
             self.hidden, cell, self.p.seed, self.p.rate, self.requests, self.p.candidates
         )
         self.console.print(f'hidden world drawn with seed {self.p.seed}; starting the nodes')
+        self.console.print(
+            'the fake arm moves without a Cartesian speed limit (real.yaml: 0.25 m/s)'
+        )
         self._start()
         self._wait(self._ready, 60.0, 'the nodes to come up')
         self._trigger('remaster/collect', 'pose_planner')

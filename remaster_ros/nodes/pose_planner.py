@@ -14,14 +14,13 @@ state goes out first; what the journal must remember is written afterwards.
 
 from __future__ import annotations
 
-import hashlib
 import threading
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -39,9 +38,9 @@ from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.run_token import LivingRun, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, Event, Status, listen
-from remaster_ros.nodes.touring import TourPlanner
+from remaster_ros.nodes.touring import Background, TourPlanner
 from remaster_ros.storage.cell import read_cell
-from remaster_ros.storage.plan_book import PlanBook
+from remaster_ros.storage.plan_book import NO_FREE_PATH, PlanBook
 
 RETRY_WALL_S = 1.0
 """How often a full disk is tried again, wall time."""
@@ -103,7 +102,9 @@ class PosePlanner(RemasterNode):
         }
         margin = np.deg2rad(self.p.limit_margin_deg)
         self._tours = TourPlanner(self.cell, self.chain, counts, self.p.seed, margin)
-        self.book = PlanBook(Path(self.p.session), self._settings(), self.chain)
+        self._background = Background()
+        model = self._tours.model
+        self.book = PlanBook(Path(self.p.session), self._settings(), self.chain, model)
         self._tried_wall = 0.0
         self._resume()
         self._announcer = Announcer(self, self.chain)
@@ -125,7 +126,7 @@ class PosePlanner(RemasterNode):
         """Return what the plan depends on."""
         p = self.p
         return {
-            'cell': hashlib.sha256(msgspec.json.encode(self.cell)).hexdigest(),
+            'cell': self.cell.fingerprint(),
             'optimization_candidates': p.optimization_candidates,
             'validation_candidates': p.validation_candidates,
             'registration_candidates': p.registration_candidates,
@@ -155,7 +156,7 @@ class PosePlanner(RemasterNode):
         reason = f' ({why})' if why else ''
         return f'{self._progress()}; /remaster/collect goes on{reason}'
 
-    def _go_on(self) -> None:
+    def _take_up_run(self) -> None:
         """Go on with a run that a killed planner has left, if it is certain that it still lives.
 
         Somebody may stand beside an arm that has not moved for a while.
@@ -320,7 +321,7 @@ class PosePlanner(RemasterNode):
         if run is not None:
             run.stay_alive()
         if self._left:
-            self._go_on()
+            self._take_up_run()
         self._write_state()
         if self.book.trouble and not self._is_written():
             return
@@ -333,7 +334,7 @@ class PosePlanner(RemasterNode):
             stop = self.book.stop
             if stop is not None and stop.ids:
                 if self._announcer.is_lost():
-                    self._publish(stop)
+                    self._announce_rest(stop, self._q)
                 return
             stop = self._next_stop(self._q)
         except RemasterError as error:
@@ -343,9 +344,36 @@ class PosePlanner(RemasterNode):
         if stop is not None:
             self._announcer.close()
             self.book.open_stop(stop)
-            if not self.book.trouble:
+            if stop.ids and not self.book.trouble:
                 self._publish(stop)
 
+    def _announce_rest(self, stop: Stop, q: FloatArray) -> None:
+        """Announce what is left of a stop, by ways that begin where the arm stands now."""
+        tour = self.book.tour
+        assert tour is not None
+        what = (tour, stop.split, stop.pose, stop.ids)
+        found = self._background.ask(what, q, lambda: tour.reroute(stop, q))
+        if found is not None:
+            self.book.reroute(found[0])
+            if found[0].ids and not self.book.trouble:
+                self._publish(found[0])
+
+    def _propose(self, q: FloatArray) -> tuple[Stop | None] | None:
+        """Return the next stop in a tuple, None in it at the end; None while it is planned."""
+        tour = self.book.tour
+        assert tour is not None
+        self._why = ''
+        standing = self._tours.model.trouble(q)
+        if standing:
+            # The bridge halts such an arm and offers a way out; after it the arm is elsewhere.
+            self._why = f'the arm stands too near to something: {standing}'
+            if self._joint_states is None:
+                self._joint_states = self._listen_to_the_arm()
+            return None
+        found = self._background.ask((tour, tour.visited), q, lambda: tour.propose(q))
+        if found is None or found[0] is None:
+            return found
+        return (tour.take(found[0]),)
     def _write_state(self) -> None:
         """Write down what was said; a stop or pause came in a thread that must not wait for it."""
         with self._lock:
@@ -400,12 +428,15 @@ class PosePlanner(RemasterNode):
         if self.phase == REGISTRATION:
             return self._next_registration(q)
         if self.book.tour is None or REGISTRATION in self.book.tour.plans:
-            self.book.begin(self._tours.collection(self.T_R_N))
-        assert self.book.tour is not None
-        stop = self.book.tour.next(q)
-        if stop is None:
+            T_R_N = dict(self.T_R_N)
+            planned = self._background.ask('plan', q, lambda: self._tours.collection(T_R_N))
+            if planned is None:
+                return None
+            self.book.begin(planned[0])
+        proposed = self._propose(q)
+        if proposed == (None,):
             self._set_state('complete', only_from='running')
-        return stop
+        return None if proposed is None else proposed[0]
 
     def _next_registration(self, q: FloatArray) -> Stop | None:
         """Visit poses until the recorder has registered every sensor."""
@@ -417,16 +448,19 @@ class PosePlanner(RemasterNode):
             # The recorder said so; its transforms are on their way.
             return None
         if self.book.tour is None:
-            self.book.begin(self._tours.registration())
-        assert self.book.tour is not None
-        stop = self.book.tour.next(q)
-        if stop is None:
+            planned = self._background.ask('register', q, self._tours.registration)
+            if planned is None:
+                return None
+            self.book.begin(planned[0])
+        proposed = self._propose(q)
+        if proposed == (None,):
+            assert self.book.tour is not None
             raise InsufficientDataError(
                 f'no registration of {", ".join(missing)} after {self.book.tour.visited} poses '
                 f'({self._announcer.says("recorder", "registration")}); the recorder counts why '
                 'readings were rejected'
             )
-        return stop
+        return None if proposed is None else proposed[0]
 
     def _publish(self, stop: Stop) -> None:
         tour = self.book.tour
@@ -442,6 +476,9 @@ class PosePlanner(RemasterNode):
         tour, outcomes, run = self.book.tour, dict(self.book.outcomes), self._run
         full = f'waiting for room on the disk: {self.book.trouble}' if self.book.trouble else ''
         dropped = tour.dropped if tour and self.phase != REGISTRATION else {}
+        collecting = tour is not None and self.phase != REGISTRATION
+        solutions = Counter(tour.dropped_solutions if tour and collecting else {})
+        solutions['no free path'] = outcomes[NO_FREE_PATH]
         values = {
             'state': 'held' if full and self.state == 'running' else self.state,
             'phase': self.phase,
@@ -456,6 +493,7 @@ class PosePlanner(RemasterNode):
             'resuming': 'yes' if self._left else 'no',
             **{f'outcome_{name}': count for name, count in sorted(outcomes.items())},
             **{f'dropped_{name}': count for name, count in sorted(dropped.items())},
+            **{f'dropped_solutions_{name}': n for name, n in sorted(solutions.items())},
         }
         why = full or self._why
         level = 'error' if self.state == 'failed' else 'warn' if why else 'ok'

@@ -23,6 +23,7 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.rivalry import Rivalry
+from remaster_ros.storage.bag_metadata import LATCHED_DEPTH
 
 TOPIC = 'remaster/status'
 RELIABLE = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
@@ -30,7 +31,7 @@ JOINT_STATES = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Of subscribers of joint_states: it matches reliable and best-effort publishers alike, and keeps
 what a busy node has not yet taken, seconds of the fastest stream."""
 LATCHED = QoSProfile(
-    depth=10,
+    depth=LATCHED_DEPTH,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
