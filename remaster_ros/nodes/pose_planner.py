@@ -478,7 +478,7 @@ class PosePlanner(RemasterNode):
         dropped = tour.dropped if tour and self.phase != REGISTRATION else {}
         collecting = tour is not None and self.phase != REGISTRATION
         solutions = Counter(tour.dropped_solutions if tour and collecting else {})
-        solutions['no free path'] = outcomes[NO_FREE_PATH]
+        solutions['no free path'] = outcomes.get(NO_FREE_PATH, 0)
         values = {
             'state': 'held' if full and self.state == 'running' else self.state,
             'phase': self.phase,
