@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,18 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from hostile_arm import Command, HostileArm
+from hostile_lines import (
+    COMMANDS,
+    EMERGENCY,
+    INTRUDER,
+    LATCHED,
+    LEASED,
+    RELIABLE,
+    STATUS_PERIOD_S,
+    Lines,
+    Seen,
+)
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
@@ -36,81 +46,6 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from remaster_ros.core.types import FloatArray
 
 ROOT = Path(__file__).resolve().parents[1]
-COMMANDS = '/joint_trajectory_controller/joint_trajectory'
-EMERGENCY = '/robot/emergency_stop'
-RELIABLE = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
-# Publishers that move the arm may be asked for a lease by which they are known to live.
-LEASED = QoSProfile(
-    depth=200,
-    reliability=ReliabilityPolicy.RELIABLE,
-    liveliness=LivelinessPolicy.AUTOMATIC,
-    liveliness_lease_duration=rclpy.duration.Duration(seconds=2.0),
-)
-STATUS_PERIOD_S = 0.3
-INTRUDER = 'intruder'
-
-
-@dataclass(frozen=True)
-class Lines:
-    """What happens to messages on their way, from now on; nothing by default.
-
-    Attributes
-    ----------
-    delay_s, jitter_s
-        joint_states come so much later, and by a random part of `jitter_s` more: out of order.
-    loss, double
-        Share of joint_states that is lost, or comes twice.
-    clock_s
-        The robot's clock is so much ahead.
-    stamp_noise_s
-        Standard deviation of its stamps about the time of the sample.
-    wrap
-        Added to the reported positions, rad, (k,).
-    nan
-        Index of a joint that is not a number.
-    frozen
-        The values of the first message from now on come again and again, with new stamps.
-    stopped_stamps
-        The stamp of the first message from now on comes again and again.
-    silent
-        Nothing is published.
-    command_delay_s, command_loss, command_double
-        The same for commands.
-    """
-
-    delay_s: float = 0.0
-    jitter_s: float = 0.0
-    loss: float = 0.0
-    double: float = 0.0
-    clock_s: float = 0.0
-    stamp_noise_s: float = 0.0
-    wrap: FloatArray | None = None
-    nan: int | None = None
-    frozen: bool = False
-    stopped_stamps: bool = False
-    silent: bool = False
-    command_delay_s: float = 0.0
-    command_loss: float = 0.0
-    command_double: bool = False
-
-
-@dataclass
-class Seen:
-    """What the bridge showed of itself: its summaries and events with their monotonic times."""
-
-    summaries: list[tuple[float, str, dict[str, str]]] = field(default_factory=list)
-    events: list[tuple[float, str, str, dict[str, str]]] = field(default_factory=list)
-    settled: list[tuple[float, FloatArray]] = field(default_factory=list)
-
-    def halted(self, since_s: float = 0.0) -> str:
-        """Return the reason that the newest summary gives for a halt; '' for none."""
-        newest = self.summaries[-1] if self.summaries else (-np.inf, '', {})
-        return newest[2].get('halted', '') if newest[0] >= since_s else ''
-
-    def halt_time(self, since_s: float) -> float:
-        """When a halt was first shown after `since_s`, s; infinite if never."""
-        times = (t for t, _, values in self.summaries if t >= since_s and values.get('halted'))
-        return next(times, np.inf)
 
 
 class Bench:
@@ -187,7 +122,7 @@ class Bench:
             JointTrajectory, '/remaster/joint_waypoints', LEASED
         )
         # Only where a bridge is told of it: a topic that is configured must not be silent.
-        self._emergency = node.create_publisher(Bool, EMERGENCY, RELIABLE)
+        self._emergency = node.create_publisher(Bool, EMERGENCY, LATCHED)
         node.create_subscription(JointTrajectory, COMMANDS, self._on_command, RELIABLE)
         node.create_subscription(
             JointState,
@@ -306,6 +241,13 @@ class Bench:
         future = self._clear.call_async(Trigger.Request())
         return self.until(future.done, timeout_s) and future.result().success
 
+    def on_its_way(self) -> bool:
+        """Whether the arm is in the middle of a move: one that is being stopped is not."""
+        now = time.monotonic()
+        begun = max(t for t, state in self.running_since if state == 'running')
+        newest = self.commands_since(begun)[-1:]
+        return bool(newest) and now < newest[0].end_s - 0.1 and self.arm.speed() > 0.05
+
     def gap(self) -> float:
         """Longest time since the last call in which nothing was published here, s."""
         gap, self.worst_gap_s = self.worst_gap_s, 0.0
@@ -351,7 +293,7 @@ class Bench:
             while self._due and self._due[0][0] <= now:
                 self._states.publish(heapq.heappop(self._due)[2])
             while self._due_commands and self._due_commands[0][0] <= now:
-                self._obey(heapq.heappop(self._due_commands)[2])
+                self._obey(heapq.heappop(self._due_commands)[2], foreign=True)
             if now >= next_status:
                 next_status = now + STATUS_PERIOD_S
                 self._heartbeat()
@@ -423,10 +365,14 @@ class Bench:
             if lines.command_delay_s == 0.0:
                 self._obey(message)
             else:
+                # It is judged by where the arm was when the bridge sent it.
+                self._obey(message, withheld=True)
                 due = now + lines.command_delay_s * (0.5 + self.rng.random())
                 heapq.heappush(self._due_commands, (due, next(self._numbers), message))
 
-    def _obey(self, message: JointTrajectory) -> None:
+    def _obey(
+        self, message: JointTrajectory, withheld: bool = False, foreign: bool = False
+    ) -> None:
         names = list(message.joint_names)
         columns = [names.index(name) for name in self.names]
         points = message.points
@@ -440,7 +386,7 @@ class Bench:
         q = rows('positions')
         if q is None or not len(q):
             return
-        lost = self.rng.random() < self.lines.command_loss
+        lost = withheld or self.rng.random() < self.lines.command_loss
         self.arm.take(
             time.monotonic(),
             np.array(times),
@@ -448,7 +394,7 @@ class Bench:
             rows('velocities'),
             rows('accelerations'),
             lost,
-            foreign=message.header.frame_id == INTRUDER,
+            foreign=foreign or message.header.frame_id == INTRUDER,
         )
 
     def _on_status(self, array: DiagnosticArray) -> None:

@@ -8,11 +8,12 @@ from multiprocessing import Queue, get_context
 from pathlib import Path
 
 import numpy as np
-from hostile_bench import EMERGENCY, Bench
-from hostile_injections import INJECTIONS, WITH_TOPIC, Injection, Scene, restart
+from hostile_bench import Bench
+from hostile_injections import INJECTIONS, WITH_TOPIC, Injection, restart
 from hostile_judge import GRACE_S, Body, Judge, Rules, after
+from hostile_lines import EMERGENCY
 from hostile_outcomes import Outcome
-from hostile_scene import HOME, begin, bench_of, demo_body, target
+from hostile_scene import HOME, Scene, begin, bench_of, demo_body, target
 
 HALT_WITHIN_S = 4.0
 """A halt not shown so long after the injection was not made, s: see `hostile_scene.FAST`."""
@@ -107,6 +108,8 @@ class Campaign:
         bench.emergency_shown = False
         bench.start()
         bench.until(lambda: bench.seen.summaries, 30.0)
+        # As in a cell: everything has been up for a while before the collection is begun.
+        time.sleep(3.0)
         return bench
 
     def _inject(self, bench: Bench, kind: Injection) -> Outcome:
@@ -123,7 +126,19 @@ class Campaign:
         if outcome.moved:
             scene.left_s -= scene.wait(0.0, 0.55 * left)
             self._act(kind, scene, outcome, settled)
-        outcome.note, outcome.latencies = scene.note, scene.latencies
+        else:
+            # Why not, in the bridge's own words.
+            failed = [
+                text for t, event, text, _ in bench.seen.events if t > began and event == 'failed'
+            ]
+            scene.note = '; '.join(
+                [*failed[-2:], *(text for _, text, _ in bench.seen.summaries[-1:])]
+            )
+        arm = bench.arm
+        options = [f'{1 / bench.period_s:.0f} Hz', *(('exact',) if arm.exact else ())]
+        options += ['open loop'] if arm.open_loop else []
+        outcome.note = f'({", ".join(options)}) {scene.note}'.strip()
+        outcome.latencies = scene.latencies
         outcome.gap_s = bench.gap()
         outcome.arm_share = bench.arm.fastest(began, self.rules.speed_share * self.body.velocity)
         commands = bench.commands_since(began)
@@ -171,8 +186,12 @@ class Campaign:
             restart(bench)
         if not bench.until(lambda: bench.arm.speed() < 1e-3, 10.0):
             return False
-        if bench.seen.halted() and bench.clear_halt() is False:
-            return False
+        if bench.seen.halted():
+            if bench.clear_halt() is False:
+                return False
+            # Only a collection that is begun after that goes on.
+            bench.plan_state('stopped')
+            time.sleep(0.1)
         bench.arm.history.clear()
         return bench.process is not None and bench.process.poll() is None
 

@@ -11,79 +11,16 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from hostile_bench import COMMANDS, EMERGENCY, INTRUDER, RELIABLE, STATUS_PERIOD_S, Bench
-from hostile_judge import Body
-from hostile_scene import HOME, SPREAD
+from hostile_bench import Bench
+from hostile_lines import COMMANDS, INTRUDER, RELIABLE
+from hostile_scene import ANSWER_S, HOME, SPREAD, Scene
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.core.types import FloatArray
-
-ANSWER_S = 0.5
-"""A stop that has not come after so long was not sent, s."""
-
-
-@dataclass
-class Scene:
-    """One injection under way.
-
-    Attributes
-    ----------
-    bench, body, rng
-        Where it happens.
-    solutions
-        What the planner has sent, rad, (k,) each.
-    left_s
-        How long the arm is still to move when the injection begins, s.
-    silent_from
-        From when on nothing may be commanded any more; None if that depends on the halt.
-    latencies
-        Times from a request to stop to the stop's arrival, s; infinite where none came.
-    note
-        The figures of this injection, in words.
-    """
-
-    bench: Bench
-    body: Body
-    rng: np.random.Generator
-    solutions: list[FloatArray]
-    left_s: float
-    silent_from: float | None = None
-    latencies: list[float] = field(default_factory=list)
-    note: str = ''
-
-    def wait(self, low_s: float, high_s: float) -> float:
-        """Let a random time pass; returns it, s."""
-        duration = float(self.rng.uniform(low_s, high_s))
-        time.sleep(duration)
-        return duration
-
-    def pause(self) -> None:
-        """Ask for a stop, and measure how long that takes if the arm moves."""
-        bench = self.bench
-        moving = bench.arm.speed() > 0.05
-        asked = bench.plan_state('paused')
-        answered = bench.until(lambda: bench.commands_since(asked), ANSWER_S)
-        if moving:
-            first = bench.commands_since(asked)[0].arrival_s if answered else np.inf
-            self.latencies.append(first - asked)
-
-    def maybe_pause(self, within_s: float) -> None:
-        """Ask for a stop in two of three cases, at a random moment."""
-        self.wait(0.0, within_s)
-        if self.rng.random() < 0.67:
-            self.bench.plan_state('paused')
-            self.wait(0.05, 0.4)
-            self.bench.plan_state('running')
-
-    def joint(self) -> FloatArray:
-        """Return a full turn of one random joint, rad, (k,)."""
-        out = np.zeros(len(self.bench.names))
-        out[self.rng.integers(len(out))] = self.rng.choice([-1, 1]) * 2 * np.pi
-        return out
 
 
 def control(s: Scene) -> None:
@@ -99,9 +36,10 @@ def pauses(s: Scene) -> None:
 
 
 def pose_taken_back(s: Scene) -> None:
+    moving = s.bench.on_its_way()
     asked = time.monotonic()
     s.bench.send([])
-    if s.bench.arm.speed() > 0.05:
+    if moving:
         came = s.bench.until(lambda: s.bench.commands_since(asked), ANSWER_S)
         first = s.bench.commands_since(asked)[0].arrival_s if came else np.inf
         s.latencies.append(first - asked)
@@ -447,5 +385,3 @@ WITH_TOPIC = (
     Injection(emergency_topic_blinks, 'halt'),
 )
 """Where the bridge has an emergency_stop_topic, these are drawn too."""
-
-__all__ = ['EMERGENCY', 'INJECTIONS', 'STATUS_PERIOD_S', 'WITH_TOPIC', 'Injection', 'Scene']

@@ -70,7 +70,6 @@ class Body:
         self.model = pin.buildModelFromXML(urdf)
         self._data = self.model.createData()
         self._tip = self.model.getFrameId(tip_link)
-        self._radius = radius_m
         self.lower = self.model.lowerPositionLimit.copy()
         self.upper = self.model.upperPositionLimit.copy()
         self.velocity = self.model.velocityLimit.copy()
@@ -82,6 +81,8 @@ class Body:
         self._points += [
             (i, self.model.jointPlacements[i + 1].translation.copy()) for i in range(1, last)
         ]
+        # Links have their radius about these; the tool's points are points.
+        self._radii = [radius_m] * len(self._points) + [0.0] * (1 + len(tool_points))
         self._points += [(last, tip.act(np.asarray(p, float))) for p in [(0, 0, 0), *tool_points]]
 
     def points(self, q: FloatArray) -> FloatArray:
@@ -93,7 +94,7 @@ class Body:
         """Speed of the fastest of the points, and of the surface of the links about them, m/s."""
         pin.forwardKinematics(self.model, self._data, q, v)
         fastest = surface = 0.0
-        for i, p in self._points:
+        for (i, p), radius in zip(self._points, self._radii):
             twist = self._data.v[i]
             linear, angular = twist.linear + np.cross(twist.angular, p), twist.angular
             speed = float(np.linalg.norm(linear))
@@ -102,7 +103,7 @@ class Body:
             if turning > 1e-9:
                 # A sphere's points add any vector across the axis, up to radius times turning.
                 along = float(linear @ angular) / turning
-                across = np.sqrt(max(speed**2 - along**2, 0.0)) + turning * self._radius
+                across = np.sqrt(max(speed**2 - along**2, 0.0)) + turning * radius
                 speed = float(np.hypot(across, along))
             surface = max(surface, speed)
         return fastest, surface

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from hostile_bench import RELIABLE, Bench
+from hostile_bench import Bench
 from hostile_judge import GRACE_S, Body, Judge, Rules, after
+from hostile_lines import RELIABLE
 from hostile_outcomes import Outcome
 from hostile_scene import HOME, begin, bench_of, demo_body
 from sensor_msgs.msg import JointState
@@ -182,6 +183,7 @@ def _run(
     bench.disturb(delay_s=late_s)
     bench.start()
     bench.until(lambda: bench.seen.summaries, 30.0)
+    time.sleep(3.0)
     bench.gap()
     outcome = Outcome(name, expected)
     moved = begin(bench, [END])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -77,3 +78,67 @@ def begin(bench: Bench, solutions: Sequence[FloatArray], timeout_s: float = 15.0
 def moving(bench: Bench, since_s: float) -> bool:
     """Whether the arm is on its way by a command that arrived since then."""
     return bool(bench.commands_since(since_s)) and bench.arm.speed() > 0.1
+
+
+ANSWER_S = 0.5
+"""A stop that has not come after so long was not sent, s."""
+
+
+@dataclass
+class Scene:
+    """One injection under way.
+
+    Attributes
+    ----------
+    bench, body, rng
+        Where it happens.
+    solutions
+        What the planner has sent, rad, (k,) each.
+    left_s
+        How long the arm is still to move when the injection begins, s.
+    silent_from
+        From when on nothing may be commanded any more; None if that depends on the halt.
+    latencies
+        Times from a request to stop to the stop's arrival, s; infinite where none came.
+    note
+        The figures of this injection, in words.
+    """
+
+    bench: Bench
+    body: Body
+    rng: np.random.Generator
+    solutions: list[FloatArray]
+    left_s: float
+    silent_from: float | None = None
+    latencies: list[float] = field(default_factory=list)
+    note: str = ''
+
+    def wait(self, low_s: float, high_s: float) -> float:
+        """Let a random time pass; returns it, s."""
+        duration = float(self.rng.uniform(low_s, high_s))
+        time.sleep(duration)
+        return duration
+
+    def pause(self) -> None:
+        """Ask for a stop, and measure how long that takes if the arm moves."""
+        bench = self.bench
+        moving = bench.on_its_way()
+        asked = bench.plan_state('paused')
+        answered = bench.until(lambda: bench.commands_since(asked), ANSWER_S)
+        if moving:
+            first = bench.commands_since(asked)[0].arrival_s if answered else np.inf
+            self.latencies.append(first - asked)
+
+    def maybe_pause(self, within_s: float) -> None:
+        """Ask for a stop in two of three cases, at a random moment."""
+        self.wait(0.0, within_s)
+        if self.rng.random() < 0.67:
+            self.bench.plan_state('paused')
+            self.wait(0.05, 0.4)
+            self.bench.plan_state('running')
+
+    def joint(self) -> FloatArray:
+        """Return a full turn of one random joint, rad, (k,)."""
+        out = np.zeros(len(self.bench.names))
+        out[self.rng.integers(len(out))] = self.rng.choice([-1, 1]) * 2 * np.pi
+        return out

@@ -252,10 +252,10 @@ class RobotBridge(RemasterNode):
                     self.counts['failed'] += 1
                     self._event('failed', reason, 'warn', solution=solution, reason=reason)
                 case Halted(reason):
+                    self._disk.submit(partial(self._halt_file.write, reason), self._on_written)
                     self._event('halted', reason, 'error')
                     self.status.publish()
                     self.get_logger().error(f'halted: {reason}')
-                    self._disk.submit(partial(self._halt_file.write, reason), self._on_written)
 
     def _publish(self, admitted: Admitted) -> None:
         """Publish what the gate has admitted; nothing else is ever published to a controller."""

@@ -62,7 +62,7 @@ def test_cartesian_speed_is_that_of_the_fastest_point(body):
     radius = np.max(np.hypot(points[:, 0], points[:, 1]))
     fastest, surface = body.speeds(HOME, one(0, 0.5))
     assert fastest == pytest.approx(0.5 * radius, rel=1e-9)
-    assert surface == pytest.approx(0.5 * (radius + 0.075), rel=0.02)
+    assert fastest <= surface <= 0.5 * (radius + 0.075)
     judged = Judge(body, Rules(1.0, cartesian_m_s=0.1)).judge(move(one(0, 0.6), 1.0))
     assert any('m/s' in text for text in judged.wrong(Rules(1.0, cartesian_m_s=0.1)))
 

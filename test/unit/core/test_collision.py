@@ -262,6 +262,20 @@ def test_neighbours_and_what_always_overlaps_are_left_out_and_named(lwr):
     assert ('the link of joint_3', 'the link of joint_4') not in names
 
 
+def test_what_is_always_near_is_kept_from_touching_only():
+    """A collar 3 mm above the base: nearer than is kept wherever it turns, and no contact."""
+    chain = planar_arm(2, axis='0 0 1', limit=3.0)
+    bodies = [
+        Body('base', 0, cylinder(0.05, 0.1), at(0, 0, 0.05)),
+        Body('collar', 2, cylinder(0.05, 0.1), at(0, 0, -0.6 + 0.153)),
+    ]
+    model = CollisionModel(chain, bodies, floor_z=None)
+    assert model.left_out == ('base and collar: checked for contact',)
+    q = np.random.default_rng(0).uniform(-3, 3, (50, 2))
+    assert model.free_mask(q, collision.RESERVE_M).all()
+    assert model.path_trouble(q, collision.RESERVE_M) == ''
+
+
 def test_a_tool_is_checked_against_the_link_before_its_own():
     """A hook that bends back over the last joint hits the link before it."""
     chain = planar_arm(2, limit=3.0)
