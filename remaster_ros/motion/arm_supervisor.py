@@ -225,7 +225,7 @@ class ArmSupervisor:
         self._doubted_wall = None
         gap = self._gap(report)
         self._excuse_gap(report)
-        self._seen = seen = Seen.after(self._seen, report, self.rules)
+        self._seen = seen = Seen.after(self._seen, report, self.rules, self.reports.late_s)
         actions: list[Action] = []
         visit = self._visit
         if gap:
@@ -363,14 +363,15 @@ class ArmSupervisor:
         if last is None or wall_s - last <= OWN_PAUSE_S:
             return
         pause = wall_s - last
-        self._heard = {name: heard + pause for name, heard in self._heard.items()}
+        # Who was heard since is no exception, and nobody was heard in the future.
+        self._heard = {name: min(heard + pause, wall_s) for name, heard in self._heard.items()}
 
     def _silence_s(self, name: str, wall_s: float) -> float:
         return wall_s - self._heard[name] if name in self._heard else np.inf
 
     def _gap(self, report: JointReport) -> str:
         """Return in words that the arm was not observed for long while it was to be; ''."""
-        if self._seen is None or not self._engaged:
+        if self._seen is None or not self._engaged or self.halted:
             return ''
         gap = (report.stamp_s - self._seen.stamp) / self._rate
         too_long = gap > self.rules.heartbeat_s
@@ -575,11 +576,9 @@ class ArmSupervisor:
     def _brake(self, visit: _Visit, seen: Seen, reason: str, wall_s: float) -> list[Action]:
         """Leave the rest of the line along the line."""
         self._visit, self._pending = None, None
-        low, high = visit.following.window(seen, wall_s, self._rate)
-        if low >= visit.trajectory.duration_s:
-            # It is at its end.
+        if visit.following.has_ended(seen, wall_s, self._rate):
             return []
-        admitted = self.gate.stop(low, high)
+        admitted = self.gate.stop(*visit.following.window(seen, wall_s, self._rate))
         (stop,) = admitted.waypoints
         deadline = (
             seen.now(wall_s, self._rate)

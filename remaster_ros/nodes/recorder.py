@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
 from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
@@ -122,7 +123,13 @@ class Recorder(RemasterNode):
         recording = self.p.bag and not self.logbook.closed
         self._bag = BagRecorder(self, folder / 'bag' if recording else None)
         self._subscribe()
-        self.create_service(Trigger, 'remaster/register', self._on_register)
+        # A group of its own: while it waits for the reading, what makes the reading goes on.
+        self.create_service(
+            Trigger,
+            'remaster/register',
+            self._on_register,
+            callback_group=ReentrantCallbackGroup(),
+        )
         self.status = Status(self, self._summary)
         for note in (*self.logbook.notes, *self._bag.notes):
             self.get_logger().warning(note)
