@@ -51,6 +51,8 @@ PROBE = -1
 """The number of the move before the first one."""
 WAY_OUT = -2
 """The number of a way out of a contact or a margin."""
+STANDING = -3
+"""The number of a question about where the arm stands, before it is moved at all."""
 PROBE_RAD = 1e-6
 """How far the probe goes, rad: less than the arm repeats, more than the last bit."""
 PROBE_WAIT_S = 0.5
@@ -130,7 +132,7 @@ class ArmSupervisor:
         # Why the arm must not move, by each reason's origin; '' if it may.
         self._reasons: dict[str, str] = {}
         self._failures = 0
-        self._must_probe = True
+        self._must_probe = self._must_look = True
         # Before a collection is begun (again) by a person nothing moves.
         self._must_collect = bool(halted)
         self._seen: Seen | None = None
@@ -222,6 +224,7 @@ class ArmSupervisor:
             return self._doubt(self.reports.trouble, wall_s)
         self._doubted_wall = None
         gap = self._gap(report)
+        self._excuse_gap(report)
         self._seen = seen = Seen.after(self._seen, report, self.rules, self.reports.late_s)
         actions: list[Action] = []
         visit = self._visit
@@ -246,6 +249,9 @@ class ArmSupervisor:
         solution = request[1]
         if answer.path is None and answer.at_start:
             return self._halt(self._offer(answer), wall_s)
+        if solution == STANDING:
+            self._must_look = False
+            return self.tick(wall_s)
         if answer.path is None:
             return self._give_up(solution, f'no free path: {answer.why}', wall_s)
         return self._drive(solution, answer.path, seen, wall_s)
@@ -261,7 +267,7 @@ class ArmSupervisor:
         if not self.halted:
             return 'the arm is not halted'
         self.halted, self._failures = '', 0
-        self._must_collect = self._must_probe = True
+        self._must_collect = self._must_probe = self._must_look = True
         self._way_out, self._offered = self._offered, None
         # What was not believed may be the truth now: a robot that was mastered, a clock that was
         # set. It is learned anew while the arm stands.
@@ -373,6 +379,14 @@ class ArmSupervisor:
 
     # Inside: the arm
 
+    def _excuse_gap(self, report: JointReport) -> None:
+        """Give an arm that was not seen for a while as much longer to arrive."""
+        if self._seen is None or self._visit is None:
+            return
+        gap = report.stamp_s - self._seen.stamp
+        if gap > self.rules.settle.max_gap_s:
+            self._visit.deadline += gap
+
     # Inside: the next configuration
 
     def _begin(
@@ -391,12 +405,14 @@ class ArmSupervisor:
         idle = self._visit is None and self._pending is None and self._braking is None
         if seen is None or not idle or not seen.stands(wall_s):
             return actions
+        if self._way_out is not None:
+            path, self._way_out = self._way_out, None
+            return self._drive(WAY_OUT, path, seen, wall_s)
+        if self._must_look:
+            return [self._ask(STANDING, seen.q, seen.q)]
         while self._next < len(self._solutions):
             target = self._solutions[self._next]
             outside = self.gate.limits.outside(target)
-            if self._way_out is not None:
-                path, self._way_out = self._way_out, None
-                return actions + self._drive(WAY_OUT, path, seen, wall_s)
             if self._must_probe:
                 return [*actions, self._ask(PROBE, seen.q, self._probe(seen.q))]
             if not outside:

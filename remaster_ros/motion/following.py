@@ -127,8 +127,8 @@ class Following:
         """Return why it is not known where on its path the arm is; ''."""
         if not seen.is_fresh(wall_s):
             return f'the last report of the joints is {wall_s - seen.wall:.1f} s old'
-        if self._lag_s > self._allowed_s:
-            return 'the arm has not begun to move'
+        if self._lag_s > self._allowed_s and not self._astray:
+            return 'the arm is not seen to move yet'
         return self._astray
 
     def window(self, seen: Seen, wall_s: float, rate: float) -> tuple[float, float]:

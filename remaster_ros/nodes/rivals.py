@@ -3,8 +3,8 @@
 The graph lists the publishers of a killed process for some 20 s more. Those with a liveliness
 lease (ours have one) are told from the living by the lease: where several are listed, a
 subscription that asks for the lease counts those that are alive. Publishers without one count as
-long as they are listed: a driver that was killed is gone for good, or was started again, and then a
-person has to look at the arm anyway.
+long as they are listed: a driver that was killed is gone for good, or was started again, and then
+a person has to look at the arm anyway.
 """
 
 from __future__ import annotations

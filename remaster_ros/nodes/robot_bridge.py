@@ -74,7 +74,7 @@ class RobotBridge(RemasterNode):
         offsets = self._offsets(self.chain)
         model = cell.collision_model(self.chain, None if offsets is None else KNOWN_OFFSET_RAD)
         speeds = PointSpeeds(self.chain, model.extent_points)
-        self._acceleration = cell.accelerations(self.chain)
+        self._acceleration = cell.acceleration_limits(self.chain)
         self._limits = partial(self._make_limits, offsets)
         self._halt_file = HaltFile(self.get_fully_qualified_name())
         self.supervisor = ArmSupervisor(
@@ -252,10 +252,10 @@ class RobotBridge(RemasterNode):
                     self.counts['failed'] += 1
                     self._event('failed', reason, 'warn', solution=solution, reason=reason)
                 case Halted(reason):
+                    self._disk.submit(partial(self._halt_file.write, reason), self._on_written)
                     self._event('halted', reason, 'error')
                     self.status.publish()
                     self.get_logger().error(f'halted: {reason}')
-                    self._disk.submit(partial(self._halt_file.write, reason), self._on_written)
 
     def _publish(self, admitted: Admitted) -> None:
         """Publish what the gate has admitted; nothing else is ever published to a controller."""
