@@ -101,7 +101,7 @@ setup(
             *JUDGES,
         ],
         # What the benchmarks compare with; figaroh and pybotics get environments of their own.
-        # PyBullet has no wheels beyond Python 3.11; without it the paths of its iiwa are not judged.
+        # PyBullet has wheels up to Python 3.11; without it the paths of its iiwa are not judged.
         'bench': [
             'emcee>=3.1',
             'numpyro>=0.15',
