@@ -59,7 +59,7 @@ setup(
     packages=[*find_packages(include=[NAME, f'{NAME}.*']), f'{NAME}.config'],
     package_dir={f'{NAME}.config': 'config'},
     package_data={
-        f'{NAME}.config': ['*.yaml', '*.rviz', 'robots/*', 'cells/*'],
+        f'{NAME}.config': ['*.yaml', '*.rviz', 'robots/*', 'cells/*', 'sros2/*'],
         f'{NAME}.storage': ['*.jinja'],
     },
     data_files=[

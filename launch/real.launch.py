@@ -58,6 +58,8 @@ def generate_launch_description():
                     name=name,
                     parameters=[params],
                     remappings=remappings,
+                    # Of config/sros2/policy.xml; without ROS_SECURITY_ENABLE it has no effect.
+                    ros_arguments=['--enclave', f'/remaster/{name}'],
                     output='screen',
                     respawn=True,
                     respawn_delay=1.0,

@@ -364,6 +364,7 @@ class NatNetClientTarget:
         )
         self.client._server_ip = self.SERVER
         self.client._command = None
+        self.client._lock.source = (self.SERVER, 1510)
         self.client._data = self._data = DatagramSource()  # type: ignore[assignment]
         self._answers = DatagramSource()
         self.samples = self.strangers = self._number = self._fed = 0

@@ -25,6 +25,8 @@ from remaster_ros.core.types import BoolArray, FloatArray, IntArray
 
 # Directions of the offsets model below this share of the largest are its gauge.
 ROUNDING = 1e-8
+# Bytes of displacements that are kept for the next fit; only those of large sessions are more.
+KEPT_BYTES = 1 << 28
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,11 +171,16 @@ class Residuals:
 
     def columns(self, cells: Sequence[Cell]) -> FloatArray:
         """Return what a unit of each parameter displaces in every row of the session."""
-        for cell in cells:
-            if cell not in self._displacements:
-                self._displacements[cell] = cell.columns(self.scene).displacement(self.scene)
-        parts = [self._displacements[cell] for cell in cells]
+        parts = [self._displacement(cell) for cell in cells]
         return np.concatenate([np.zeros((len(self.scene), 3, 0)), *parts], axis=2)
+
+    def _displacement(self, cell: Cell) -> FloatArray:
+        kept = self._displacements
+        if cell not in kept:
+            kept[cell] = cell.columns(self.scene).displacement(self.scene)
+            while len(kept) > 1 and sum(values.nbytes for values in kept.values()) > KEPT_BYTES:
+                del kept[next(iter(kept))]
+        return kept[cell]
 
     def unexplained(self, fit: Fit) -> FloatArray:
         """Return what a fit leaves of the errors in every row of the session, m, (all rows, 3)."""

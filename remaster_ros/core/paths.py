@@ -240,7 +240,7 @@ def way_out(
     for _ in range(WAY_OUT_STEPS):
         short = model.shortfalls(q[None])
         if not short:
-            path = np.array(way)
+            path = _fewest_lines(model, np.array(way))
             return path if not model.escape_trouble(path) else None
         pairs = np.array([each.pair for each in short])
         before = np.array([each.distance for each in short])
@@ -271,3 +271,17 @@ def way_out(
         q = steps[best]
         way.append(q)
     return None
+
+
+def _fewest_lines(model: CollisionModel, way: FloatArray) -> FloatArray:
+    """Leave out points of a way out, (n, k): the arm comes to rest at each that is kept."""
+    kept, here, last = [way[0]], 0, len(way) - 1
+    while here < last:
+        there = last
+        while there > here + 1 and model.escape_trouble(
+            way[[here, there]], ends_free=there == last
+        ):
+            there = here + (there - here) // 2
+        kept.append(way[there])
+        here = there
+    return np.array(kept)

@@ -27,6 +27,7 @@ from remaster_ros.drivers.natnet_sockets import (
     open_socket,
     port_is_closed,
 )
+from remaster_ros.drivers.natnet_source import Source
 from remaster_ros.protocols import natnet
 from remaster_ros.protocols.natnet import Message, MessageId, ProtocolError, ServerInfo
 from remaster_ros.protocols.natnet_frames import BITSTREAM_CHANGED, MODEL_LIST_CHANGED, Frame
@@ -55,6 +56,7 @@ MALFORMED_IN_A_ROW = 3
 """Then the version has probably changed, and the server is asked."""
 NEGOTIATION_TRIES = 4
 MAX_DATAGRAM_BYTES = 1 << 16
+_FRAME_ID = MessageId.FRAMEOFDATA.to_bytes(2, 'little')
 
 
 class NatNetClient(MarkerFollower):
@@ -89,8 +91,8 @@ class NatNetClient(MarkerFollower):
         self._negotiation_tries = 0
         self._malformed_in_a_row = 0
         self._bitstream_changed = False
-        # Received and not yet decoded: datagram, arrival, whether it came to the data socket.
-        self._backlog: deque[tuple[bytes, float, bool]] = deque()
+        # Received and not yet decoded: datagram, arrival, sender, whether to the data socket.
+        self._backlog: deque[tuple[bytes, float, Source, bool]] = deque()
         self._backlog_bytes = 0
         self._due = dict.fromkeys(('connect', 'model', 'keepalive', 'bitstream'), 0.0)
 
@@ -124,6 +126,7 @@ class NatNetClient(MarkerFollower):
                 if opened is not None:
                     selector.register(opened, selectors.EVENT_READ)
             while not self._stopping.is_set():
+                self._greet = self._release_silent_source() or self._greet
                 self._keep_in_touch(time.monotonic())
                 for key, _ in selector.select(0.0 if self._backlog else POLL_S):
                     self._receive(key.fileobj)  # type: ignore[arg-type]
@@ -182,7 +185,7 @@ class NatNetClient(MarkerFollower):
         """
         for _ in range(DATAGRAMS_PER_TURN):
             try:
-                datagram, (address, _port) = source.recvfrom(MAX_DATAGRAM_BYTES)
+                datagram, sender = source.recvfrom(MAX_DATAGRAM_BYTES)
             except BlockingIOError:
                 return
             except OSError as error:
@@ -190,25 +193,38 @@ class NatNetClient(MarkerFollower):
                 self._stopping.wait(POLL_S)
                 return
             received_s = self._clock()
-            if self._is_foreign(address):
+            if self._is_foreign(sender[0]):
                 continue
             if self._backlog_bytes + len(datagram) > MAX_BACKLOG_BYTES:
                 self._gate.drop(Dropped.OVERRUN)
                 continue
             self._backlog_bytes += len(datagram)
-            self._backlog.append((datagram, received_s, source is self._data))
+            self._backlog.append((datagram, received_s, sender, source is self._data))
 
     def _digest_backlog(self) -> None:
         until = time.monotonic() + DIGEST_S
         while self._backlog:
-            datagram, received_s, from_data_socket = self._backlog.popleft()
+            datagram, received_s, sender, from_data_socket = self._backlog.popleft()
             self._backlog_bytes -= len(datagram)
-            self._digest(datagram, received_s, from_data_socket=from_data_socket)
+            self._digest(datagram, received_s, sender, from_data_socket=from_data_socket)
             if time.monotonic() >= until:
                 return
 
-    def _digest(self, datagram: bytes, received_s: float, *, from_data_socket: bool) -> None:
-        """Decode one datagram and act on it."""
+    def _digest(
+        self, datagram: bytes, received_s: float, sender: Source, *, from_data_socket: bool
+    ) -> None:
+        """Decode one datagram and act on it.
+
+        Frames are believed from one source; answers from the port that was asked, as whoever
+        else sends on that computer could name another version or another marker.
+        """
+        looks_like_frame = datagram[:2] == _FRAME_ID
+        answers = not from_data_socket and sender[1] == self._settings.command_port
+        if not (answers and not looks_like_frame) and self._is_refused(sender):
+            return
+        if not (answers or looks_like_frame or from_data_socket):
+            self._gate.drop(Dropped.FOREIGN)
+            return
         try:
             message_id, _payload = natnet.split_datagram(datagram)
             is_frame = message_id == MessageId.FRAMEOFDATA
@@ -224,11 +240,14 @@ class NatNetClient(MarkerFollower):
             self._greet = self._greet or self._malformed_in_a_row >= MALFORMED_IN_A_ROW
             return
         if isinstance(message, Frame):
-            self._take_frame(message, received_s)
+            self._take_frame(message, received_s, sender)
         else:
             self._take_answer(message)
 
-    def _take_frame(self, frame: Frame, received_s: float) -> None:
+    def _take_frame(self, frame: Frame, received_s: float, sender: Source) -> None:
+        sample = self._take_whole_frame(frame, received_s, sender)
+        if sender != self._lock.source:
+            return
         self._malformed_in_a_row = 0
         bitstream_changed = bool(frame.params & BITSTREAM_CHANGED)
         if bitstream_changed and not self._bitstream_changed:
@@ -236,7 +255,6 @@ class NatNetClient(MarkerFollower):
         self._bitstream_changed = bitstream_changed
         if frame.params & MODEL_LIST_CHANGED:
             self._model_wanted = True
-        sample = self._take_whole_frame(frame, received_s)
         if sample is not None:
             self._hand_on(sample)
 
@@ -257,6 +275,7 @@ class NatNetClient(MarkerFollower):
 
     def _take_server(self, server: ServerInfo) -> None:
         self._server = server
+        self._lock.answer()
         self._port_closed = False
         self._malformed_in_a_row = 0
         self._greet = False

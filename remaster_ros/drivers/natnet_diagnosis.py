@@ -122,6 +122,14 @@ class StreamStatus:
         See `MarkerGate`.
     foreign
         Addresses that sent something and are not the server (the first few).
+    source
+        Address and port whose frames are believed; '' while there is none.
+    sources_taken
+        How often it was decided whose frames are believed.
+    rivals
+        Other ports of the server's address that sent lately, beside the believed one; refused.
+    contestants
+        Sources of which none is believed, as they send at the same time.
     last_malformed
         What was wrong with the last datagram that could not be decoded; ''.
     problem
@@ -151,6 +159,10 @@ class StreamStatus:
     problem: str
     marker_id: int | None
     labels: tuple[int, ...]
+    source: str = ''
+    sources_taken: int = 0
+    rivals: tuple[str, ...] = ()
+    contestants: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -177,6 +189,8 @@ def diagnose(status: StreamStatus, settings: NatNetSettings) -> Diagnosis:
             f'the server at {status.server_ip} streams a bitstream that cannot be read: {error}; '
             f'change it in Motive, or in unicast set bitstream to 4.1',
         )
+    if status.contestants:
+        return Diagnosis('address', _contest(status))
     if status.silent_s is None or status.silent_s > settings.silence_s:
         return _no_frames(status, settings, status.server, version)
     if status.problem:
@@ -241,6 +255,8 @@ def _no_frames(
         )
     if status.foreign:
         return Diagnosis('address', _foreign(status))
+    if status.rivals:
+        return Diagnosis('address', _refused(status))
     if status.silent_s is not None:
         return Diagnosis(
             'silence',
@@ -266,6 +282,31 @@ def _foreign(status: StreamStatus) -> str:
     return (
         f'NatNet data come from {", ".join(status.foreign)}, not from {status.server_ip}: set '
         f'server to the one that is meant, or stop the other'
+    )
+
+
+def _contest(status: StreamStatus) -> str:
+    return (
+        f'frames come from {" and ".join(status.contestants)} at the same time, and none is '
+        f'believed, as nothing tells which of them Motive sends: stop the other program'
+    )
+
+
+def _refused(status: StreamStatus) -> str:
+    return (
+        f'frames come only from {", ".join(status.rivals)}, which sent beside the believed source '
+        f'and is refused: stop it; if it is Motive, restart its streaming'
+    )
+
+
+def warning(status: StreamStatus) -> str:
+    """Tell what is odd while readings come: who else sends; '' if nobody does."""
+    others = [*status.rivals, *status.foreign]
+    if not others or not status.source:
+        return ''
+    return (
+        f'frames also come from {", ".join(others)} and are refused; those of {status.source} '
+        f'are believed: stop the other program'
     )
 
 

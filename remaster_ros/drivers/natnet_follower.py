@@ -12,6 +12,7 @@ from remaster_ros.core.errors import DeviceError
 from remaster_ros.drivers.natnet_diagnosis import Diagnosis, NatNetSettings, StreamStatus, diagnose
 from remaster_ros.drivers.natnet_gate import Dropped, MarkerGate, MarkerSample
 from remaster_ros.drivers.natnet_sockets import interface_towards, resolve
+from remaster_ros.drivers.natnet_source import Source, SourceLock, Verdict, describe
 from remaster_ros.protocols.natnet import ServerInfo, Version
 from remaster_ros.protocols.natnet_frames import Frame
 
@@ -43,6 +44,8 @@ class MarkerFollower(ABC):
         self._on_sample = on_sample
         self._clock = clock
         self._gate = MarkerGate(settings.marker)
+        self._lock = SourceLock(settings.silence_s)
+        self._believed_before: Source | None = None
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
         self._ready = threading.Event()
@@ -125,6 +128,10 @@ class MarkerFollower(ABC):
             dropped=dict(gate.dropped),
             last_reason=gate.last_reason,
             foreign=self._foreign,
+            source='' if self._lock.source is None else describe(self._lock.source),
+            sources_taken=self._lock.taken,
+            rivals=tuple(map(describe, self._lock.rivals(now)[:FOREIGN_REMEMBERED])),
+            contestants=tuple(map(describe, self._lock.contestants(now)[:FOREIGN_REMEMBERED])),
             last_malformed=self._last_malformed,
             problem=gate.problem,
             marker_id=gate.marker_id,
@@ -156,20 +163,65 @@ class MarkerFollower(ABC):
             self._foreign = (*self._foreign, address)
         return True
 
+    def _is_refused(self, source: Source) -> bool:
+        """Count what comes from a port of the server that is not the believed one."""
+        if not self._lock.is_refused(source, time.monotonic()):
+            return False
+        self._gate.drop(Dropped.FOREIGN)
+        return True
+
+    def _release_silent_source(self) -> bool:
+        """Free the lock after a silence; the server must answer before it is given again."""
+        holder = self._lock.source
+        if holder is None or not self._lock.release_if_silent(time.monotonic()):
+            return False
+        _log.warning(
+            'OptiTrack: no frame from %s for %g s; whose frames are believed is decided anew',
+            describe(holder),
+            self._settings.silence_s,
+        )
+        return True
+
     def _note_malformed(self, what: object) -> None:
         self._gate.drop(Dropped.MALFORMED)
         self._last_malformed = str(what)
 
-    def _take_whole_frame(self, frame: Frame, received_s: float) -> MarkerSample | None:
+    def _take_whole_frame(
+        self, frame: Frame, received_s: float, source: Source
+    ) -> MarkerSample | None:
         """Account for a frame that decoded to its end, and find its reading."""
+        now = time.monotonic()
+        before = self._lock.source
+        verdict = self._lock.judge(source, now)
+        if verdict is Verdict.FOREIGN:
+            self._gate.drop(Dropped.FOREIGN)
+            return None
+        if verdict is Verdict.PROBATION:
+            self._gate.pass_over(Dropped.PROBATION)
+            return None
+        if before is None:
+            self._begin_source(source)
         self._last_malformed = ''
-        self._frame_at = time.monotonic()
+        self._frame_at = now
         connection = self._server.connection if self._server is not None else None
         ticks_per_s = connection.clock_frequency if connection is not None else 0
         sample = self._gate.admit(frame, received_s, ticks_per_s)
         if self._gate.resolved:
             self._ready.set()
         return sample
+
+    def _begin_source(self, source: Source) -> None:
+        """Report whose frames are believed from now on."""
+        before, self._believed_before = self._believed_before, source
+        if before is not None and before != source:
+            self._gate.begin_source()
+            _log.warning(
+                'OptiTrack: frames of %s are believed from now on, before it was %s',
+                describe(source),
+                describe(before),
+            )
+        else:
+            _log.info('OptiTrack: frames of %s are believed', describe(source))
 
     def _hand_on(self, sample: MarkerSample) -> None:
         self._sample_at = time.monotonic()

@@ -38,7 +38,10 @@ class Dropped(StrEnum):
     """Why a datagram or a frame gave no reading."""
 
     FOREIGN = 'foreign'
-    """It came from an address that is not the configured server."""
+    """It came from an address that is not the configured server's, or from a port of it that is
+    not the believed one (`natnet_source`)."""
+    PROBATION = 'probation'
+    """Its source is not believed yet: it must be the only one for a moment."""
     OVERRUN = 'overrun'
     """This computer cannot keep up: too much waits to be decoded."""
     MALFORMED = 'malformed'
@@ -213,6 +216,19 @@ class MarkerGate:
     def drop(self, reason: Dropped) -> None:
         """Count something dropped before it became a frame."""
         self.dropped[reason] += 1
+
+    def pass_over(self, reason: Dropped) -> None:
+        """Count a whole frame that is not looked at; it is compared with no other."""
+        self.frames += 1
+        self.dropped[reason] += 1
+        self.last_reason = reason
+
+    def begin_source(self) -> None:
+        """Compare the frames to come with none before: they are another source's."""
+        self._last_number = None
+        self._last_timestamp = -math.inf
+        self._last_reading = None
+        self._repeats = 0
 
     def admit(self, frame: Frame, received_s: float, ticks_per_s: int) -> MarkerSample | None:
         """Return the reading in a frame, or None and count why.

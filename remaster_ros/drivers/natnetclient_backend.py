@@ -124,6 +124,7 @@ class NatNetClientBackend(MarkerFollower):
             )
             return False
         self._server, self._port_closed = answer, False
+        self._lock.answer()
         self._version = answer.natnet_version
         self._refusal = ''
         if not OLDEST_VERSION <= answer.natnet_version <= NEWEST_READ:
@@ -143,14 +144,16 @@ class NatNetClientBackend(MarkerFollower):
         failures = 0
         heard_at = time.monotonic()
         while not self._stopping.is_set() and failures < FAILURES_IN_A_ROW:
-            if time.monotonic() - heard_at > self._settings.silence_s:
+            if self._release_silent_source() or (
+                time.monotonic() - heard_at > self._settings.silence_s
+            ):
                 return
             try:
-                datagram, (address, _port) = source.recvfrom(1 << 16)
+                datagram, sender = source.recvfrom(1 << 16)
             except TimeoutError:
                 continue
             received_s = self._clock()
-            if self._is_foreign(address):
+            if self._is_foreign(sender[0]) or self._is_refused(sender):
                 continue
             try:
                 frame = natnet.decode_message(datagram, self._version)
@@ -160,9 +163,11 @@ class NatNetClientBackend(MarkerFollower):
                 self._note_malformed(error)
                 continue
             heard_at = time.monotonic()
+            sample = self._take_whole_frame(frame, received_s, sender)
+            if sender != self._lock.source:
+                continue
             theirs = _read(client, datagram)
             failures = failures + 1 if theirs is None else 0
-            sample = self._take_whole_frame(frame, received_s)
             if sample is not None:
                 self._compare(sample, theirs)
 

@@ -15,7 +15,7 @@ from geometry_msgs.msg import PointStamped
 from remaster_ros.core.clock_mapping import ClockMapping
 from remaster_ros.core.errors import DeviceError, InputError
 from remaster_ros.drivers.natnet import NatNetClient
-from remaster_ros.drivers.natnet_diagnosis import NatNetSettings
+from remaster_ros.drivers.natnet_diagnosis import NatNetSettings, warning
 from remaster_ros.drivers.natnet_follower import MarkerFollower
 from remaster_ros.drivers.natnet_gate import MarkerChoice, MarkerSample
 from remaster_ros.drivers.natnetclient_backend import NatNetClientBackend
@@ -138,9 +138,14 @@ class OptiTrackMarkers(RemasterNode):
             'frames': status.frames,
             'published': self.published,
             'lost': status.lost,
+            'source': status.source,
+            'sources_taken': status.sources_taken,
+            'refused_sources': ', '.join([*status.rivals, *status.contestants, *status.foreign]),
             **{f'dropped_{reason}': count for reason, count in status.dropped.items()},
         }
-        return ('error' if trouble else 'ok'), trouble or 'ok', values
+        odd = warning(status)
+        level = 'error' if trouble else 'warn' if odd else 'ok'
+        return level, trouble or odd or 'ok', values
 
     def close(self) -> None:
         """Say goodbye to the server."""

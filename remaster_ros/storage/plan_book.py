@@ -7,7 +7,6 @@ the tour where it was.
 
 from __future__ import annotations
 
-import time
 import uuid
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -23,14 +22,12 @@ from remaster_ros.core.errors import DiskError, InputError
 from remaster_ros.core.planning import Plan, PlannedPose
 from remaster_ros.core.tour import REGISTRATION, Stop, Tour
 from remaster_ros.core.types import FloatArray
-from remaster_ros.storage.files import make_folder, reason
+from remaster_ros.storage.files import make_folder
 from remaster_ros.storage.journal import Journal, Record
 from remaster_ros.storage.session_writer import PLAN
 
 NO_FREE_PATH = 'no_free_path'
 """Outcome of a configuration that the arm cannot get to without hitting something."""
-ALIVE_S = 1.0
-"""How often a running planner touches the file, s."""
 
 
 class PlanBook:
@@ -61,8 +58,8 @@ class PlanBook:
         How many configurations of the collection came to which end.
     state
         What the planner last said it does, '' before.
-    silent_s
-        For how long no planner has been running, s.
+    run
+        The token of the run in which it said so, '' where none was under way.
     lost
         What a crash has cut off, in words; '' where nothing was.
     trouble
@@ -85,20 +82,15 @@ class PlanBook:
         self.path = folder / PLAN
         self._settings, self._chain, self._model = dict(settings), chain, model
         self._journal: Journal | None = None
-        self.id = self.state = self.lost = self.trouble = ''
+        self.id = self.state = self.run = self.lost = self.trouble = ''
         self._unwritten: deque[Record] = deque()
         self.tour: Tour | None = None
         self.stop: Stop | None = None
         self.outcomes: Counter[str] = Counter()
-        self.silent_s = 0.0
-        self._touched = 0.0
         if self.path.exists():
             self._open()
 
     def _open(self) -> Journal:
-        new = not self.path.exists()
-        if not new:
-            self.silent_s = self._age_s()
         self._journal = Journal(self.path)
         self.lost = self._journal.lost
         if not self._journal.records:
@@ -118,12 +110,6 @@ class PlanBook:
                 ) from None
             raise
         return self._journal
-
-    def _age_s(self) -> float:
-        try:
-            return time.time() - self.path.stat().st_mtime
-        except OSError as error:
-            raise InputError(f'{self.path}: cannot be read ({reason(error)})') from None
 
     def _check(self, record: Record) -> None:
         self.id = record['id']
@@ -162,7 +148,7 @@ class PlanBook:
         elif kind == 'outcome':
             self._close_solution(record['id'], record['result'])
         elif kind == 'state':
-            self.state = record['state']
+            self.state, self.run = record['state'], record.get('run', '')
 
     def _take(self, stop: Stop) -> None:
         """Go to a stop; the solutions that nothing leads to have their outcome with it."""
@@ -205,7 +191,7 @@ class PlanBook:
             }
         )
         # Said before there was a file to keep it in.
-        self._append({'kind': 'state', 'state': self.state})
+        self._append({'kind': 'state', 'state': self.state, 'run': self.run})
         self.tour, self.stop = tour, None
 
     def open_stop(self, stop: Stop) -> None:
@@ -234,18 +220,11 @@ class PlanBook:
         self._append({'kind': 'outcome', 'id': solution, 'result': result})
         self._close_solution(solution, result)
 
-    def say_state(self, state: str) -> None:
-        """Remember what the planner does, once there is a plan."""
-        if self._journal is not None and state != self.state:
-            self._append({'kind': 'state', 'state': state})
-        self.state = state
-
-    def stay_alive(self) -> None:
-        """Leave a sign of life, by which a planner started again knows how long nobody ran."""
-        now = time.monotonic()
-        if self._journal is not None and now - self._touched > ALIVE_S:
-            self._touched = now
-            self._journal.touch()
+    def say_state(self, state: str, run: str = '') -> None:
+        """Remember what the planner does, and in which run, once there is a plan."""
+        before, (self.state, self.run) = (self.state, self.run), (state, run)
+        if self._journal is not None and before != (state, run):
+            self._append({'kind': 'state', 'state': state, 'run': run})
 
     def close(self) -> None:
         """Let others go on with the plan."""

@@ -27,6 +27,7 @@ from remaster_ros.core.registration import register_agreeing
 from remaster_ros.core.visiting import Visitor
 from remaster_ros.drivers.laser_tracker import LaserTrackerClient, LaserTrackerSettings
 from remaster_ros.drivers.natnet import MarkerChoice, NatNetClient, NatNetSettings
+from remaster_ros.drivers.natnet_diagnosis import warning
 from remaster_ros.fakes.laser_tracker import FakeLaserTracker
 from remaster_ros.fakes.laser_tracker_settings import TrackerBehaviour
 from remaster_ros.fakes.optitrack import FakeOptiTrackServer
@@ -399,6 +400,28 @@ def test_two_servers_on_one_group(bar):
     assert foreign > 0
     text = 'the other one is counted and dropped as foreign; readings go on'
     observe('named', 'OptiTrack: two servers on one group', text)
+
+
+def test_another_program_on_the_computer_of_the_server(bar):
+    """Its frames have the server's address and another port; none becomes a reading."""
+    _world, client, samples = bar
+    other = FaultyMarkerWorld()
+    other.marker_in_sensor = lambda sensor, t: np.array([0.0, 0.0, 1.0])
+    count = len(samples)
+    with FakeOptiTrackServer(
+        other, optitrack_world.SENSOR, np.random.default_rng(2), rate_hz=100.0,
+        command_port=0, data_port=client._settings.data_port,
+    ):  # fmt: skip
+        assert optitrack_world.eventually(lambda: len(samples) > count + 100)
+        status = client.status()
+    radii = [np.hypot(*sample.position[:2]) for sample in samples]
+    assert np.max(np.abs(np.array(radii) - 0.3)) < 5e-3
+    assert status.dropped['foreign'] > 20
+    assert len(status.rivals) == 1
+    said = re.sub(r'127\.0\.0\.1:\d+', '…', warning(status))
+    observe(
+        'named', "OptiTrack: another program on the server's computer", f'{said}; readings go on'
+    )
 
 
 def test_a_second_measurement_while_busy():

@@ -6,10 +6,13 @@ values are compared with the world's truth, which does not move here.
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import socket
 import subprocess
 import sys
 import threading
+import time
 from contextlib import contextmanager
 
 import numpy as np
@@ -252,6 +255,34 @@ def test_the_natnetclient_backend_survives_damage_and_a_restarted_server():
     client.stop()
     positions = [sample.position for sample in samples]
     np.testing.assert_allclose(positions, np.tile(MARKER, (len(positions), 1)), atol=TOLERANCE_M)
+
+
+def test_the_natnetclient_backend_believes_one_source():
+    samples = []
+    data_port = free_port()
+    with (
+        fake_server(version=(2, 10), transport='unicast', unicast_port=data_port) as server,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as forger,
+    ):
+        client = NatNetClientBackend(backend_settings(server, data_port), samples.append)
+        client.start(wait_s=20.0)
+        for _ in range(30):
+            frame = server._latest
+            forged = dataclasses.replace(
+                frame,
+                number=frame.number + 1,
+                timestamp=frame.timestamp + 0.01,
+                labeled_markers=tuple(
+                    marker._replace(position=tuple(np.add(marker.position, (0.0, 0.0, 0.004))))
+                    for marker in frame.labeled_markers
+                ),
+            )
+            forger.sendto(our_natnet.encode_message(forged, (2, 10)), ('127.0.0.1', data_port))
+            time.sleep(0.01)
+        assert eventually(lambda: client.status().dropped[Dropped.FOREIGN] == 30)
+        client.stop()
+    heights = [sample.position[2] for sample in samples]
+    assert np.max(np.abs(np.array(heights) - MARKER[2])) < 0.002
 
 
 @pytest.mark.parametrize('fault', ['another position', 'hidden', 'nothing', 'an exception'])

@@ -7,7 +7,12 @@ import dataclasses
 import pytest
 
 from remaster_ros.core.errors import InputError
-from remaster_ros.drivers.natnet_diagnosis import NatNetSettings, StreamStatus, diagnose
+from remaster_ros.drivers.natnet_diagnosis import (
+    NatNetSettings,
+    StreamStatus,
+    diagnose,
+    warning,
+)
 from remaster_ros.drivers.natnet_gate import Dropped
 from remaster_ros.protocols.natnet import Connection, ServerInfo
 
@@ -48,6 +53,13 @@ def test_nothing_is_wrong_when_readings_come():
     assert (diagnosis.fault, diagnosis.message) == ('none', '')
 
 
+def test_who_else_sends_is_told_while_readings_come():
+    status = dataclasses.replace(FINE, source='10.0.0.2:4', rivals=('10.0.0.2:5',))
+    assert diagnose(status, SETTINGS).fault == 'none'
+    assert '10.0.0.2:5 and are refused; those of 10.0.0.2:4' in warning(status)
+    assert warning(dataclasses.replace(FINE, source='10.0.0.2:4')) == ''
+
+
 NO_SERVER = {'server': None, 'version': None, 'silent_s': None}
 NO_FRAMES = {'silent_s': None}
 OTHER_GROUP = dataclasses.replace(MULTICAST, multicast_group='239.1.1.1')
@@ -72,6 +84,12 @@ UNICAST = dataclasses.replace(MULTICAST, is_multicast=False)
         (NO_FRAMES | {'last_malformed': 'junk'}, 'version', 'not NatNet 3.1 (junk)'),
         (NO_FRAMES | {'foreign': ('10.0.0.9',)}, 'address', '10.0.0.9'),
         ({'silent_s': 3.2}, 'silence', 'no frame for 3.2 s'),
+        ({'silent_s': 3.2, 'rivals': ('10.0.0.2:5',)}, 'address', 'only from 10.0.0.2:5, which'),
+        (
+            NO_FRAMES | {'contestants': ('10.0.0.2:5', '10.0.0.2:6')},
+            'address',
+            '10.0.0.2:5 and 10.0.0.2:6 at the same time',
+        ),
         ({'problem': "no rigid body 'x'"}, 'rigid_body', "no rigid body 'x'"),
         ({'starved_s': None, 'last_reason': Dropped.NOT_PRESENT}, 'rigid_body', '1:1 is not in'),
         ({'starved_s': 2.0, 'last_reason': Dropped.OCCLUDED}, 'marker', 'hidden'),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -90,24 +89,21 @@ def test_a_registration_tour_keeps_its_order_and_its_numbers(chain, tmp_path):
     book.close()
 
 
-def test_the_state_and_the_time_of_silence_are_known(chain, tmp_path):
+def test_the_state_and_its_run_are_known(chain, tmp_path):
     book = PlanBook(tmp_path, SETTINGS, chain)
-    book.say_state('running')
+    book.say_state('running', 'abc')
     assert not book.path.exists()
     book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
     with pytest.raises(InputError, match='another process'):
         PlanBook(tmp_path, SETTINGS, chain)
     book.close()
-    then = os.stat(book.path).st_mtime - 50.0
-    os.utime(book.path, (then, then))
-    book = PlanBook(tmp_path, SETTINGS, chain)
-    assert book.state == 'running'
-    assert 49.0 < book.silent_s < 200.0
-    book.stay_alive()
-    book.close()
-    book = PlanBook(tmp_path, SETTINGS, chain)
-    assert book.silent_s < 30.0
-    book.close()
+    for state, run in (('running', 'abc'), ('running', 'def'), ('paused', '')):
+        book = PlanBook(tmp_path, SETTINGS, chain)
+        book.say_state(state, run)
+        book.close()
+        book = PlanBook(tmp_path, SETTINGS, chain)
+        assert (book.state, book.run) == (state, run)
+        book.close()
 
 
 @pytest.mark.parametrize(
