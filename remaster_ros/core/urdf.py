@@ -19,6 +19,10 @@ from remaster_ros.core.types import FloatArray
 
 _LARGEST = 1e6
 """No robot has a length (m), angle (rad) or mass (kg) above it; larger ones would overflow."""
+_XACRO = (
+    'URDF: this is xacro, from which a URDF is still to be made; expand it: '
+    'ros2 run xacro xacro FILE > robot.urdf'
+)
 _NO_LIMIT = 1e300
 """Some programs write a huge limit, such as 1e16, where they mean none."""
 
@@ -43,7 +47,7 @@ class UrdfJoint:
     origin
         T_parent_joint, (4, 4).
     axis
-        Unit vector in the joint frame, (3,).
+        Unit vector in the joint frame, (3,); X for a joint that is fixed.
     lower, upper, velocity
         Limits as written, rad and rad/s; None where absent.
     mimic
@@ -93,7 +97,12 @@ def parse_urdf(text: str) -> UrdfModel:
         robot = ElementTree.fromstring(text)
     # A ValueError where the text holds what no encoding can write.
     except (ElementTree.ParseError, ValueError) as error:
+        if '<xacro:' in text:  # Without its namespace, which is not well-formed.
+            raise InputError(_XACRO) from None
         raise InputError(f'URDF: not well-formed XML ({error})') from None
+    # What xacro has expanded may still declare its namespace, but has no element of it.
+    if any(_is_xacro(element) for element in robot.iter()):
+        raise InputError(_XACRO)
     if robot.tag != 'robot':
         raise InputError(f'URDF: the outermost element is <{robot.tag}>, not <robot>')
 
@@ -131,6 +140,13 @@ def parse_urdf(text: str) -> UrdfModel:
     return UrdfModel(robot.get('name', ''), roots[0], links, parent_joint)
 
 
+def _is_xacro(element: ElementTree.Element) -> bool:
+    """Tell an element of xacro's namespace, of which there are several spellings."""
+    # Comments have a function for their tag.
+    tag = element.tag if isinstance(element.tag, str) else ''
+    return tag.startswith('{') and tag.partition('}')[0].endswith('xacro')
+
+
 def _refuse_loops(links: Iterable[str], root: str, parent_joint: Mapping[str, UrdfJoint]) -> None:
     """Refuse links whose ancestors form a loop apart from the root."""
     hanging = {root}
@@ -145,7 +161,7 @@ def _refuse_loops(links: Iterable[str], root: str, parent_joint: Mapping[str, Ur
 
 
 def _link(element: ElementTree.Element) -> UrdfLink:
-    name = _attribute(element, 'name', 'a link')
+    name = attribute(element, 'name', 'a link')
     where = f"link '{name}'"
     inertial = element.find('inertial')
     if inertial is None:
@@ -153,40 +169,35 @@ def _link(element: ElementTree.Element) -> UrdfLink:
     mass_element = inertial.find('mass')
     if mass_element is None:
         raise InputError(f'URDF: {where} has <inertial> without <mass>')
-    mass = _number(_attribute(mass_element, 'value', where), f'the mass of {where}')
+    mass = _number(attribute(mass_element, 'value', where), f'the mass of {where}')
     if mass < 0.0:
         raise InputError(f'URDF: the mass of {where} is {mass} kg; it cannot be negative')
-    return UrdfLink(name, mass, _origin(inertial, where)[:3, 3])
+    return UrdfLink(name, mass, origin_of(inertial, where)[:3, 3])
 
 
 def _joint(element: ElementTree.Element) -> UrdfJoint:
-    name = _attribute(element, 'name', 'a joint')
+    name = attribute(element, 'name', 'a joint')
     where = f"joint '{name}'"
     ends = {}
     for end in ('parent', 'child'):
         child = element.find(end)
         if child is None:
             raise InputError(f'URDF: {where} has no <{end}>')
-        ends[end] = _attribute(child, 'link', f'<{end}> of {where}')
-    axis_element = element.find('axis')
-    axis = np.array([1.0, 0.0, 0.0])
-    if axis_element is not None:
-        axis = _triple(_attribute(axis_element, 'xyz', where), f'the axis of {where}')
-    length = math.hypot(*axis)
-    if not 1e-6 < length < 1e6:
-        raise InputError(f'URDF: the axis of {where} has length {length:g}; give a unit vector')
+        ends[end] = attribute(child, 'link', f'<{end}> of {where}')
+    kind = attribute(element, 'type', where)
     limit = element.find('limit')
     limits: dict[str, float | None] = {}
     for key in ('lower', 'upper', 'velocity'):
         written = None if limit is None else limit.get(key)
         limits[key] = None if written is None else _number(written, f'{key} of {where}', _NO_LIMIT)
+    _check_what_is_passed_over(element, where)
     return UrdfJoint(
         name=name,
-        kind=_attribute(element, 'type', where),
+        kind=kind,
         parent=ends['parent'],
         child=ends['child'],
-        origin=_origin(element, where),
-        axis=axis / length,
+        origin=origin_of(element, where),
+        axis=_axis(element, kind, where),
         lower=limits['lower'],
         upper=limits['upper'],
         velocity=limits['velocity'],
@@ -194,26 +205,55 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
     )
 
 
-def _origin(element: ElementTree.Element, where: str) -> FloatArray:
+def _check_what_is_passed_over(element: ElementTree.Element, where: str) -> None:
+    """Refuse numbers that are none where this reader needs none, but a calibrated copy does."""
+    for tag, keys in (
+        ('mimic', ('multiplier', 'offset')),
+        ('safety_controller', ('soft_lower_limit', 'soft_upper_limit')),
+    ):
+        for found in element.findall(tag):
+            for key in keys:
+                if (text := found.get(key)) is not None:
+                    _number(text, f'{key} of {where}', _NO_LIMIT)
+
+
+def _axis(element: ElementTree.Element, kind: str, where: str) -> FloatArray:
+    """Return the unit axis of a joint in its frame; X where it is not given, as URDF has it."""
+    axis_element = element.find('axis')
+    # CAD exporters write an axis of 0 0 0 where there is none to move about.
+    if axis_element is None or kind in ('fixed', 'floating'):
+        return np.array([1.0, 0.0, 0.0])
+    axis = numbers(attribute(axis_element, 'xyz', where), 3, f'the axis of {where}')
+    length = math.hypot(*axis)
+    if not 1e-6 < length < 1e6:
+        raise InputError(f'URDF: the axis of {where} has length {length:g}; give a unit vector')
+    return axis / length
+
+
+def origin_of(element: ElementTree.Element, where: str) -> FloatArray:
+    """Return the place that ``<origin>`` gives, (4, 4); the identity where there is none."""
     origin = element.find('origin')
     if origin is None:
         return np.eye(4)
-    xyz = _triple(origin.get('xyz', '0 0 0'), f'the origin xyz of {where}')
-    rpy = _triple(origin.get('rpy', '0 0 0'), f'the origin rpy of {where}')
+    xyz = numbers(origin.get('xyz', '0 0 0'), 3, f'the origin xyz of {where}')
+    rpy = numbers(origin.get('rpy', '0 0 0'), 3, f'the origin rpy of {where}')
     return transform(matrix_from_rpy(rpy), xyz)
 
 
-def _attribute(element: ElementTree.Element, key: str, where: str) -> str:
+def attribute(element: ElementTree.Element, key: str, where: str) -> str:
+    """Return an attribute that has to be there; `where` names its place in messages."""
     value = element.get(key, '')
     if not value:
         raise InputError(f"URDF: {where} has no attribute '{key}'")
     return value
 
 
-def _triple(text: str, what: str) -> FloatArray:
+def numbers(text: str, count: int, what: str) -> FloatArray:
+    """Return so many numbers, (count,); `what` names them in messages."""
     words = text.split()
-    if len(words) != 3:
-        raise InputError(f"URDF: {what} is '{text}'; three numbers are needed")
+    if len(words) != count:
+        needed = 'three numbers are needed' if count == 3 else f'{count} is needed'
+        raise InputError(f"URDF: {what} is '{text}'; {needed}")
     return np.array([_number(word, what) for word in words])
 
 

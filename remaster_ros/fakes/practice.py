@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.collision import ArmCapsules
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.inverse import InverseKinematics
 from remaster_ros.core.planning import candidate_poses, plan_poses
@@ -45,7 +44,7 @@ def plan_tour(
         No closed form for this robot, or no pose to fit that it can take.
     """
     inverse = InverseKinematics(chain, cell.held(chain))
-    arm = ArmCapsules(chain, cell.link_radius_m)
+    arm = cell.collision_model(chain)
     sights = cell.lines_of_sight({name: T_R_N[:3, 3] for name, T_R_N in places.items()})
     aim = places[cell.aim_at][:3, 3]
     plans = {}

@@ -28,10 +28,17 @@ PRACTICE_CANDIDATES = 14
 PRACTICE_STEP_S = 10.0
 
 
-def default_folder() -> Path:
-    """Where the fakes of this user and DDS domain meet when nobody says otherwise."""
+def default_folder(namespace: str = '/') -> Path:
+    """Where the fakes of this user, DDS domain and ROS namespace meet when nobody says otherwise.
+
+    Parameters
+    ----------
+    namespace
+        Such as ``/left``: every cell of a domain has its own World.
+    """
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
-    return Path(tempfile.gettempdir()) / f'remaster_world_{os.getuid()}_{domain}'
+    cell = namespace.rstrip('/').replace('/', '%')
+    return Path(tempfile.gettempdir()) / f'remaster_world_{os.getuid()}_{domain}{cell}'
 
 
 def make_private_folder(folder: Path) -> None:
@@ -149,15 +156,22 @@ def _draw_hidden(
     return hide(stage, hidden, rng)
 
 
-def open_world(folder: str, timeout_s: float = 20.0) -> World:
+def open_world(folder: str, namespace: str = '/', timeout_s: float = 20.0) -> World:
     """Open the World in `folder` ('' for the default one), waiting until somebody has made it.
+
+    Parameters
+    ----------
+    folder, namespace
+        See `default_folder`.
+    timeout_s
+        How long to wait, wall time, s.
 
     Raises
     ------
     InputError
         If there is none after `timeout_s` of wall time.
     """
-    path = Path(folder) if folder else default_folder()
+    path = Path(folder) if folder else default_folder(namespace)
     deadline = time.monotonic() + timeout_s
     while not (path / 'world.yaml').exists() and time.monotonic() < deadline:
         time.sleep(0.05)

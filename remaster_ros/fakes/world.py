@@ -25,8 +25,8 @@ import yaml
 
 from remaster_ros.core import transforms
 from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.collision import ArmCapsules
 from remaster_ros.core.errors import InputError
+from remaster_ros.core.line_of_sight import LinkCapsules
 from remaster_ros.core.types import FloatArray
 from remaster_ros.fakes.effects import HiddenEffect
 from remaster_ros.fakes.faults import Faults, Numbers, is_out
@@ -211,7 +211,7 @@ class World:
         self.rate = float(data['rate'])
         self._started = float(data['started_monotonic_s'])
         self.chain = SerialChain.from_urdf(data['urdf'], data['base_link'], data['tip_link'])
-        self._capsules = ArmCapsules(self.chain, data['link_radius_m'])
+        self._capsules = LinkCapsules(self.chain, data['link_radius_m'])
         self.start_q = np.array(data['start_q_rad'], float)
         self._motion = Motion(START_S, self.start_q)
         self._wrong = WrongArm(

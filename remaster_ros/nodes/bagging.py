@@ -15,11 +15,14 @@ from sensor_msgs.msg import JointState
 
 from remaster_ros.core.errors import DiskError, InputError
 from remaster_ros.nodes.status import LATCHED, TOPIC
+from remaster_ros.storage.bag import RECORDED
 from remaster_ros.storage.bag_writer import BagWriter
 
 DEEP = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 """What a busy recorder has not yet taken is kept for it: seconds of the fastest stream."""
 STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
+MOST_EARLY = 20_000
+"""Messages that are kept while there is no clock: some ten seconds of the fastest streams."""
 BEGAN = 'began'
 """The event by which a bag says that its recorder was started (again)."""
 
@@ -46,6 +49,8 @@ class BagRecorder:
     def __init__(self, node: Node, folder: Path | None) -> None:
         self._node, self._folder = node, folder
         self._writer: BagWriter | None = None
+        # Heard while the node's clock, a simulated one, was not known: topic, type, bytes.
+        self._early: list[tuple[str, str, bytes]] = []
         self.notes: list[str] = []
         self.dropped = 0
         self.reopen()
@@ -63,15 +68,30 @@ class BagRecorder:
             self._writer = BagWriter(self._folder)
         # First in each file, so that a replay forgets the reading that was under way before it.
         status = DiagnosticStatus(name=f'{self._node.get_name()}: {BEGAN}', message=BEGAN)
-        self._write(TOPIC, STATUS_TYPE, serialize_message(DiagnosticArray(status=[status])))
+        self._write(
+            name_in_bag(TOPIC), STATUS_TYPE, serialize_message(DiagnosticArray(status=[status]))
+        )
 
     def _write(self, topic: str, type_name: str, data: bytes) -> None:
+        """Write a message under the node's time; what came before there was one comes first.
+
+        A bag that began at time 0 would last as long as the simulation has been running.
+        """
         if self._writer is None:
             return
-        try:
-            self._writer.write(topic, type_name, data, self._node.get_clock().now().nanoseconds)
-        except DiskError:
-            self.dropped += 1
+        now_ns = self._node.get_clock().now().nanoseconds
+        if now_ns == 0:
+            if len(self._early) < MOST_EARLY:
+                self._early.append((topic, type_name, data))
+            else:
+                self.dropped += 1
+            return
+        waiting, self._early = [*self._early, (topic, type_name, data)], []
+        for message in waiting:
+            try:
+                self._writer.write(*message, now_ns)
+            except DiskError:
+                self.dropped += 1
 
     def subscribe(
         self,
@@ -80,13 +100,18 @@ class BagRecorder:
         receive: Callable[[Any], None] | None = None,
         qos: QoSProfile = DEEP,
     ) -> None:
-        """Record `topic`; call `receive` with each decoded message, if given."""
+        """Record `topic`; call `receive` with each decoded message, if given.
+
+        In the bag it has the name of `name_in_bag`: without this node's namespace and as if it was
+        not remapped, so that a bag can be replayed in any namespace.
+        """
         module = kind.__module__.split('.')[0]
         type_name = f'{module}/msg/{kind.__name__}'
+        name = name_in_bag(topic)
 
         def take(data: bytes) -> None:
             # Raw, because serialising again can leave uninitialised bytes behind the message.
-            self._write(topic, type_name, data)
+            self._write(name, type_name, data)
             if receive is not None:
                 receive(deserialize_message(data, kind))
 
@@ -96,10 +121,10 @@ class BagRecorder:
         """Record the topics that the recorder itself has no use for."""
         if self._folder is None:
             return
-        self.subscribe(PoseStamped, '/remaster/target_pose')
-        self.subscribe(TransformStamped, '/remaster/registration', qos=LATCHED)
-        self.subscribe(JointState, '/remaster/joint_offsets', qos=LATCHED)
-        self.subscribe(JointState, '/remaster/joint_offsets_std', qos=LATCHED)
+        self.subscribe(PoseStamped, 'remaster/target_pose')
+        self.subscribe(TransformStamped, 'remaster/registration', qos=LATCHED)
+        self.subscribe(JointState, 'remaster/joint_offsets', qos=LATCHED)
+        self.subscribe(JointState, 'remaster/joint_offsets_std', qos=LATCHED)
 
     def close(self) -> None:
         """Close the bag; messages that come later are not recorded.
@@ -107,11 +132,22 @@ class BagRecorder:
         Where the disk does not take its end, it stays as that of a killed recorder.
         """
         writer, self._writer = self._writer, None
+        self.dropped += len(self._early)
+        self._early = []
         if writer is not None:
             try:
                 writer.close()
             except DiskError as error:
                 self._node.get_logger().warning(f'{error}; `remaster recover` finishes the bag')
+
+
+def name_in_bag(topic: str) -> str:
+    """Return the name in bags of a topic as this package's code names it, relative or not.
+
+    What moves an arm has another one there (`storage.bag.RECORDED`).
+    """
+    name = f'/{topic.lstrip("/")}'
+    return RECORDED.get(name, name)
 
 
 def _free(folder: Path) -> Path:

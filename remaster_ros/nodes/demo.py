@@ -142,12 +142,15 @@ class Demo:
             self.hidden, cell, self.p.seed, self.p.rate, self.requests, self.p.candidates
         )
         self.console.print(f'hidden world drawn with seed {self.p.seed}; starting the nodes')
+        self.console.print(
+            'the fake arm moves without a Cartesian speed limit (real.yaml: 0.25 m/s)'
+        )
         self._start()
         self._wait(self._ready, 60.0, 'the nodes to come up')
-        self._trigger('/remaster/collect', 'pose_planner')
+        self._trigger('remaster/collect', 'pose_planner')
         self._collect()
         self.console.print('fitting')
-        self._trigger('/remaster/fit', 'optimizer', timeout_s=300.0)
+        self._trigger('remaster/fit', 'optimizer', timeout_s=300.0)
         result = read_fit(self.fit / 'fit.json')
         discovery = self._discover() if self.requests else None
         self.processes.stop()
@@ -166,7 +169,7 @@ class Demo:
 
     def _discover(self) -> dict[str, Any]:
         self.console.print('looking for causes')
-        self._trigger('/remaster/discover', 'optimizer', timeout_s=300.0)
+        self._trigger('remaster/discover', 'optimizer', timeout_s=300.0)
         return read_discovery(self.discovery / 'discovery.json')
 
     def _start(self) -> None:
@@ -264,6 +267,9 @@ class Demo:
                         total=int(planner.get('configurations', 0)),
                         completed=int(planner.get('configurations_done', 0)),
                     )
+                if planner.get('state') == 'idle' and planner.get('resuming') == 'no':
+                    # It was killed, and could not be certain that its run still lives.
+                    self._trigger('remaster/collect', 'pose_planner')
                 if planner.get('state') == 'failed':
                     raise DeviceError(f'the planner gave up: {planner["message"]}')
                 closed = self.node.summaries.get('recorder', {}).get('exit_status')

@@ -32,7 +32,7 @@ class FakeLaserTrackerNode(RemasterNode):
     def __init__(self) -> None:
         super().__init__('fake_laser_tracker')
         p = declare(self, Parameters)
-        self.world = world = open_world(p.world)
+        self.world = world = open_world(p.world, self.get_namespace())
         self.tracker = FakeLaserTracker(
             world,
             p.sensor,

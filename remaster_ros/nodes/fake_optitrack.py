@@ -38,7 +38,7 @@ class FakeOptiTrackNode(RemasterNode):
     def __init__(self) -> None:
         super().__init__('fake_optitrack')
         p = declare(self, Parameters)
-        self.world = world = open_world(p.world)
+        self.world = world = open_world(p.world, self.get_namespace())
         major, minor = (int(part) for part in p.version.split('.'))
         self.server = FakeOptiTrackServer(
             world,

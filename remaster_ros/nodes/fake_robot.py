@@ -1,4 +1,8 @@
-"""ROS shell of the fake arm: joint_trajectory_controller, joint_states, and /clock."""
+"""ROS shell of the fake arm: joint_trajectory_controller, joint_states, and a clock.
+
+The clock is relative like every name here: in a namespace, nodes that use it are started with the
+remapping ``/clock:=clock`` (rclpy itself subscribes to /clock).
+"""
 
 from __future__ import annotations
 
@@ -44,7 +48,7 @@ class Parameters:
         50.0, 'joint_states per second of world time', unit='Hz', low=1.0, high=1000.0
     )
     clock_rate: float = parameter(
-        40.0, '/clock messages per second of wall time', unit='Hz', low=10.0, high=1000.0
+        40.0, 'clock messages per second of wall time', unit='Hz', low=10.0, high=1000.0
     )
 
 
@@ -56,20 +60,20 @@ class FakeRobotNode(RemasterNode):
         self.p = declare(self, Parameters)
         self._drawn: Path | None = None
         if self.p.world:
-            self.world = open_world(self.p.world)
+            self.world = open_world(self.p.world, self.get_namespace())
         else:
-            folder = default_folder()
+            folder = default_folder(self.get_namespace())
             make_private_folder(folder)
             self._drawn = folder
             self.world = make_world(self._drawn, read_cell(self.p.cell), self.p.seed, self.p.rate)
         rng = np.random.default_rng([self.world.truth.seed, 2])
         self.arm = FakeArm(self.world, rng)
         reliable = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
-        self._states = self.create_publisher(JointState, '/joint_states', reliable)
-        self._clock_publisher = self.create_publisher(ClockMessage, '/clock', 10)
+        self._states = self.create_publisher(JointState, 'joint_states', reliable)
+        self._clock_publisher = self.create_publisher(ClockMessage, 'clock', 10)
         self.create_subscription(
             JointTrajectory,
-            '/joint_trajectory_controller/joint_trajectory',
+            'joint_trajectory_controller/joint_trajectory',
             self._on_trajectory,
             reliable,
         )

@@ -111,19 +111,19 @@ class LaserTrackerMarkers(RemasterNode):
         self._temperatures = self.create_publisher(
             Temperature, temperature_topic(sensor.topic), RELIABLE
         )
-        self.create_subscription(PoseStamped, '/remaster/target_pose', self._on_pose, RELIABLE)
+        self.create_subscription(PoseStamped, 'remaster/target_pose', self._on_pose, RELIABLE)
         self.create_subscription(
-            TransformStamped, '/remaster/registration', self._on_registration, LATCHED
+            TransformStamped, 'remaster/registration', self._on_registration, LATCHED
         )
         self.create_subscription(
             JointTrajectory,
-            '/joint_trajectory_controller/joint_trajectory',
+            'joint_trajectory_controller/joint_trajectory',
             self._on_trajectory,
             RELIABLE,
         )
         self.create_service(
             Trigger,
-            sensor.measure_service or '/laser_tracker/measure',
+            sensor.measure_service or 'laser_tracker/measure',
             self._on_measure,
             callback_group=MutuallyExclusiveCallbackGroup(),
         )

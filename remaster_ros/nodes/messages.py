@@ -38,7 +38,8 @@ def duration_of(time_s: float) -> Duration:
 
 def temperature_topic(marker_topic: str) -> str:
     """Return where a sensor that has a thermometer publishes it: beside its marker."""
-    return f'{marker_topic.rpartition("/")[0]}/temperature'
+    place, slash, _ = marker_topic.rpartition('/')
+    return f'{place}{slash}temperature'
 
 
 class JointOrder:

@@ -60,17 +60,20 @@ class Parameters:
 class Optimizer(RemasterNode):
     """See the module's text."""
 
+    # It moves nothing, and nobody counts on it: what fails is asked for again.
+    outlives_faults = True
+
     def __init__(self) -> None:
         super().__init__('optimizer')
         self.p = declare(self, Parameters)
         self._state, self._ending = 'waiting', False
         self._busy = threading.Lock()
-        self._means = self.create_publisher(JointState, '/remaster/joint_offsets', LATCHED)
-        self._stds = self.create_publisher(JointState, '/remaster/joint_offsets_std', LATCHED)
+        self._means = self.create_publisher(JointState, 'remaster/joint_offsets', LATCHED)
+        self._stds = self.create_publisher(JointState, 'remaster/joint_offsets_std', LATCHED)
         # Groups of their own: status and clock go on while a fit takes its seconds.
         for service, work in (
-            ('/remaster/fit', self._fit),
-            ('/remaster/discover', self._discover),
+            ('remaster/fit', self._fit),
+            ('remaster/discover', self._discover),
         ):
             serve = partial(self._serve, work)
             group = MutuallyExclusiveCallbackGroup()
@@ -90,8 +93,9 @@ class Optimizer(RemasterNode):
         try:
             report, self._state = work()
             response.success, response.message = True, str(report)
-        except RemasterError as error:
-            response.message = self._state = str(error)
+        except Exception as error:
+            response = self.failed(error, response)
+            self._state = response.message
         finally:
             self._busy.release()
         return response
@@ -113,7 +117,9 @@ class Optimizer(RemasterNode):
         )
         report = save_fit(result, out, figures=self.p.figures)
         self._publish(result.joint_names, result.joint_offsets, result.joint_offsets_std)
-        return report, 'fitted'
+        for line in result.implausible:
+            self.get_logger().warning(line)
+        return report, '; '.join(('fitted', *result.implausible))
 
     def _discover(self) -> tuple[Path, str]:
         # What takes a second to import comes when it is asked for: a node is there at once.

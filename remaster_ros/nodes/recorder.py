@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
 from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
@@ -39,8 +40,8 @@ from remaster_ros.nodes.recorder_parameters import Parameters, sensor_rules
 from remaster_ros.nodes.registering import Registrar
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.shots import Shots
+from remaster_ros.nodes.status import JOINT_STATES, Event, Status, receiver, run_after
 from remaster_ros.nodes.status import TOPIC as STATUS
-from remaster_ros.nodes.status import Event, Status, receiver
 from remaster_ros.storage.cell import read_cell
 from remaster_ros.storage.logbook import Logbook
 from remaster_ros.storage.session_writer import ExitStatus
@@ -110,6 +111,8 @@ class Recorder(RemasterNode):
         self._from_q: FloatArray | None = None
         self._temperatures: deque[tuple[float, float]] = deque(maxlen=500)
         self._was_waiting = False
+        # The token of the planner's run; in memory alone, so that it lives no longer than this.
+        self._run = ''
         # Settled where no announced pose has a solution (yet): joints, rad, and when.
         self._unknown: tuple[FloatArray, float] | None = None
         self._checked_wall = time.monotonic()
@@ -120,7 +123,13 @@ class Recorder(RemasterNode):
         recording = self.p.bag and not self.logbook.closed
         self._bag = BagRecorder(self, folder / 'bag' if recording else None)
         self._subscribe()
-        self.create_service(Trigger, '/remaster/register', self._on_register)
+        # A group of its own: while it waits for the reading, what makes the reading goes on.
+        self.create_service(
+            Trigger,
+            'remaster/register',
+            self._on_register,
+            callback_group=ReentrantCallbackGroup(),
+        )
         self.status = Status(self, self._summary)
         for note in (*self.logbook.notes, *self._bag.notes):
             self.get_logger().warning(note)
@@ -130,11 +139,11 @@ class Recorder(RemasterNode):
     def _subscribe(self) -> None:
         """Take each topic once, raw: into the bag as it came, then decoded."""
         bag = self._bag
-        bag.subscribe(JointState, '/joint_states', self._on_joint_state)
-        bag.subscribe(JointState, '/remaster/settled', self._on_settled)
+        bag.subscribe(JointState, 'joint_states', self._on_joint_state, JOINT_STATES)
+        bag.subscribe(JointState, 'remaster/settled', self._on_settled)
         announcements = self._announcements
-        bag.subscribe(JointTrajectory, '/remaster/joint_solutions', announcements.hear_solutions)
-        bag.subscribe(JointTrajectory, '/joint_trajectory_controller/joint_trajectory')
+        bag.subscribe(JointTrajectory, 'remaster/joint_solutions', announcements.hear_solutions)
+        bag.subscribe(JointTrajectory, 'joint_trajectory_controller/joint_trajectory')
         clients = {}
         for name, sensor in self.cell.sensors.items():
             bag.subscribe(PointStamped, sensor.topic, self._on_point(name))
@@ -208,6 +217,8 @@ class Recorder(RemasterNode):
                 values.get('started', ''),
                 hidden=values.get('fault') == 'marker',
             )
+        if node == 'pose_planner':
+            self._run = run_after(self._run, values)
         if node == 'pose_planner' and not self._busy() and not self._due:
             state = values.get('state')
             if state == 'complete':
@@ -446,6 +457,7 @@ class Recorder(RemasterNode):
             # By these the planner, or one that was started again, takes up where this one is.
             'pose': '' if pose is None else pose.stamp,
             'plan': self.logbook.plan_id,
+            'run': self._run,
             'decided': self.logbook.decided(),
             'registration': self.registrar.describe(),
             'require': self.p.require,

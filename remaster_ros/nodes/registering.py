@@ -39,9 +39,7 @@ class Registrar:
         }
         self.T_R_N: dict[str, FloatArray] = {}
         self._notes: dict[str, str] = {}
-        self._publisher = node.create_publisher(
-            TransformStamped, '/remaster/registration', LATCHED
-        )
+        self._publisher = node.create_publisher(TransformStamped, 'remaster/registration', LATCHED)
 
     @property
     def complete(self) -> bool:

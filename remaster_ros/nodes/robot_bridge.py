@@ -1,105 +1,65 @@
-"""Command the joint solutions of a pose one by one; say when the arm has settled.
+"""Command the joint solutions of a pose one by one; tell when the arm has settled.
 
-The bridge never commands outside the joint limits, one configuration at a time, and only while
-planner, recorder and robot are heard from and the planner says ``running``. After a configuration
-has settled the arm stays until the recorder has said what became of it. The rules are those of
-`remaster_ros.core.visiting`; this is their ROS shell.
+Every command comes from the motion gate (`remaster_ros.motion`); this is the ROS shell of its
+rules. After a configuration has settled the arm stays until the recorder has answered what became
+of it. What is slow (path checks, the file that keeps a halt) runs beside the callbacks.
 """
 
 from __future__ import annotations
 
+import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.errors import InputError
-from remaster_ros.core.motion import MotionLimits, Waypoint
-from remaster_ros.core.settling import SettleRules
 from remaster_ros.core.types import FloatArray
-from remaster_ros.core.visiting import (
-    PROBE,
+from remaster_ros.motion.actions import (
     Action,
+    CheckPath,
     Drive,
     Failed,
     Halted,
+    PathAnswer,
     Settled,
     Stop,
-    Visitor,
-    VisitRules,
 )
+from remaster_ros.motion.arm_supervisor import ArmSupervisor
+from remaster_ros.motion.joint_reports import JointReport, JointReports
+from remaster_ros.motion.limits import MotionLimits
+from remaster_ros.motion.motion_gate import Admitted, MotionGate
+from remaster_ros.motion.path_check import PointSpeeds
+from remaster_ros.motion.path_search import PathSearch
+from remaster_ros.nodes.announcements import waypoints_by_solution
+from remaster_ros.nodes.background import Background
+from remaster_ros.nodes.bridge_parameters import Parameters
+from remaster_ros.nodes.emergency_link import EmergencyLink
 from remaster_ros.nodes.messages import JointOrder, duration_of, seconds, stamp_key, stamp_of
-from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.parameters import declare
+from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import RELIABLE, Event, Status, listen
+from remaster_ros.nodes.status import JOINT_STATES, LEASED, RELIABLE, Event, Status, listen
 from remaster_ros.storage.cell import read_cell
+from remaster_ros.storage.halt_file import HaltFile
 from remaster_ros.storage.results import joint_offsets_rad, read_fit
 
-COMMANDS = '/joint_trajectory_controller/joint_trajectory'
+COMMANDS = 'joint_trajectory_controller/joint_trajectory'
+JOINTS = 'joint_states'
+SOLUTIONS = 'remaster/joint_solutions'
+WAYPOINTS = 'remaster/joint_waypoints'
 MATCHED_WALL_S = 0.5
 """So much later than ours the controller's side of a DDS match may come."""
-
-
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the bridge."""
-
-    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
-    speed_share: float = parameter(
-        0.3, 'share of each joint velocity limit that is used', low=0.01, high=1.0
-    )
-    offsets: str = parameter(
-        '',
-        'fit.json whose joint offsets shift the joint limits; empty for offsets not known yet',
-    )
-    settle_s: float = parameter(
-        3.0, 'how long the arm must stand still before a reading', unit='s', low=0.1, high=60.0
-    )
-    arrive_tolerance: float = parameter(
-        2e-3, 'largest distance of a joint from its target', unit='rad', low=1e-6, high=0.1
-    )
-    still_tolerance: float = parameter(
-        2e-4, 'largest spread of a joint position while still', unit='rad', low=1e-7, high=0.01
-    )
-    arrive_timeout_s: float = parameter(
-        10.0, 'beyond the expected motion and settle: not arrived', unit='s', low=1.0, high=600.0
-    )
-    answer_timeout_s: float = parameter(
-        180.0,
-        "longest wait for the recorder's word on a settled configuration",
-        unit='s',
-        low=1.0,
-        high=3600.0,
-    )
-    heartbeat_s: float = parameter(
-        3.0,
-        'longest silence of planner, recorder or robot, wall time',
-        unit='s',
-        low=0.5,
-        high=60.0,
-    )
-    stall_s: float = parameter(
-        1.0,
-        'an arm that stands for so long and not at its target has been stopped',
-        unit='s',
-        low=0.2,
-        high=60.0,
-    )
-    reaction_s: float = parameter(
-        2.0,
-        'how long a command may take to be seen in joint_states, wall time',
-        unit='s',
-        low=0.1,
-        high=60.0,
-    )
-    emergency_stop_topic: str = parameter(
-        '', "std_msgs/Bool, true while the robot's own safety stops it; empty where there is none"
-    )
+WATCH_WALL_S = 0.05
+"""How often silence and the graph are looked at."""
+KNOWN_OFFSET_RAD = np.deg2rad(0.1)
+"""What may still be wrong with a joint whose offset is in use, for the clearance of paths."""
 
 
 class RobotBridge(RemasterNode):
@@ -108,28 +68,58 @@ class RobotBridge(RemasterNode):
     def __init__(self) -> None:
         super().__init__('robot_bridge')
         self.p = declare(self, Parameters)
-        self.chain = read_cell(self.p.cell).chain()
-        limits = MotionLimits.of(self.chain, self.p.speed_share, self._offsets(self.chain))
-        self._visitor = Visitor(limits, self._rules())
+        cell = read_cell(self.p.cell)
+        self.chain = cell.chain()
         self._order = JointOrder(self.chain.joint_names)
-        self._pose_stamp = ''
+        offsets = self._offsets(self.chain)
+        model = cell.collision_model(self.chain, None if offsets is None else KNOWN_OFFSET_RAD)
+        speeds = PointSpeeds(self.chain, model.extent_points)
+        self._acceleration = cell.acceleration_limits(self.chain)
+        self._limits = partial(self._make_limits, offsets)
+        self._halt_file = HaltFile(self.get_fully_qualified_name())
+        self.supervisor = ArmSupervisor(
+            MotionGate(self._limits(self.p), speeds),
+            JointReports(self.chain.lower, self.chain.upper, self.chain.velocity_limits),
+            self.p.rules(),
+            self._halt_file.read(),
+        )
+        self._search = PathSearch(model, speeds)
+        self._paths, self._disk = Background(self), Background(self)
+        self._pose_stamp = self._run = ''
         self._settled_wall = time.monotonic()
+        self._waypoints = JointTrajectory()
         self.counts = {'commanded': 0, 'settled': 0, 'failed': 0, 'stopped': 0}
-        self._controller = self.create_publisher(JointTrajectory, COMMANDS, RELIABLE)
+        # Made when this bridge is known to be the only one of its name.
+        self._controller: Any = None
         # Since when a controller listens; a command before that would be lost.
         self._listened_wall: float | None = None
-        self._settled = self.create_publisher(JointState, '/remaster/settled', RELIABLE)
+        self._settled = self.create_publisher(JointState, 'remaster/settled', RELIABLE)
         self.status = Status(self, self._summary)
-        self.create_subscription(JointState, '/joint_states', self._on_joint_state, RELIABLE)
-        self.create_subscription(
-            JointTrajectory, '/remaster/joint_solutions', self._on_solutions, RELIABLE
+        self.create_subscription(JointState, JOINTS, self._on_joint_state, JOINT_STATES)
+        self.create_subscription(JointTrajectory, WAYPOINTS, self._on_waypoints, RELIABLE)
+        self.create_subscription(JointTrajectory, SOLUTIONS, self._on_solutions, RELIABLE)
+        self._emergency = EmergencyLink(
+            self, self.p.emergency_stop_topic, self._on_emergency_stop, self.p.heartbeat_s
         )
-        if self.p.emergency_stop_topic:
-            self.create_subscription(
-                Bool, self.p.emergency_stop_topic, self._on_emergency_stop, RELIABLE
+        self._only = [
+            OnlyPublisher(self, topic, kind)
+            for topic, kind in (
+                (JOINTS, JointState),
+                (SOLUTIONS, JointTrajectory),
+                (WAYPOINTS, JointTrajectory),
+                (COMMANDS, JointTrajectory),
             )
+        ]
+        self.create_service(Trigger, 'remaster/clear_halt', self._on_clear_halt)
         listen(self, self._on_event, self._on_summary)
-        self.create_timer(0.1, self._watch, clock=self.status.steady)
+        self.create_timer(WATCH_WALL_S, self._watch, clock=self.status.steady)
+        if self.supervisor.halted:
+            self.get_logger().error(f'halted: {self.supervisor.halted}')
+        if not self.p.cartesian_speed_limit_m_s:
+            self.get_logger().warning(
+                'no Cartesian speed limit (cartesian_speed_limit_m_s is 0): the joints alone '
+                'limit the speed of the arm'
+            )
 
     def _offsets(self, chain: SerialChain) -> FloatArray | None:
         """Return the offsets in use, rad, (k,); what a fit could not tell counts as none."""
@@ -138,15 +128,14 @@ class RobotBridge(RemasterNode):
         offsets, std = joint_offsets_rad(read_fit(self.p.offsets), chain.joint_names)
         return np.where(std > 0.0, offsets, 0.0)
 
-    def _rules(self) -> VisitRules:
-        p = self.p
-        return VisitRules(
-            settle=SettleRules(p.settle_s, p.arrive_tolerance, p.still_tolerance),
-            arrive_timeout_s=p.arrive_timeout_s,
-            answer_timeout_s=p.answer_timeout_s,
-            heartbeat_s=p.heartbeat_s,
-            stall_s=p.stall_s,
-            reaction_s=p.reaction_s,
+    def _make_limits(self, offsets: FloatArray | None, p: Parameters) -> MotionLimits:
+        return MotionLimits.of(
+            self.chain,
+            p.speed_share,
+            offsets,
+            self._acceleration,
+            p.cartesian_speed_limit_m_s or np.inf,
+            float(np.deg2rad(p.limit_margin_deg)),
         )
 
     # What comes in
@@ -154,90 +143,122 @@ class RobotBridge(RemasterNode):
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
         now = time.monotonic()
         if node == 'pose_planner':
-            self._do(self._visitor.planner_says(values.get('state', 'unknown'), now))
+            state = values.get('state', 'unknown')
+            if state == 'running':
+                # By it a planner that is started again sees that this bridge was there all along.
+                self._run = values.get('run', '')
+            self._do(self.supervisor.planner_is(state, now))
         elif node == 'recorder':
-            self._do(self._visitor.recorder_says(values.get('waiting_for', ''), now))
+            self._do(self.supervisor.recorder_waits(values.get('waiting_for', ''), now))
 
     def _on_event(self, event: Event) -> None:
         if (event.node, event.event) != ('recorder', 'configuration'):
             return
         solution = event.values.get('solution', '')
         if event.values.get('stamp') == self._pose_stamp and solution.isdecimal():
-            self._do(self._visitor.answered(int(solution), time.monotonic()))
+            self._do(self.supervisor.answered(int(solution), time.monotonic()))
+
+    def _on_waypoints(self, message: JointTrajectory) -> None:
+        self._waypoints = message
 
     def _on_solutions(self, message: JointTrajectory) -> None:
+        names = self.chain.joint_names
         try:
-            columns = [list(message.joint_names).index(name) for name in self.chain.joint_names]
+            columns = [list(message.joint_names).index(name) for name in names]
             solutions = [[point.positions[c] for c in columns] for point in message.points]
-        except (ValueError, IndexError):
+            belongs = self._waypoints.header.stamp == message.header.stamp
+            waypoints = waypoints_by_solution(self._waypoints, names) if belongs else {}
+        except (ValueError, IndexError, InputError):
             self.get_logger().error(
                 f'joint_solutions dropped: they are for {", ".join(message.joint_names)}, '
-                f'the cell has {", ".join(self.chain.joint_names)}'
+                f'the cell has {", ".join(names)}'
             )
             return
         self._pose_stamp = stamp_key(message.header.stamp)
         targets = np.reshape(np.array(solutions, float), (-1, len(self.chain)))
-        self._do(self._visitor.plan(targets, time.monotonic()))
+        self._do(self.supervisor.plan(targets, time.monotonic(), waypoints))
 
     def _on_joint_state(self, message: JointState) -> None:
         now = time.monotonic()
-        if self._listened_wall is None or now - self._listened_wall < MATCHED_WALL_S:
-            self._do(self._visitor.unreadable(f'no controller listens to {COMMANDS}', now))
+        if self.clock_trouble:
+            self._do(self.supervisor.observe('clock', self.clock_trouble, now))
             return
         try:
             q = self._order.positions(message)
         except InputError as error:
-            self._do(self._visitor.unreadable(str(error), now))
+            self._do(self.supervisor.unreadable(str(error), now))
             return
-        self._do(self._visitor.report(seconds(message.header.stamp), q, now))
+        report = JointReport(seconds(message.header.stamp), q, self.now_s(), now)
+        self._do(self.supervisor.report(report))
 
-    def _on_emergency_stop(self, message: Bool) -> None:
-        self._do(self._visitor.emergency(message.data, time.monotonic()))
+    def _on_emergency_stop(self, stopped: bool) -> None:
+        self._do(self.supervisor.emergency(stopped, time.monotonic()))
+
+    def _on_clear_halt(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+        refusal = self.supervisor.clear_halt(time.monotonic())
+        response.success = not refusal
+        response.message = refusal or 'cleared; /remaster/collect goes on'
+        if not refusal:
+            self._disk.submit(self._halt_file.clear, self._on_written)
+            self._event('halt_cleared', 'the halt was cleared by a person')
+            self.status.publish()
+        return response
 
     def _watch(self) -> None:
+        now = time.monotonic()
+        rivals = next(filter(None, (only.trouble() for only in self._only)), '')
+        for name, trouble in (
+            ('rivals', rivals),
+            ('controller', self._controller_trouble(now)),
+            ('clock', self.clock_trouble),
+            ('safety_link', self._emergency.trouble()),
+        ):
+            self._do(self.supervisor.observe(name, trouble, now))
+
+    def _controller_trouble(self, now: float) -> str:
+        """Return why a command would be lost; ''."""
+        if self._controller is None:
+            if not self.status.alone(now):
+                return 'looking for another robot_bridge of this name'
+            self._controller = self.create_publisher(JointTrajectory, COMMANDS, LEASED)
         if not self._controller.get_subscription_count():
             self._listened_wall = None
         elif self._listened_wall is None:
-            self._listened_wall = time.monotonic()
-        self._do(self._visitor.tick(time.monotonic()))
+            self._listened_wall = now
+        if self._listened_wall is None or now - self._listened_wall < MATCHED_WALL_S:
+            return f'no controller listens to {self.resolve_topic_name(COMMANDS)}'
+        return ''
 
     # What goes out
 
     def _do(self, actions: list[Action]) -> None:
         for action in actions:
             match action:
+                case CheckPath():
+                    self._paths.submit(
+                        partial(self._search.find, action), partial(self._on_path, action.number)
+                    )
                 case Drive():
-                    self._drive(action)
-                case Stop():
-                    self._stop(action)
+                    self._publish(action.admitted)
+                    self._on_commanded(action.solution)
+                case Stop(admitted, reason):
+                    self._publish(admitted)
+                    self.counts['stopped'] += 1
+                    self._event('stopped', reason, 'warn')
+                    self.get_logger().info(f'stopping the arm: {reason}')
                 case Settled():
                     self._announce(action)
                 case Failed(solution, reason):
                     self.counts['failed'] += 1
                     self._event('failed', reason, 'warn', solution=solution, reason=reason)
                 case Halted(reason):
+                    self._disk.submit(partial(self._halt_file.write, reason), self._on_written)
                     self._event('halted', reason, 'error')
                     self.status.publish()
+                    self.get_logger().error(f'halted: {reason}')
 
-    def _drive(self, drive: Drive) -> None:
-        self._send(drive.waypoints)
-        if drive.solution == PROBE:
-            return
-        self.counts['commanded'] += 1
-        self._event(
-            'commanded',
-            f'solution {drive.solution} commanded',
-            solution=drive.solution,
-            since_settled_wall_s=f'{time.monotonic() - self._settled_wall:.6f}',
-        )
-
-    def _stop(self, stop: Stop) -> None:
-        self._send((stop.waypoint,))
-        self.counts['stopped'] += 1
-        self._event('stopped', stop.reason, 'warn')
-        self.get_logger().info(f'stopping the arm: {stop.reason}')
-
-    def _send(self, waypoints: tuple[Waypoint, ...]) -> None:
+    def _publish(self, admitted: Admitted) -> None:
+        """Publish what the gate has admitted; nothing else is ever published to a controller."""
         # A stop is a trajectory too: an empty one is refused by some versions of
         # joint_trajectory_controller, and the arm goes on.
         message = JointTrajectory(joint_names=list(self.chain.joint_names))
@@ -247,9 +268,30 @@ class RobotBridge(RemasterNode):
                 velocities=point.velocity.tolist(),
                 time_from_start=duration_of(point.time_s),
             )
-            for point in waypoints
+            for point in admitted.waypoints
         ]
         self._controller.publish(message)
+
+    def _on_commanded(self, solution: int) -> None:
+        if solution < 0:
+            return
+        self.counts['commanded'] += 1
+        self._event(
+            'commanded',
+            f'solution {solution} commanded',
+            solution=solution,
+            since_settled_wall_s=f'{time.monotonic() - self._settled_wall:.6f}',
+        )
+
+    def _on_path(self, number: int, answer: PathAnswer | Exception) -> None:
+        if isinstance(answer, Exception):
+            self.get_logger().error(f'the path could not be checked: {answer!r}')
+            answer = PathAnswer(None, f'it could not be checked ({answer})')
+        self._do(self.supervisor.path_found(number, answer, time.monotonic()))
+
+    def _on_written(self, result: object) -> None:
+        if isinstance(result, Exception):
+            self.get_logger().error(f'{self._halt_file.path}: the halt is not kept ({result})')
 
     def _announce(self, settled: Settled) -> None:
         self._settled_wall = time.monotonic()
@@ -269,26 +311,37 @@ class RobotBridge(RemasterNode):
         self.status.event(event, message, level=level, stamp=self._pose_stamp, **values)
 
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
-        blocked = self._visitor.blocked(time.monotonic())
-        text = 'moving or measuring' if self._visitor.busy else 'waiting for a pose'
+        supervisor, now = self.supervisor, time.monotonic()
+        blocked = supervisor.blocked(now)
+        text = 'moving or measuring' if supervisor.busy else 'waiting for a pose'
+        refused = supervisor.reports.refused
         values = {
             **self.counts,
-            'halted': self._visitor.halted,
-            'joints_age_s': f'{self._visitor.report_age_s(time.monotonic()):.1f}',
-            'joints_trouble': self._visitor.trouble,
+            'halted': supervisor.halted,
+            'joints_age_s': f'{supervisor.report_age_s(now):.1f}',
+            'joints_trouble': supervisor.trouble,
+            **{f'joints_refused_{reason}': count for reason, count in sorted(refused.items())},
+            'moves_refused': supervisor.gate.refused,
             # By it the planner sees whether a bridge that was started again knows the pose.
             'pose': self._pose_stamp,
+            'run': self._run,
         }
-        return ('warn' if blocked else 'ok'), blocked or text, values
+        level = 'error' if supervisor.halted else 'warn' if blocked else 'ok'
+        return level, blocked or text, values
 
     def close(self) -> None:
         """Leave the arm standing still."""
-        self._do(self._visitor.planner_says('gone: the bridge stops', time.monotonic()))
+        self._do(self.supervisor.planner_is('gone: the bridge stops', time.monotonic()))
+        self._paths.close(0.5)
+        self._disk.close()
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
-    return run(RobotBridge, args)
+    # A path check must not keep a stop waiting for the interpreter: 1 ms instead of 5.
+    sys.setswitchinterval(1e-3)
+    make: Callable[[], RemasterNode] = RobotBridge
+    return run(make, args)
 
 
 if __name__ == '__main__':

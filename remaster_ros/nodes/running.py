@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
+import os
 import signal
 import sys
-from collections.abc import Callable
+import traceback
+from collections.abc import Awaitable, Callable
+from functools import wraps
 from typing import Any
 
 import rclpy
@@ -17,14 +21,25 @@ from rclpy.executors import (
 )
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from std_srvs.srv import Trigger
 
 from remaster_ros.core.errors import InsufficientDataError, RemasterError
+from remaster_ros.nodes.locking import NameLock
+
+TRACEBACK = 'REMASTER_TRACEBACK'
+"""Environment variable: also print where in this program a fault came from."""
 
 
 class RemasterNode(Node):
-    """A node that `run` can end.
+    """A node that `run` can end, and of whose name there is one in a ROS domain.
+
+    Raises
+    ------
+    InputError
+        Another process on this computer is that node.
 
     Attributes
     ----------
@@ -32,10 +47,24 @@ class RemasterNode(Node):
         Set (from any thread) to end the process with this error.
     finished
         Set (from any thread) to end the process with status 0.
+    outlives_faults
+        True for a node that a fault of this program in one of its services does not end. It is
+        ended otherwise: a node that others count on is better gone, which they notice and hold
+        the arm for, than there in a state that nobody has thought of.
     """
 
     failure: RemasterError | None = None
     finished = False
+    outlives_faults = False
+
+    def __init__(self, node_name: str, **options: Any) -> None:
+        super().__init__(node_name, **options)
+        self._name_lock = NameLock(self.context.get_domain_id(), self.get_fully_qualified_name())
+
+    def destroy_node(self) -> None:
+        """As in rclpy; another process may be this node from then on."""
+        super().destroy_node()
+        self._name_lock.release()
 
     # rclpy gives every endpoint an event handler that only warns of QoS mismatches, and looks at
     # each of them for every message: half of what a message costs. All endpoints here are
@@ -53,6 +82,30 @@ class RemasterNode(Node):
         )
         return super().create_subscription(*args, **kwargs)
 
+    def create_service(
+        self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **kwargs: Any
+    ) -> Service:
+        """As in rclpy, but the caller of a Trigger is answered whatever the callback raises.
+
+        rclpy lets an exception out of the callback end the process, and the caller waits for ever.
+        The answer of such a call is that of `failed`: no success, and one line.
+        """
+        if srv_type is not Trigger:  # Those of rclpy itself, for parameters.
+            return super().create_service(srv_type, srv_name, callback, **kwargs)
+        serve = _answering_later if inspect.iscoroutinefunction(callback) else _answering
+        return super().create_service(srv_type, srv_name, serve(self, callback), **kwargs)
+
+    def failed(self, error: Exception, response: Any) -> Any:
+        """Return a Trigger response that says why a service has failed, in one line."""
+        response.success, response.message = False, str(error)
+        if not isinstance(error, RemasterError):
+            fault = fault_of_this_program(error)
+            response.message = str(fault)
+            self.get_logger().error(str(fault))
+            if not self.outlives_faults:
+                self.failure = fault
+        return response
+
     def now_s(self) -> float:
         """Time of the node's clock, s; simulated where use_sim_time is set."""
         return self.get_clock().now().nanoseconds * 1e-9
@@ -60,11 +113,53 @@ class RemasterNode(Node):
     @property
     def clock_trouble(self) -> str:
         """Why the node's clock says nothing: a simulated one that has not been heard; ''."""
-        known = self.get_clock().now().nanoseconds > 0
-        return '' if known else 'the simulated clock has not been heard: who publishes /clock?'
+        if self.get_clock().now().nanoseconds > 0:
+            return ''
+        topic = self.resolve_topic_name('/clock')
+        inside = self.get_namespace() != '/' and topic == '/clock'
+        hint = ' (that of a fake cell in this namespace: -r /clock:=clock)' if inside else ''
+        return f'the simulated clock has not been heard: who publishes {topic}?{hint}'
 
     def close(self) -> None:
         """Finish: files closed, threads joined. Called once, before the node is destroyed."""
+
+
+def fault_of_this_program(error: Exception) -> RemasterError:
+    """Return what to say of an exception that nobody has thought of."""
+    if os.environ.get(TRACEBACK):
+        traceback.print_exception(error)
+    return RemasterError(
+        f'a fault of this program, please report it: {type(error).__name__}: {error} '
+        f'(set {TRACEBACK}=1 to see where)'
+    )
+
+
+def _answering(node: RemasterNode, callback: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the callback of a service with `RemasterNode.failed` where it raises."""
+
+    @wraps(callback)
+    def serve(request: Any, response: Any) -> Any:
+        try:
+            return callback(request, response)
+        except Exception as error:
+            return node.failed(error, response)
+
+    return serve
+
+
+def _answering_later(
+    node: RemasterNode, callback: Callable[..., Awaitable[Any]]
+) -> Callable[..., Awaitable[Any]]:
+    """Return the same of a callback that waits for others."""
+
+    @wraps(callback)
+    async def serve(request: Any, response: Any) -> Any:
+        try:
+            return await callback(request, response)
+        except Exception as error:
+            return node.failed(error, response)
+
+    return serve
 
 
 class _Executor(MultiThreadedExecutor):

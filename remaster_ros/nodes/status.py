@@ -1,4 +1,4 @@
-"""/remaster/status: every node's state, counts and reasons, and the events of a configuration.
+"""remaster/status: every node's state, counts and reasons, and the events of a configuration.
 
 A DiagnosticArray carries either a node's *summary* (name = the node; published twice a second and
 at each change; what rqt_robot_monitor shows) or an *event* (name = ``node: event``), by which the
@@ -8,21 +8,30 @@ of its joint solutions. Events are identified by the pose's stamp and the soluti
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
-TOPIC = '/remaster/status'
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.rivalry import Rivalry
+from remaster_ros.storage.bag_metadata import LATCHED_DEPTH
+
+TOPIC = 'remaster/status'
 RELIABLE = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
+JOINT_STATES = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Of subscribers of joint_states: it matches reliable and best-effort publishers alike, and keeps
+what a busy node has not yet taken, seconds of the fastest stream."""
 LATCHED = QoSProfile(
-    depth=10,
+    depth=LATCHED_DEPTH,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
@@ -52,12 +61,12 @@ class Event:
 
 
 class Status:
-    """Publish a node's summary and events.
+    """Publish a node's summary and events; end the node where another of its name is longer there.
 
     Parameters
     ----------
     node
-        The node that reports.
+        The node that reports. Its `failure` is set where it must end.
     summary
         Returns (level, message, values) now; level is ``ok``, ``warn`` or ``error``.
     """
@@ -66,16 +75,73 @@ class Status:
         self._node = node
         self._summary = summary
         # Tells a node that was started again from the one before it.
-        self._started = str(time.time_ns())
+        self._started, self._started_wall = str(time.time_ns()), time.monotonic()
+        self._rivalry = Rivalry(self._started)
         self._publisher = node.create_publisher(DiagnosticArray, TOPIC, RELIABLE)
+        # Where the executor has threads, heartbeats go on while a callback plans or writes.
+        group = MutuallyExclusiveCallbackGroup()
+        # What is published last must have been true last.
+        self._order = threading.Lock()
         # A wall timer: status must go on when the simulated clock stands still.
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(0.5, self.publish, clock=self.steady)
+        self._timer = node.create_timer(0.5, self.publish, callback_group=group, clock=self.steady)
+        receive = receiver(lambda event: None, self._on_summary)
+        node.create_subscription(DiagnosticArray, TOPIC, receive, RELIABLE, callback_group=group)
+
+    @property
+    def alone_since(self) -> float | None:
+        """Since when no other of this name was heard, `time.monotonic`; None where not yet."""
+        return self._rivalry.alone_since_s
+
+    def alone(self, now: float) -> bool:
+        """Whether this node has listened for 1.5 s and heard of no other of its name.
+
+        Parameters
+        ----------
+        now
+            `time.monotonic`, s.
+        """
+        return self._rivalry.alone(now)
+
+    def _on_summary(self, name: str, message: str, values: dict[str, str]) -> None:
+        own = self._node.get_fully_qualified_name()
+        started = values.get('started', '')
+        if name != self._node.get_name() or values.get('node', own) != own or not started:
+            return
+        now = time.monotonic()
+        if started == self._started:
+            self._rivalry.hear_itself(now)
+            return
+        try:
+            uptime_s = float(values['uptime_s'])
+        except (KeyError, ValueError):
+            return
+        # A replay publishes what a node of this name once said, and is another node.
+        if self._namesakes() < 2:
+            return
+        if self._rivalry.hear(started, uptime_s, now - self._started_wall, now):
+            self._node.failure = InputError(  # type: ignore[attr-defined]
+                f'{own} is running already in this ROS domain, for {uptime_s:.0f} s, on another '
+                'computer or for another user; end that one, or give this one a namespace '
+                '(__ns:=/…) or a domain (ROS_DOMAIN_ID) of its own'
+            )
+
+    def _namesakes(self) -> int:
+        """Return how many publishers of this topic are of nodes with this node's name."""
+        own = self._node.get_name(), self._node.get_namespace()
+        found = self._node.get_publishers_info_by_topic(self._publisher.topic_name)
+        return sum((info.node_name, info.node_namespace) == own for info in found)
 
     def publish(self) -> None:
-        """Publish the summary now."""
-        level, message, values = self._summary()
-        self._send(self._node.get_name(), level, message, {**values, 'started': self._started})
+        """Publish the summary now; from any thread."""
+        with self._order:
+            level, message, values = self._summary()
+            own = {
+                'node': self._node.get_fully_qualified_name(),
+                'started': self._started,
+                'uptime_s': f'{time.monotonic() - self._started_wall:.3f}',
+            }
+            self._send(self._node.get_name(), level, message, {**values, **own})
 
     def event(self, event: str, message: str, level: str = 'ok', **values: Any) -> None:
         """Publish an event now."""
@@ -122,3 +188,23 @@ def listen(
 ) -> None:
     """Subscribe `node` to /remaster/status with a `receiver` of these callbacks."""
     node.create_subscription(DiagnosticArray, TOPIC, receiver(on_event, on_summary), RELIABLE)
+
+
+def run_after(run: str, planner: Mapping[str, str]) -> str:
+    """Return the token to hold after a summary of the planner.
+
+    The recorder and the bridge hold it in memory and publish it as `run`: by that a planner which
+    is started again finds whether its run still lives. A pause or a stop ends the run; a planner
+    that has just been started and has not decided yet (``idle``) does not.
+
+    Parameters
+    ----------
+    run
+        The token held so far, '' for none.
+    planner
+        The values of the planner's summary.
+    """
+    state = planner.get('state', '')
+    if state in ('running', 'held'):
+        return planner.get('run', '') or run
+    return run if state in ('idle', '') else ''

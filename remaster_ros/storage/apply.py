@@ -2,12 +2,17 @@
 
 The true joint angle is the reported one plus the offset. Each way corrects all of it, so only one
 may be in use at a time.
+
+An offset that the data cannot tell is in none of the three: its mean is a choice of the fit (0, or
+where the marker's nominal place leads), and applied it would move the arm for no reason. Each file
+says which joints are left out, and why.
 """
 
 from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
@@ -48,28 +53,51 @@ def write_apply(result: FitResult, folder: str | os.PathLike[str]) -> list[Path]
     texts = {
         REMASTER_FILE: remaster_text(result),
         LAYER_FILE: layer_text(result),
-        URDF_FILE: calibrated_urdf(result.session.urdf, result.chain, result.joint_offsets),
+        URDF_FILE: calibrated_urdf(
+            result.session.urdf,
+            result.chain,
+            np.where(result.identifiable, result.joint_offsets, 0.0),
+            notes=(
+                *(f'CHECK FIRST: {line}' for line in result.implausible),
+                *(
+                    f'left out, not identifiable: {joint}: {why}'
+                    for joint, why in left_out(result).items()
+                ),
+            ),
+        ),
     }
     for name, text in texts.items():
         write_atomically(folder / name, text)
     return [folder / name for name in texts]
 
 
+def left_out(result: FitResult) -> dict[str, str]:
+    """Return the joints whose offsets are not applied -> what the data cannot tell them from."""
+    return {
+        joint: why
+        for joint, known, why in zip(
+            result.joint_names, result.identifiable, result.why, strict=True
+        )
+        if not known
+    }
+
+
 def remaster_text(result: FitResult) -> str:
     """Return the instructions for re-mastering on the robot's own pad."""
-    rows, notes = [], []
-    for i, joint in enumerate(result.joint_names):
+    rows = []
+    for i in np.flatnonzero(result.identifiable):
         offset, std = np.degrees((result.joint_offsets[i], result.joint_offsets_std[i]))
-        row = f'  {joint:<20} {offset:>+12.4f} {std:>10.4f} {0.0 - offset:>+16.4f}'
-        if not result.identifiable[i]:
-            row += '   *'
-            notes.append(f'* {joint}: {result.why[i]}')
-        rows.append(row)
+        name = result.joint_names[i]
+        rows.append(f'  {name:<20} {offset:>+12.4f} {std:>10.4f} {0.0 - offset:>+16.4f}')
+    head = f'  {"joint":<20} {"offset, deg":>12} {"std, deg":>10} {"drive to, deg":>16}'
+    notes = [f'  {joint}: {why}' for joint, why in left_out(result).items()]
     return '\n'.join(
         [
             f'Joint zero-offsets of robot {result.chain.name!r}',
             f'(URDF with SHA-256 {urdf_sha256(result.session)})',
             '',
+            *(f'CHECK FIRST: {line}' for line in result.implausible),
+            *(('',) if result.implausible else ()),
             'The true joint angle is the reported one plus the offset. Use ONE of three ways,',
             'never two at once:',
             '',
@@ -78,9 +106,9 @@ def remaster_text(result: FitResult) -> str:
             f'2. An offset layer between planner and controller: {LAYER_FILE}.',
             f'3. A corrected robot model for planner and controller: {URDF_FILE}.',
             '',
-            f'  {"joint":<20} {"offset, deg":>12} {"std, deg":>10} {"drive to, deg":>16}',
-            *rows,
-            *(('', *notes) if notes else ()),
+            *((head, *rows) if rows else ('  No joint: these data tell no offset.',)),
+            *(('', 'Left out of all three, as the data cannot tell their offsets. Leave these',
+               'joints as they are:', *notes) if notes else ()),
             '',
             'Afterwards measure a few poses again and run "remaster accuracy": it shows whether',
             'the offsets are in use.',
@@ -97,27 +125,44 @@ def layer_text(result: FitResult) -> str:
         '#   angle to the planner      = reported angle + offset\n'
         "# Shift the joint limits as well: the controller's limits apply to its own angles.\n"
     )  # fmt: skip
+    for line in result.implausible:
+        head += f'# CHECK FIRST: {line}\n'
+    missing = left_out(result)
+    for joint, why in missing.items():
+        head += f'# Left out, not identifiable: {joint}: {" ".join(why.split())}\n'
+    known = np.flatnonzero(result.identifiable)
+    lists: dict[str, list[str] | list[float]] = {
+        'joint_names': [result.joint_names[i] for i in known],
+        'joint_offsets': [float(result.joint_offsets[i]) for i in known],
+        'joint_offsets_std': [float(result.joint_offsets_std[i]) for i in known],
+        'left_out': list(missing),
+    }
     return head + dump_yaml(
         {
             '/**': {
                 'ros__parameters': {
                     'robot': result.chain.name,
                     'urdf_sha256': urdf_sha256(result.session),
-                    'joint_names': list(result.joint_names),
-                    'joint_offsets': [float(offset) for offset in result.joint_offsets],
-                    'joint_offsets_std': [float(std) for std in result.joint_offsets_std],
-                    'identifiable': [bool(yes) for yes in result.identifiable],
+                    # ROS cannot tell the type of an empty list.
+                    **{key: values for key, values in lists.items() if values},
                 }
             }
         }
     )
 
 
-def calibrated_urdf(urdf: str, chain: SerialChain, joint_offsets: FloatArray) -> str:
+def calibrated_urdf(
+    urdf: str,
+    chain: SerialChain,
+    joint_offsets: FloatArray,
+    notes: Sequence[str] = (),
+) -> str:
     """Return the URDF whose kinematics at reported angles is that of the true ones.
 
     Each joint's origin is turned by its offset about its axis, and its limits are shifted the
-    other way, so that they still stop the arm in the same places.
+    other way, so that they still stop the arm in the same places. A joint that mimics one of them
+    follows the true angle. What names the joints elsewhere (``<transmission>``,
+    ``<ros2_control>``, ``<gazebo>``) means reported angles and stays as it is.
 
     Parameters
     ----------
@@ -127,11 +172,16 @@ def calibrated_urdf(urdf: str, chain: SerialChain, joint_offsets: FloatArray) ->
         Its joints.
     joint_offsets
         rad, (k,).
+    notes
+        What else a comment in the file says, such as the joints left out.
     """
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
     root = ElementTree.fromstring(urdf, parser)
-    joints = {joint.get('name'): joint for joint in root.iter('joint')}
+    # The robot's own children: a <transmission> or <ros2_control> has joints of the same names.
+    joints = {joint.get('name'): joint for joint in root.findall('joint')}
     for name, axis, offset in zip(chain.joint_names, chain.axes, joint_offsets, strict=True):
+        if offset == 0.0:
+            continue
         joint = joints[name]
         origin = joint.find('origin')
         if origin is None:
@@ -144,9 +194,16 @@ def calibrated_urdf(urdf: str, chain: SerialChain, joint_offsets: FloatArray) ->
             for element in joint.findall(tag):
                 for key in keys.intersection(element.keys()):
                     element.set(key, repr(float(element.attrib[key]) - float(offset)))
-    note = ElementTree.Comment(' joint origins and limits hold the calibrated zero-offsets ')
-    note.tail = '\n  '
-    root.insert(0, note)
+        for other in joints.values():
+            for mimic in other.findall('mimic'):
+                if mimic.get('joint') == name:
+                    share = float(mimic.get('multiplier', '1')) * float(offset)
+                    mimic.set('offset', repr(float(mimic.get('offset', '0')) + share))
+    for text in (*reversed(notes), 'joint origins and limits hold the calibrated zero-offsets'):
+        # Two hyphens would end the comment.
+        note = ElementTree.Comment(f' {re.sub("-(?=-)", "- ", text).rstrip("-")} ')
+        note.tail = '\n  '
+        root.insert(0, note)
     # What stands before the root (who made the model, under which licence) is no part of the tree.
     prolog = _PROLOG.match(urdf)
     head = prolog.group() if prolog else ''

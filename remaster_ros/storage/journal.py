@@ -8,7 +8,6 @@ and the file is refused.
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import hashlib
 import json
@@ -144,11 +143,6 @@ class Journal:
         self._file.truncate(self._before)
         self._sum = self._sum_before
         self.records.pop()
-
-    def touch(self) -> None:
-        """Renew the file's time of change, as a sign of life; it need not last."""
-        with contextlib.suppress(OSError):
-            os.utime(self._file.descriptor)
 
     def close(self) -> None:
         """Close the file and let others open it; closing again does nothing."""

@@ -42,6 +42,23 @@ def test_the_optimizer_discovers_on_request(start, client, tmp_path):
     wait_until(lambda: node.poll() is None, 1.0, 'the optimizer to live on')
 
 
+def test_a_healthy_arm_is_answered_with_figures_and_again(start, client, tmp_path):
+    """Nothing is there to be drawn as a cause, and the optimizer is there for the next call."""
+    session, out = tmp_path / 'session', tmp_path / 'discovery'
+    made = remaster(
+        'simulate', session, '--poses', '20', '--validation', '10', '--seed', '1',
+        '--sensors', 'mocap',
+    )  # fmt: skip
+    assert made.returncode == 0
+    start('remaster_ros.nodes.optimizer', *node_arguments(session=session, discovery=out))
+    for _ in range(2):
+        response = call(client, '/remaster/discover', timeout_s=200)
+        assert response.success, response.message
+        assert response.message == str(out / 'report.html')
+    assert json.loads((out / 'discovery.json').read_text())['verdict'] == 'none'
+    assert 'None. Every combination' in (out / 'report.html').read_text()
+
+
 def test_a_demo_finds_what_is_hidden_and_opens_the_truth_at_the_end(ros_environment, tmp_path):
     out = tmp_path / 'out'
     process = subprocess.run(

@@ -1,6 +1,8 @@
 """The optimizer on request: fit, and the latched offsets. Pausing is in test_faults.py."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -70,3 +72,71 @@ def test_a_fit_of_no_session_says_why(start, client, tmp_path):
     response = call(client, '/remaster/fit')
     assert not response.success
     assert str(tmp_path / 'none') in response.message
+
+
+FAULTY = """
+import sys
+from std_srvs.srv import Trigger
+from remaster_ros.nodes.running import RemasterNode, run
+
+class Faulty(RemasterNode):
+    outlives_faults = {outlives}
+
+    def __init__(self):
+        super().__init__('faulty')
+        self.create_service(Trigger, '/faulty/now', self._now)
+        self.create_service(Trigger, '/faulty/later', self._later)
+
+    def _now(self, request, response):
+        response.success = True
+        return {{}}['causes']
+
+    async def _later(self, request, response):
+        response.success = True
+        return self._now(request, response)
+
+sys.exit(run(Faulty))
+"""
+
+
+def start_faulty(ros_environment, outlives):
+    return subprocess.Popen(
+        [sys.executable, '-c', FAULTY.format(outlives=outlives)],
+        env=ros_environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize('service', ['/faulty/now', '/faulty/later'])
+def test_a_fault_in_a_service_is_an_answer_and_ends_a_node_that_others_count_on(
+    ros_environment, client, service
+):
+    node = start_faulty(ros_environment, outlives=False)
+    try:
+        response = call(client, service, timeout_s=20)
+        node.wait(timeout=20)
+    finally:
+        node.kill()
+        out, err = node.communicate()
+    assert not response.success
+    assert 'a fault of this program' in response.message
+    assert "KeyError: 'causes'" in response.message
+    assert '\n' not in response.message
+    assert node.returncode == 2, out + err
+    assert [line for line in err.splitlines() if line.startswith('error: a fault of')]
+    assert 'Traceback' not in err
+
+
+def test_a_node_that_outlives_faults_answers_again(ros_environment, client):
+    node = start_faulty(ros_environment, outlives=True)
+    try:
+        for service in ('/faulty/now', '/faulty/later', '/faulty/now'):
+            response = call(client, service, timeout_s=20)
+            assert not response.success
+            assert 'a fault of this program' in response.message
+        assert node.poll() is None
+    finally:
+        node.kill()
+        node.communicate()

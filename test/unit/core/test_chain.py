@@ -154,6 +154,14 @@ def test_unknown_velocity_and_continuous_limits_are_infinite():
     assert (chain.lower[0], chain.upper[0], chain.velocity_limits[0]) == (-np.inf, np.inf, np.inf)
 
 
+def test_a_fixed_joint_has_no_axis_and_an_expanded_xacro_may_say_where_it_is_from():
+    text = arm(
+        more='<link name="flange"/><joint name="j" type="fixed"><parent link="tool"/>'
+        '<child link="flange"/><axis xyz="0 0 0"/></joint>'
+    ).replace('<robot', '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"', 1)
+    assert SerialChain.from_urdf(text).tip_link == 'flange'
+
+
 BAD = {
     'prismatic': (arm(kind='prismatic'), "'joint_1' is prismatic"),
     'planar': (arm(kind='planar'), "'joint_1' is planar"),
@@ -169,6 +177,20 @@ BAD = {
     'no number': (arm(joint='<origin xyz="0 0 a"/>'), "xyz of joint 'joint_1' is 'a'"),
     'nan': (arm(joint='<origin rpy="0 0 nan"/>'), "rpy of joint 'joint_1' is 'nan'"),
     'xacro': (arm(joint='<origin xyz="0 0 ${d}"/>'), 'run xacro on the file first'),
+    'xacro macros': (
+        '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:macro name="m" params="p">'
+        '<link name="${p}a"/></xacro:macro><xacro:m p=""/></robot>',
+        'this is xacro, from which',
+    ),
+    'xacro without namespace': ('<robot><xacro:include filename="x"/></robot>', 'this is xacro'),
+    'mimic factor': (
+        arm(joint='<mimic joint="x" multiplier="two"/>'),
+        "multiplier of joint 'joint_1' is 'two'",
+    ),
+    'soft limit': (
+        arm(joint='<safety_controller soft_lower_limit="low"/>'),
+        "soft_lower_limit of joint 'joint_1' is 'low'",
+    ),
     'malformed': ('<robot><link', 'not well-formed XML'),
     'empty': ('', 'not well-formed XML'),
     'other XML': ('<sdf/>', 'outermost element is <sdf>'),

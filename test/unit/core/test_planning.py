@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from remaster_ros.core import planning
+from remaster_ros.core import collision, planning
 from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.collision import ArmCapsules
+from remaster_ros.core.collision import CollisionModel, arm_bodies
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.inverse import InverseKinematics
+from remaster_ros.core.line_of_sight import LinkCapsules
 from remaster_ros.core.planning import (
     LineOfSight,
     PoseRanges,
@@ -20,6 +21,12 @@ from remaster_ros.core.planning import (
 )
 
 ROBOTS = Path(__file__).parents[3] / 'config' / 'robots'
+
+
+def capsules(chain, radius=0.075, **kwargs):
+    return CollisionModel(chain, arm_bodies(chain, [], radius), **kwargs)
+
+
 SENSOR = np.array([1.5, 1.5, 1.2])
 SIGHTS = (
     LineOfSight('mocap', SENSOR + np.array([0, 0, 0.2]), np.array([0.1, 0, 0.02])),
@@ -82,7 +89,7 @@ def test_the_paper_s_yield_is_reproduced(ik):
     # Van Wyk et al. kept 36 and 32 of 60 poses, with 4.8 and 4.9 solutions a pose. The plan's
     # seeds spread by 2 poses and 0.2 solutions; of 6 seeds the means are known to 0.8 and 0.1,
     # and the bounds are 3 of that and more.
-    arm = ArmCapsules(ik.chain)
+    arm = capsules(ik.chain)
     plans = [
         plan_poses(
             ik, arm, candidate_poses(60, PoseRanges(), SENSOR, np.random.default_rng(seed)), SIGHTS
@@ -97,7 +104,7 @@ def test_the_paper_s_yield_is_reproduced(ik):
 
 def test_kept_solutions_reach_the_pose_within_limits_and_all_candidates_are_accounted_for(ik):
     candidates = candidate_poses(60, PoseRanges(), SENSOR, np.random.default_rng(5))
-    plan = plan_poses(ik, ArmCapsules(ik.chain), candidates, SIGHTS, limit_margin_rad=0.05)
+    plan = plan_poses(ik, capsules(ik.chain), candidates, SIGHTS, limit_margin_rad=0.05)
     assert len(plan.poses) + sum(plan.dropped.values()) == 60
     total = sum(len(ik.solutions(T, within_limits=False)) for T in candidates)
     kept = sum(len(pose.solutions) for pose in plan.poses)
@@ -116,8 +123,8 @@ def pose_facing_up(x, z):
     return T
 
 
-def only_reason(ik, candidates, sights=(), **capsules):
-    plan = plan_poses(ik, ArmCapsules(ik.chain, **capsules), np.array(candidates), sights)
+def only_reason(ik, candidates, sights=(), **arm):
+    plan = plan_poses(ik, capsules(ik.chain, **arm), np.array(candidates), sights)
     assert plan.poses == ()
     (reason,) = plan.dropped
     assert plan.dropped[reason] == len(candidates)
@@ -128,11 +135,11 @@ def test_each_reason_is_counted(ik):
     assert only_reason(ik, [pose_facing_up(3.0, 0.5)]) == planning.OUT_OF_REACH
     assert only_reason(ik, [pose_facing_up(0.45, 0.05)]) == planning.JOINT_LIMITS
     reachable = [ik.chain.forward([0.4, 0.7, 0, -1.2, 0.3, 0.9, 0.2])]
-    assert only_reason(ik, reachable, floor_z=1.0) == planning.FLOOR
+    assert only_reason(ik, reachable, floor_z=1.0) == collision.FLOOR
     # Half of this pose's solutions are outside the limits, half are too narrow at the elbow.
     folded = [ik.chain.forward([0.4, -0.5, 0, -2.0, 0.3, 0.9, 0.2])]
     thick = {'radius': 0.09, 'floor_z': None}
-    assert only_reason(ik, folded, **thick) == planning.SELF_COLLISION
+    assert only_reason(ik, folded, **thick) == collision.SELF_COLLISION
     behind = reachable[0] @ [0, 0, -1, 1]
     sight = LineOfSight('tracker', behind[:3], np.array([0.1, 0, 0.02]))
     assert only_reason(ik, reachable, [sight]) == 'no line of sight to tracker'
@@ -142,8 +149,8 @@ def test_a_link_in_the_line_of_sight_drops_the_solution(ik):
     q = np.array([0.4, 0.7, 0, -1.2, 0.3, 0.9, 0.2])
     T = ik.chain.forward(q)
     marker = np.array([0.1, 0, 0.02])
-    arm = ArmCapsules(ik.chain)
-    elbow = arm.points(q)[4]
+    arm = capsules(ik.chain)
+    elbow = LinkCapsules(ik.chain).points(q)[4]
     at = ik.chain.positions(q, marker)
     sight = LineOfSight('mocap', at + 3 * (elbow - at), marker, max_angle_rad=np.pi)
     plan = plan_poses(ik, arm, T[None], [sight])
@@ -155,7 +162,7 @@ def test_a_link_in_the_line_of_sight_drops_the_solution(ik):
 
 
 def test_no_candidates_make_an_empty_plan(ik):
-    plan = plan_poses(ik, ArmCapsules(ik.chain), np.empty((0, 4, 4)), SIGHTS)
+    plan = plan_poses(ik, capsules(ik.chain), np.empty((0, 4, 4)), SIGHTS)
     assert (plan.poses, plan.dropped, plan.dropped_solutions) == ((), {}, {})
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -153,22 +154,53 @@ def test_roll_pitch_yaw_are_exact_at_and_near_the_singularity():
 
 
 def test_the_offset_layer_is_a_ros_parameter_file(fit_result):
+    known = fit_result.identifiable
+    assert 0 < known.sum() < len(known)
     parameters = yaml.safe_load(layer_text(fit_result))['/**']['ros__parameters']
-    assert parameters['joint_names'] == list(fit_result.joint_names)
-    assert parameters['joint_offsets'] == fit_result.joint_offsets.tolist()
-    assert parameters['identifiable'] == fit_result.identifiable.tolist()
+    names = np.array(fit_result.joint_names)
+    assert parameters['joint_names'] == names[known].tolist()
+    assert parameters['joint_offsets'] == fit_result.joint_offsets[known].tolist()
+    assert parameters['joint_offsets_std'] == fit_result.joint_offsets_std[known].tolist()
+    assert parameters['left_out'] == names[~known].tolist()
 
 
 def test_the_instructions_say_minus_the_offset(fit_result):
     text = remaster_text(fit_result)
+    table, _, notes = text.partition('Left out of all three')
     for i, joint in enumerate(fit_result.joint_names):
-        line = next(line for line in text.splitlines() if line.split()[:1] == [joint])
-        offset, _, drive_to = map(float, line.split()[1:4])
+        lines = [line for line in table.splitlines() if line.split()[:1] == [joint]]
+        assert len(lines) == fit_result.identifiable[i]
+        if not fit_result.identifiable[i]:
+            assert f'{joint}: {fit_result.why[i]}' in notes
+            continue
+        offset, _, drive_to = map(float, lines[0].split()[1:4])
         assert (
             offset == -drive_to == pytest.approx(np.degrees(fit_result.joint_offsets[i]), abs=6e-5)
         )
-        assert line.endswith('*') != fit_result.identifiable[i]
-    assert f'* {fit_result.joint_names[0]}: {fit_result.why[0]}' in text
+
+
+@pytest.mark.parametrize('known', [True, False])
+def test_all_joints_or_none_may_be_applied(fit_result, tmp_path, known):
+    """No list that ROS cannot read, no table without rows, and hyphens that end no comment."""
+    count = len(fit_result.joint_names)
+    result = replace(
+        fit_result,
+        identifiable=np.full(count, known),
+        why=('' if known else 'joint_1 -- a <name> --->',) * count,
+    )
+    write_apply(result, tmp_path)
+    layer = yaml.safe_load((tmp_path / 'offset_layer.yaml').read_text())
+    parameters = layer['/**']['ros__parameters']
+    assert ('joint_names' in parameters) == ('joint_offsets' in parameters) == known
+    assert ('left_out' in parameters) != known
+    text = (tmp_path / 'remaster.txt').read_text()
+    assert ('drive to, deg' in text) == known
+    assert ('these data tell no offset' in text) != known
+    assert ('Left out' in text) != known
+    urdf = (tmp_path / 'robot_calibrated.urdf').read_text()
+    chain = SerialChain.from_urdf(urdf, result.chain.base_link, result.chain.tip_link)
+    assert np.array_equal(chain.lower, result.chain.lower) != known
+    assert ('left out' in urdf) != known
 
 
 def test_write_apply_writes_all_three(fit_result, tmp_path):

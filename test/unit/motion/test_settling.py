@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from remaster_ros.core.settling import SettleDetector, SettleRules
+from remaster_ros.motion.settling import SettleDetector, SettleRules
 
 RULES = SettleRules(settle_s=3.0, arrive_tolerance=2e-3, still_tolerance=2e-4, max_gap_s=0.5)
 TARGET = np.array([0.5, -1.0])

@@ -1,0 +1,590 @@
+"""Which joint configuration an arm is sent to, when it may move at all, and when it is halted.
+
+The rules of the robot bridge as a state machine: reports come in with their times, what is to be
+done goes out as actions. Two times are told apart. *Wall* time is when something arrived, and
+silence is judged by it. *Robot* time is what the stamps of joint_states say has passed.
+
+Three things end a motion. Its end. A *stop*: the rest of the line that is under way is left along
+the same line, and the configuration is commanded again later. A *halt*: the arm stays where it is
+until a person calls `clear_halt`. Where it is not known that the arm follows its path (emergency
+stop, silence, reports that are not believed) nothing is commanded any more: whatever were
+commanded then would begin where the arm is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.core.types import FloatArray
+from remaster_ros.motion.actions import (
+    Action,
+    CheckPath,
+    Drive,
+    Failed,
+    Halted,
+    PathAnswer,
+    Settled,
+    Stop,
+    SupervisorRules,
+)
+from remaster_ros.motion.following import (
+    STOPPED_ON_ITS_WAY,
+    Following,
+    Seen,
+    allowed_lag_s,
+)
+from remaster_ros.motion.joint_reports import JointReport, JointReports
+from remaster_ros.motion.motion_gate import (
+    WAY_OUT_TOOL_SPEED,
+    MotionGate,
+    MotionRefusedError,
+    StartMovedError,
+)
+from remaster_ros.motion.path_check import FreePath
+from remaster_ros.motion.settling import SettleDetector
+from remaster_ros.motion.trajectory import Trajectory
+
+PROBE = -1
+"""The number of the move before the first one."""
+WAY_OUT = -2
+"""The number of a way out of a contact or a margin."""
+STANDING = -3
+"""The number of a question about where the arm stands, before it is moved at all."""
+PROBE_RAD = 1e-6
+"""How far the probe goes, rad: less than the arm repeats, more than the last bit."""
+PROBE_WAIT_S = 0.5
+"""After its end a robot that copies commands has copied this one, s."""
+DOUBT_S = 0.5
+"""Reports that are not believed for so long (wall time) halt the arm, s."""
+MOVED_RAD = 0.02
+"""An arm that was moved by so much while nothing was commanded was moved by another, rad."""
+ELSEWHERE_RAD = 0.05
+"""An arm that stands so far from its target does not follow, rad; nearer it is inaccurate."""
+STOPPED_S = 1.0
+"""After the end of a stop the arm stands within so much time, s; the lag comes on top."""
+OWN_PAUSE_S = 0.5
+"""Between two looks at the clock passes less, s of wall time, or this process was paused."""
+
+
+@dataclass
+class _Visit:
+    """The configuration under way: when it was sent (stamp) and must have arrived (robot time)."""
+
+    solution: int
+    following: Following
+    detector: SettleDetector
+    sent_stamp: float
+    deadline: float
+    settled: bool = False
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Where it was sent."""
+        return self.following.trajectory
+
+
+@dataclass(frozen=True)
+class _Braking:
+    """A stop under way: where it ends (rad, (k,)), and when the arm must stand (robot time)."""
+
+    end: FloatArray
+    deadline: float
+
+
+NAMES = ('planner', 'recorder', 'robot')
+"""Who must be alive; their reasons not to move count in this order."""
+OBSERVED = ('safety_link', 'controller', 'clock', 'rivals')
+"""What else must be right."""
+NO_WAYPOINTS: Mapping[int, FloatArray] = {}
+
+
+class ArmSupervisor:
+    """Visit the joint solutions of a pose one by one, and stop or halt when anything is wrong.
+
+    Every method that returns actions wants them carried out in their order.
+
+    Parameters
+    ----------
+    gate
+        Every command comes from it.
+    reports
+        Judges the reports of the joints.
+    rules
+        See `SupervisorRules`.
+    halted
+        A halt that was there before this process was; ''.
+
+    Attributes
+    ----------
+    halted
+        Why the arm stays where it is until a person clears the halt; ''.
+    """
+
+    def __init__(
+        self, gate: MotionGate, reports: JointReports, rules: SupervisorRules, halted: str = ''
+    ) -> None:
+        self.gate, self.reports, self.rules = gate, reports, rules
+        self.halted = halted
+        self._heard: dict[str, float] = {}
+        # Why the arm must not move, by each reason's origin; '' if it may.
+        self._reasons: dict[str, str] = {}
+        self._failures = 0
+        self._must_probe = self._must_look = True
+        # Before a collection is begun (again) by a person nothing moves.
+        self._must_collect = bool(halted)
+        self._seen: Seen | None = None
+        self._doubted_wall: float | None = None
+        self._ticked_wall: float | None = None
+        self._braking: _Braking | None = None
+        self._offered: FreePath | None = None
+        self._way_out: FreePath | None = None
+        self._requests = 0
+        # The number of the path that is asked for, and of the solution that it leads to.
+        self._pending: tuple[int, int] | None = None
+        self._visit: _Visit | None = None
+        self._begin(())
+
+    # What comes in
+
+    def planner_is(self, state: str, wall_s: float) -> list[Action]:
+        """Take the planner's state; anything but ``running`` stops the arm."""
+        reason = '' if state == 'running' else f'planner is {state}'
+        if reason and not self.halted:
+            self._must_collect, self._failures = False, 0
+        return self._hear('planner', reason, wall_s)
+
+    def recorder_waits(self, waiting_for: str, wall_s: float) -> list[Action]:
+        """Take the recorder's sign of life, and which required sensor it misses ('' for none)."""
+        return self._hear('recorder', f'waiting for {waiting_for}' if waiting_for else '', wall_s)
+
+    def plan(
+        self,
+        solutions: FloatArray,
+        wall_s: float,
+        waypoints: Mapping[int, FloatArray] = NO_WAYPOINTS,
+    ) -> list[Action]:
+        """Take the solutions of a pose in the order of visiting; none to stop.
+
+        Parameters
+        ----------
+        solutions
+            rad, (m, k).
+        wall_s
+            Now, s.
+        waypoints
+            Number of a solution -> what to go through on the way to it, rad, (n, k).
+        """
+        actions = self._stop('another pose' if len(solutions) else 'stopped', wall_s)
+        self._begin(solutions, waypoints)
+        return actions + self.tick(wall_s)
+
+    def answered(self, solution: int, wall_s: float) -> list[Action]:
+        """Take the recorder's answer that it is done with a settled configuration."""
+        visit = self._visit
+        if visit is not None and visit.settled and visit.solution == solution:
+            self._leave(visit)
+        return self.tick(wall_s)
+
+    def unreadable(self, why: str, wall_s: float) -> list[Action]:
+        """Take a report that does not tell where the joints are."""
+        return self._doubt(why, wall_s)
+
+    def emergency(self, stopped: bool, wall_s: float) -> list[Action]:
+        """Take the state of the robot's own safety circuit."""
+        self._reasons['safety'] = 'the robot reports an emergency stop' if stopped else ''
+        return self.tick(wall_s)
+
+    def observe(self, name: str, trouble: str, wall_s: float) -> list[Action]:
+        """Take what else must be right before the arm may move.
+
+        Parameters
+        ----------
+        name
+            One of `OBSERVED`: the link to the safety circuit, the controller, the node's clock,
+            who else publishes what moves the arm. The last always halts a collection; the others
+            where they were right before, and else only hold it: they take a while at the start.
+        trouble
+            What is wrong; '' for nothing.
+        wall_s
+            Now, s.
+        """
+        before = self._reasons.get(name)
+        self._reasons[name] = trouble
+        if trouble and self._engaged and not self.halted and (name == 'rivals' or before == ''):
+            return self._halt(trouble, wall_s, stop=True)
+        return self.tick(wall_s)
+
+    def report(self, report: JointReport) -> list[Action]:
+        """Take a report of the joints."""
+        wall_s = report.wall_s
+        if not self.reports.believes(report):
+            return self._doubt(self.reports.trouble, wall_s)
+        self._doubted_wall = None
+        gap = self._gap(report)
+        self._excuse_gap(report)
+        self._seen = seen = Seen.after(self._seen, report, self.rules, self.reports.late_s)
+        actions: list[Action] = []
+        visit = self._visit
+        if gap:
+            actions = self._halt(gap, wall_s)
+        elif visit is not None and visit.settled:
+            actions = self._watch_settled(visit, seen)
+        elif visit is not None:
+            actions = self._judge(visit, seen)
+        elif self._braking is not None:
+            actions = self._watch_braking(self._braking, seen)
+        return actions + self._hear('robot', '', wall_s)
+
+    def path_found(self, number: int, answer: PathAnswer, wall_s: float) -> list[Action]:
+        """Take the answer to a `CheckPath`; one that was asked before the last counts nothing."""
+        request, seen = self._pending, self._seen
+        if request is None or request[0] != number:
+            return []
+        self._pending = None
+        if seen is None or self.blocked(wall_s) or not seen.stands(wall_s):
+            return []
+        solution = request[1]
+        if answer.path is None and answer.at_start:
+            return self._halt(self._offer(answer), wall_s)
+        if solution == STANDING:
+            self._must_look = False
+            return self.tick(wall_s)
+        if answer.path is None:
+            return self._give_up(solution, f'no free path: {answer.why}', wall_s)
+        return self._drive(solution, answer.path, seen, wall_s)
+
+    def clear_halt(self, wall_s: float) -> str:
+        """Take a person's word that the arm may be moved again; return why not, '' if so.
+
+        What stands in the way of a motion still does; nothing moves before the collection is
+        begun again.
+        """
+        if self._reasons.get('safety'):
+            return self._reasons['safety']
+        if not self.halted:
+            return 'the arm is not halted'
+        self.halted, self._failures = '', 0
+        self._must_collect = self._must_probe = self._must_look = True
+        self._way_out, self._offered = self._offered, None
+        # What was not believed may be the truth now: a robot that was mastered, a clock that was
+        # set. It is learned anew while the arm stands.
+        self.reports.forget()
+        self._seen, self._doubted_wall, self._braking = None, None, None
+        self._reasons['robot'] = ''
+        return ''
+
+    def tick(self, wall_s: float) -> list[Action]:
+        """Look at the time: stop or halt on silence, go on when nothing is in the way."""
+        self._excuse_own_pause(wall_s)
+        if self.halted:
+            return []
+        emergency = self._reasons.get('safety')
+        if emergency:
+            return self._halt(emergency, wall_s)
+        silent = self._silence_s('robot', wall_s) > self.rules.heartbeat_s
+        if silent and 'robot' in self._heard and self._engaged:
+            return self._halt(f'no sign of robot for {self.rules.heartbeat_s:g} s', wall_s)
+        blocked = self.blocked(wall_s)
+        return self._stop(blocked, wall_s) if blocked else self._go_on(wall_s)
+
+    # What it tells
+
+    @property
+    def busy(self) -> bool:
+        """Whether a configuration is under way."""
+        return self._visit is not None
+
+    @property
+    def moving(self) -> bool:
+        """Whether the arm is on its way."""
+        return self._visit is not None and not self._visit.settled
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the reports of the joints; ''."""
+        return self._reasons.get('robot', '')
+
+    def report_age_s(self, wall_s: float) -> float:
+        """Time since a report was believed, s; infinite if none was."""
+        return self._silence_s('robot', wall_s)
+
+    def blocked(self, wall_s: float) -> str:
+        """Why the arm must not move; '' if it may."""
+        limit = self.rules.heartbeat_s
+        if self.halted:
+            return self.halted
+        silent = [name for name in NAMES if self._silence_s(name, wall_s) > limit]
+        if silent:
+            return f'no sign of {", ".join(silent)} for {limit:g} s'
+        reasons = (self._reasons.get(name, '') for name in (*NAMES, *OBSERVED))
+        if self._must_collect and not self._reasons.get('planner'):
+            return 'the halt was cleared: /remaster/collect goes on'
+        return next(filter(None, reasons), '')
+
+    # Inside: reasons not to move
+
+    @property
+    def _rate(self) -> float:
+        """Seconds of the robot per second of wall time; at least 1."""
+        return max(self.reports.clock.rate, 1.0)
+
+    @property
+    def _engaged(self) -> bool:
+        """Whether a collection is running: what is wrong with the robot then halts it."""
+        running = 'planner' in self._heard and not self._reasons.get('planner')
+        return (running and not self._must_collect) or self._visit is not None
+
+    def _hear(self, name: str, reason: str, wall_s: float) -> list[Action]:
+        self._heard[name], self._reasons[name] = wall_s, reason
+        return self.tick(wall_s)
+
+    def _doubt(self, why: str, wall_s: float) -> list[Action]:
+        """Take a report that is not believed; where that goes on it halts a collection."""
+        if self._doubted_wall is None:
+            self._doubted_wall = wall_s
+        if wall_s - self._doubted_wall <= DOUBT_S:
+            return self.tick(wall_s)
+        self._reasons['robot'] = why
+        jumped = self._seen is not None and self.reports.kind in ('too_fast', 'outside_limits')
+        if (self._engaged or jumped) and not self.halted:
+            return self._halt(why, wall_s)
+        # Nothing moves, so that what is usual can be learned anew: a driver that was restarted, a
+        # clock that was set.
+        self.reports.forget()
+        self._seen = None
+        return self.tick(wall_s)
+
+    def _excuse_own_pause(self, wall_s: float) -> None:
+        """Shift what was last heard where this process was paused: nobody else was silent."""
+        last, self._ticked_wall = self._ticked_wall, wall_s
+        if last is None or wall_s - last <= OWN_PAUSE_S:
+            return
+        pause = wall_s - last
+        # Who was heard since is no exception, and nobody was heard in the future.
+        self._heard = {name: min(heard + pause, wall_s) for name, heard in self._heard.items()}
+
+    def _silence_s(self, name: str, wall_s: float) -> float:
+        return wall_s - self._heard[name] if name in self._heard else np.inf
+
+    def _gap(self, report: JointReport) -> str:
+        """Return in words that the arm was not observed for long while it was to be; ''."""
+        if self._seen is None or not self._engaged or self.halted:
+            return ''
+        gap = (report.stamp_s - self._seen.stamp) / self._rate
+        too_long = gap > self.rules.heartbeat_s
+        return f'the robot was not observed for {gap:.1f} s' if too_long else ''
+
+    # Inside: the arm
+
+    def _excuse_gap(self, report: JointReport) -> None:
+        """Give an arm that was not seen for a while as much longer to arrive."""
+        if self._seen is None or self._visit is None:
+            return
+        gap = report.stamp_s - self._seen.stamp
+        if gap > self.rules.settle.max_gap_s:
+            self._visit.deadline += gap
+
+    # Inside: the next configuration
+
+    def _begin(
+        self,
+        solutions: FloatArray | tuple[()],
+        waypoints: Mapping[int, FloatArray] = NO_WAYPOINTS,
+    ) -> None:
+        """Begin another pose."""
+        self._solutions, self._waypoints, self._next = solutions, waypoints, 0
+        self._visit, self._pending = None, None
+
+    def _go_on(self, wall_s: float) -> list[Action]:
+        """Ask for the way to the next solution of the pose, if the arm stands."""
+        actions: list[Action] = []
+        seen = self._seen
+        idle = self._visit is None and self._pending is None and self._braking is None
+        if seen is None or not idle or not seen.stands(wall_s):
+            return actions
+        if self._way_out is not None:
+            path, self._way_out = self._way_out, None
+            return self._drive(WAY_OUT, path, seen, wall_s)
+        if self._must_look:
+            return [self._ask(STANDING, seen.q, seen.q)]
+        while self._next < len(self._solutions):
+            target = self._solutions[self._next]
+            outside = self.gate.limits.outside(target)
+            if self._must_probe:
+                return [*actions, self._ask(PROBE, seen.q, self._probe(seen.q))]
+            if not outside:
+                return [*actions, self._ask(self._next, seen.q, target)]
+            actions.append(Failed(self._next, outside))
+            self._next += 1
+        return actions
+
+    def _ask(self, solution: int, start: FloatArray, target: FloatArray) -> CheckPath:
+        self._requests += 1
+        self._pending = self._requests, solution
+        none = np.empty((0, len(target)))
+        return CheckPath(self._requests, start, target, self._waypoints.get(solution, none))
+
+    def _probe(self, q: FloatArray) -> FloatArray:
+        """Return a place a micrometre away: no measurement comes back to it to the bit."""
+        limits = self.gate.limits
+        low, high = np.clip((limits.lower, limits.upper), -1e3, 1e3)
+        return q + np.where(2 * q > low + high, -PROBE_RAD, PROBE_RAD)
+
+    def _drive(self, solution: int, path: FreePath, seen: Seen, wall_s: float) -> list[Action]:
+        try:
+            admitted = self.gate.admit(path, seen.q)
+        except StartMovedError:
+            # It has moved since it was asked: asked again as soon as it stands.
+            return []
+        except MotionRefusedError as error:
+            return self._give_up(solution, str(error), wall_s)
+        trajectory, rules = admitted.trajectory, self.rules
+        assert trajectory is not None
+        time = seen.now(wall_s, self._rate)
+        deadline = time + trajectory.duration_s + rules.settle.settle_s + rules.arrive_timeout_s
+        detector = SettleDetector(trajectory.end, rules.settle)
+        following = Following(trajectory, time, wall_s, rules)
+        self._visit = _Visit(solution, following, detector, seen.stamp, deadline)
+        return [Drive(solution, admitted)]
+
+    def _give_up(self, solution: int, reason: str, wall_s: float) -> list[Action]:
+        """Go on with the next solution where the gate or the path refuses one."""
+        if solution < 0:
+            return self._halt(reason, wall_s)
+        self._next = solution + 1
+        return [Failed(solution, reason), *self.tick(wall_s)]
+
+    def _offer(self, answer: PathAnswer) -> str:
+        """Remember a way out for the person who clears the halt; return what to tell them."""
+        self._offered = answer.way_out
+        stands = f'the arm stands where it must not: {answer.why}'
+        if answer.way_out is None:
+            return f'{stands}; no way out is known: move it by hand, then /remaster/clear_halt'
+        way = np.max(np.abs(np.diff(answer.way_out.points, axis=0)), axis=0)
+        names = self.gate.limits.names
+        joints = ', '.join(
+            f'{name} by {np.rad2deg(angle):.1f} deg' for name, angle in zip(names, way) if angle
+        )
+        return (
+            f'{stands}; /remaster/clear_halt and /remaster/collect let it leave slowly '
+            f'(at most {WAY_OUT_TOOL_SPEED:g} m/s): {joints}'
+        )
+
+    def _leave(self, visit: _Visit) -> None:
+        """Be done with a configuration: the next one follows."""
+        self._visit, self._next = None, visit.solution + 1
+
+    # Inside: the configuration under way
+
+    def _judge(self, visit: _Visit, seen: Seen) -> list[Action]:
+        """Say what becomes of the configuration that the arm is on its way to."""
+        detector, rules, wall_s = visit.detector, self.rules, seen.wall
+        trajectory, elapsed = visit.trajectory, visit.following.elapsed_s(seen.time)
+        settled = detector.update(seen.stamp, seen.q) == 'settled'
+        arrived = elapsed > trajectory.duration_s + PROBE_WAIT_S
+        if (arrived or settled) and np.array_equal(seen.q, trajectory.end):
+            why = 'joint_states repeat what was commanded to the last bit: no measurement'
+            return self._halt(f'{why}; switch the driver to measured positions', wall_s)
+        astray = visit.following.update(seen, self._rate)
+        if astray:
+            return self._halt(astray, wall_s)
+        if visit.solution < 0:
+            if arrived:
+                self._visit, self._must_probe = None, visit.solution != PROBE
+            return []
+        if settled:
+            assert detector.still_since is not None
+            visit.settled, self._failures = True, 0
+            visit.deadline = seen.time + rules.answer_timeout_s
+            motion_s = detector.still_since - visit.sent_stamp
+            settle_s = seen.stamp - detector.still_since
+            return [Settled(visit.solution, seen.stamp, detector.mean, motion_s, settle_s)]
+        distance = float(np.max(np.abs(seen.q - trajectory.end)))
+        if distance > ELSEWHERE_RAD and arrived and seen.stands(wall_s):
+            return self._halt(STOPPED_ON_ITS_WAY, wall_s)
+        stood_s = min(seen.time - seen.stands_since, elapsed - trajectory.duration_s)
+        if distance > rules.settle.arrive_tolerance and stood_s >= rules.stall_s:
+            return self._fail(visit, f'arrived elsewhere: {distance:.4f} rad off', wall_s)
+        if seen.time > visit.deadline:
+            return self._fail(visit, 'did not come to rest at its target in time', wall_s)
+        return []
+
+    def _watch_settled(self, visit: _Visit, seen: Seen) -> list[Action]:
+        """Wait for the recorder's answer; the arm must stand meanwhile."""
+        moved = float(np.max(np.abs(seen.q - visit.trajectory.end)))
+        if moved > MOVED_RAD:
+            why = f'the arm was moved by {np.rad2deg(moved):.1f} deg, and not by a command'
+            return self._halt(why, seen.wall)
+        if self._reasons.get('recorder'):
+            visit.deadline = seen.time + self.rules.answer_timeout_s
+        elif seen.time > visit.deadline:
+            self._leave(visit)
+            return [Failed(visit.solution, 'the recorder did not say what became of it')]
+        return []
+
+    def _watch_braking(self, braking: _Braking, seen: Seen) -> list[Action]:
+        """See that a stop is a stop."""
+        if seen.stands(seen.wall):
+            self._braking = None
+            if np.max(np.abs(seen.q - braking.end)) <= ELSEWHERE_RAD:
+                return []
+            return self._halt('the arm stands, but not where its stop led', seen.wall)
+        if seen.time > braking.deadline:
+            self._braking = None
+            return self._halt('the arm goes on after a stop', seen.wall)
+        return []
+
+    # Inside: ends of a motion
+
+    def _fail(self, visit: _Visit, reason: str, wall_s: float) -> list[Action]:
+        """Give a configuration up; halt where that happens too often in a row."""
+        self._failures += 1
+        if self._failures >= self.rules.failures_in_a_row:
+            why = f'{self._failures} configurations not reached: {reason}'
+            return self._halt(why, wall_s, stop=True)
+        # Its trajectory has ended: there is nothing to be stopped.
+        self._leave(visit)
+        return [Failed(visit.solution, reason)]
+
+    def _halt(self, reason: str, wall_s: float, *, stop: bool = False) -> list[Action]:
+        """Halt; with `stop` the arm is stopped first where it is known to follow its path."""
+        visit, seen = self._visit, self._seen
+        actions: list[Action] = []
+        if stop and visit is not None and seen is not None and not visit.settled:
+            known = not visit.following.lost(seen, wall_s)
+            actions = self._brake(visit, seen, reason, wall_s) if known else []
+        self.halted = reason
+        self._visit, self._pending = None, None
+        return [*actions, Halted(reason)]
+
+    def _stop(self, reason: str, wall_s: float) -> list[Action]:
+        """Stop an arm that is on its way; the configuration is commanded again later.
+
+        An arm that has settled stands already: its reading goes on, only no command follows it.
+        """
+        visit, seen = self._visit, self._seen
+        if visit is None or visit.settled or seen is None:
+            return []
+        lost = visit.following.lost(seen, wall_s)
+        if lost:
+            return self._halt(f'{reason}; {lost}: nothing is commanded', wall_s)
+        return self._brake(visit, seen, reason, wall_s)
+
+    def _brake(self, visit: _Visit, seen: Seen, reason: str, wall_s: float) -> list[Action]:
+        """Leave the rest of the line along the line."""
+        self._visit, self._pending = None, None
+        if visit.following.has_ended(seen, wall_s, self._rate):
+            return []
+        admitted = self.gate.stop(*visit.following.window(seen, wall_s, self._rate))
+        (stop,) = admitted.waypoints
+        deadline = (
+            seen.now(wall_s, self._rate)
+            + stop.time_s
+            + allowed_lag_s(self.rules, self._rate)
+            + STOPPED_S
+        )
+        self._braking = _Braking(stop.q, deadline)
+        return [Stop(admitted, reason)]

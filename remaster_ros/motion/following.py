@@ -1,0 +1,201 @@
+"""Where the arm is, and whether it follows the trajectory that it was sent along."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.core.types import FloatArray
+from remaster_ros.motion.actions import SupervisorRules
+from remaster_ros.motion.joint_reports import JointReport
+from remaster_ros.motion.trajectory import Trajectory
+
+STANDING_S = 0.25
+"""An arm that has not moved for so long stands; it must before it is sent anywhere, s."""
+FRESH_S = 0.3
+"""A report older than this (wall time) no longer tells where the arm is, s."""
+ASTRAY_S = 0.3
+"""An arm that is off its path for so long (wall time) is halted, s."""
+LATENCY_S = 0.1
+"""What a busy machine may add to the lag of an arm, s of wall time."""
+JITTER_S = 0.02
+"""By so much a command's way to the robot may differ from another's, s of wall time."""
+EARLY_S = 0.1
+"""An arm may be so far ahead of its path, s of robot time; `LATENCY_S` comes on top."""
+ON_PATH_RAD = 0.02
+"""An arm is on its path that is no further from it, rad: its servo overshoots."""
+STOPPED_ON_ITS_WAY = 'the robot stopped on its way: an emergency or protective stop?'
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The last report that was believed.
+
+    Attributes
+    ----------
+    q
+        Joint positions, rad, (k,).
+    stamp, wall, time
+        Its stamp, wall time and robot time, s.
+    stands_at, stands_since
+        Where (rad, (k,)) and since when (robot time, s) the arm has been standing.
+    late_s
+        How much later than usual it came, s: the arm has gone on meanwhile.
+    """
+
+    q: FloatArray
+    stamp: float
+    wall: float
+    time: float
+    stands_at: FloatArray
+    stands_since: float
+    late_s: float = 0.0
+
+    @classmethod
+    def after(
+        cls, last: Seen | None, report: JointReport, rules: SupervisorRules, late_s: float = 0.0
+    ) -> Seen:
+        """Follow robot time and standstill; a gap begins the standstill anew."""
+        q, stamp, wall = report.q, report.stamp_s, report.wall_s
+        if last is None:
+            return cls(q, stamp, wall, stamp, q, stamp, late_s)
+        time = last.time + stamp - last.stamp
+        moved = np.any(np.abs(q - last.stands_at) > rules.settle.still_tolerance)
+        if moved or stamp - last.stamp > rules.settle.max_gap_s:
+            return cls(q, stamp, wall, time, q, time, late_s)
+        return cls(q, stamp, wall, time, last.stands_at, last.stands_since, late_s)
+
+    def is_fresh(self, wall_s: float) -> bool:
+        """Whether it tells where the arm is now."""
+        return wall_s - self.wall <= FRESH_S
+
+    def stands(self, wall_s: float) -> bool:
+        """Whether the arm stands now."""
+        return self.time - self.stands_since >= STANDING_S and self.is_fresh(wall_s)
+
+    def now(self, wall_s: float, rate: float) -> float:
+        """Return robot time now, s, for a clock that runs at `rate`."""
+        return self.time + rate * (wall_s - self.wall)
+
+
+class Following:
+    """Compare the arm with one trajectory, report by report.
+
+    Parameters
+    ----------
+    trajectory
+        Where it was sent.
+    sent, sent_wall
+        When, robot time and wall time, s.
+    rules
+        How far it may lag and how long a command may take to be seen.
+    """
+
+    def __init__(
+        self, trajectory: Trajectory, sent: float, sent_wall: float, rules: SupervisorRules
+    ) -> None:
+        self.trajectory, self._rules = trajectory, rules
+        self._sent, self._sent_wall = sent, sent_wall
+        self._reacted = False
+        self._lag_s = 0.0
+        self._allowed_s = rules.lag_s
+        self._astray = ''
+        self._astray_wall: float | None = None
+
+    def elapsed_s(self, time: float) -> float:
+        """Return the time since it was sent at a robot time, s."""
+        return time - self._sent
+
+    def update(self, seen: Seen, rate: float) -> str:
+        """Take a report; return in words how the arm has been off its path for too long, ''."""
+        self._allowed_s = allowed_lag_s(self._rules, rate)
+        self._astray = self._look(seen, self.elapsed_s(seen.time))
+        if not self._astray:
+            self._astray_wall = None
+        elif self._astray_wall is None:
+            self._astray_wall = seen.wall
+        lasts = self._astray_wall is not None and seen.wall - self._astray_wall > ASTRAY_S
+        return self._astray if lasts else ''
+
+    def lost(self, seen: Seen, wall_s: float) -> str:
+        """Return why it is not known where on its path the arm is; ''."""
+        if not seen.is_fresh(wall_s):
+            return f'the last report of the joints is {wall_s - seen.wall:.1f} s old'
+        if self._lag_s > self._allowed_s and not self._astray:
+            return 'the arm is not seen to move yet'
+        return self._astray
+
+    def window(self, seen: Seen, wall_s: float, rate: float) -> tuple[float, float]:
+        """Return between which times on the trajectory the arm is now, s.
+
+        The later one is where the controller's reference is: a stop takes as long to get there as
+        the move did, give or take `JITTER_S`. Where the last report came late, it has gone on for
+        so long. The earlier one is where an arm is that lags.
+        """
+        elapsed, jitter = self.elapsed_s(seen.now(wall_s, rate)), JITTER_S * rate
+        # In a rest the lag is what the arm still has to the end of the line.
+        index, since_s = self.trajectory.line_at(elapsed)
+        rested_s = max(since_s - self.trajectory.lines[index].duration_s, 0.0)
+        return elapsed - rested_s - self._lag_s - jitter, elapsed + seen.late_s + jitter
+
+    def has_ended(self, seen: Seen, wall_s: float, rate: float) -> bool:
+        """Whether the arm is at the end of the trajectory, or will be without any command."""
+        elapsed = self.elapsed_s(seen.now(wall_s, rate))
+        return elapsed - self._lag_s - JITTER_S * rate >= self.trajectory.duration_s
+
+    def _look(self, seen: Seen, elapsed: float) -> str:
+        """Return how the arm is off its path, '' where it follows; note how far it lags."""
+        if not self._reacted:
+            still = self._is_still_at_start(seen)
+            if still and seen.wall - self._sent_wall <= self._rules.reaction_s:
+                self._lag_s = max(elapsed, 0.0)
+                return ''
+            if still:
+                return 'the robot does not take commands: see its controller, and its driver'
+            self._reacted = True
+        lag, off, is_near = self._lag(elapsed, seen.q)
+        self._lag_s = float(np.clip(lag, 0.0, self._allowed_s))
+        if off <= ON_PATH_RAD and (is_near or -EARLY_S - LATENCY_S <= lag <= self._allowed_s):
+            return ''
+        if seen.time - seen.stands_since >= STANDING_S:
+            return STOPPED_ON_ITS_WAY
+        if off > ON_PATH_RAD:
+            return f'the robot does not follow its path: {np.rad2deg(off):.1f} deg beside it'
+        return (
+            f'the robot does not follow its path: {lag:.2f} s behind it; is its speed override '
+            'below 100 %, or do joint_states come late?'
+        )
+
+    def _is_still_at_start(self, seen: Seen) -> bool:
+        """Whether nothing of a move has been seen yet; the probe is too short to be seen."""
+        start = self.trajectory.start
+        longest = np.max(np.abs(self.trajectory.points - start))
+        away = np.max(np.abs(seen.q - start))
+        return bool(longest > ON_PATH_RAD and away <= self._rules.settle.arrive_tolerance)
+
+    def _lag(self, elapsed: float, q: FloatArray) -> tuple[float, float, bool]:
+        """Return how far `q` is behind the trajectory, s, how far off it, rad, and if it is near.
+
+        Near is what is within `ON_PATH_RAD` of where it should be: at the ends of a line a small
+        distance is a long time.
+        """
+        trajectory = self.trajectory
+        index, since_s = trajectory.line_at(elapsed)
+        found = []
+        # Just after a rest an arm that lags may still be on the line before it.
+        for number in {index, max(index - 1, 0)} if since_s < self._allowed_s else {index}:
+            line = trajectory.lines[number]
+            share, off = line.project(q)
+            begun_s = trajectory.starts_s[number]
+            expected, _ = line.share(elapsed - begun_s)
+            lag = min(elapsed - begun_s, line.duration_s) - line.time_s(share)
+            slack = ON_PATH_RAD / max(float(np.max(np.abs(line.way))), ON_PATH_RAD)
+            found.append((off, lag, abs(expected - share) <= slack))
+        off, lag, is_near = min(found)
+        return lag, off, is_near
+
+
+def allowed_lag_s(rules: SupervisorRules, rate: float) -> float:
+    """Return how far an arm may be behind its trajectory, s of robot time."""
+    return rules.lag_s + LATENCY_S * max(rate, 1.0)

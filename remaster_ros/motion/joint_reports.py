@@ -1,0 +1,192 @@
+"""Which reports of the joints are believed.
+
+They are finite, within limits and no faster than the arm can be; their stamps advance and are not
+late.
+
+Three clocks meet here. *Wall* time is this process's own and always runs. The *node's* time is the
+system's, or a simulated one that may run faster. *Stamps* come from the robot's host, whose clock
+may be off by any constant. A report is late if it took longer than the others between its stamp
+and its arrival; a constant difference of the clocks is the same for all and learned from them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.core.types import FloatArray
+
+LIMIT_TOLERANCE_RAD = 0.05
+"""A joint may be reported so far outside its limits."""
+SPEED_TOLERANCE = 1.5
+"""A joint may be reported so many times as fast as its limit."""
+JITTER_S = 0.02
+"""Stamps may be off by so much, s."""
+LATE_S = 0.15
+"""A report may come so much later than the others, s of the node's time."""
+LATE_WALL_S = 0.1
+"""And so much, s of wall time: a busy machine delays by wall time, however fast a clock runs."""
+DRIFT = 2e-3
+"""Two clocks may run apart by so many seconds a second."""
+LEARN = 5
+"""So many reports are needed to learn how long one usually takes."""
+RATE_WINDOW_S = 2.0
+"""The rate of the node's clock is taken over so much wall time, s."""
+RATE_LEAST_S = 0.3
+"""And over so much at least, s."""
+UNKNOWN_SPEED = 4.0
+"""Where a robot model has no velocity limit an arm may be reported so fast, rad/s."""
+
+
+@dataclass(frozen=True)
+class JointReport:
+    """What a message on joint_states says, and when.
+
+    Attributes
+    ----------
+    stamp_s
+        Its stamp, s.
+    q
+        Joint positions, rad, (k,).
+    clock_s
+        The node's time at its arrival, s.
+    wall_s
+        Wall time at its arrival, s.
+    """
+
+    stamp_s: float
+    q: FloatArray
+    clock_s: float
+    wall_s: float
+
+
+class ClockRate:
+    """How fast the node's clock runs beside the wall's; 1 for the system's clock.
+
+    Attributes
+    ----------
+    rate
+        Seconds of the node's clock per second of wall time.
+    """
+
+    def __init__(self) -> None:
+        self._seen: deque[tuple[float, float]] = deque()
+        self.rate = 1.0
+
+    def update(self, clock_s: float, wall_s: float) -> None:
+        """Take a pair of times read together, s."""
+        seen = self._seen
+        if seen and clock_s < seen[-1][1]:
+            # Set back: nothing before it counts.
+            seen.clear()
+        # More often would be no better, and a robot may report a thousand times a second.
+        if not seen or wall_s - seen[-1][0] > RATE_WINDOW_S / 40:
+            seen.append((wall_s, clock_s))
+        while wall_s - seen[0][0] > RATE_WINDOW_S:
+            seen.popleft()
+        since_wall, since_clock = seen[0]
+        if wall_s - since_wall >= RATE_LEAST_S:
+            self.rate = (clock_s - since_clock) / (wall_s - since_wall)
+
+
+class JointReports:
+    """Judge reports one by one.
+
+    Parameters
+    ----------
+    lower, upper
+        Joint limits, rad, (k,); infinite where there is none.
+    velocity
+        Velocity limits of the robot itself, rad/s, (k,); infinite where unknown.
+
+    Attributes
+    ----------
+    refused
+        Reason -> number of reports that were not believed.
+    trouble, kind
+        Why the last report was not believed, in words and as a word for the counts; '' where it
+        was.
+    late_s
+        How much later than usual the last report came that was believed, s of the node's time.
+    clock
+        The rate of the node's clock.
+    """
+
+    def __init__(self, lower: FloatArray, upper: FloatArray, velocity: FloatArray) -> None:
+        self._lower, self._upper = lower - LIMIT_TOLERANCE_RAD, upper + LIMIT_TOLERANCE_RAD
+        speed = np.where(np.isfinite(velocity), velocity, UNKNOWN_SPEED)
+        self._speed = SPEED_TOLERANCE * speed
+        self.refused: Counter[str] = Counter()
+        self.trouble = self.kind = ''
+        self.clock = ClockRate()
+        self.forget()
+
+    def forget(self) -> None:
+        """Learn anew what is usual: somebody has seen to the robot, or its clock was set."""
+        self._last: JointReport | None = None
+        self._delays: list[float] = []
+        self._delay: float | None = None
+        self.late_s = 0.0
+
+    def believes(self, report: JointReport) -> bool:
+        """Judge a report; `trouble` is the reason where it is not believed."""
+        self.clock.update(report.clock_s, report.wall_s)
+        self.kind, self.trouble = self._doubt(report)
+        if self.kind:
+            self.refused[self.kind] += 1
+            return False
+        if self._delay is not None:
+            self.late_s = max(report.clock_s - report.stamp_s - self._delay, 0.0)
+        self._learn(report)
+        self._last = report
+        return True
+
+    def _doubt(self, report: JointReport) -> tuple[str, str]:
+        """Return why a report is not believed, as a word for the counts and in words."""
+        q, last = report.q, self._last
+        if not np.all(np.isfinite(q)):
+            return 'not_finite', 'joint_states are not finite'
+        if np.any((q < self._lower) | (q > self._upper)):
+            joint = int(np.argmax(np.maximum(self._lower - q, q - self._upper)))
+            return 'outside_limits', (
+                f'joint {joint + 1} is reported at {np.rad2deg(q[joint]):.1f} deg, outside its '
+                'limits'
+            )
+        if last is not None:
+            passed = report.stamp_s - last.stamp_s
+            if passed <= 0.0:
+                return 'stamp', 'the stamps of joint_states do not advance'
+            moved = np.abs(q - last.q) - self._speed * (passed + JITTER_S)
+            if np.any(moved > 0.0):
+                joint = int(np.argmax(moved))
+                jump = np.rad2deg(abs(q[joint] - last.q[joint]))
+                return 'too_fast', (
+                    f'joint {joint + 1} is reported {jump:.1f} deg away after {passed:.3f} s'
+                )
+        return self._doubt_time(report)
+
+    def _doubt_time(self, report: JointReport) -> tuple[str, str]:
+        if self._delay is None:
+            return '', ''
+        late = report.clock_s - report.stamp_s - self._delay
+        tolerance = LATE_S + LATE_WALL_S * max(self.clock.rate, 1.0)
+        if late > tolerance:
+            return 'late', f'joint_states come {late:.2f} s late'
+        if late < -tolerance:
+            return 'early', f'joint_states are stamped {-late:.2f} s ahead of their time'
+        return '', ''
+
+    def _learn(self, report: JointReport) -> None:
+        """Follow how long a report usually takes; a drift of the clocks, but no jump."""
+        delay = report.clock_s - report.stamp_s
+        if self._delay is None:
+            self._delays.append(delay)
+            if len(self._delays) >= LEARN:
+                self._delay = float(np.median(self._delays))
+            return
+        assert self._last is not None
+        passed = min(report.wall_s - self._last.wall_s, 1.0)
+        step = DRIFT * passed * max(self.clock.rate, 1.0)
+        self._delay += float(np.clip(delay - self._delay, -step, step))

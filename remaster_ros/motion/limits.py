@@ -1,0 +1,101 @@
+"""What limits motion: joint limits, speeds of joints and of the fastest point, accelerations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.types import FloatArray
+
+UNKNOWN_VELOCITY = 1.0
+"""Where a robot model has no velocity limit, rad/s: slow for any arm."""
+ACCELERATION = 5.0
+"""Largest joint acceleration where a cell file gives none, rad/s².
+
+URDFs have none. Makers of arms of this size state 7.5 (joint 2 of the Franka Panda) and more.
+"""
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """Limits of commanded joint positions, speeds and accelerations.
+
+    Attributes
+    ----------
+    names
+        Joint names, base to tip.
+    lower, upper
+        Position limits in reported angles, rad, (k,).
+    velocity
+        Largest commanded joint velocities (the share of the robot's limits), rad/s, (k,).
+    acceleration
+        Largest commanded joint accelerations, rad/s², (k,).
+    tool_speed
+        Largest speed of the fastest point of arm and tool, m/s; infinite for none.
+    margin
+        Distance kept from the position limits, rad.
+    """
+
+    names: Sequence[str]
+    lower: FloatArray
+    upper: FloatArray
+    velocity: FloatArray
+    acceleration: FloatArray
+    tool_speed: float = np.inf
+    margin: float = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        chain: SerialChain,
+        speed_share: float,
+        offsets: FloatArray | None = None,
+        acceleration: FloatArray | float = ACCELERATION,
+        tool_speed: float = np.inf,
+        margin: float = 0.0,
+    ) -> MotionLimits:
+        """Take the limits of a chain.
+
+        A joint's stops are at true angles, which are the reported ones plus the offset: in
+        reported angles the limits are shifted by minus the offset. The robot's own controller
+        watches the limits in reported angles, so the shifted ones never reach beyond them.
+
+        Parameters
+        ----------
+        chain
+            The arm.
+        speed_share
+            Share (0 to 1) of its velocity limits that is used.
+        offsets
+            Joint zero-offsets in use, rad, (k,); None for none.
+        acceleration
+            rad/s², for all joints or (k,).
+        tool_speed, margin
+            See the attributes.
+        """
+        shift = np.zeros(len(chain)) if offsets is None else offsets
+        known = np.isfinite(chain.velocity_limits)
+        velocity = np.where(known, chain.velocity_limits, UNKNOWN_VELOCITY)
+        return cls(
+            chain.joint_names,
+            np.maximum(chain.lower, chain.lower - shift),
+            np.minimum(chain.upper, chain.upper - shift),
+            speed_share * velocity,
+            np.broadcast_to(np.asarray(acceleration, dtype=float), velocity.shape),
+            tool_speed,
+            margin,
+        )
+
+    def outside(self, q: FloatArray) -> str:
+        """Return which joint of `q` (rad, (k,)) lies outside, in words; '' if none does."""
+        for name, value, low, high in zip(self.names, q, self.lower, self.upper):
+            if not low + self.margin <= value <= high - self.margin:
+                kept = f' less {np.rad2deg(self.margin):.2f} deg' if self.margin else ''
+                return (
+                    f'{name} at {np.rad2deg(value):.2f} deg is outside its limits '
+                    f'[{np.rad2deg(low):.2f}, {np.rad2deg(high):.2f}] deg{kept}'
+                )
+        return ''

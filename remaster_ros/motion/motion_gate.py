@@ -1,0 +1,290 @@
+"""The gate: the last thing before a command leaves for the controller.
+
+A move passes if everything that the controller will make of it is allowed: it joins the present
+state and the waypoints by cubics, and each of these is looked at for itself, whatever planned it.
+A stop is not planned at all. It is taken from the move that was admitted last, as another timing
+of the rest of its line, so it is never refused and never a target of its own.
+
+Nothing is published that is not `Admitted`, and only this module makes those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from remaster_ros.core.errors import RemasterError
+from remaster_ros.core.types import FloatArray
+from remaster_ros.motion.limits import MotionLimits
+from remaster_ros.motion.path_check import FreePath, PointSpeeds
+from remaster_ros.motion.stopping import stop_on_line
+from remaster_ros.motion.trajectory import Trajectory, Waypoint, plan_trajectory
+
+START_RAD = 2e-3
+"""A move begins so near to where the arm stands, rad: the way between is not checked."""
+ON_PATH_RAD = 1e-6
+"""A waypoint is so near to the path that was checked, rad."""
+BETWEEN = 9
+"""And so many places between two waypoints, both included."""
+TOLERANCE = 1e-3
+"""Share by which speeds and accelerations may exceed their limits: noise of the present state."""
+SAMPLE_RAD = 0.05
+"""The speed of the fastest point is looked at every so many radians of the fastest joint."""
+WAY_OUT_SPEED = 0.1
+"""Share of the joint speeds on a way out of a contact or a margin."""
+WAY_OUT_TOOL_SPEED = 0.05
+"""Largest speed of the fastest point on it, m/s."""
+
+
+class MotionRefusedError(RemasterError):
+    """A move that is not sent, and why."""
+
+
+class StartMovedError(MotionRefusedError):
+    """The arm is not where the path begins that was checked."""
+
+
+@dataclass(frozen=True)
+class Admitted:
+    """What may be published.
+
+    Attributes
+    ----------
+    waypoints
+        For the controller, which begins at once.
+    trajectory
+        The lines that the arm will be on; None for a stop, which stays on those of its move.
+    """
+
+    waypoints: tuple[Waypoint, ...]
+    trajectory: Trajectory | None = None
+
+
+class MotionGate:
+    """Admit moves and make stops of them.
+
+    Parameters
+    ----------
+    limits
+        Positions, speeds, accelerations.
+    speeds
+        Speed of the fastest point of arm and tool; None where no such limit is kept.
+
+    Attributes
+    ----------
+    limits
+        May be replaced between two moves.
+    refused
+        Number of moves that were not admitted.
+    """
+
+    def __init__(self, limits: MotionLimits, speeds: PointSpeeds | None = None) -> None:
+        self.limits, self._speeds = limits, speeds
+        self._under_way: Trajectory | None = None
+        self._under_way_limits = limits
+        self.refused = 0
+
+    def admit(self, path: FreePath, q: FloatArray) -> Admitted:
+        """Return a move along a path that was found free.
+
+        Parameters
+        ----------
+        path
+            The path.
+        q
+            Where the arm stands, rad, (k,).
+
+        Raises
+        ------
+        MotionRefusedError
+            With the limit, the value and the joint.
+        """
+        limits = _way_out_limits(self.limits) if path.way_out else self.limits
+        try:
+            if not np.max(np.abs(path.points[0] - q)) <= START_RAD:
+                off = float(np.max(np.abs(path.points[0] - q)))
+                raise StartMovedError(f'the arm stands {off:.4f} rad from the start of the path')
+            trajectory = plan_trajectory(limits, path.points, path.peaks_m)
+            waypoints = trajectory.waypoints()
+            self._check(waypoints, q, path, limits)
+        except MotionRefusedError:
+            self.refused += 1
+            raise
+        self._under_way, self._under_way_limits = trajectory, limits
+        return Admitted(waypoints, trajectory)
+
+    def stop(self, low_s: float, high_s: float) -> Admitted:
+        """Return a stop on the line that is under way.
+
+        Parameters
+        ----------
+        low_s, high_s
+            Between which times since its start the arm is on the trajectory, s.
+
+        Raises
+        ------
+        LookupError
+            No move was admitted: there is nothing that could be stopped.
+        """
+        trajectory = self._under_way
+        if trajectory is None:
+            raise LookupError('no move is under way')
+        index, since_s = trajectory.line_at(high_s)
+        low_since_s = max(low_s - trajectory.starts_s[index], 0.0)
+        line = trajectory.lines[index]
+        # In the rest after a line both times lie past its end.
+        end_s = line.duration_s
+        stop = stop_on_line(
+            line, min(low_since_s, end_s), min(since_s, end_s), self._under_way_limits
+        )
+        self._under_way = None
+        return Admitted((stop,))
+
+    def _check(
+        self, waypoints: Sequence[Waypoint], q: FloatArray, path: FreePath, limits: MotionLimits
+    ) -> None:
+        """Look at each cubic from the present state on."""
+        low = np.minimum(limits.lower + limits.margin, q)
+        high = np.maximum(limits.upper - limits.margin, q)
+        points = [Waypoint(0.0, q, np.zeros_like(q)), *waypoints]
+        if np.any(points[-1].velocity != 0.0):
+            raise MotionRefusedError('the move does not end at rest')
+        for before, after in pairwise(points):
+            piece = Cubic.between(before, after)
+            if not piece.duration_s > 0.0 or not np.all(np.isfinite(piece.coefficients)):
+                raise MotionRefusedError('the times of the move do not increase')
+            _check_range(piece, low, high, limits)
+            _check_rate('speed', piece.largest_speed(), limits.velocity, 'rad/s', limits)
+            largest = piece.largest_acceleration()
+            _check_rate('acceleration', largest, limits.acceleration, 'rad/s2', limits)
+            self._check_point_speed(piece, limits)
+            off = path.distance(after.q)
+            if not off <= ON_PATH_RAD:
+                raise MotionRefusedError(f'a waypoint lies {off:.6f} rad off the path found free')
+            # What the arm stands off the start of the path is lost on the first piece.
+            allowed = START_RAD * np.sqrt(len(q)) if before is points[0] else 0.0
+            between = np.linspace(0.0, piece.duration_s, BETWEEN)
+            off = max(path.distance(place) for place in piece.at(between))
+            if not off <= allowed + ON_PATH_RAD:
+                raise MotionRefusedError(
+                    f'the move leaves the path found free by {off:.6f} rad between two waypoints'
+                )
+
+    def _check_point_speed(self, piece: Cubic, limits: MotionLimits) -> None:
+        if self._speeds is None or not np.isfinite(limits.tool_speed):
+            return
+        count = 5 + int(np.max(np.abs(piece.at(piece.duration_s) - piece.at(0.0))) / SAMPLE_RAD)
+        times = np.linspace(0.0, piece.duration_s, count)
+        fastest = float(np.max(self._speeds.fastest(piece.at(times), piece.velocity(times))))
+        if not fastest <= limits.tool_speed * (1.0 + TOLERANCE):
+            raise MotionRefusedError(
+                f'the fastest point of arm and tool would move at {fastest:.3f} m/s; '
+                f'{limits.tool_speed:g} m/s are allowed'
+            )
+
+
+def _way_out_limits(limits: MotionLimits) -> MotionLimits:
+    return MotionLimits(
+        limits.names,
+        limits.lower,
+        limits.upper,
+        WAY_OUT_SPEED * limits.velocity,
+        limits.acceleration,
+        min(limits.tool_speed, WAY_OUT_TOOL_SPEED),
+        limits.margin,
+    )
+
+
+def _check_range(piece: Cubic, low: FloatArray, high: FloatArray, limits: MotionLimits) -> None:
+    least, most = piece.range()
+    # To rounding: an arm that stands outside may stay there, and go inwards.
+    bad = (least < low - 1e-9) | (most > high + 1e-9)
+    if np.any(bad):
+        joint = int(np.argmax(bad))
+        value = least[joint] if least[joint] < low[joint] else most[joint]
+        raise MotionRefusedError(
+            f'{limits.names[joint]} would go to {np.rad2deg(value):.2f} deg; its limits less the '
+            f'margin are [{np.rad2deg(low[joint]):.2f}, {np.rad2deg(high[joint]):.2f}] deg'
+        )
+
+
+def _check_rate(
+    what: str, largest: FloatArray, allowed: FloatArray, unit: str, limits: MotionLimits
+) -> None:
+    bad = ~(largest <= allowed * (1.0 + TOLERANCE))
+    if np.any(bad):
+        joint = int(np.argmax(largest / allowed))
+        raise MotionRefusedError(
+            f'{limits.names[joint]} would have a {what} of {largest[joint]:.3f} {unit}; '
+            f'{allowed[joint]:.3f} are allowed'
+        )
+
+
+@dataclass(frozen=True)
+class Cubic:
+    """What a controller makes of two waypoints.
+
+    Attributes
+    ----------
+    duration_s
+        s.
+    coefficients
+        Of the powers of time since its start, lowest first, (4, k).
+    """
+
+    duration_s: float
+    coefficients: FloatArray
+
+    @classmethod
+    def between(cls, before: Waypoint, after: Waypoint) -> Cubic:
+        """Return the cubic that meets positions and velocities of both (Hermite)."""
+        duration = after.time_s - before.time_s
+        gap = after.q - before.q
+        with np.errstate(divide='ignore', invalid='ignore'):
+            second = (3 * gap / duration - 2 * before.velocity - after.velocity) / duration
+            third = (before.velocity + after.velocity - 2 * gap / duration) / duration**2
+        return cls(duration, np.array([before.q, before.velocity, second, third]))
+
+    def at(self, time_s: float | FloatArray) -> FloatArray:
+        """Return positions, rad, (k,) or (n, k) for times (n,)."""
+        powers = np.power.outer(np.asarray(time_s, dtype=float), np.arange(4))
+        return powers @ self.coefficients
+
+    def velocity(self, time_s: float | FloatArray) -> FloatArray:
+        """Return velocities, rad/s, (k,) or (n, k)."""
+        powers = np.power.outer(np.asarray(time_s, dtype=float), np.arange(3))
+        return powers @ (self.coefficients[1:] * np.array([[1.0], [2.0], [3.0]]))
+
+    def range(self) -> tuple[FloatArray, FloatArray]:
+        """Return the smallest and the largest position of each joint, rad, (k,) each."""
+        _, velocity, second, third = self.coefficients
+        # Where the velocity v + 2 c t + 3 d t^2 is zero, and at both ends.
+        root = np.sqrt(np.maximum(second**2 - 3 * third * velocity, 0.0))
+        with np.errstate(divide='ignore', invalid='ignore'):
+            # The form that does not lose digits where the cubic is nearly a parabola.
+            flat = -(second + np.where(second >= 0.0, root, -root))
+            times = np.array([flat / (3 * third), velocity / flat])
+        times = np.clip(np.nan_to_num(times, nan=0.0, posinf=0.0, neginf=0.0), 0, self.duration_s)
+        ends = np.zeros_like(times)
+        ends[1] = self.duration_s
+        times = np.concatenate([times, ends])
+        values = sum(c * times**power for power, c in enumerate(self.coefficients))
+        return np.min(values, axis=0), np.max(values, axis=0)
+
+    def largest_speed(self) -> FloatArray:
+        """Return the largest absolute velocity of each joint, rad/s, (k,)."""
+        _, velocity, second, third = self.coefficients
+        with np.errstate(divide='ignore', invalid='ignore'):
+            middle = np.nan_to_num(-second / (3 * third), nan=0.0, posinf=0.0, neginf=0.0)
+        times = np.array([np.zeros_like(middle), np.clip(middle, 0.0, self.duration_s)])
+        times = np.vstack([times, np.full_like(middle, self.duration_s)])
+        return np.max(np.abs(velocity + 2 * second * times + 3 * third * times**2), axis=0)
+
+    def largest_acceleration(self) -> FloatArray:
+        """Return the largest absolute acceleration of each joint, rad/s², (k,)."""
+        _, _, second, third = self.coefficients
+        ends = np.array([2 * second, 2 * second + 6 * third * self.duration_s])
+        return np.max(np.abs(ends), axis=0)

@@ -1,0 +1,47 @@
+"""Find a free path for the arm supervisor; slow, so it runs beside the callbacks of the node."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from remaster_ros.core.collision import CollisionModel
+from remaster_ros.core.paths import free_path, way_out
+from remaster_ros.motion.actions import CheckPath, PathAnswer
+from remaster_ros.motion.path_check import FreePath, PointSpeeds, peak_speeds
+
+SEED = 20
+
+
+class PathSearch:
+    """Check the planner's way, and look for another where it is not free.
+
+    Parameters
+    ----------
+    model
+        Arm, tool, floor and obstacles.
+    speeds
+        Of the fastest point.
+    """
+
+    def __init__(self, model: CollisionModel, speeds: PointSpeeds) -> None:
+        self._model, self._speeds = model, speeds
+
+    def find(self, request: CheckPath) -> PathAnswer:
+        """Answer a request."""
+        rng = np.random.default_rng(SEED)
+        at_start = self._model.trouble(request.start)
+        if at_start:
+            out = way_out(self._model, request.start, rng)
+            path = None if out is None else self._path(out, is_way_out=True)
+            return PathAnswer(None, at_start, at_start=True, way_out=path)
+        points = np.vstack([request.start, request.waypoints, request.target])
+        trouble = self._model.path_trouble(points)
+        if not trouble:
+            return PathAnswer(self._path(points))
+        found = free_path(
+            self._model, request.start, request.target, rng, hints=list(request.waypoints)
+        )
+        return PathAnswer(None, trouble) if found is None else PathAnswer(self._path(found))
+
+    def _path(self, points: np.ndarray, *, is_way_out: bool = False) -> FreePath:
+        return FreePath(points, peak_speeds(points, self._speeds), is_way_out)

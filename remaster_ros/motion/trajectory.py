@@ -1,0 +1,220 @@
+"""Trajectories: straight lines in joint space, each from rest to rest.
+
+A controller joins positions and velocities by cubics, as joint_trajectory_controller does; it then
+follows the ramps of a line at constant acceleration, and never leaves the line.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from remaster_ros.core.types import FloatArray
+from remaster_ros.motion.limits import MotionLimits
+
+RAMP_S = 0.5
+"""How long a line takes to reach its speed, and to lose it, s."""
+REST_S = 0.5
+"""How long the arm rests between two lines, s: longer than it may lag, so that it is never on two
+lines at once."""
+HEADROOM = 0.97
+"""Share of the allowed speeds that is planned with: an arm that stands is reported to move a
+little, and the first cubic begins there."""
+STOPPABLE = 0.5
+"""Share of the allowed accelerations that a line is planned with: a stop of an arm that lags may
+have to brake harder than the line does."""
+NO_CRUISE = 1.0 - 2.0**-20
+"""Ramps that take this share of the way have none between them: two waypoints need two times."""
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """A point of a trajectory: time from its start (s), positions (rad), velocities (rad/s)."""
+
+    time_s: float
+    q: FloatArray
+    velocity: FloatArray
+
+
+@dataclass(frozen=True)
+class Line:
+    """A straight line in joint space: ramp up, cruise, ramp down; all joints arrive together.
+
+    Attributes
+    ----------
+    start, end
+        Joint positions at rest, rad, (k,).
+    rate
+        Share of the way per second while cruising, 1/s; at most 1/`RAMP_S`.
+    """
+
+    start: FloatArray
+    end: FloatArray
+    rate: float
+
+    @classmethod
+    def within(
+        cls, limits: MotionLimits, start: FloatArray, end: FloatArray, peak_m: float = 0.0
+    ) -> Line:
+        """Return the fastest line within the speeds and accelerations.
+
+        Parameters
+        ----------
+        limits
+            The limits.
+        start, end
+            rad, (k,).
+        peak_m
+            Speed of the fastest point of arm and tool where the whole way takes a second, m/s.
+        """
+        way = np.maximum(np.abs(end - start), 1e-12)
+        # The ramp is of a given length: what the joints may accelerate bounds the speed as well.
+        speeds = np.minimum(limits.velocity, STOPPABLE * limits.acceleration * RAMP_S)
+        rate = float(np.min(speeds / way))
+        if peak_m > 0.0:
+            rate = min(rate, limits.tool_speed / peak_m)
+        # A short way is over before the cruising speed is reached.
+        return cls(start, end, min(HEADROOM * rate, 1.0 / RAMP_S))
+
+    @property
+    def way(self) -> FloatArray:
+        """From start to end, rad, (k,)."""
+        return self.end - self.start
+
+    @property
+    def cruise_s(self) -> float:
+        """Time between the two ramps, s."""
+        return 1.0 / self.rate - RAMP_S
+
+    @property
+    def duration_s(self) -> float:
+        """Time from start to end, s."""
+        return self.cruise_s + 2 * RAMP_S
+
+    @property
+    def kinks_s(self) -> tuple[float, float]:
+        """When the ramp up ends and when the ramp down begins, s."""
+        return RAMP_S, RAMP_S + self.cruise_s
+
+    def waypoints(self) -> tuple[Waypoint, ...]:
+        """Return the end of each phase."""
+        velocity, ramp = self.rate * self.way, 0.5 * RAMP_S * self.rate * self.way
+        points = [Waypoint(RAMP_S, self.start + ramp, velocity)]
+        if self.rate * RAMP_S < NO_CRUISE:
+            points.append(Waypoint(RAMP_S + self.cruise_s, self.end - ramp, velocity))
+        points.append(Waypoint(self.duration_s, self.end, np.zeros_like(self.end)))
+        return tuple(points)
+
+    def share(self, time_s: float) -> tuple[float, float]:
+        """Return which share of the way is gone at a time, and its rate, 1/s."""
+        # The speed goes up from the start, and down by as much from where it is to be lost.
+        up, gone_up = _ramp(time_s)
+        down, gone_down = _ramp(time_s - RAMP_S - self.cruise_s)
+        return min((gone_up - gone_down) * self.rate, 1.0), (up - down) * self.rate
+
+    def time_s(self, share: float) -> float:
+        """Return when a share of the way (0 to 1) is gone, s: the inverse of `share`."""
+        share = min(max(share, 0.0), 1.0)
+        ramp = 0.5 * RAMP_S * self.rate
+        if share <= ramp:
+            return float(np.sqrt(2 * RAMP_S * share / self.rate))
+        if share >= 1.0 - ramp:
+            return self.duration_s - float(np.sqrt(2 * RAMP_S * (1.0 - share) / self.rate))
+        return 0.5 * RAMP_S + share / self.rate
+
+    def project(self, q: FloatArray) -> tuple[float, float]:
+        """Return the share of the way nearest to `q` (rad, (k,)), and how far `q` is off, rad."""
+        length = float(self.way @ self.way)
+        share = float(np.clip(self.way @ (q - self.start) / length, 0.0, 1.0)) if length else 1.0
+        return share, float(np.max(np.abs(q - self.start - share * self.way)))
+
+
+def _ramp(time_s: float) -> tuple[float, float]:
+    """Return a speed that goes from 0 to 1 in `RAMP_S`, and its integral, s."""
+    speed = min(max(time_s / RAMP_S, 0.0), 1.0)
+    return speed, 0.5 * RAMP_S * speed**2 + max(time_s - RAMP_S, 0.0)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Lines one after the other, with a rest between them."""
+
+    lines: tuple[Line, ...]
+
+    @cached_property
+    def starts_s(self) -> tuple[float, ...]:
+        """When each line begins, s."""
+        times = [0.0]
+        for line in self.lines[:-1]:
+            times.append(times[-1] + line.duration_s + REST_S)
+        return tuple(times)
+
+    @property
+    def start(self) -> FloatArray:
+        """Where it begins, rad, (k,)."""
+        return self.lines[0].start
+
+    @property
+    def end(self) -> FloatArray:
+        """Where it ends, rad, (k,)."""
+        return self.lines[-1].end
+
+    @property
+    def points(self) -> FloatArray:
+        """The polyline, rad, (n + 1, k) for n lines."""
+        return np.array([self.lines[0].start, *(line.end for line in self.lines)])
+
+    @property
+    def duration_s(self) -> float:
+        """Time from start to end, s."""
+        return self.starts_s[-1] + self.lines[-1].duration_s
+
+    def waypoints(self) -> tuple[Waypoint, ...]:
+        """Return the waypoints for the controller."""
+        points: list[Waypoint] = []
+        for start_s, line in zip(self.starts_s, self.lines):
+            if start_s:
+                # The end of the rest.
+                points.append(Waypoint(start_s, line.start, np.zeros_like(line.start)))
+            points += [Waypoint(start_s + p.time_s, p.q, p.velocity) for p in line.waypoints()]
+        return tuple(points)
+
+    def line_at(self, time_s: float) -> tuple[int, float]:
+        """Return which line is under way (or rested on) at a time, and since when, s."""
+        index = max(bisect_right(self.starts_s, time_s) - 1, 0)
+        return index, time_s - self.starts_s[index]
+
+    def at(self, time_s: float) -> tuple[FloatArray, FloatArray]:
+        """Return where the arm should be (rad) and how fast (rad/s), (k,) each."""
+        index, since_s = self.line_at(time_s)
+        line = self.lines[index]
+        share, rate = line.share(since_s)
+        return line.start + share * line.way, rate * line.way
+
+
+def plan_trajectory(
+    limits: MotionLimits, points: FloatArray, peaks_m: tuple[float, ...] = ()
+) -> Trajectory:
+    """Return the trajectory along a polyline.
+
+    Parameters
+    ----------
+    limits
+        Its speeds and accelerations.
+    points
+        rad, (n + 1, k).
+    peaks_m
+        For each line the speed of the fastest point where the whole way takes a second, m/s, (n,);
+        none where no such limit is kept.
+    """
+    peaks = peaks_m or (0.0,) * (len(points) - 1)
+    return Trajectory(
+        tuple(
+            Line.within(limits, start, end, peak)
+            for (start, end), peak in zip(pairwise(points), peaks, strict=True)
+        )
+    )

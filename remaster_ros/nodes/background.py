@@ -1,0 +1,58 @@
+"""Slow work beside the callbacks of a node: path checks, writing to a disk."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from queue import SimpleQueue
+from typing import Any
+
+from rclpy.node import Node
+
+Work = Callable[[], Any]
+Then = Callable[[Any], object]
+
+
+class Background:
+    """One thread that does what it is given, one after the other.
+
+    Parameters
+    ----------
+    node
+        In whose callbacks the results are taken.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._work: SimpleQueue[tuple[Work, Then] | None] = SimpleQueue()
+        self._results: deque[tuple[Then, Any]] = deque()
+        self._guard = node.create_guard_condition(self._deliver)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def submit(self, work: Work, then: Then) -> None:
+        """Do `work` in the thread, and call `then` with its result among the node's callbacks.
+
+        The result is the exception where `work` raises one.
+        """
+        self._work.put((work, then))
+
+    def close(self, timeout_s: float = 5.0) -> None:
+        """End the thread when all is done, or after a time; results are no longer taken."""
+        self._work.put(None)
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        while (item := self._work.get()) is not None:
+            work, then = item
+            try:
+                result = work()
+            except Exception as error:  # Whatever it is, the node must go on.
+                result = error
+            self._results.append((then, result))
+            self._guard.trigger()
+
+    def _deliver(self) -> None:
+        while self._results:
+            then, result = self._results.popleft()
+            then(result)

@@ -1,0 +1,96 @@
+"""Parameters of the robot bridge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from remaster_ros.motion.actions import SupervisorRules
+from remaster_ros.motion.settling import SettleRules
+from remaster_ros.nodes.parameters import parameter
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the bridge."""
+
+    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
+    speed_share: float = parameter(
+        0.3, 'share of each joint velocity limit that is used', low=0.01, high=1.0
+    )
+    cartesian_speed_limit_m_s: float = parameter(
+        0.25,
+        'largest speed of the fastest point of arm and tool; 0.25 is customary in manual mode, '
+        '0 means no such limit',
+        unit='m/s',
+        low=0.0,
+        high=10.0,
+    )
+    limit_margin_deg: float = parameter(
+        0.5, 'distance kept from the joint limits', unit='deg', low=0.0, high=45.0
+    )
+    offsets: str = parameter(
+        '',
+        'fit.json whose joint offsets shift the joint limits; empty for offsets not known yet',
+    )
+    settle_s: float = parameter(
+        3.0, 'how long the arm must stand still before a reading', unit='s', low=0.1, high=60.0
+    )
+    arrive_tolerance: float = parameter(
+        2e-3, 'largest distance of a joint from its target', unit='rad', low=1e-6, high=0.1
+    )
+    still_tolerance: float = parameter(
+        2e-4, 'largest spread of a joint position while still', unit='rad', low=1e-7, high=0.01
+    )
+    arrive_timeout_s: float = parameter(
+        10.0, 'beyond the expected motion and settle: not arrived', unit='s', low=1.0, high=600.0
+    )
+    answer_timeout_s: float = parameter(
+        180.0,
+        "longest wait for the recorder's answer on a settled configuration",
+        unit='s',
+        low=1.0,
+        high=3600.0,
+    )
+    heartbeat_s: float = parameter(
+        3.0,
+        'longest silence of planner, recorder or robot, wall time',
+        unit='s',
+        low=0.5,
+        high=60.0,
+    )
+    stall_s: float = parameter(
+        1.0,
+        'an arm that stands for so long after its move, and not at its target, will not get there',
+        unit='s',
+        low=0.2,
+        high=60.0,
+    )
+    reaction_s: float = parameter(
+        2.0,
+        'how long a command may take to be seen in joint_states, wall time',
+        unit='s',
+        low=0.1,
+        high=60.0,
+    )
+    lag_s: float = parameter(
+        0.35,
+        'how far the arm may be behind its trajectory; beyond it the arm is halted',
+        unit='s',
+        low=0.05,
+        high=2.0,
+    )
+    emergency_stop_topic: str = parameter(
+        '', "std_msgs/Bool, true while the robot's own safety stops it; empty where there is none"
+    )
+
+    def rules(self) -> SupervisorRules:
+        """Return what of them the supervisor keeps."""
+        return SupervisorRules(
+            settle=SettleRules(self.settle_s, self.arrive_tolerance, self.still_tolerance),
+            arrive_timeout_s=self.arrive_timeout_s,
+            answer_timeout_s=self.answer_timeout_s,
+            heartbeat_s=self.heartbeat_s,
+            stall_s=self.stall_s,
+            reaction_s=self.reaction_s,
+            lag_s=self.lag_s,
+        )

@@ -1,0 +1,68 @@
+"""The link to the robot's own safety circuit: a std_msgs/Bool, true while it stops the arm."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from itertools import pairwise
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Bool
+
+PERIODIC = 6
+"""So many messages tell whether they come regularly."""
+
+
+class EmergencyLink:
+    """Follow a topic; a link that is silent is trouble.
+
+    Parameters
+    ----------
+    node
+        The node that listens.
+    topic
+        The topic; '' for no such link.
+    on_state
+        Called with every message's value.
+    silence_s
+        Messages that come regularly and then are silent for so much longer than between them
+        are missed, s of wall time.
+    """
+
+    def __init__(
+        self, node: Node, topic: str, on_state: Callable[[bool], None], silence_s: float
+    ) -> None:
+        self._node, self._on_state, self._silence_s = node, on_state, silence_s
+        self.topic = node.resolve_topic_name(topic) if topic else ''
+        self._heard: deque[float] = deque(maxlen=PERIODIC)
+        if not topic:
+            return
+        # The last value of a publisher that keeps it, and whatever any publisher sends from now
+        # on: one subscription cannot ask for both.
+        for durability, reliability in (
+            (DurabilityPolicy.TRANSIENT_LOCAL, ReliabilityPolicy.RELIABLE),
+            (DurabilityPolicy.VOLATILE, ReliabilityPolicy.BEST_EFFORT),
+        ):
+            qos = QoSProfile(depth=50, durability=durability, reliability=reliability)
+            node.create_subscription(Bool, self.topic, self._on_message, qos)
+
+    def trouble(self) -> str:
+        """Return why the state of the circuit is not known; '' where it is, or is not used."""
+        if not self.topic:
+            return ''
+        if not self._heard:
+            return f'{self.topic} (emergency_stop_topic) is silent: nothing moves without it'
+        if not self._node.count_publishers(self.topic):
+            return f'nobody publishes {self.topic} (emergency_stop_topic) any more'
+        if len(self._heard) == PERIODIC:
+            longest = max(later - earlier for earlier, later in pairwise(self._heard))
+            silent_s = time.monotonic() - self._heard[-1]
+            if longest <= self._silence_s < silent_s - longest:
+                return f'{self.topic} (emergency_stop_topic) has been silent for {silent_s:.1f} s'
+        return ''
+
+    def _on_message(self, message: Bool) -> None:
+        self._heard.append(time.monotonic())
+        self._on_state(message.data)

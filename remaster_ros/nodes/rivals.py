@@ -1,0 +1,87 @@
+"""Who else publishes on a topic that moves the arm, or that tells where it is.
+
+The graph lists the publishers of a killed process for some 20 s more. Those with a liveliness
+lease (ours have one) are told from the living by the lease: where several are listed, a
+subscription that asks for the lease counts those that are alive. Publishers without one count as
+long as they are listed: a driver that was killed is gone for good, or was started again, and then
+a person has to look at the arm anyway.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from rclpy.event_handler import QoSLivelinessChangedInfo, SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from remaster_ros.nodes.status import LEASED
+
+COUNT_WALL_S = 3.0
+"""After so long the lease of whoever was killed has ended; wall time, s."""
+
+
+class OnlyPublisher:
+    """See that a topic has one publisher.
+
+    Parameters
+    ----------
+    node
+        The node that depends on it.
+    topic, message_type
+        The topic.
+    """
+
+    def __init__(self, node: Node, topic: str, message_type: Any) -> None:
+        self._node, self._type = node, message_type
+        self._topic = node.resolve_topic_name(topic)
+        self._counter: Subscription | None = None
+        self._counted_wall, self._alive = 0.0, 0
+
+    def trouble(self) -> str:
+        """Return who publishes there, if they are more than one; ''."""
+        if self._node.count_publishers(self._topic) <= 1:
+            self._count(False)
+            return ''
+        listed = self._node.get_publishers_info_by_topic(self._topic)
+        leased = [info for info in listed if _has_lease(info)]
+        if len(leased) < len(listed):
+            # One without a lease beside another one.
+            return self._words(listed) if len(listed) > 1 else ''
+        self._count(len(leased) > 1)
+        known = time.monotonic() - self._counted_wall > COUNT_WALL_S
+        return self._words(listed) if known and self._alive > 1 else ''
+
+    def _count(self, wanted: bool) -> None:
+        """Begin or end to count those that are alive."""
+        if wanted and self._counter is None:
+            self._counted_wall, self._alive = time.monotonic(), 0
+            self._counter = self._node.create_subscription(
+                self._type,
+                self._topic,
+                lambda message: None,
+                LEASED,
+                event_callbacks=SubscriptionEventCallbacks(
+                    liveliness=self._on_liveliness, use_default_callbacks=False
+                ),
+            )
+        elif not wanted and self._counter is not None:
+            self._node.destroy_subscription(self._counter)
+            self._counter = None
+
+    def _on_liveliness(self, change: QoSLivelinessChangedInfo) -> None:
+        self._alive = change.alive_count
+
+    def _words(self, listed: list[TopicEndpointInfo]) -> str:
+        names = sorted(f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in listed)
+        return (
+            f'{len(listed)} publishers on {self._topic}, where one may be: {", ".join(names)}; '
+            'end the others (those of a killed process are listed for some 20 s)'
+        )
+
+
+def _has_lease(info: TopicEndpointInfo) -> bool:
+    # Without a lease it lasts some hundred years.
+    return bool(info.qos_profile.liveliness_lease_duration.nanoseconds < 3600 * 10**9)

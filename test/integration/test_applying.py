@@ -1,0 +1,173 @@
+"""Each applied form, used, leaves nothing to correct, on descriptions as makers ship them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import robot_descriptions
+import yaml
+from command_line import remaster
+
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.simulation import SimulatedSensor, simulate_session
+from remaster_ros.core.transforms import rotation_vector_to_matrix, transform
+from remaster_ros.core.types import Session
+from remaster_ros.storage.results import joint_offsets_rad, read_fit
+from remaster_ros.storage.session import write_session
+
+MARKERS = {'sir': np.array([0.1, 0.0, 0.02]), 'smr': np.array([-0.1, 0.03, 0.02])}
+
+
+def simulated(robot: robot_descriptions.Description, seed: int) -> Session:
+    """Visit random configurations, four to a pose, with offsets of some 0.3 degrees."""
+    chain = SerialChain.from_urdf(robot.urdf, robot.base_link, robot.tip_link)
+    rng = np.random.default_rng(seed)
+    low, high = np.maximum(chain.lower, -2.5), np.minimum(chain.upper, 2.5)
+
+    def poses(count: int) -> list[np.ndarray]:
+        return [rng.uniform(low, high, (4, len(chain))) for _ in range(count)]
+
+    turn = rotation_vector_to_matrix(rng.standard_normal(3))
+    session, _ = simulate_session(
+        chain,
+        robot.urdf,
+        rng,
+        poses=poses(20),
+        validation_poses=poses(8),
+        sensors={
+            'mocap': SimulatedSensor('sir', transform(turn, (2.0, 0.3, 1.0))),
+            'tracker': SimulatedSensor('smr', transform(turn.T, (3.0, -1.0, 0.2))),
+        },
+        markers=MARKERS,
+        joint_offset_std=np.radians(0.3),
+    )
+    return session
+
+
+def fitted(session: Session, folder: Path) -> Path:
+    write_session(folder / 'session', session)
+    out = folder / 'fit'
+    process = remaster('fit', folder / 'session', '--out', out, '--no-figures', '--quiet')
+    assert process.returncode == 0, process.stderr
+    return out
+
+
+def shifted(session: Session, shift: np.ndarray) -> Session:
+    """Return the session as it would be recorded were ``shift`` added to what is reported."""
+    m = session.measurements
+    # A limit of the nominal robot may be passed by a fraction of a degree.
+    return replace(
+        session, measurements=replace(m, q=m.q + shift, from_q=np.full_like(m.q, np.nan))
+    )
+
+
+def through_the_urdf(session: Session, apply: Path) -> Session:
+    return replace(session, urdf=(apply / 'robot_calibrated.urdf').read_text(encoding='utf-8'))
+
+
+def through_the_layer(session: Session, apply: Path) -> Session:
+    """Read as a ROS node reads its parameters."""
+    content = yaml.safe_load((apply / 'offset_layer.yaml').read_text(encoding='utf-8'))
+    layer = content['/**']['ros__parameters']
+    by_name = dict(zip(layer['joint_names'], layer['joint_offsets'], strict=True))
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    return shifted(session, np.array([by_name.get(name, 0.0) for name in chain.joint_names]))
+
+
+def through_the_pad(session: Session, apply: Path) -> Session:
+    """Read as a person does: each joint in the table is driven to its last column, and zeroed."""
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    new_zero = np.zeros(len(chain))
+    for line in (apply / 'remaster.txt').read_text(encoding='utf-8').splitlines():
+        words = line.split()
+        if len(words) == 4 and words[0] in chain.joint_names:
+            new_zero[chain.joint_names.index(words[0])] = np.radians(float(words[3]))
+    return shifted(session, -new_zero)
+
+
+FORMS = {'urdf': through_the_urdf, 'layer': through_the_layer, 'pad': through_the_pad}
+
+
+@pytest.fixture(scope='module', params=list(robot_descriptions.ROBOTS))
+def before(request, tmp_path_factory):
+    """Return the session of a robot, its fit's folder, and the fit's offsets and stds, rad."""
+    robot = robot_descriptions.ROBOTS[request.param]()
+    session = simulated(robot, seed=5)
+    out = fitted(session, tmp_path_factory.mktemp(request.param))
+    fit = read_fit(out / 'fit.json')
+    names = [row['joint'] for row in fit['joint_offsets']]
+    offsets, std = joint_offsets_rad(fit, names)
+    known = np.array([row['identifiable'] for row in fit['joint_offsets']])
+    # What is to be corrected is there, and the outer two joints are not to be told.
+    assert np.abs(offsets[known]).max() > 10 * std[known].max()
+    assert not known[0]
+    assert known[1:-1].all()
+    return session, out, fit, known, std
+
+
+@pytest.mark.parametrize('form', list(FORMS))
+def test_a_refit_after_applying_finds_nothing(before, form, tmp_path):
+    session, out, _, known, std = before
+    again = read_fit(fitted(FORMS[form](session, out / 'apply'), tmp_path) / 'fit.json')
+    names = [row['joint'] for row in again['joint_offsets']]
+    left, _ = joint_offsets_rad(again, names)
+    # The same measurements: what is left is the draws' error and the rounding of four digits.
+    assert np.all(np.abs(left[known]) < 0.3 * std[known] + np.radians(1e-4)), np.degrees(left)
+
+
+def test_what_the_data_cannot_tell_is_in_no_file_and_said_in_each(before):
+    session, out, fit, known, _ = before
+    apply = out / 'apply'
+    unknown = {row['joint']: row['why'] for row in fit['joint_offsets'] if not row['identifiable']}
+    assert unknown
+    nominal = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    calibrated = through_the_urdf(session, apply)
+    corrected = SerialChain.from_urdf(calibrated.urdf, calibrated.base_link, calibrated.tip_link)
+    for i, name in enumerate(nominal.joint_names):
+        same = nominal.lower[i] == corrected.lower[i]
+        assert same == (name in unknown), name
+    layer = (apply / 'offset_layer.yaml').read_text(encoding='utf-8')
+    parameters = yaml.safe_load(layer)['/**']['ros__parameters']
+    assert parameters['left_out'] == list(unknown)
+    assert not set(parameters['joint_names']) & set(unknown)
+    assert len(parameters['joint_offsets']) == len(parameters['joint_names']) == known.sum()
+    text = (apply / 'remaster.txt').read_text(encoding='utf-8')
+    comments = calibrated.urdf
+    for name, why in unknown.items():
+        for content in (layer, text, comments):
+            assert f'{name}: {why}' in content
+
+
+def elements(urdf: str, *, but: str) -> list[tuple[str, list[tuple[str, str]], str]]:
+    """Return every element outside the robot's own joints, in order."""
+    root = ElementTree.fromstring(urdf)
+    return [
+        (e.tag, sorted(e.attrib.items()), (e.text or '').strip())
+        for child in root
+        if child.tag != but
+        for e in child.iter()
+    ]
+
+
+def test_only_the_joints_of_the_arm_are_changed(before):
+    """What names them again, for drivers and simulators, is as it was."""
+    session, out, fit, _, _ = before
+    urdf = (out / 'apply' / 'robot_calibrated.urdf').read_text(encoding='utf-8')
+    assert elements(urdf, but='joint') == elements(session.urdf, but='joint')
+    old = {j.get('name'): j for j in ElementTree.fromstring(session.urdf).findall('joint')}
+    new = {j.get('name'): j for j in ElementTree.fromstring(urdf).findall('joint')}
+    assert list(new) == list(old)
+    changed = {n for n in old if ElementTree.tostring(old[n]) != ElementTree.tostring(new[n])}
+    applied = {row['joint'] for row in fit['joint_offsets'] if row['identifiable']}
+    assert changed - {'joint_2_cover'} == applied
+    if 'joint_2_cover' in old:
+        offset = next(r['mean_deg'] for r in fit['joint_offsets'] if r['joint'] == 'joint_2')
+        mimic = new['joint_2_cover'].find('mimic')
+        assert mimic is not None
+        # Half the true angle of joint 2, backwards; what joint 2 reports lacks the offset.
+        expected = 0.1 - 0.5 * np.radians(offset)
+        assert float(mimic.attrib['offset']) == pytest.approx(expected, abs=1e-12)

@@ -1,0 +1,158 @@
+"""The supervisor with an arm in stepped time: a servo that lags and overshoots behind cubics."""
+
+import numpy as np
+
+from remaster_ros.fakes import motion as servo
+from remaster_ros.motion.actions import (
+    CheckPath,
+    Drive,
+    PathAnswer,
+    Settled,
+    Stop,
+    SupervisorRules,
+)
+from remaster_ros.motion.arm_supervisor import ArmSupervisor
+from remaster_ros.motion.joint_reports import JointReport, JointReports
+from remaster_ros.motion.limits import MotionLimits
+from remaster_ros.motion.motion_gate import Cubic, MotionGate
+from remaster_ros.motion.path_check import FreePath
+from remaster_ros.motion.settling import SettleRules
+from remaster_ros.motion.trajectory import Waypoint
+
+SPEED = np.array([0.5, 1.0])
+LIMITS = MotionLimits(
+    ('a', 'b'), np.array([-1.0, -2.0]), np.array([1.0, 2.0]), SPEED, np.array([5.0, 5.0])
+)
+RULES = SupervisorRules(
+    settle=SettleRules(settle_s=1.0), arrive_timeout_s=5.0, answer_timeout_s=20.0
+)
+HOME = np.array([0.1, 0.2])
+
+
+class Rig:
+    """The supervisor with everybody alive, at 50 Hz.
+
+    `alter` changes what the arm reports, `obey` what becomes of a trajectory, `answer_path` what
+    is found out about a path, `delay_s` how long a report takes.
+    """
+
+    def __init__(self, rules=RULES, wall_s=1000.0, begun=True, halted='', rate=1.0):
+        gate = MotionGate(LIMITS)
+        # The robot itself may be three times as fast.
+        reports = JointReports(LIMITS.lower, LIMITS.upper, 3 * SPEED)
+        self.supervisor = ArmSupervisor(gate, reports, rules, halted)
+        self.t, self.wall = 50.0, wall_s
+        self.arm = servo.Motion(self.t, HOME)
+        self.rng = np.random.default_rng(2)
+        self.alive = {'planner', 'recorder', 'robot', 'bridge'}
+        self.state, self.waiting_for = 'running', ''
+        self.actions, self.commands = [], []
+        self.obey = lambda waypoints: waypoints
+        self.alter = lambda t, q: q
+        self.answer_path = self._free
+        self.delay_s = self.stamp_shift = 0.0
+        self.rate = rate
+        self.told_wall = -np.inf
+        self.under_way = []
+        if not begun:
+            return
+        # The first move is the probe; then the arm settles where it stands.
+        self.plan(HOME)
+        self.run(10.0, lambda: self.said(Settled))
+        self.answer(0)
+        self.actions.clear()
+        self.commands.clear()
+
+    @staticmethod
+    def _free(request):
+        points = np.vstack([request.start, request.waypoints, request.target])
+        return PathAnswer(FreePath(points))
+
+    def do(self, actions):
+        for action in actions:
+            self.actions.append((self.t, action))
+            if isinstance(action, CheckPath):
+                answer = self.answer_path(action)
+                if answer is not None:
+                    self.do(self.supervisor.path_found(action.number, answer, self.wall))
+            elif isinstance(action, Drive | Stop):
+                self._command(self.obey(action.admitted.waypoints))
+
+    def _command(self, points):
+        if not points:
+            return
+        q, velocity = self.arm.at(self.t)
+        self.commands.append((self.t, q, velocity, points))
+        self.arm.follow(self.t, [servo.Waypoint(p.time_s, p.q, p.velocity) for p in points])
+
+    def cubics(self):
+        """What the controller makes of each command, from where the arm really is."""
+        for _, q, velocity, points in self.commands:
+            before = Waypoint(0.0, q, velocity)
+            for point in points:
+                yield Cubic.between(before, point)
+                before = point
+
+    def step(self, dt=0.02):
+        self.t, self.wall = self.t + dt, self.wall + dt / self.rate
+        self.under_way.append((self.t, self.alter(self.t, self.noisy())))
+        if 'bridge' not in self.alive:
+            return
+        if self.wall - self.told_wall >= 0.5:
+            self.told_wall = self.wall
+            if 'planner' in self.alive:
+                self.do(self.supervisor.planner_is(self.state, self.wall))
+            if 'recorder' in self.alive:
+                self.do(self.supervisor.recorder_waits(self.waiting_for, self.wall))
+        while self.under_way and self.under_way[0][0] <= self.t - self.delay_s + 1e-9:
+            stamp, q = self.under_way.pop(0)
+            if 'robot' in self.alive and q is not None:
+                self.do(
+                    self.supervisor.report(
+                        JointReport(stamp + self.stamp_shift, q, self.t, self.wall)
+                    )
+                )
+        self.do(self.supervisor.tick(self.wall))
+
+    def noisy(self):
+        # No encoder reads the same twice.
+        return self.arm.at(self.t)[0] + self.rng.normal(0.0, 1e-6, 2)
+
+    def run(self, seconds, until=None):
+        end = self.t + seconds
+        while self.t < end:
+            self.step()
+            if until is not None and until():
+                return
+        assert until is None, f'waited {seconds} s in vain'
+
+    def plan(self, *solutions, waypoints=None):
+        targets = np.reshape(np.array(solutions, float), (-1, 2))
+        self.do(self.supervisor.plan(targets, self.wall, waypoints or {}))
+
+    def said(self, *kinds):
+        return [action for _, action in self.actions if isinstance(action, kinds)]
+
+    def last(self, kind):
+        return self.said(kind)[-1]
+
+    def speed(self, t=None):
+        return np.max(np.abs(self.arm.at(self.t if t is None else t)[1]))
+
+    def go(self, target, seconds=0.8):
+        """Send the arm off and let it get into motion."""
+        self.plan(target)
+        self.run(seconds)
+        assert self.said(Drive)
+        assert self.speed() > 0.1
+
+    def answer(self, solution):
+        self.do(self.supervisor.answered(solution, self.wall))
+
+    def collect(self):
+        """What a person does after a halt."""
+        assert self.supervisor.clear_halt(self.wall) == ''
+        self.state = 'paused'
+        self.run(1.0)
+        self.state = 'running'
+        self.run(1.0)
