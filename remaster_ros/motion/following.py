@@ -122,7 +122,7 @@ class Following:
         """Return why it is not known where on its path the arm is; ''."""
         if not seen.is_fresh(wall_s):
             return f'the last report of the joints is {wall_s - seen.wall:.1f} s old'
-        if self._lag_s > self._allowed_s:
+        if self._lag_s > self._allowed_s and not self._astray:
             return 'the arm is not seen to move yet'
         return self._astray
 

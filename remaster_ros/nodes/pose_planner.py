@@ -374,6 +374,7 @@ class PosePlanner(RemasterNode):
         if found is None or found[0] is None:
             return found
         return (tour.take(found[0]),)
+
     def _write_state(self) -> None:
         """Write down what was said; a stop or pause came in a thread that must not wait for it."""
         with self._lock:

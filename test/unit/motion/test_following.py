@@ -241,7 +241,7 @@ def test_a_command_that_is_not_taken():
     assert low <= 0.0
     assert high == pytest.approx(arm.following.elapsed_s(arm.seen.time) + JITTER_S)
     assert arm.run(0.49, lambda t: LINE.start) is None
-    assert arm.lost == 'the arm has not begun to move'
+    assert arm.lost == 'the arm is not seen to move yet'
     astray = arm.run(4.0, lambda t: LINE.start)
     reason = 'the robot does not take commands: see its controller, and its driver'
     assert arm.said == arm.lost == reason
@@ -252,7 +252,7 @@ def test_the_reaction_is_wall_time():
     """With a clock ten times as fast half a second of the robot is no time to react."""
     arm = Arm(rate=10.0)
     assert arm.run(4.9, lambda t: LINE.start) is None
-    assert arm.lost == 'the arm has not begun to move'
+    assert arm.lost == 'the arm is not seen to move yet'
     assert arm.run(12.0, lambda t: LINE.start) is not None
     assert 'does not take commands' in arm.said
 
