@@ -90,6 +90,11 @@ class Following:
         When, robot time and wall time, s.
     rules
         How far it may lag and how long a command may take to be seen.
+
+    Attributes
+    ----------
+    reacted
+        Whether the arm has left its start, or goes too short a way for that to be seen.
     """
 
     def __init__(
@@ -97,7 +102,7 @@ class Following:
     ) -> None:
         self.trajectory, self._rules = trajectory, rules
         self._sent, self._sent_wall = sent, sent_wall
-        self._reacted = False
+        self.reacted = False
         self._lag_s = 0.0
         self._allowed_s = rules.lag_s
         self._astray = ''
@@ -146,14 +151,14 @@ class Following:
 
     def _look(self, seen: Seen, elapsed: float) -> str:
         """Return how the arm is off its path, '' where it follows; note how far it lags."""
-        if not self._reacted:
+        if not self.reacted:
             still = self._is_still_at_start(seen)
             if still and seen.wall - self._sent_wall <= self._rules.reaction_s:
                 self._lag_s = max(elapsed, 0.0)
                 return ''
             if still:
                 return 'the robot does not take commands: see its controller, and its driver'
-            self._reacted = True
+            self.reacted = True
         lag, off, is_near = self._lag(elapsed, seen.q)
         self._lag_s = float(np.clip(lag, 0.0, self._allowed_s))
         if off <= ON_PATH_RAD and (is_near or -EARLY_S - LATENCY_S <= lag <= self._allowed_s):

@@ -95,7 +95,7 @@ def test_faster_than_the_arm_can_be(joint, speed, side):
 def test_a_joint_is_judged_by_the_last_report_that_was_believed():
     """A whole turn off for good: never believed; for one message: the next is believed."""
     stream = Stream()
-    turned = AT + [0.0, 2 * np.pi]
+    turned = np.add(AT, [0.0, 2 * np.pi])
     for _ in range(40):
         assert not stream.next(q=turned)
     assert stream.reports.kind == 'too_fast'
@@ -201,7 +201,7 @@ def test_after_it_was_told_to_forget_everything_is_new():
     stream = Stream()
     stream.next(q=[0.25, np.nan])
     stream.reports.forget()
-    assert stream.next(q=AT + [0.5, 3.0])
+    assert stream.next(q=np.add(AT, [0.5, 3.0]))
     stream.reports.forget()
     assert stream.next(stamp_dt=-50.0)
     assert stream.next(late=9.0)
