@@ -335,7 +335,8 @@ class Bench:
             time.sleep(0.2)
         if self.planner != 'running':
             response = self.call('collect')
-            assert response is not None and response.success, response
+            assert response is not None, 'no answer of /remaster/collect'
+            assert response.success, response.message
             took.append('collect')
             self.until(lambda: self.planner == 'running', 5, 'the collection')
         return took

@@ -21,6 +21,21 @@ HALT_S = 0.3
 """A command may be on its way when a halt is said, s."""
 GOES_ON_S = 30.0
 """Once a fault is over the next configuration is recorded within so much wall time."""
+BENCHES = {
+    'plain': {},
+    'relays': {'relays': True},
+    'emergency': {'emergency': True},
+    'bar alone': {'require': 'mocap'},
+    'any sensor': {'require': 'any'},
+}
+"""Set of nodes -> what the bench is given for it."""
+REFUSED = {
+    'outside_limits': 'outside the limits',
+    'too_fast': 'faster than the arm can be',
+    'stamp': 'its stamp does not advance',
+    'not_finite': 'not finite',
+}
+"""What a busy machine alone never does to a report."""
 COLUMNS = 'who', 'fault', 'what is said', 'what is commanded', 'how it goes on'
 
 
@@ -39,7 +54,7 @@ class Row:
     during
         ``move`` or ``reading``: what is under way when it begins.
     bench
-        Which set of nodes it is tried in: ``plain``, ``relays``, ``emergency``.
+        Which set of nodes it is tried in, see `BENCHES`.
     quick
         Whether `make test` tries it.
     """
@@ -103,11 +118,26 @@ def observe(bench: Bench, row: Row) -> Seen:
         commanded = 'nothing new: it stops, or stands, as long as it lasts'
     else:
         commanded = 'the planned moves'
-    said = observer.reasons(began)
+    refused = [kind for kind in REFUSED if _refused(bench, kind, began) > 0]
+    said = [
+        *observer.reasons(began),
+        *(f'a report of the joints is refused ({REFUSED[kind]})' for kind in refused),
+    ]
     numbers = (0.0, 0.0)
     if stop is not None:
         numbers = float(np.rad2deg(stop.travel_rad)), observer.share(stop)
     return Seen('; '.join(said) or 'nothing', commanded, goes_on, *numbers)
+
+
+def _refused(bench: Bench, kind: str, began: float) -> int:
+    """Return how many reports of the joints were refused for a reason since then."""
+    counts = [
+        (at, int(values.get(f'joints_refused_{kind}', 0)))
+        for at, node, _, values in list(bench.observer.summaries)
+        if node == 'robot_bridge'
+    ]
+    before = [count for at, count in counts if at <= began]
+    return max(count for _, count in counts) - before[-1]
 
 
 def _wait(bench: Bench, until_s: float) -> None:
@@ -511,6 +541,10 @@ DEVICES = (
         lambda bench: bench.inject(tracker={'off': 1}), lasts_s=6.0),
     Row('laser_tracker_markers', 'its reflector is hidden',
         lambda bench: bench.inject(tracker={'occluded': 1}), lasts_s=6.0),
+    Row('laser_tracker_markers', 'killed for good, and `require` is the bar alone',
+        killed('laser_tracker_markers'), nothing, lasts_s=6.0, bench='bar alone'),
+    Row('laser_tracker_markers', 'killed for good, and `require` is any',
+        killed('laser_tracker_markers'), nothing, lasts_s=6.0, bench='any sensor'),
 )  # fmt: skip
 
 ROWS = (*FIVE, *ROBOT, *(row for name in (

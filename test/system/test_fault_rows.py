@@ -9,8 +9,10 @@ import os
 import subprocess
 import sys
 
+import fault_observer
 import fault_page
 import fault_rows
+import numpy as np
 import pytest
 from conftest import ROOT, _domains
 
@@ -23,6 +25,11 @@ ENOUGH = 6
 """So many configurations must be left for another row."""
 FIVE_HEADING = 'situation', 'commanded before', 'commanded now', 'what is said', 'how it goes on'
 BAD_FITS = {'no gauge': '{"format": "remaster-fit/1", "joint_offsets": []}', 'garbage': '\0{"f'}
+
+
+COPIED = 'robot', 'publishes what was commanded as measured, from the start'
+NO_OFFSETS = 'offsets that are none: {}'
+OTHERS = [COPIED, *(('optimizer', NO_OFFSETS.format(fault)) for fault in BAD_FITS)]
 
 
 class Benches:
@@ -42,8 +49,7 @@ class Benches:
 
             folder = self._folders.mktemp(f'faults_{next(self._numbers)}')
             self._kind, self.broken = kind, False
-            options = {} if kind == 'plain' else {kind: True}
-            self._bench = Bench(folder, next(_domains), **options)
+            self._bench = Bench(folder, next(_domains), **fault_rows.BENCHES[kind])
             self._bench.begin()
         return self._bench
 
@@ -72,8 +78,9 @@ def write(section, seen):
         rows = [row for row in rows if row[:keys] != seen[:keys]]
     if not any(fault_page.same(seen, other) for other in rows):
         rows.append(seen)
-    rows = [row for row in rows if row[:keys] in order or row[0] == 'optimizer']
-    rows.sort(key=lambda row: order.index(row[:keys]) if row[:keys] in order else len(order))
+    order += OTHERS
+    rows = [row for row in rows if row[:keys] in order]
+    rows.sort(key=lambda row: order.index(row[:keys]))
     heading = FIVE_HEADING if keys == 1 else fault_rows.COLUMNS
     fault_page.replace(section, fault_page.table(heading, rows))
 
@@ -112,6 +119,31 @@ def test_row(benches, row):
     compare(section, line)
 
 
+@pytest.mark.skipif(not ALL, reason='needs a set of nodes of its own: make faults')
+def test_a_robot_that_copies_its_commands_never_moves(tmp_path):
+    """Found by a probe of a micrometre, before the first motion."""
+    from fault_bench import Bench
+
+    bench = Bench(tmp_path, next(_domains))
+    try:
+        bench.inject(robot={'copy': 1})
+        bench.until(lambda: bench.observer.says('pose_planner', 'robot') == 'heard', 90, 'it')
+        bench.call('collect')
+        bench.until(lambda: bench.halted, 90, 'a halt')
+        moved = bench.world.reported(bench.world.now())[0] - bench.world.start_q
+        assert np.max(np.abs(moved)) < 1e-4
+        assert all(command.travel_rad < 1e-4 for command in bench.observer.commands)
+        said = fault_observer.plain(bench.halted)
+        bench.inject()
+        took = bench.operate()
+        bench.until(lambda: any(c.is_move for c in bench.observer.commands), 60, 'a move')
+        bench.observer.judge(bench.observer.commands)
+    finally:
+        bench.close()
+    goes_on = f'after {" and ".join(took)}'
+    compare('nodes', (*COPIED, said[0].upper() + said[1:], 'a micrometre', goes_on))
+
+
 @pytest.mark.parametrize('fault', BAD_FITS)
 def test_offsets_that_are_none(fault, tmp_path):
     """The optimizer takes no part in a collection; what it can do is hand on wrong offsets."""
@@ -132,7 +164,7 @@ def test_offsets_that_are_none(fault, tmp_path):
     (line,) = [line for line in done.stderr.splitlines() if line.startswith('error:')]
     said = line.removeprefix('error: ').replace(f'{path}: ', '')
     row = (
-        'optimizer', f'offsets that are none: {fault}', f'The bridge does not start: {said}',
+        'optimizer', NO_OFFSETS.format(fault), f'The bridge does not start: {said}',
         'nothing', 'with a fit.json',
     )  # fmt: skip
     compare('nodes', row)
