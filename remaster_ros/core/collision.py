@@ -563,6 +563,10 @@ class CollisionModel:
         grid = np.unique(np.append(np.arange(0, steps, _STRIDE), steps))
         share = np.arange(steps + 1) / steps
         q = start + share[:, None] * (end - start)
+        # Most ways that are not free show it at one of these.
+        found, _ = self._examine(self._place(q[[steps // 2, steps // 4, -1]]), extra, one=True)
+        if found:
+            return found[0]
         found, distances = self._examine(self._place(q[grid]), extra, one=True)
         if found:
             return found[0]

@@ -37,6 +37,7 @@ from remaster_ros.motion.following import (
     allowed_lag_s,
 )
 from remaster_ros.motion.joint_reports import JointReport, JointReports
+from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import (
     WAY_OUT_TOOL_SPEED,
     MotionGate,
@@ -225,7 +226,7 @@ class ArmSupervisor:
         self._doubted_wall = None
         gap = self._gap(report)
         self._excuse_gap(report)
-        self._seen = seen = Seen.after(self._seen, report, self.rules)
+        self._seen = seen = Seen.after(self._seen, report, self.rules, self.reports.late_s)
         actions: list[Action] = []
         visit = self._visit
         if gap:
@@ -275,6 +276,12 @@ class ArmSupervisor:
         self._seen, self._doubted_wall, self._braking = None, None, None
         self._reasons['robot'] = ''
         return ''
+
+    def use_limits(self, limits: MotionLimits, wall_s: float) -> list[Action]:
+        """Use other limits from now on; a move under way is stopped and commanded again."""
+        actions = self._stop('other limits', wall_s)
+        self.gate.limits = limits
+        return actions + self.tick(wall_s)
 
     def tick(self, wall_s: float) -> list[Action]:
         """Look at the time: stop or halt on silence, go on when nothing is in the way."""
@@ -363,14 +370,15 @@ class ArmSupervisor:
         if last is None or wall_s - last <= OWN_PAUSE_S:
             return
         pause = wall_s - last
-        self._heard = {name: heard + pause for name, heard in self._heard.items()}
+        # Who was heard since is no exception, and nobody was heard in the future.
+        self._heard = {name: min(heard + pause, wall_s) for name, heard in self._heard.items()}
 
     def _silence_s(self, name: str, wall_s: float) -> float:
         return wall_s - self._heard[name] if name in self._heard else np.inf
 
     def _gap(self, report: JointReport) -> str:
         """Return in words that the arm was not observed for long while it was to be; ''."""
-        if self._seen is None or not self._engaged:
+        if self._seen is None or not self._engaged or self.halted:
             return ''
         gap = (report.stamp_s - self._seen.stamp) / self._rate
         too_long = gap > self.rules.heartbeat_s
@@ -501,6 +509,9 @@ class ArmSupervisor:
             motion_s = detector.still_since - visit.sent_stamp
             settle_s = seen.stamp - detector.still_since
             return [Settled(visit.solution, seen.stamp, detector.mean, motion_s, settle_s)]
+        if not visit.following.reacted:
+            # On a simulated clock that runs fast its time is over before a command is seen.
+            return []
         distance = float(np.max(np.abs(seen.q - trajectory.end)))
         if distance > ELSEWHERE_RAD and arrived and seen.stands(wall_s):
             return self._halt(STOPPED_ON_ITS_WAY, wall_s)
@@ -575,11 +586,9 @@ class ArmSupervisor:
     def _brake(self, visit: _Visit, seen: Seen, reason: str, wall_s: float) -> list[Action]:
         """Leave the rest of the line along the line."""
         self._visit, self._pending = None, None
-        low, high = visit.following.window(seen, wall_s, self._rate)
-        if low >= visit.trajectory.duration_s:
-            # It is at its end.
+        if visit.following.has_ended(seen, wall_s, self._rate):
             return []
-        admitted = self.gate.stop(low, high)
+        admitted = self.gate.stop(*visit.following.window(seen, wall_s, self._rate))
         (stop,) = admitted.waypoints
         deadline = (
             seen.now(wall_s, self._rate)

@@ -108,6 +108,8 @@ class JointReports:
     trouble, kind
         Why the last report was not believed, in words and as a word for the counts; '' where it
         was.
+    late_s
+        How much later than usual the last report came that was believed, s of the node's time.
     clock
         The rate of the node's clock.
     """
@@ -126,6 +128,7 @@ class JointReports:
         self._last: JointReport | None = None
         self._delays: list[float] = []
         self._delay: float | None = None
+        self.late_s = 0.0
 
     def believes(self, report: JointReport) -> bool:
         """Judge a report; `trouble` is the reason where it is not believed."""
@@ -134,6 +137,8 @@ class JointReports:
         if self.kind:
             self.refused[self.kind] += 1
             return False
+        if self._delay is not None:
+            self.late_s = max(report.clock_s - report.stamp_s - self._delay, 0.0)
         self._learn(report)
         self._last = report
         return True

@@ -165,7 +165,7 @@ class MotionGate:
             if not off <= ON_PATH_RAD:
                 raise MotionRefusedError(f'a waypoint lies {off:.6f} rad off the path found free')
             # What the arm stands off the start of the path is lost on the first piece.
-            allowed = START_RAD if before is points[0] else 0.0
+            allowed = START_RAD * np.sqrt(len(q)) if before is points[0] else 0.0
             between = np.linspace(0.0, piece.duration_s, BETWEEN)
             off = max(path.distance(place) for place in piece.at(between))
             if not off <= allowed + ON_PATH_RAD:

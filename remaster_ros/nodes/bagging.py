@@ -15,6 +15,7 @@ from sensor_msgs.msg import JointState
 
 from remaster_ros.core.errors import DiskError, InputError
 from remaster_ros.nodes.status import LATCHED, TOPIC
+from remaster_ros.storage.bag import RECORDED
 from remaster_ros.storage.bag_writer import BagWriter
 
 DEEP = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
@@ -101,8 +102,8 @@ class BagRecorder:
     ) -> None:
         """Record `topic`; call `receive` with each decoded message, if given.
 
-        In the bag it has the name without this node's namespace, and as if it was not remapped: a
-        bag can be replayed in any namespace.
+        In the bag it has the name of `name_in_bag`: without this node's namespace and as if it was
+        not remapped, so that a bag can be replayed in any namespace.
         """
         module = kind.__module__.split('.')[0]
         type_name = f'{module}/msg/{kind.__name__}'
@@ -141,8 +142,12 @@ class BagRecorder:
 
 
 def name_in_bag(topic: str) -> str:
-    """Return the name in bags of a topic as this package's code names it, relative or not."""
-    return f'/{topic.lstrip("/")}'
+    """Return the name in bags of a topic as this package's code names it, relative or not.
+
+    What moves an arm has another one there (`storage.bag.RECORDED`).
+    """
+    name = f'/{topic.lstrip("/")}'
+    return RECORDED.get(name, name)
 
 
 def _free(folder: Path) -> Path:

@@ -374,6 +374,7 @@ class PosePlanner(RemasterNode):
         if found is None or found[0] is None:
             return found
         return (tour.take(found[0]),)
+
     def _write_state(self) -> None:
         """Write down what was said; a stop or pause came in a thread that must not wait for it."""
         with self._lock:
@@ -478,7 +479,7 @@ class PosePlanner(RemasterNode):
         dropped = tour.dropped if tour and self.phase != REGISTRATION else {}
         collecting = tour is not None and self.phase != REGISTRATION
         solutions = Counter(tour.dropped_solutions if tour and collecting else {})
-        solutions['no free path'] = outcomes[NO_FREE_PATH]
+        solutions['no free path'] = outcomes.get(NO_FREE_PATH, 0)
         values = {
             'state': 'held' if full and self.state == 'running' else self.state,
             'phase': self.phase,

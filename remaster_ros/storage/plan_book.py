@@ -154,7 +154,8 @@ class PlanBook:
         """Go to a stop; the solutions that nothing leads to have their outcome with it."""
         if stop.split != REGISTRATION and stop.unreached:
             self.outcomes[NO_FREE_PATH] += len(stop.unreached)
-        self.stop = stop
+        # Counted once.
+        self.stop = replace(stop, unreached=())
 
     def _close_solution(self, solution: int, result: str) -> None:
         assert self.stop is not None

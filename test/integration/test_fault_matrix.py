@@ -20,11 +20,11 @@ import optitrack_world
 import pytest
 import tracker_world
 from fault_bench import NODES, SENSOR_OF, Bench, Node
+from remaster_ros.core.visiting import Visitor
 
 from remaster_ros.core import transforms
 from remaster_ros.core.errors import DeviceError, InputError, InsufficientDataError
 from remaster_ros.core.registration import register_agreeing
-from remaster_ros.core.visiting import Visitor
 from remaster_ros.drivers.laser_tracker import LaserTrackerClient, LaserTrackerSettings
 from remaster_ros.drivers.natnet import MarkerChoice, NatNetClient, NatNetSettings
 from remaster_ros.drivers.natnet_diagnosis import warning

@@ -163,9 +163,9 @@ def test_third_parties_open_the_bag(demo):
     folder = demo[0] / 'session' / 'bag'
     with Reader(folder) as reader:
         topics = {connection.topic: connection.msgcount for connection in reader.connections}
-    needed = ['/joint_states', '/remaster/target_pose', '/remaster/joint_solutions']
+    needed = ['/joint_states', '/remaster/target_pose', '/remaster/recorded/joint_solutions']
     needed += ['/remaster/settled', '/optitrack/marker', '/laser_tracker/marker']
-    needed += ['/remaster/status', '/joint_trajectory_controller/joint_trajectory']
+    needed += ['/remaster/status', '/remaster/recorded/joint_trajectory']
     assert all(topics[topic] > 0 for topic in needed)
 
     reason = 'needs the judge: pip install mcap-ros2-support'
