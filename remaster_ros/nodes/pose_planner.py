@@ -234,8 +234,9 @@ class PosePlanner(RemasterNode):
     def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Any:
         with self._lock:
             self._left = ''
-            self._set_state('stopped')
+            # The command first: nothing that fails behind it may keep the arm moving.
             self._announcer.stop()
+            self._set_state('stopped')
         response.success, response.message = True, 'stopped'
         return response
 
