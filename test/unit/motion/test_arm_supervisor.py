@@ -126,8 +126,14 @@ def test_nothing_is_commanded_before_the_first_report():
     assert arm.blocked(5.0) == ''
     assert arm.report(report(0.2, HOME, 5.1)) == []
     assert arm.report(report(0.34, HOME, 5.2)) == []
-    (check,) = arm.report(report(0.36, HOME, 5.3))
-    assert isinstance(check, CheckPath)
+    (look,) = arm.report(report(0.36, HOME, 5.3))
+    assert isinstance(look, CheckPath)
+    np.testing.assert_array_equal(look.start, HOME)
+    np.testing.assert_array_equal(look.target, HOME)
+    # Where it stands is free; then the probe is asked for.
+    (check,) = arm.path_found(
+        look.number, PathAnswer(FreePath(np.array([look.start, look.target]))), 5.32
+    )
     np.testing.assert_array_equal(check.start, HOME)
     np.testing.assert_array_equal(check.target, HOME)
     assert check.waypoints.shape == (0, 2)
@@ -152,12 +158,19 @@ def test_before_the_planner_is_heard_nothing_moves():
 
 
 def test_without_a_plan_nothing_is_commanded():
+    """Where the arm stands is looked at, once."""
     arm = supervisor()
     arm.planner_is('running', 0.0)
     arm.recorder_waits('', 0.0)
+    said = []
     for i in range(40):
-        assert arm.report(report(8.0 + i * 0.05, HOME, i * 0.05)) == []
+        said += arm.report(report(8.0 + i * 0.05, HOME, i * 0.05))
+        if said and i < 20:
+            assert arm.path_found(said[0].number, PathAnswer(None, 'unknown'), i * 0.05) == []
+    (look,) = said
+    np.testing.assert_array_equal(look.start, look.target)
     assert arm.blocked(2.0) == ''
+    assert not arm.busy
 
 
 def test_a_new_pose_stops_the_arm_first(rig):

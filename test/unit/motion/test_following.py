@@ -259,8 +259,7 @@ def test_a_command_that_is_not_taken():
     assert arm.lost == 'the arm is not seen to move yet'
     astray = arm.run(4.0, lambda t: LINE.start)
     reason = 'the robot does not take commands: see its controller, and its driver'
-    assert arm.said == reason
-    assert arm.lost == 'the arm has not begun to move'
+    assert arm.said == arm.lost == reason
     assert RULES.reaction_s + ASTRAY_S < astray < RULES.reaction_s + ASTRAY_S + 0.05
 
 
