@@ -29,7 +29,7 @@ from remaster_ros.storage.cell import config_path, read_cell
 from remaster_ros.storage.session import read_session
 
 ROOT = Path(__file__).parents[1]
-SEED, RATE, SPEED_SHARE = 11, 8.0, 0.1
+SEED, RATE, SPEED_SHARE = 11, 4.0, 0.2
 SENSOR_OF = {'optitrack_markers': 'mocap', 'laser_tracker_markers': 'tracker'}
 NODES = ('pose_planner', 'robot_bridge', 'recorder', *SENSOR_OF)
 FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
@@ -121,14 +121,14 @@ class Bench:
         hidden = {'world': str(folder / 'world')}
         self._values = {
             'fake_robot': hidden,
-            'fake_optitrack': {**hidden, **ports},
+            'fake_optitrack': {**hidden, **ports, 'rate': 20.0},
             'fake_laser_tracker': {**hidden, 'port': tracker},
             'pose_planner': {
                 'session': str(self.session), 'optimization_candidates': candidates,
                 'validation_candidates': 1, 'registration_candidates': 6, 'seed': SEED,
             },
             'robot_bridge': {
-                'speed_share': SPEED_SHARE, 'settle_s': 1.0, 'answer_timeout_s': 40.0,
+                'speed_share': SPEED_SHARE, 'settle_s': 0.6, 'answer_timeout_s': 30.0,
                 **({'emergency_stop_topic': EMERGENCY} if emergency else {}),
             },
             'recorder': {'session': str(self.session), 'require': require, 'bag': False},

@@ -19,6 +19,8 @@ from fault_bench import RATE, SENSOR_OF, Bench
 
 HALT_S = 0.3
 """A command may be on its way when a halt is said, s."""
+TRIES = 4
+"""So often at most a row is tried."""
 GOES_ON_S = 30.0
 """Once a fault is over the next configuration is recorded within so much wall time."""
 BENCHES = {
@@ -57,6 +59,8 @@ class Row:
         Which set of nodes it is tried in, see `BENCHES`.
     quick
         Whether `make test` tries it.
+    times
+        Whether it makes joint_states late or early; only a busy machine does else.
     """
 
     who: str
@@ -67,6 +71,7 @@ class Row:
     during: str = 'move'
     bench: str = 'plain'
     quick: bool = False
+    times: bool = False
 
 
 @dataclass(frozen=True)
@@ -88,7 +93,17 @@ class Seen:
 
 
 def observe(bench: Bench, row: Row) -> Seen:
-    """Try a row; return what was seen."""
+    """Try a row; return what was seen. On a machine that was too busy for it, try again."""
+    for _ in range(TRIES):
+        began = time.monotonic()
+        seen = _observe(bench, row)
+        if row.times or not any(_refused(bench, kind, began) for kind in ('late', 'early')):
+            break
+        print(f'{row.fault}: once more, joint_states came late without a fault: {seen.said}')
+    return seen
+
+
+def _observe(bench: Bench, row: Row) -> Seen:
     observer = bench.observer
     (bench.under_way if row.during == 'move' else bench.settled)()
     began = time.monotonic()
@@ -137,7 +152,7 @@ def _refused(bench: Bench, kind: str, began: float) -> int:
         if node == 'robot_bridge'
     ]
     before = [count for at, count in counts if at <= began]
-    return max(count for _, count in counts) - before[-1]
+    return max(count for _, count in counts) - (before[-1] if before else 0)
 
 
 def _wait(bench: Bench, until_s: float) -> None:
@@ -252,6 +267,7 @@ FIVE = (
         'its process is paused (SIGSTOP), and the emergency stop is pressed meanwhile',
         paused_in_an_emergency,
         lasts_s=4.0,
+        times=True,
         quick=True,
     ),
     *(
@@ -261,6 +277,7 @@ FIVE = (
             then_pause(robot(late=late * RATE)),
             lasts_s=2.5,
             quick=late == 1.0,
+            times=True,
         )
         for late in (0.5, 1.0, 2.0)
     ),
@@ -277,6 +294,7 @@ FIVE = (
         second_publisher,
         strangers_leave,
         lasts_s=3.0,
+        times=True,
         quick=True,
     ),
 )
@@ -298,21 +316,22 @@ ROBOT = (
     Row('robot', 'arrives elsewhere', robot(elsewhere=0.02), lasts_s=8.0),
     Row('robot', 'moves at a third of its speed', robot(slow=3.0), lasts_s=8.0),
     Row('robot', 'drifts while settling', robot(drift=1e-3), lasts_s=12.0),
-    Row('robot', 'stops publishing', robot(off=1), lasts_s=6.0),
-    Row('robot', 'switched off and on', robot(off=1), robot(reordered=1), lasts_s=6.0),
-    Row('robot', 'publishes every other 4 s', robot(intermittent=4.0 * RATE), lasts_s=9.0),
+    Row('robot', 'stops publishing', robot(off=1), lasts_s=6.0, times=True),
+    Row('robot', 'switched off and on', robot(off=1), robot(reordered=1), lasts_s=6.0, times=True),
+    Row('robot', 'publishes every other 4 s', robot(intermittent=4.0 * RATE), lasts_s=9.0,
+        times=True),
     Row('robot', 'publishes what was commanded as measured', robot(copy=1), lasts_s=8.0),
     Row('robot', 'reports NaN', robot(nan=1)),
     Row('robot', 'joints renamed', robot(renamed=1)),
     Row('robot', 'joints in another order each time', robot(reordered=1)),
-    Row('robot', 'clock jumps an hour ahead', robot(clock=3600.0)),
-    Row('robot', 'clock jumps an hour back', robot(clock=-3600.0)),
-    Row('robot', 'joint_states come 1 s late', robot(late=RATE)),
-    Row('robot', 'joint_states stamped 1 s early', robot(clock=RATE)),
+    Row('robot', 'clock jumps an hour ahead', robot(clock=3600.0), times=True),
+    Row('robot', 'clock jumps an hour back', robot(clock=-3600.0), times=True),
+    Row('robot', 'joint_states come 1 s late', robot(late=RATE), times=True),
+    Row('robot', 'joint_states stamped 1 s early', robot(clock=RATE), times=True),
     Row('robot', 'two of three joint_states lost', robot(lost=3)),
     Row('robot', 'each of joint_states doubled', robot(doubled=1)),
-    Row('robot', 'the same joint_states again and again', robot(repeated=1)),
-    Row('robot', 'joint_states frozen, with new stamps', robot(frozen=1)),
+    Row('robot', 'the same joint_states again and again', robot(repeated=1), times=True),
+    Row('robot', 'joint_states frozen, with new stamps', robot(frozen=1), times=True),
     Row('robot', 'a joint off by 2π for good', robot(wrapped=1)),
     Row('robot', 'a joint off by 2π in one message', robot(wrapped_once=1)),
     Row('robot', 'emergency_stop_topic says true', lambda b: setattr(b, 'pressed', True),
@@ -390,7 +409,15 @@ def _common(name: str) -> tuple[Row, ...]:
         ('intermittent', 'stands still for 4 s, twice', intermittent(name), nothing, 0.0),
     )
     return tuple(
-        Row(name, fault, inject, end, lasts_s, quick=kind == quick.get(name, 'stuck' * sensor))
+        Row(
+            name,
+            fault,
+            inject,
+            end,
+            lasts_s,
+            quick=kind == quick.get(name, 'stuck' * sensor),
+            times=name == 'robot_bridge',
+        )
         for kind, fault, inject, end, lasts_s in rows
     )
 
