@@ -37,6 +37,7 @@ from remaster_ros.motion.following import (
     allowed_lag_s,
 )
 from remaster_ros.motion.joint_reports import JointReport, JointReports
+from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import (
     WAY_OUT_TOOL_SPEED,
     MotionGate,
@@ -275,6 +276,12 @@ class ArmSupervisor:
         self._seen, self._doubted_wall, self._braking = None, None, None
         self._reasons['robot'] = ''
         return ''
+
+    def use_limits(self, limits: MotionLimits, wall_s: float) -> list[Action]:
+        """Use other limits from now on; a move under way is stopped and commanded again."""
+        actions = self._stop('other limits', wall_s)
+        self.gate.limits = limits
+        return actions + self.tick(wall_s)
 
     def tick(self, wall_s: float) -> list[Action]:
         """Look at the time: stop or halt on silence, go on when nothing is in the way."""

@@ -136,13 +136,15 @@ class Following:
 
         The later one is where the controller's reference is: a stop takes as long to get there as
         the move did, give or take `JITTER_S`. Where the last report came late, it has gone on for
-        so long. The earlier one is where an arm is that lags.
+        so long. The earlier one is where an arm is that lags, and that has been stopped by itself
+        since the last report.
         """
-        elapsed, jitter = self.elapsed_s(seen.now(wall_s, rate)), JITTER_S * rate
+        reported, jitter = self.elapsed_s(seen.time), JITTER_S * rate
+        elapsed = self.elapsed_s(seen.now(wall_s, rate))
         # In a rest the lag is what the arm still has to the end of the line.
-        index, since_s = self.trajectory.line_at(elapsed)
+        index, since_s = self.trajectory.line_at(reported)
         rested_s = max(since_s - self.trajectory.lines[index].duration_s, 0.0)
-        return elapsed - rested_s - self._lag_s - jitter, elapsed + seen.late_s + jitter
+        return reported - rested_s - self._lag_s - jitter, elapsed + seen.late_s + jitter
 
     def has_ended(self, seen: Seen, wall_s: float, rate: float) -> bool:
         """Whether the arm is at the end of the trajectory, or will be without any command."""

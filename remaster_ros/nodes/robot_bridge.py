@@ -67,7 +67,7 @@ class RobotBridge(RemasterNode):
 
     def __init__(self) -> None:
         super().__init__('robot_bridge')
-        self.p = declare(self, Parameters)
+        self.p = declare(self, Parameters, self._on_parameters)
         cell = read_cell(self.p.cell)
         self.chain = cell.chain()
         self._order = JointOrder(self.chain.joint_names)
@@ -136,6 +136,15 @@ class RobotBridge(RemasterNode):
             self._acceleration,
             p.cartesian_speed_limit_m_s or np.inf,
             float(np.deg2rad(p.limit_margin_deg)),
+        )
+
+    def _on_parameters(self, p: Parameters) -> None:
+        """Go on with other speeds."""
+        self.p = p
+        self._do(self.supervisor.use_limits(self._limits(p), time.monotonic()))
+        self.get_logger().info(
+            f'speed_share is {p.speed_share:g}, cartesian_speed_limit_m_s '
+            f'{p.cartesian_speed_limit_m_s:g}'
         )
 
     # What comes in

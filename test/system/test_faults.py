@@ -1,7 +1,7 @@
 """A pause, then faults in the middle of a whole run of real nodes: the reason, and its end.
 
 The faults are injected into the fakes' hidden World one after the other; what each kind does to
-each device and node is in test/integration/test_fault_matrix.py.
+each node is in test_fault_rows.py, to each device in test/integration/test_device_faults.py.
 """
 
 import signal
