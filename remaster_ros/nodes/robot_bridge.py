@@ -68,6 +68,11 @@ class RobotBridge(RemasterNode):
     def __init__(self) -> None:
         super().__init__('robot_bridge')
         self.p = declare(self, Parameters, self._on_parameters)
+        if not self.p.cell:
+            raise InputError(
+                'robot_bridge: parameter cell is empty; give the cell file of this arm (demo, the '
+                'shipped one, is for the fakes)'
+            )
         cell = read_cell(self.p.cell)
         self.chain = cell.chain()
         self._order = JointOrder(self.chain.joint_names)
