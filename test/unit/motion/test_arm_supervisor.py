@@ -14,7 +14,7 @@ from remaster_ros.motion.actions import (
     Stop,
     SupervisorRules,
 )
-from remaster_ros.motion.arm_supervisor import PROBE, PROBE_WAIT_S, ArmSupervisor
+from remaster_ros.motion.arm_supervisor import PROBE, ArmSupervisor
 from remaster_ros.motion.following import STANDING_S
 from remaster_ros.motion.joint_reports import JointReport, JointReports
 from remaster_ros.motion.limits import MotionLimits
@@ -22,6 +22,7 @@ from remaster_ros.motion.motion_gate import MotionGate
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.motion.trajectory import Line
+from remaster_ros.motion.visit import PROBE_WAIT_S
 
 
 def supervisor(rules=RULES, limits=LIMITS):
