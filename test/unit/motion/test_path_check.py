@@ -14,6 +14,8 @@ from remaster_ros.motion.path_check import (
     peak_speeds,
 )
 
+pin = pytest.importorskip('pinocchio', reason='a judge: pip install .[test]')
+
 URDF = Path(__file__).parents[3] / 'config' / 'robots' / 'iiwa7.urdf'
 
 
@@ -48,7 +50,6 @@ def test_speeds_against_numerical_differences(arm):
 
 
 def test_speeds_against_pinocchio(arm):
-    pin = pytest.importorskip('pinocchio', reason='a judge: pip install .[test]')
     """Its frame velocities; each joint's placement is the frame after the joint."""
     chain, extents, speeds, model = arm
     data = model.createData()
