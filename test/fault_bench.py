@@ -252,9 +252,13 @@ class Bench:
         self.until(lambda: says('pose_planner', 'robot') == 'heard', 90, 'the robot')
         self.call('collect')
 
+        halts: list[str] = []
+
         def registered() -> bool:
             if self.halted:
                 # A machine that is far too busy as the nodes start; no row has begun yet.
+                halts.append(self.halted)
+                assert len(halts) <= 3, f'halted without a fault: {halts}'
                 time.sleep(1.0)
                 self.operate()
             return says('pose_planner', 'phase') == 'collection'

@@ -235,6 +235,7 @@ def plain(text: str) -> str:
     """Return a reason without what depends on the moment."""
     text = re.sub(r' \((halted|process) [^)]*\)', '', text).replace('|', '/')
     text = re.sub(r'joint(s?)[ _]\d', r'joint\1 …', text)
+    text = re.sub(r'((?:other_)?joint …)(, \1)+', r'\1', text)
     text = text.replace(UNNAMED, '…')
     text = re.sub(r'-?\d+\.\d+|\b(inf|nan)\b|\d+(?= mm| usable| readings| s old)', '…', text)
     return re.sub(r'solutions? \d+', 'a solution', text)

@@ -315,7 +315,7 @@ ROBOT = (
     Row('robot', 'drops its commands', robot(dropped=1), lasts_s=8.0),
     Row('robot', 'arrives elsewhere', robot(elsewhere=0.02), lasts_s=8.0),
     Row('robot', 'moves at a third of its speed', robot(slow=3.0), lasts_s=8.0),
-    Row('robot', 'drifts while settling', robot(drift=1e-3), lasts_s=12.0),
+    Row('robot', 'drifts while settling', robot(drift=1e-3), lasts_s=22.0),
     Row('robot', 'stops publishing', robot(off=1), lasts_s=6.0, times=True),
     Row('robot', 'switched off and on', robot(off=1), robot(reordered=1), lasts_s=6.0, times=True),
     Row('robot', 'publishes every other 4 s', robot(intermittent=4.0 * RATE), lasts_s=9.0,

@@ -120,6 +120,8 @@ class RobotBridge(RemasterNode):
         self.create_timer(WATCH_WALL_S, self._watch, clock=self.status.steady)
         if self.supervisor.halted:
             self.get_logger().error(f'halted: {self.supervisor.halted}')
+        for pair in model.left_out:
+            self.get_logger().info(f'collisions: {pair}')
         if not self.p.cartesian_speed_limit_m_s:
             self.get_logger().warning(
                 'no Cartesian speed limit (cartesian_speed_limit_m_s is 0): the joints alone '
