@@ -100,7 +100,7 @@ class Bench:
 
     def __init__(
         self, folder: Path, domain: int, *, relays=False, emergency=False, require='all',
-        candidates=16,
+        candidates=32,
     ) -> None:  # fmt: skip
         self.folder, self.session = folder, folder / 'session'
         self.world = make_world(folder / 'world', read_cell('demo'), SEED, RATE)
