@@ -31,7 +31,7 @@ JUDGES = [
     'CESAPI==1.1.3',
     'mcap-ros2-support>=0.5',
     'arviz-stats>=0.4',
-    'pin>=2.7',
+    'python-fcl>=0.7',
 ]
 
 
@@ -59,7 +59,7 @@ setup(
     packages=[*find_packages(include=[NAME, f'{NAME}.*']), f'{NAME}.config'],
     package_dir={f'{NAME}.config': 'config'},
     package_data={
-        f'{NAME}.config': ['*.yaml', '*.rviz', 'robots/*', 'cells/*'],
+        f'{NAME}.config': ['*.yaml', '*.rviz', 'robots/*', 'cells/*', 'sros2/*'],
         f'{NAME}.storage': ['*.jinja'],
     },
     data_files=[
@@ -76,6 +76,11 @@ setup(
         'scipy>=1.11',
         'PyYAML>=6',
         'EAIK>=1.2',
+        # Brings coal, which measures distances between bodies; on NumPy 1, which ROS 2 Jazzy's
+        # Ubuntu has, the older hpp-fcl in its place: coal itself cannot be installed there.
+        'pin>=2.7',
+        'trimesh>=4',
+        'pycollada>=0.7',
         'msgspec>=0.18',
         'rich>=13',
         'Jinja2>=3.1',
@@ -96,7 +101,13 @@ setup(
             *JUDGES,
         ],
         # What the benchmarks compare with; figaroh and pybotics get environments of their own.
-        'bench': ['emcee>=3.1', 'numpyro>=0.15', 'jax>=0.4.30'],
+        # PyBullet has wheels up to Python 3.11; without it the paths of its iiwa are not judged.
+        'bench': [
+            'emcee>=3.1',
+            'numpyro>=0.15',
+            'jax>=0.4.30',
+            'pybullet>=3.2.7; python_version < "3.12"',
+        ],
         'check': ['ruff', 'mypy', 'types-PyYAML', 'import-linter'],
     },
     zip_safe=False,

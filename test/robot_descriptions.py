@@ -326,4 +326,32 @@ def iiwa14() -> Description:
     return Description(urdf, 'world', 'lbr_link_ee')
 
 
+def xarm7() -> Description:
+    """UFACTORY xArm7: seven joints, whose third one leaves no closed form when it is held."""
+    quarter = PI / 2
+    rows = (
+        ((0, 0, 0.267), 0.0, -2 * PI, 2 * PI),
+        ((0, 0, 0), -quarter, -2.059, 2.0944),
+        ((0, -0.293, 0), quarter, -2 * PI, 2 * PI),
+        ((0.0525, 0, 0), quarter, -0.19198, 3.927),
+        ((0.0775, -0.3425, 0), quarter, -2 * PI, 2 * PI),
+        ((0, 0, 0), quarter, -1.69297, PI),
+        ((0.076, 0.097, 0), -quarter, -2 * PI, 2 * PI),
+    )
+    joints = [
+        Joint(f'joint{i}', xyz, (roll, 0, 0), (0, 0, 1), lower, upper)
+        for i, (xyz, roll, lower, upper) in enumerate(rows, start=1)
+    ]
+    links = ['link_base', *(f'link{i}' for i in range(1, 8))]
+    urdf = document(
+        'xarm7',
+        ros2_control(joints),
+        *(link(name) for name in links),
+        arm(joints, links),
+        link('link_eef', None),
+        fixed('link7', 'link_eef'),
+    )
+    return Description(urdf, 'link_base', 'link_eef')
+
+
 ROBOTS = {'ur5e': ur5e, 'irb120': irb120, 'panda': panda, 'iiwa14': iiwa14}

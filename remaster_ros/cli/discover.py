@@ -78,6 +78,13 @@ def summary(found: Discovery, confirmation: Confirmation | None = None) -> str:
             f'{1e3 * gain.held_out_rms_after_m:.3f} mm after; '
             f'the noise alone is {1e3 * gain.noise_floor_m:.3f} mm'
         )
+    if found.thinning is not None:
+        part = found.thinning
+        lines.append(
+            f'searched: {part.searched} of {part.rows} rows; the others fall from '
+            f'{1e3 * part.others_rms_before_m:.3f} to {1e3 * part.others_rms_after_m:.3f} mm RMS '
+            'with the causes as found, frozen'
+        )
     lines += [f'not testable: {name}: {why}' for name, why in found.untestable.items()]
     if confirmation is not None:
         lines.append(

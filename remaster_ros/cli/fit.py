@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import time
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from remaster_ros.core.fit import (
 from remaster_ros.storage.priors import read_priors
 from remaster_ros.storage.results import prepare_folder, save_fit
 from remaster_ros.storage.session import read_session
+
+log = logging.getLogger('remaster_ros')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,6 +81,8 @@ def run(args: argparse.Namespace) -> int:
         )
         progress('writing', 0.0)
         report = save_fit(result, args.out, figures=not args.no_figures)
+    for line in result.implausible:
+        log.warning('%s', line)
     say(args.quiet, summary(result))
     say(args.quiet, f'written: {report}')
     return 0
@@ -103,6 +108,15 @@ def summary(result: FitResult) -> str:
             if sides['before'] and sides['after']:
                 before, after = sides['before']['mean_mm'], sides['after']['mean_mm']
                 lines.append(f'{split}, {metric}: {before:.3f} mm before, {after:.3f} mm after')
+    for check in result.noise_checks:
+        left = f'{1e3 * check.error_m:.3f} mm that are left'
+        if check.noise_error_m is None:
+            lines.append(f'{check.sensor}: nothing tells how much of the {left} is noise')
+        elif not check.explained:
+            lines.append(
+                f'{check.sensor}: noise ({1e3 * check.noise_error_m:.3f} mm) does not explain the '
+                f'{left}: other errors dominate; run "remaster discover"'
+            )
     lines.append(result.sampler.message)
     if result.left_out:
         rows = ', '.join(str(observation) for observation, _ in result.left_out)

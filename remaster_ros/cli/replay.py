@@ -22,6 +22,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--wait-for', metavar='TOPIC', default='', help='wait for the first subscriber of TOPIC'
     )
+    parser.add_argument(
+        '--with-commands',
+        action='store_true',
+        help='publish also what the controller was told; refused where a controller listens',
+    )
 
 
 def run(args: argparse.Namespace) -> NoReturn:
@@ -33,5 +38,6 @@ def run(args: argparse.Namespace) -> NoReturn:
             'rate': args.rate,
             'publish_clock': not args.no_clock,
             'wait_for': args.wait_for,
+            'with_commands': args.with_commands,
         },
     )

@@ -88,7 +88,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--offset-std-deg',
-        type=number(high=10.0, unit='deg'),
+        # A joint that is off by more has lost its mastering, or the URDF is another robot's.
+        type=number(high=2.0, unit='deg'),
         default=0.3,
         metavar='S',
         help='the true zero-offsets are drawn with this std (default 0.3)',

@@ -26,7 +26,7 @@ names them all. The base itself touches the floor.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -260,12 +260,12 @@ class CollisionModel:
         """Return the distances of pairs (p,) (see `Shortfall`) at configurations (n, k), m."""
         placed = self._place(q)
         bounds = self._lower_bounds(placed)
-        return np.array(
-            [
-                [self._measure(placed, row, int(pair), bounds[row, pair]) for pair in pairs]
-                for row in range(len(q))
-            ]
-        )
+        for column in pairs:
+            rows = np.arange(len(q))
+            decided = self._measure_cheap(placed, rows, np.full(len(q), column), bounds)
+            for row in rows[~decided]:
+                bounds[row, column] = self._measure(placed, int(row), int(column))
+        return bounds[:, pairs]
 
     def reasons(
         self, q: ArrayLike, extra: float = 0.0
@@ -483,48 +483,75 @@ class CollisionModel:
         # At most what the bound says: the capsule around a body is wider than the body.
         return np.minimum(kept, self._most_kept[pairs])
 
-    def _measure(self, placed: _Placed, row: int, pair: int, bound: float) -> float:
-        """Return the distance of a pair, m, negative where it overlaps."""
-        if self._is_exact[pair]:
-            return bound
-        outer = int(self._outer[pair])
+    def _extra(self, extra: float) -> FloatArray:
+        """Return what is kept on top, m, (P,): nothing where only contact counts."""
+        return np.where(self._contact_only, 0.0, extra)
+
+    def _measure(self, placed: _Placed, row: int, pair: int) -> float:
+        """Return the distance of a pair of bodies, m, negative where they overlap."""
+        inner, outer = int(self._inner[pair]), int(self._outer[pair])
         frames = placed.frames[row]
-        if self._is_floor[pair]:
-            return self._lowest(outer, frames[self._link[outer]]) - (self.floor_z or 0.0)
-        inner = int(self._inner[pair])
         return self._convex.distance(
             inner, frames[self._link[inner]], outer, frames[self._link[outer]]
         )
 
-    def _lowest(self, body: int, T_R_link: FloatArray) -> float:
-        shape = self.bodies[body].shape
-        T = T_R_link @ self.bodies[body].T_link_body
-        lowest = float(np.min(shape.points @ T[2, :3]) + T[2, 3])
-        return lowest - shape.ball - shape.disc * float(np.hypot(T[2, 0], T[2, 1]))
+    def _measure_cheap(
+        self, placed: _Placed, rows: IntArray, pairs: IntArray, bounds: FloatArray
+    ) -> BoolArray:
+        """Put distances that need no coal into `bounds` (n, P); return which were, (c,)."""
+        on_floor = self._is_floor[pairs]
+        for pair in np.unique(pairs[on_floor]):
+            own = rows[pairs == pair]
+            outer = int(self._outer[pair])
+            shape = self.bodies[outer].shape
+            T = placed.frames[own, self._link[outer]] @ self.bodies[outer].T_link_body
+            lowest = np.min(T[:, 2, :3] @ shape.points.T, axis=1) + T[:, 2, 3]
+            lowest = lowest - shape.ball - shape.disc * np.hypot(T[:, 2, 0], T[:, 2, 1])
+            bounds[own, pair] = lowest - (self.floor_z or 0.0)
+        return on_floor | self._is_exact[pairs]
 
-    def _examine(
-        self, placed: _Placed, extra: float, *, first: bool = False
-    ) -> tuple[list[Shortfall], FloatArray]:
-        """Return shortfalls, and distances or lower bounds of them (n, P)."""
-        bounds = self._lower_bounds(placed)
-        rows, pairs = np.nonzero(bounds < self._most_kept + extra)
-        found: list[Shortfall] = []
+    def _candidates(
+        self, placed: _Placed, bounds: FloatArray, is_open: BoolArray | None, extra: float
+    ) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
+        """Return what may be too near: rows, pairs, what is kept, and whether it is decided.
+
+        What needs no coal is measured; of that only what is too near is returned.
+        """
+        on_top = self._extra(extra)
+        may = bounds < self._most_kept + on_top
+        rows, pairs = np.nonzero(may if is_open is None else may & is_open)
         if not len(rows):
-            return found, bounds
-        kept = self._kept(placed, rows, pairs) + extra
+            return rows, pairs, np.empty(0), np.empty(0, dtype=bool)
+        kept = self._kept(placed, rows, pairs) + on_top[pairs]
         near = bounds[rows, pairs] < kept
         rows, pairs, kept = rows[near], pairs[near], kept[near]
+        decided = self._measure_cheap(placed, rows, pairs, bounds)
+        near = bounds[rows, pairs] < kept
+        return rows[near], pairs[near], kept[near], decided[near]
+
+    def _examine(
+        self, placed: _Placed, extra: float, *, first: bool = False, one: bool = False
+    ) -> tuple[list[Shortfall], FloatArray]:
+        """Return shortfalls, and distances or lower bounds of them (n, P).
+
+        With `first` one of each configuration is enough, with `one` a single one.
+        """
+        bounds = self._lower_bounds(placed)
+        rows, pairs, kept, decided = self._candidates(placed, bounds, None, extra)
+        found: list[Shortfall] = []
         done: set[int] = set()
-        # What the capsules decide first: the rest costs more.
-        for n in np.argsort(~self._is_exact[pairs], kind='stable'):
+        # What is decided comes first, then what is probably too near: the rest costs more.
+        for n in np.lexsort((bounds[rows, pairs] - kept, self._is_floor[pairs], ~decided)):
             row, pair = int(rows[n]), int(pairs[n])
             if first and row in done:
                 continue
-            distance = self._measure(placed, row, pair, float(bounds[row, pair]))
-            bounds[row, pair] = distance
-            if distance < kept[n]:
-                found.append(Shortfall(row, pair, distance, float(kept[n] - extra)))
+            if not decided[n]:
+                bounds[row, pair] = self._measure(placed, row, pair)
+            if bounds[row, pair] < kept[n]:
+                found.append(Shortfall(row, pair, float(bounds[row, pair]), float(kept[n])))
                 done.add(row)
+                if one:
+                    break
         return found, bounds
 
     # Swept paths
@@ -536,58 +563,48 @@ class CollisionModel:
         grid = np.unique(np.append(np.arange(0, steps, _STRIDE), steps))
         share = np.arange(steps + 1) / steps
         q = start + share[:, None] * (end - start)
-        found, distances = self._examine(self._place(q[grid]), extra, first=True)
+        # Most ways that are not free show it at one of these.
+        found, _ = self._examine(self._place(q[[steps // 2, steps // 4, -1]]), extra, one=True)
+        if found:
+            return found[0]
+        found, distances = self._examine(self._place(q[grid]), extra, one=True)
         if found:
             return found[0]
         # Where neither end of an interval excludes a pair, all of the interval is looked at.
         least = distances[:-1] + distances[1:] - np.diff(grid)[:, None] / steps * travel
-        is_open = least / 2 < self._most_kept + extra - np.where(
-            self._contact_only, 0.0, HALF_STEP_M
-        )
-        for inside, pairs in self._openings(grid, is_open):
-            found_here = self._look_closely(q[inside], pairs, travel / steps, extra)
-            if found_here is not None:
-                return found_here
-        return None
-
-    def _openings(
-        self, grid: IntArray, is_open: BoolArray
-    ) -> Iterator[tuple[IntArray, BoolArray]]:
-        """Yield what lies inside runs of open intervals, and which pairs are open there."""
-        rows = np.flatnonzero(is_open.any(axis=1))
-        for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
-            inside = [np.arange(grid[row] + 1, grid[row + 1]) for row in run]
-            points = np.concatenate(inside) if inside else np.empty(0, dtype=np.int64)
-            if len(points):
-                which = np.concatenate(
-                    [
-                        np.broadcast_to(is_open[row], (len(p), is_open.shape[1]))
-                        for row, p in zip(run, inside)
-                    ]
-                )
-                yield points, which
+        is_open = least / 2 < self._most_kept + self._extra(extra - HALF_STEP_M)
+        open_ones = np.flatnonzero(is_open.any(axis=1))
+        inside = [np.arange(grid[row] + 1, grid[row + 1]) for row in open_ones]
+        if not sum(map(len, inside)):
+            return None
+        which = is_open[np.repeat(open_ones, [len(part) for part in inside])]
+        return self._look_closely(q, np.concatenate(inside), which, travel / steps, extra)
 
     def _look_closely(
-        self, q: FloatArray, is_open: BoolArray, per_step: FloatArray, extra: float
+        self,
+        q: FloatArray,
+        inside: IntArray,
+        is_open: BoolArray,
+        per_step: FloatArray,
+        extra: float,
     ) -> Shortfall | None:
-        """Check configurations next to each other (n, k), the pairs (n, P) that are open there."""
-        placed = self._place(q)
+        """Check some steps (m,) of a way (n, k): the pairs (m, P) that are open there."""
+        placed = self._place(q[inside])
         bounds = self._lower_bounds(placed)
-        rows, pairs = np.nonzero(is_open & (bounds < self._most_kept + extra))
-        if not len(rows):
-            return None
-        kept = self._kept(placed, rows, pairs) + extra
-        near = bounds[rows, pairs] < kept
-        rows, pairs, kept = rows[near], pairs[near], kept[near]
+        rows, pairs, kept, decided = self._candidates(placed, bounds, is_open, extra)
+        if decided.any():
+            n = int(np.argmax(decided))
+            row, pair = int(rows[n]), int(pairs[n])
+            return Shortfall(row, pair, float(bounds[row, pair]), float(kept[n]))
+        most = self._most_kept + self._extra(extra)
         beyond = np.full(len(per_step), -1.0)
         for n in range(len(rows)):
             row, pair = int(rows[n]), int(pairs[n])
-            if row < beyond[pair]:
+            if inside[row] < beyond[pair]:
                 continue
-            distance = self._measure(placed, row, pair, float(bounds[row, pair]))
+            distance = self._measure(placed, row, pair)
             if distance < kept[n]:
-                return Shortfall(row, pair, distance, float(kept[n] - extra))
-            # So many checks further it cannot have come nearer than what is kept at most.
-            room = distance - self._most_kept[pair] - extra
-            beyond[pair] = row + room / max(per_step[pair], 1e-12)
+                return Shortfall(row, pair, distance, float(kept[n]))
+            # So many steps further it cannot have come nearer than what is kept at most.
+            beyond[pair] = inside[row] + (distance - most[pair]) / max(per_step[pair], 1e-12)
         return None

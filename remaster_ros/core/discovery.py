@@ -25,6 +25,7 @@ from remaster_ros.core.discovery_gain import (
 from remaster_ros.core.discovery_markers import loosened, moved_markers
 from remaster_ros.core.discovery_noise import Residuals
 from remaster_ros.core.discovery_select import Search, Selection
+from remaster_ros.core.discovery_thin import Thinning, draw_rows, judge_by_others
 from remaster_ros.core.effects.cell import Cell
 from remaster_ros.core.effects.registry import EFFECTS
 from remaster_ros.core.errors import InsufficientDataError
@@ -33,7 +34,7 @@ from remaster_ros.core.fit import fit_session
 from remaster_ros.core.outliers import find_outliers
 from remaster_ros.core.result import FitResult
 from remaster_ros.core.sampling import Progress, silent
-from remaster_ros.core.types import BoolArray, FloatArray, Session
+from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Session
 
 Verdict = Literal['effects', 'none', 'undetermined']
 # Of the means, in standard deviations: 400 effective draws, enough for values of two figures.
@@ -72,6 +73,8 @@ class Discovery:
         Zero-offsets without the effects, and their stds (NaN where the gauge holds them), rad.
     fit
         The sampled fit, with the effects where there are any.
+    thinning
+        Which part of a large session was searched, and what the rest says; None for all of it.
     """
 
     verdict: Verdict
@@ -86,6 +89,7 @@ class Discovery:
     selection: Selection
     residuals: Residuals
     fit: FitResult
+    thinning: Thinning | None = None
 
 
 def discover_session(
@@ -145,6 +149,7 @@ def discover_session(
         selection=findings.selection,
         residuals=residuals,
         fit=fit,
+        thinning=findings.thinning,
     )
 
 
@@ -161,6 +166,7 @@ class Findings:
     groups: tuple[tuple[Cell, ...], ...]
     effects: tuple[FoundEffect, ...]
     untestable: Mapping[str, str]
+    thinning: Thinning | None
 
 
 def find_causes(session: Session, *, rng: np.random.Generator, progress: Progress) -> Findings:
@@ -174,6 +180,10 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         # A marker that is pulled to where it is not leaves errors for other causes to explain.
         found = estimate(Problem.of(session, loosened(session, moved)))
         residuals = Residuals.of(found)
+    pool = draw_rows(found.problem.measurements, found.problem.fitted, rng)
+    thinned = len(pool) < len(found.problem.fitted)
+    if thinned:
+        residuals = residuals.only(np.intersect1d(pool, found.kept), found.model.reference)
     untestable = {
         name: why for name, effect in EFFECTS.items() if (why := effect.needs(residuals.scene))
     }
@@ -187,7 +197,7 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         residuals,
         tuple(cells),
         rng,
-        lambda data, solution: _judged(found, data, solution),
+        lambda data, solution: _judged(found, data, solution, pool),
         lambda share: progress('searching causes', share),
     )
     selection = search.run()
@@ -196,7 +206,12 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         residuals, selection, cells, lambda share: progress('comparing look-alikes', share)
     )
     effects += moved_markers(found, residuals, selection.solution)
-    return Findings(before, residuals, selection, groups, effects, untestable)
+    thinning = None
+    if thinned:
+        thinning = judge_by_others(
+            residuals, found.kept, residuals.rows.source, selection.empty, selection.solution
+        )
+    return Findings(before, residuals, selection, groups, effects, untestable, thinning)
 
 
 def _offsets(found: Estimate) -> tuple[FloatArray, FloatArray]:
@@ -209,10 +224,12 @@ def _offsets(found: Estimate) -> tuple[FloatArray, FloatArray]:
     return found.model.offsets(found.mode.z), std
 
 
-def _judged(found: Estimate, residuals: Residuals, solution: Solution) -> Residuals:
-    """Return the residuals of the rows that the extended model does not call gross."""
+def _judged(
+    found: Estimate, residuals: Residuals, solution: Solution, pool: IntArray
+) -> Residuals:
+    """Return the residuals of the rows of the pool that the extended model does not call gross."""
     problem = found.problem
-    every = residuals.only(problem.fitted, found.model.reference)
+    every = residuals.only(pool, found.model.reference)
     left = residuals.unexplained(solution)[every.rows.source]
 
     def refit(keep: BoolArray) -> FloatArray:

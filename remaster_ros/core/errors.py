@@ -26,6 +26,10 @@ class DiskError(InputError):
     """The disk does not take what is to be written; it may once there is room."""
 
 
+class MovedError(DiskError):
+    """A folder that is written to has gone elsewhere; it may once it is put back."""
+
+
 class InsufficientDataError(RemasterError):
     """The data do not allow an answer; says why, and what to measure."""
 

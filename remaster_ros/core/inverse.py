@@ -84,6 +84,15 @@ class InverseKinematics:
         if held is None:
             held = {2: (0.0,)} if len(chain) == FREE_JOINTS + 1 else {}
         _check_held(chain, held)
+        try:
+            self._prepare(chain, held)
+        except InputError as error:
+            if len(chain) != FREE_JOINTS + 1:
+                raise
+            raise InputError(f'{error}; {_what_may_be_held(chain)}') from None
+
+    def _prepare(self, chain: SerialChain, held: Mapping[int, Sequence[float]]) -> None:
+        """Set up the closed forms; an `InputError` where these held joints leave none."""
         self.chain = chain
         self.held = {joint: tuple(map(float, held[joint])) for joint in sorted(held)}
         self._free = [i for i in range(len(chain)) if i not in held]
@@ -141,7 +150,7 @@ class InverseKinematics:
             names = ', '.join(self.chain.joint_names[joint] for joint in self.held)
             raise InputError(
                 f"inverse kinematics: with {names or 'no joint'} held, robot '{self.chain.name}' "
-                'is singular everywhere; hold another joint'
+                'is singular everywhere'
             )
 
     def _decompose(self, clean: SerialChain, values: tuple[float, ...]) -> _Decomposition:
@@ -218,7 +227,7 @@ def _check_held(chain: SerialChain, held: Mapping[int, Sequence[float]]) -> None
     if free != FREE_JOINTS:
         raise InputError(
             f'inverse kinematics: {len(chain)} joints with {len(held)} held leave {free} free; '
-            f'closed forms need {FREE_JOINTS} free joints'
+            f'closed forms need {FREE_JOINTS} free joints: hold none of six, one of seven'
         )
     for joint, values in held.items():
         if not 0 <= joint < len(chain):
@@ -269,9 +278,35 @@ def _no_closed_form(chain: SerialChain, held: Mapping[int, Sequence[float]]) -> 
     free = ', '.join(name for i, name in enumerate(chain.joint_names) if i not in held)
     return (
         f"inverse kinematics: robot '{chain.name}' has no closed form in {free}: no three "
-        'successive axes are parallel, nor do the first or last three meet in a point; '
-        'hold another joint or name the joint solutions yourself'
+        'successive axes are parallel, nor do the first or last three meet in a point'
     )
+
+
+def _what_may_be_held(chain: SerialChain) -> str:
+    """Return which joints of seven leave a closed form, found by trying each."""
+    good = []
+    for joint, name in enumerate(chain.joint_names):
+        for value in _trial_values(chain, joint):
+            solver = InverseKinematics.__new__(InverseKinematics)
+            try:
+                solver._prepare(chain, {joint: (value,)})
+            except InputError:
+                continue
+            good.append(f'{name} (at {np.degrees(value):.0f} degrees, say)')
+            break
+    if good:
+        return f'held_joint in the cell file may be {" or ".join(good)}'
+    return (
+        'no joint of this arm may be held instead: poses cannot be planned for it, but a session '
+        'of configurations of your own can be fitted'
+    )
+
+
+def _trial_values(chain: SerialChain, joint: int) -> list[float]:
+    """Return angles to try to hold a joint at: zero or mid-range, and off it, rad."""
+    low, high = max(chain.lower[joint], -np.pi), min(chain.upper[joint], np.pi)
+    middle = 0.0 if low < 0.0 < high else (low + high) / 2
+    return [middle, *(v for v in (middle + np.pi / 6, middle - np.pi / 6) if low <= v <= high)]
 
 
 def _norms(twists: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -19,7 +19,7 @@ MOST_CHECKS = 400
 """Segments checked for one path at most."""
 REACH_RAD = 0.6
 """How far a tree grows at a time, in its largest joint angle."""
-_SHORTCUTS = 25
+_SHORTCUTS = 10
 _POINT_COST = 0.2  # of looking at one configuration, in segments
 
 WAY_OUT_STEP_M = 0.004
@@ -71,6 +71,12 @@ def free_path(
             return search.shortened(way, rng)
     grown = search.connect(rng)
     return None if grown is None else search.shortened(grown, rng)
+
+
+def is_straight_free(model: CollisionModel, start: FloatArray, end: FloatArray) -> bool:
+    """Whether the straight way is free, with the reserve where the start has it too."""
+    extra = RESERVE_M if model.free_mask(start[None], RESERVE_M)[0] else 0.0
+    return not model.path_trouble(np.array([start, end]), extra)
 
 
 def _intermediates(
@@ -234,7 +240,7 @@ def way_out(
     for _ in range(WAY_OUT_STEPS):
         short = model.shortfalls(q[None])
         if not short:
-            path = np.array(way)
+            path = _fewest_lines(model, np.array(way))
             return path if not model.escape_trouble(path) else None
         pairs = np.array([each.pair for each in short])
         before = np.array([each.distance for each in short])
@@ -265,3 +271,17 @@ def way_out(
         q = steps[best]
         way.append(q)
     return None
+
+
+def _fewest_lines(model: CollisionModel, way: FloatArray) -> FloatArray:
+    """Leave out points of a way out, (n, k): the arm comes to rest at each that is kept."""
+    kept, here, last = [way[0]], 0, len(way) - 1
+    while here < last:
+        there = last
+        while there > here + 1 and model.escape_trouble(
+            way[[here, there]], ends_free=there == last
+        ):
+            there = here + (there - here) // 2
+        kept.append(way[there])
+        here = there
+    return np.array(kept)

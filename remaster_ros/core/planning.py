@@ -218,11 +218,9 @@ def _reasons(
     """Return why each solution (m, k) is no good, or '', (m,); the first reason wins."""
     # More than the bridge asks for: an arm that stands a little off a planned way may still move.
     collisions = arm.reasons(q, RESERVE_M)
-    checks = [
-        (NO_LINE_OF_SIGHT + sight.sensor, _unseen(arm, q, sight)) for sight in lines_of_sight
-    ]
-    unseen = np.select([bad for _, bad in checks], [reason for reason, _ in checks], default='')
-    return np.where(collisions != '', collisions, unseen)
+    bad = [collisions != '', *(_unseen(arm, q, sight) for sight in lines_of_sight)]
+    names = [NO_LINE_OF_SIGHT + sight.sensor for sight in lines_of_sight]
+    return np.select(bad, [collisions, *names], default='')
 
 
 def _unseen(arm: CollisionModel, q: FloatArray, sight: LineOfSight) -> BoolArray:

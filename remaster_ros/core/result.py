@@ -13,6 +13,7 @@ from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.estimate import Problem
 from remaster_ros.core.gauge import Gauge, GaugeDirection
 from remaster_ros.core.model import Model
+from remaster_ros.core.noise_check import NoiseCheck, check_noise
 from remaster_ros.core.rows import Rows
 from remaster_ros.core.sampler_info import SamplerInfo
 from remaster_ros.core.theoretical import Predictive
@@ -21,6 +22,9 @@ from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Session
 
 # An offset that a prior tells counts as known up to so many times what the data leave the others.
 AS_GOOD_AS_SEEN = 2.0
+# A mastering is off by tenths of a degree. More is a joint that has lost it, or joints, signs or a
+# robot model that are not those of the arm that was measured.
+LARGEST_OFFSET = np.radians(5.0)
 # Of an angle that nothing is known of: uniform over the turn.
 UNKNOWN_STD = np.pi / np.sqrt(3.0)
 
@@ -87,6 +91,8 @@ class FitResult:
         The three metrics as fit.json has them.
     left_out
         (observation, reason) of every gross error.
+    noise_checks
+        Of every sensor: is what the fit leaves what noise explains?
     theta_names, theta_units
         Of the extension's m parameters; empty without one.
     theta, theta_std
@@ -121,11 +127,25 @@ class FitResult:
     residuals_after: FloatArray
     accuracy: Mapping[str, Any]
     left_out: tuple[tuple[int, str], ...]
+    noise_checks: tuple[NoiseCheck, ...]
     theta_names: tuple[str, ...]
     theta_units: tuple[str, ...]
     theta: FloatArray
     theta_std: FloatArray
     theta_draws: FloatArray
+
+    @property
+    def implausible(self) -> tuple[str, ...]:
+        """A line for each joint whose offset is told, and too large for one of mastering."""
+        return tuple(
+            f'{joint}: an offset of {np.degrees(offset):.2f} degrees is more than a mastering is '
+            f'off by ({np.degrees(LARGEST_OFFSET):.0f}); before it is used, check joint order, '
+            'signs and units of the session, and that the URDF is that of this arm'
+            for joint, offset, known in zip(
+                self.joint_names, self.joint_offsets, self.identifiable, strict=True
+            )
+            if known and abs(offset) > LARGEST_OFFSET
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,6 +251,7 @@ def build_result(
     sensors, markers = problem.sensor_names, problem.marker_names
     marker_draws = model.markers(x_draws)
     left_rows = np.array([row for row, _ in sampled.left_out], dtype=np.int64)
+    residuals_after = measurements.position - predicted_after
     return FitResult(
         session=problem.session,
         chain=problem.chain,
@@ -264,9 +285,16 @@ def build_result(
         T_R_N_before=dict(zip(sensors, model.T_R_N(x_before), strict=True)),
         marker_positions_before=dict(zip(markers, model.markers(x_before), strict=True)),
         residuals_before=measurements.position - predicted_before,
-        residuals_after=measurements.position - predicted_after,
+        residuals_after=residuals_after,
         accuracy=_accuracy(problem, sampled, predicted_before, predicted_after, left_rows, rng),
         left_out=tuple((int(measurements.observation[row]), why) for row, why in sampled.left_out),
+        noise_checks=check_noise(
+            measurements,
+            sensors,
+            residuals_after,
+            measurements.observation[left_rows],
+            parameters=sum(not name.startswith('noise.') for name in sampled.names),
+        ),
         theta_names=model.extension.names if model.extension is not None else (),
         theta_units=model.extension.units if model.extension is not None else (),
         theta=model.theta(sampled.z_mean),

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
 from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.collision import CollisionModel
 from remaster_ros.core.errors import InsufficientDataError
+from remaster_ros.core.paths import free_path, is_straight_free
 from remaster_ros.core.planning import Plan, order_solutions
 from remaster_ros.core.types import FloatArray
 
@@ -35,6 +37,11 @@ class Stop:
         Which of the poses planned for its split.
     ids
         Which of that pose's planned solutions each of `solutions` is.
+    paths
+        The way to each of them from the one before (to the first from where the arm stands):
+        configurations to go through in between, rad, (n, k); n = 0 where the straight way is free.
+    unreached
+        The pose's other solutions that no free path leads to.
     """
 
     pose: int
@@ -43,11 +50,27 @@ class Stop:
     solutions: FloatArray
     index: int
     ids: tuple[int, ...]
+    paths: tuple[FloatArray, ...] = ()
+    unreached: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.paths:
+            straight = np.empty((0, self.solutions.shape[1]))
+            object.__setattr__(self, 'paths', (straight,) * len(self.solutions))
 
     def only(self, ids: Collection[int]) -> Stop:
-        """Return the stop with only these solutions, in the same order."""
+        """Return the stop with only these solutions, in the same order.
+
+        The ways stay as they were: they hold for an arm that has visited the others. From
+        anywhere else they are found anew (`Tour.reroute`).
+        """
         kept = [i for i, number in enumerate(self.ids) if number in ids]
-        return replace(self, solutions=self.solutions[kept], ids=tuple(self.ids[i] for i in kept))
+        return replace(
+            self,
+            solutions=self.solutions[kept],
+            ids=tuple(self.ids[i] for i in kept),
+            paths=tuple(self.paths[i] for i in kept),
+        )
 
 
 class Tour:
@@ -66,6 +89,9 @@ class Tour:
         Visit the poses as they come, split by split, instead of the nearest first.
     one_solution
         Visit only the nearest solution of each pose.
+    model
+        What the arm must not hit on its way; None where that does not matter (an arm that is
+        computed).
     """
 
     def __init__(
@@ -75,8 +101,9 @@ class Tour:
         *,
         in_order: bool = False,
         one_solution: bool = False,
+        model: CollisionModel | None = None,
     ) -> None:
-        self._chain = chain
+        self._chain, self._model = chain, model
         self.in_order, self.one_solution = in_order, one_solution
         self.plans = dict(plans)
         self._left = {split: list(range(len(plan.poses))) for split, plan in plans.items()}
@@ -86,12 +113,19 @@ class Tour:
             for split, plan in plans.items()
         }
         self.dropped: Counter[str] = Counter()
+        self.dropped_solutions: Counter[str] = Counter()
         for plan in plans.values():
             self.dropped.update(plan.dropped)
+            self.dropped_solutions.update(plan.dropped_solutions)
         self.visited = 0
 
     def next(self, q: FloatArray) -> Stop | None:
         """Return the next stop for an arm at joint positions `q` (rad, (k,)); None at the end."""
+        proposed = self.propose(q)
+        return None if proposed is None else self.take(proposed)
+
+    def propose(self, q: FloatArray) -> Stop | None:
+        """Return what `next` would, and leave the tour as it is: a thread may do this."""
         left = [(split, index) for split, indices in self._left.items() for index in indices]
         if not left:
             return None
@@ -100,21 +134,71 @@ class Tour:
         distances = np.linalg.norm(np.array(places) - here, axis=1)
         split, index = left[0 if self.in_order else int(np.argmin(distances))]
         solutions = self.plans[split].poses[index].solutions
-        order = order_solutions(solutions, q, self._chain.velocity_limits)
-        if self.one_solution:
-            order = order[:1]
-        return self.go_to(split, index, [int(number) for number in order])
+        ids, paths, unreached = self._route(split, index, range(len(solutions)), q)
+        return self._stop(split, index, ids, paths, unreached)
 
-    def go_to(self, split: str, index: int, ids: Sequence[int]) -> Stop:
+    def take(self, proposed: Stop) -> Stop:
+        """Count a proposed stop visited and return it with its number."""
+        return self.go_to(
+            proposed.split, proposed.index, proposed.ids, proposed.paths, proposed.unreached
+        )
+
+    def reroute(self, stop: Stop, q: FloatArray) -> Stop:
+        """Return a stop with the ways to its solutions, and their order, found anew from `q`."""
+        ids, paths, unreached = self._route(stop.split, stop.index, stop.ids, q)
+        solutions = self.plans[stop.split].poses[stop.index].solutions[list(ids)]
+        return replace(
+            stop, solutions=solutions, ids=tuple(ids), paths=tuple(paths), unreached=unreached
+        )
+
+    def go_to(
+        self,
+        split: str,
+        index: int,
+        ids: Sequence[int],
+        paths: Sequence[FloatArray] = (),
+        unreached: Sequence[int] = (),
+    ) -> Stop:
         """Return the stop at one planned pose with these of its solutions, and count it visited.
 
         This is how a tour that was begun before takes up where it was: the stops so far, in order.
         """
         self._left[split].remove(index)
+        stop = self._stop(split, index, ids, paths, unreached)
+        self.visited += 1
+        return stop
+
+    def _stop(
+        self,
+        split: str,
+        index: int,
+        ids: Sequence[int],
+        paths: Sequence[FloatArray],
+        unreached: Sequence[int],
+    ) -> Stop:
         pose = self.plans[split].poses[index]
         number = self.visited if split != REGISTRATION else -1 - self.visited
-        self.visited += 1
-        return Stop(number, split, pose.T_R_T, pose.solutions[list(ids)], index, tuple(ids))
+        solutions = pose.solutions[list(ids)]
+        return Stop(
+            number, split, pose.T_R_T, solutions, index, tuple(ids), tuple(paths), tuple(unreached)
+        )
+
+    def _route(
+        self, split: str, index: int, ids: Iterable[int], q: FloatArray
+    ) -> tuple[list[int], list[FloatArray], tuple[int, ...]]:
+        """Order these solutions of a pose; see `free_order`."""
+        ids = list(ids)
+        solutions = self.plans[split].poses[index].solutions[ids]
+        # The same draws whenever this pose is planned: a tour can be told again.
+        rng = np.random.default_rng([index, *split.encode()])
+        order, paths = free_order(
+            self._model, q, solutions, self._chain.velocity_limits, rng, self.one_solution
+        )
+        found = [ids[i] for i in order]
+        if self.one_solution:
+            # One is visited; where none can be, one is lost.
+            return found, paths, () if found else tuple(ids[:1])
+        return found, paths, tuple(number for number in ids if number not in found)
 
     def describe(self) -> str:
         """Return what was planned and dropped, in a line."""
@@ -126,7 +210,75 @@ class Tour:
         return f'planned {kept}; dropped poses: {reasons or "none"}'
 
 
-def registration_tour(chain: SerialChain, plan: Plan, markers_T: Sequence[FloatArray]) -> Tour:
+def free_order(
+    model: CollisionModel | None,
+    q: FloatArray,
+    solutions: FloatArray,
+    velocity_limits: FloatArray,
+    rng: np.random.Generator,
+    one: bool = False,
+) -> tuple[list[int], list[FloatArray]]:
+    """Order joint solutions so that each can be reached from the one before.
+
+    The nearest to where the arm stands of those that a free straight way leads to is first, then
+    the next from there, and so on. Where no straight way is free, one around is looked for, to the
+    nearest first; a solution that cannot be reached is tried again from each that could be.
+
+    Parameters
+    ----------
+    model
+        What must not be hit; with None every straight way is free.
+    q
+        Where the arm stands, rad, (k,).
+    solutions
+        rad, (m, k).
+    velocity_limits
+        rad/s, (k,).
+    rng
+        Source of randomness.
+    one
+        One solution is enough.
+
+    Returns
+    -------
+    order, paths
+        Indices into solutions, without those that could not be reached, and for each the
+        configurations to go through before it, rad, (n, k).
+    """
+    left = [int(i) for i in order_solutions(solutions, q, velocity_limits)]
+    straight = np.empty((0, solutions.shape[1]))
+    if model is None:
+        left = left[:1] if one else left
+        return left, [straight] * len(left)
+    order: list[int] = []
+    paths: list[FloatArray] = []
+    here = q
+    while left:
+        way = straight
+        found = next((i for i in left if is_straight_free(model, here, solutions[i])), None)
+        if found is None:
+            for i in left:
+                around = free_path(model, here, solutions[i], rng)
+                if around is not None:
+                    found, way = i, around[1:-1]
+                    break
+        if found is None:
+            break
+        order.append(found)
+        paths.append(way)
+        if one:
+            break
+        left.remove(found)
+        here = solutions[found]
+    return order, paths
+
+
+def registration_tour(
+    chain: SerialChain,
+    plan: Plan,
+    markers_T: Sequence[FloatArray],
+    model: CollisionModel | None = None,
+) -> Tour:
     """Choose poses for a three-point registration: the first three span the largest triangle.
 
     The others follow in case a sensor cannot see one of them.
@@ -139,6 +291,8 @@ def registration_tour(chain: SerialChain, plan: Plan, markers_T: Sequence[FloatA
         Poses that face roughly towards the sensors.
     markers_T
         The markers that are seen, in the tool frame, m, (3,) each.
+    model
+        What the arm must not hit on its way.
 
     Raises
     ------
@@ -164,7 +318,7 @@ def registration_tour(chain: SerialChain, plan: Plan, markers_T: Sequence[FloatA
     rest = [i for i in range(len(plan.poses)) if i not in best]
     poses = tuple(plan.poses[i] for i in (*best, *rest))
     ordered = Plan(poses, plan.dropped, plan.dropped_solutions)
-    return Tour(chain, {REGISTRATION: ordered}, in_order=True, one_solution=True)
+    return Tour(chain, {REGISTRATION: ordered}, in_order=True, one_solution=True, model=model)
 
 
 def nearest_solution(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import tempfile
 import time
 from collections.abc import Sequence
@@ -38,6 +39,51 @@ def default_folder(namespace: str = '/') -> Path:
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     cell = namespace.rstrip('/').replace('/', '%')
     return Path(tempfile.gettempdir()) / f'remaster_world_{os.getuid()}_{domain}{cell}'
+
+
+def make_private_folder(folder: Path) -> None:
+    """Make a folder that nobody else may look into, or take over such a one.
+
+    Its name can be foreseen and the temporary directory is open to all: another user may have
+    put a folder or a link there, through which files elsewhere would be overwritten.
+
+    Raises
+    ------
+    InputError
+        There is something else of this name; see `require_private`.
+    """
+    try:
+        folder.mkdir(mode=0o700)
+    except FileExistsError:
+        require_private(folder)
+    except OSError as error:
+        raise InputError(
+            f'{folder}: the folder of the fakes cannot be made ({error.strerror}); set TMPDIR to '
+            f'a folder you may write to'
+        ) from None
+
+
+def require_private(folder: Path) -> None:
+    """Raise `InputError` unless this is a folder, no link, of this user and for him alone."""
+    try:
+        found = folder.lstat()
+    except OSError as error:
+        raise InputError(f'{folder}: cannot be looked at ({error.strerror})') from None
+    mode = stat.S_IMODE(found.st_mode)
+    if stat.S_ISLNK(found.st_mode):
+        wrong = 'is a link, which is not followed'
+    elif not stat.S_ISDIR(found.st_mode):
+        wrong = 'is no folder'
+    elif found.st_uid != os.getuid():
+        wrong = f'belongs to the user number {found.st_uid}'
+    elif mode & 0o077:
+        wrong = f'is open to other users (mode {mode:o} instead of 700)'
+    else:
+        return
+    raise InputError(
+        f'{folder}: {wrong}; the fakes meet in a folder of their user alone: remove it, or set '
+        f'TMPDIR or the parameter world'
+    )
 
 
 def make_world(
@@ -129,4 +175,7 @@ def open_world(folder: str, namespace: str = '/', timeout_s: float = 20.0) -> Wo
     deadline = time.monotonic() + timeout_s
     while not (path / 'world.yaml').exists() and time.monotonic() < deadline:
         time.sleep(0.05)
+    # As long as it is not there, somebody else may put it there.
+    if not folder and os.path.lexists(path):
+        require_private(path)
     return World.open(path)

@@ -254,7 +254,7 @@ class World:
             'start_q_rad': np.asarray(start_q, float).tolist(),
             'link_radius_m': float(link_radius_m),
         }
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         (folder / 'motion.jsonl').write_text('')
         (folder / 'world.yaml').write_text(yaml.safe_dump(data, sort_keys=False))
         return cls(folder, data)

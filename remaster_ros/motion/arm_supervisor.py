@@ -37,6 +37,7 @@ from remaster_ros.motion.following import (
     allowed_lag_s,
 )
 from remaster_ros.motion.joint_reports import JointReport, JointReports
+from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import (
     WAY_OUT_TOOL_SPEED,
     MotionGate,
@@ -51,6 +52,8 @@ PROBE = -1
 """The number of the move before the first one."""
 WAY_OUT = -2
 """The number of a way out of a contact or a margin."""
+STANDING = -3
+"""The number of a question about where the arm stands, before it is moved at all."""
 PROBE_RAD = 1e-6
 """How far the probe goes, rad: less than the arm repeats, more than the last bit."""
 PROBE_WAIT_S = 0.5
@@ -130,7 +133,7 @@ class ArmSupervisor:
         # Why the arm must not move, by each reason's origin; '' if it may.
         self._reasons: dict[str, str] = {}
         self._failures = 0
-        self._must_probe = True
+        self._must_probe = self._must_look = True
         # Before a collection is begun (again) by a person nothing moves.
         self._must_collect = bool(halted)
         self._seen: Seen | None = None
@@ -222,7 +225,8 @@ class ArmSupervisor:
             return self._doubt(self.reports.trouble, wall_s)
         self._doubted_wall = None
         gap = self._gap(report)
-        self._seen = seen = Seen.after(self._seen, report, self.rules)
+        self._excuse_gap(report)
+        self._seen = seen = Seen.after(self._seen, report, self.rules, self.reports.late_s)
         actions: list[Action] = []
         visit = self._visit
         if gap:
@@ -246,6 +250,9 @@ class ArmSupervisor:
         solution = request[1]
         if answer.path is None and answer.at_start:
             return self._halt(self._offer(answer), wall_s)
+        if solution == STANDING:
+            self._must_look = False
+            return self.tick(wall_s)
         if answer.path is None:
             return self._give_up(solution, f'no free path: {answer.why}', wall_s)
         return self._drive(solution, answer.path, seen, wall_s)
@@ -261,7 +268,7 @@ class ArmSupervisor:
         if not self.halted:
             return 'the arm is not halted'
         self.halted, self._failures = '', 0
-        self._must_collect = self._must_probe = True
+        self._must_collect = self._must_probe = self._must_look = True
         self._way_out, self._offered = self._offered, None
         # What was not believed may be the truth now: a robot that was mastered, a clock that was
         # set. It is learned anew while the arm stands.
@@ -269,6 +276,12 @@ class ArmSupervisor:
         self._seen, self._doubted_wall, self._braking = None, None, None
         self._reasons['robot'] = ''
         return ''
+
+    def use_limits(self, limits: MotionLimits, wall_s: float) -> list[Action]:
+        """Use other limits from now on; a move under way is stopped and commanded again."""
+        actions = self._stop('other limits', wall_s)
+        self.gate.limits = limits
+        return actions + self.tick(wall_s)
 
     def tick(self, wall_s: float) -> list[Action]:
         """Look at the time: stop or halt on silence, go on when nothing is in the way."""
@@ -357,20 +370,29 @@ class ArmSupervisor:
         if last is None or wall_s - last <= OWN_PAUSE_S:
             return
         pause = wall_s - last
-        self._heard = {name: heard + pause for name, heard in self._heard.items()}
+        # Who was heard since is no exception, and nobody was heard in the future.
+        self._heard = {name: min(heard + pause, wall_s) for name, heard in self._heard.items()}
 
     def _silence_s(self, name: str, wall_s: float) -> float:
         return wall_s - self._heard[name] if name in self._heard else np.inf
 
     def _gap(self, report: JointReport) -> str:
         """Return in words that the arm was not observed for long while it was to be; ''."""
-        if self._seen is None or not self._engaged:
+        if self._seen is None or not self._engaged or self.halted:
             return ''
         gap = (report.stamp_s - self._seen.stamp) / self._rate
         too_long = gap > self.rules.heartbeat_s
         return f'the robot was not observed for {gap:.1f} s' if too_long else ''
 
     # Inside: the arm
+
+    def _excuse_gap(self, report: JointReport) -> None:
+        """Give an arm that was not seen for a while as much longer to arrive."""
+        if self._seen is None or self._visit is None:
+            return
+        gap = report.stamp_s - self._seen.stamp
+        if gap > self.rules.settle.max_gap_s:
+            self._visit.deadline += gap
 
     # Inside: the next configuration
 
@@ -390,12 +412,14 @@ class ArmSupervisor:
         idle = self._visit is None and self._pending is None and self._braking is None
         if seen is None or not idle or not seen.stands(wall_s):
             return actions
+        if self._way_out is not None:
+            path, self._way_out = self._way_out, None
+            return self._drive(WAY_OUT, path, seen, wall_s)
+        if self._must_look:
+            return [self._ask(STANDING, seen.q, seen.q)]
         while self._next < len(self._solutions):
             target = self._solutions[self._next]
             outside = self.gate.limits.outside(target)
-            if self._way_out is not None:
-                path, self._way_out = self._way_out, None
-                return actions + self._drive(WAY_OUT, path, seen, wall_s)
             if self._must_probe:
                 return [*actions, self._ask(PROBE, seen.q, self._probe(seen.q))]
             if not outside:
@@ -485,6 +509,9 @@ class ArmSupervisor:
             motion_s = detector.still_since - visit.sent_stamp
             settle_s = seen.stamp - detector.still_since
             return [Settled(visit.solution, seen.stamp, detector.mean, motion_s, settle_s)]
+        if not visit.following.reacted:
+            # On a simulated clock that runs fast its time is over before a command is seen.
+            return []
         distance = float(np.max(np.abs(seen.q - trajectory.end)))
         if distance > ELSEWHERE_RAD and arrived and seen.stands(wall_s):
             return self._halt(STOPPED_ON_ITS_WAY, wall_s)
@@ -559,11 +586,9 @@ class ArmSupervisor:
     def _brake(self, visit: _Visit, seen: Seen, reason: str, wall_s: float) -> list[Action]:
         """Leave the rest of the line along the line."""
         self._visit, self._pending = None, None
-        low, high = visit.following.window(seen, wall_s, self._rate)
-        if low >= visit.trajectory.duration_s:
-            # It is at its end.
+        if visit.following.has_ended(seen, wall_s, self._rate):
             return []
-        admitted = self.gate.stop(low, high)
+        admitted = self.gate.stop(*visit.following.window(seen, wall_s, self._rate))
         (stop,) = admitted.waypoints
         deadline = (
             seen.now(wall_s, self._rate)

@@ -30,8 +30,11 @@ LATE_WALL_S = 0.1
 """And so much, s of wall time: a busy machine delays by wall time, however fast a clock runs."""
 DRIFT = 2e-3
 """Two clocks may run apart by so many seconds a second."""
-LEARN = 5
-"""So many reports are needed to learn how long one usually takes."""
+LEARN, LEARN_WALL_S = 5, 1.0
+"""By so many reports at least, over so much wall time (s), is learned how long one takes.
+
+The shortest counts: those that waited in a queue while this process was starting took longer.
+"""
 RATE_WINDOW_S = 2.0
 """The rate of the node's clock is taken over so much wall time, s."""
 RATE_LEAST_S = 0.3
@@ -108,6 +111,8 @@ class JointReports:
     trouble, kind
         Why the last report was not believed, in words and as a word for the counts; '' where it
         was.
+    late_s
+        How much later than usual the last report came that was believed, s of the node's time.
     clock
         The rate of the node's clock.
     """
@@ -124,8 +129,9 @@ class JointReports:
     def forget(self) -> None:
         """Learn anew what is usual: somebody has seen to the robot, or its clock was set."""
         self._last: JointReport | None = None
-        self._delays: list[float] = []
+        self._delays: list[tuple[float, float]] = []
         self._delay: float | None = None
+        self.late_s = 0.0
 
     def believes(self, report: JointReport) -> bool:
         """Judge a report; `trouble` is the reason where it is not believed."""
@@ -134,6 +140,8 @@ class JointReports:
         if self.kind:
             self.refused[self.kind] += 1
             return False
+        if self._delay is not None:
+            self.late_s = max(report.clock_s - report.stamp_s - self._delay, 0.0)
         self._learn(report)
         self._last = report
         return True
@@ -177,9 +185,10 @@ class JointReports:
         """Follow how long a report usually takes; a drift of the clocks, but no jump."""
         delay = report.clock_s - report.stamp_s
         if self._delay is None:
-            self._delays.append(delay)
-            if len(self._delays) >= LEARN:
-                self._delay = float(np.median(self._delays))
+            self._delays.append((report.wall_s, delay))
+            since_wall, _ = self._delays[0]
+            if len(self._delays) >= LEARN and report.wall_s - since_wall >= LEARN_WALL_S:
+                self._delay = min(delay for _, delay in self._delays)
             return
         assert self._last is not None
         passed = min(report.wall_s - self._last.wall_s, 1.0)

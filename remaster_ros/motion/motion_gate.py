@@ -20,12 +20,15 @@ from remaster_ros.core.errors import RemasterError
 from remaster_ros.core.types import FloatArray
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.path_check import FreePath, PointSpeeds
+from remaster_ros.motion.stopping import stop_on_line
 from remaster_ros.motion.trajectory import Trajectory, Waypoint, plan_trajectory
 
 START_RAD = 2e-3
 """A move begins so near to where the arm stands, rad: the way between is not checked."""
 ON_PATH_RAD = 1e-6
 """A waypoint is so near to the path that was checked, rad."""
+BETWEEN = 9
+"""And so many places between two waypoints, both included."""
 TOLERANCE = 1e-3
 """Share by which speeds and accelerations may exceed their limits: noise of the present state."""
 SAMPLE_RAD = 0.05
@@ -134,7 +137,9 @@ class MotionGate:
         line = trajectory.lines[index]
         # In the rest after a line both times lie past its end.
         end_s = line.duration_s
-        stop = line.stop(min(low_since_s, end_s), min(since_s, end_s), self._under_way_limits)
+        stop = stop_on_line(
+            line, min(low_since_s, end_s), min(since_s, end_s), self._under_way_limits
+        )
         self._under_way = None
         return Admitted((stop,))
 
@@ -159,6 +164,14 @@ class MotionGate:
             off = path.distance(after.q)
             if not off <= ON_PATH_RAD:
                 raise MotionRefusedError(f'a waypoint lies {off:.6f} rad off the path found free')
+            # What the arm stands off the start of the path is lost on the first piece.
+            allowed = START_RAD * np.sqrt(len(q)) if before is points[0] else 0.0
+            between = np.linspace(0.0, piece.duration_s, BETWEEN)
+            off = max(path.distance(place) for place in piece.at(between))
+            if not off <= allowed + ON_PATH_RAD:
+                raise MotionRefusedError(
+                    f'the move leaves the path found free by {off:.6f} rad between two waypoints'
+                )
 
     def _check_point_speed(self, piece: Cubic, limits: MotionLimits) -> None:
         if self._speeds is None or not np.isfinite(limits.tool_speed):

@@ -1,4 +1,4 @@
-"""Trajectories: straight lines in joint space, each from rest to rest, and how to stop on them.
+"""Trajectories: straight lines in joint space, each from rest to rest.
 
 A controller joins positions and velocities by cubics, as joint_trajectory_controller does; it then
 follows the ramps of a line at constant acceleration, and never leaves the line.
@@ -24,14 +24,11 @@ lines at once."""
 HEADROOM = 0.97
 """Share of the allowed speeds that is planned with: an arm that stands is reported to move a
 little, and the first cubic begins there."""
+STOPPABLE = 0.45
+"""Share of the allowed accelerations that a line is planned with: a stop of an arm that lags may
+have to brake harder than the line does."""
 NO_CRUISE = 1.0 - 2.0**-20
 """Ramps that take this share of the way have none between them: two waypoints need two times."""
-STOP_S = 0.4
-"""A stop takes at least so long, s."""
-LONGER, LONGER_STOPS = 1.15, 16
-"""By so much, and so often at most, a stop is lengthened that brakes too hard."""
-END_OF_STOP_S = 0.1
-"""A stop in the last moment of a line takes at least so long, s."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ class Line:
         """
         way = np.maximum(np.abs(end - start), 1e-12)
         # The ramp is of a given length: what the joints may accelerate bounds the speed as well.
-        speeds = np.minimum(limits.velocity, limits.acceleration * RAMP_S)
+        speeds = np.minimum(limits.velocity, STOPPABLE * limits.acceleration * RAMP_S)
         rate = float(np.min(speeds / way))
         if peak_m > 0.0:
             rate = min(rate, limits.tool_speed / peak_m)
@@ -97,6 +94,11 @@ class Line:
     def duration_s(self) -> float:
         """Time from start to end, s."""
         return self.cruise_s + 2 * RAMP_S
+
+    @property
+    def kinks_s(self) -> tuple[float, float]:
+        """When the ramp up ends and when the ramp down begins, s."""
+        return RAMP_S, RAMP_S + self.cruise_s
 
     def waypoints(self) -> tuple[Waypoint, ...]:
         """Return the end of each phase."""
@@ -129,61 +131,6 @@ class Line:
         length = float(self.way @ self.way)
         share = float(np.clip(self.way @ (q - self.start) / length, 0.0, 1.0)) if length else 1.0
         return share, float(np.max(np.abs(q - self.start - share * self.way)))
-
-    def stop(self, low_s: float, high_s: float, limits: MotionLimits) -> Waypoint:
-        """Return where and when an arm on this line comes to rest that is to stop now.
-
-        The arm, or the reference that its controller follows, is where the line is at some time
-        from `low_s` to `high_s` (an arm lags). A cubic from there to rest at the returned point
-        neither goes back nor exceeds the cruising speed where
-
-            x + v T/3 <= end <= x + 2/3 r T,
-
-        with x and v the share gone and its rate, r the cruising rate, T the time of the stop. In
-        the last ramp, which is a stop already, the end of the line is kept.
-
-        Parameters
-        ----------
-        low_s, high_s
-            Times since the start of the line, s.
-        limits
-            For the accelerations.
-        """
-        largest = float(np.max(np.abs(self.way) / limits.acceleration))
-        ends = [self.share(low_s), self.share(high_s)]
-        time = max(STOP_S, 3.3 * (high_s - low_s))
-        end, time = self._end_of_stop(low_s, high_s, time)
-        # A stop that would brake too hard takes longer, and that may move its end.
-        for _ in range(LONGER_STOPS):
-            if max(_acceleration(*here, end, time) for here in ends) * largest <= HEADROOM:
-                break
-            end, time = self._end_of_stop(low_s, high_s, time * LONGER, time * LONGER)
-        return Waypoint(time, self.start + end * self.way, np.zeros_like(self.end))
-
-    def _end_of_stop(
-        self, low_s: float, high_s: float, time: float, least_s: float = END_OF_STOP_S
-    ) -> tuple[float, float]:
-        """Return the share at which a stop ends, and its time, s, at least `least_s`."""
-        low, _ = self.share(low_s)
-        high, rate = self.share(high_s)
-        least = self._least_end(low_s, high_s, time)
-        end = min(max(least, high + 0.5 * rate * time), low + self.rate * time * 2 / 3)
-        if max(end, least) < 1.0:
-            return end, time
-        shortest = max(1.5 * (1.0 - low) / self.rate, least_s)
-        return 1.0, max(min(time, self.duration_s - high_s), shortest)
-
-    def _least_end(self, low_s: float, high_s: float, time: float) -> float:
-        """Return the least end of a stop that no arm on this stretch has to go back for."""
-        brake_s = RAMP_S + self.cruise_s
-        times = [low_s, high_s, *([brake_s] if low_s < brake_s < high_s else [])]
-        return max(share + rate * time / 3 for share, rate in map(self.share, times))
-
-
-def _acceleration(share: float, rate: float, end: float, time: float) -> float:
-    """Return the largest acceleration of the cubic from a share and rate to rest, 1/s²."""
-    mean = (end - share) / time
-    return max(abs(6 * mean - 4 * rate), abs(2 * rate - 6 * mean)) / time
 
 
 def _ramp(time_s: float) -> tuple[float, float]:

@@ -6,11 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from trajectory_msgs.msg import JointTrajectory
+from std_msgs.msg import Header
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from remaster_ros.core.tour import nearest_solution
+from remaster_ros.core.errors import InputError
+from remaster_ros.core.tour import Stop, nearest_solution
 from remaster_ros.core.types import FloatArray
-from remaster_ros.nodes.messages import stamp_key
+from remaster_ros.nodes.messages import duration_of, stamp_key
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,67 @@ class Announced:
     ids: tuple[int, ...]
     plan: str
     stamp: str = ''
+
+
+def waypoints_message(stop: Stop, joint_names: Sequence[str], header: Header) -> JointTrajectory:
+    """Return remaster/joint_waypoints of a stop.
+
+    The configurations to go through before each solution, in order; ``time_from_start.sec`` is 1
+    + the index of the solution they lead to, as in joint_solutions. Empty where all ways are
+    straight.
+    """
+    message = JointTrajectory(joint_names=list(joint_names))
+    message.header = header
+    message.points = [
+        JointTrajectoryPoint(positions=q.tolist(), time_from_start=duration_of(i + 1.0))
+        for i, path in enumerate(stop.paths)
+        for q in path
+    ]
+    return message
+
+
+def waypoints_by_solution(
+    message: JointTrajectory, joint_names: Sequence[str]
+) -> dict[int, FloatArray]:
+    """Group remaster/joint_waypoints by the solution that they lead to.
+
+    Parameters
+    ----------
+    message
+        See `waypoints_message`; its joints may be in any order.
+    joint_names
+        The wanted order of joints.
+
+    Returns
+    -------
+    dict
+        Index of the solution -> configurations to go through before it, rad, (n, k), n >= 1;
+        without those that a straight way leads to.
+
+    Raises
+    ------
+    InputError
+        Joints that are missing, points of the wrong length, not finite or out of order.
+    """
+    if not message.points:
+        return {}
+    names = list(message.joint_names)
+    missing = [name for name in joint_names if name not in names]
+    if missing:
+        raise InputError(f'joint_waypoints: {missing[0]} is missing; it has {", ".join(names)}')
+    columns = [names.index(name) for name in joint_names]
+    found: dict[int, list[FloatArray]] = {}
+    last = 0
+    for point in message.points:
+        index = point.time_from_start.sec - 1
+        positions = np.array(point.positions, dtype=float)
+        if positions.shape != (len(names),) or not np.all(np.isfinite(positions)):
+            raise InputError(f'joint_waypoints: a point {point.positions} for {len(names)} joints')
+        if index < last:
+            raise InputError(f'joint_waypoints: solution {index} after solution {last}')
+        last = index
+        found.setdefault(index, []).append(positions[columns])
+    return {index: np.array(points) for index, points in found.items()}
 
 
 class Announcements:
@@ -83,38 +146,3 @@ class Announcements:
         if self.now is None or self._solutions is None:
             return None
         return nearest_solution(self._solutions, q)
-
-
-def waypoints_by_solution(
-    message: JointTrajectory, joint_names: Sequence[str]
-) -> dict[int, FloatArray]:
-    """Return what to go through on the way to each solution, from remaster/joint_waypoints.
-
-    Parameters
-    ----------
-    message
-        Each point's time_from_start has 1 + the number of the solution it leads to as seconds.
-    joint_names
-        The wanted order of joints.
-
-    Returns
-    -------
-    dict
-        Number of the solution -> joint positions in the order of the way, rad, (n, k).
-
-    Raises
-    ------
-    ValueError
-        A joint is missing, or a point has another number of positions.
-    """
-    names = list(message.joint_names)
-    if not message.points:
-        return {}
-    columns = [names.index(name) for name in joint_names]
-    found: dict[int, list[list[float]]] = {}
-    for point in message.points:
-        if len(point.positions) != len(names):
-            raise ValueError(f'{len(point.positions)} positions for {len(names)} joints')
-        solution = point.time_from_start.sec - 1
-        found.setdefault(solution, []).append([point.positions[c] for c in columns])
-    return {solution: np.array(points) for solution, points in found.items()}

@@ -11,9 +11,10 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from remaster_ros.core import transforms
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.tour import Stop
+from remaster_ros.nodes.announcements import waypoints_message
 from remaster_ros.nodes.messages import duration_of, stamp_key
 from remaster_ros.nodes.running import RemasterNode
-from remaster_ros.nodes.status import RELIABLE, Status
+from remaster_ros.nodes.status import LEASED, Status
 
 PEERS = ('robot_bridge', 'recorder')
 ANNOUNCE_WALL_S = 5.0
@@ -42,9 +43,12 @@ class Announcer:
 
     def __init__(self, node: RemasterNode, chain: SerialChain) -> None:
         self._node, self._chain = node, chain
-        self._poses = node.create_publisher(PoseStamped, '/remaster/target_pose', RELIABLE)
+        self._poses = node.create_publisher(PoseStamped, 'remaster/target_pose', LEASED)
+        self._waypoints = node.create_publisher(
+            JointTrajectory, 'remaster/joint_waypoints', LEASED
+        )
         self._solutions = node.create_publisher(
-            JointTrajectory, '/remaster/joint_solutions', RELIABLE
+            JointTrajectory, 'remaster/joint_solutions', LEASED
         )
         self._peers: dict[str, _Peer] = {}
         # Stamp of each announcement of the open pose -> its solutions, in the order announced.
@@ -123,6 +127,8 @@ class Announcer:
         quaternion = transforms.quaternion_xyzw(stop.T_R_T[:3, :3])
         orientation.x, orientation.y, orientation.z, orientation.w = map(float, quaternion)
         self._poses.publish(pose)
+        # Before the solutions: with those the bridge begins to move.
+        self._waypoints.publish(waypoints_message(stop, self._chain.joint_names, pose.header))
         message = JointTrajectory(joint_names=list(self._chain.joint_names))
         message.header = pose.header
         message.points = [

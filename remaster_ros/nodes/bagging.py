@@ -15,11 +15,14 @@ from sensor_msgs.msg import JointState
 
 from remaster_ros.core.errors import DiskError, InputError
 from remaster_ros.nodes.status import LATCHED, TOPIC
+from remaster_ros.storage.bag import RECORDED
 from remaster_ros.storage.bag_writer import BagWriter
 
 DEEP = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 """What a busy recorder has not yet taken is kept for it: seconds of the fastest stream."""
 STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
+MOST_EARLY = 20_000
+"""Messages that are kept while there is no clock: some ten seconds of the fastest streams."""
 BEGAN = 'began'
 """The event by which a bag says that its recorder was started (again)."""
 
@@ -46,6 +49,8 @@ class BagRecorder:
     def __init__(self, node: Node, folder: Path | None) -> None:
         self._node, self._folder = node, folder
         self._writer: BagWriter | None = None
+        # Heard while the node's clock, a simulated one, was not known: topic, type, bytes.
+        self._early: list[tuple[str, str, bytes]] = []
         self.notes: list[str] = []
         self.dropped = 0
         self.reopen()
@@ -68,12 +73,25 @@ class BagRecorder:
         )
 
     def _write(self, topic: str, type_name: str, data: bytes) -> None:
+        """Write a message under the node's time; what came before there was one comes first.
+
+        A bag that began at time 0 would last as long as the simulation has been running.
+        """
         if self._writer is None:
             return
-        try:
-            self._writer.write(topic, type_name, data, self._node.get_clock().now().nanoseconds)
-        except DiskError:
-            self.dropped += 1
+        now_ns = self._node.get_clock().now().nanoseconds
+        if now_ns == 0:
+            if len(self._early) < MOST_EARLY:
+                self._early.append((topic, type_name, data))
+            else:
+                self.dropped += 1
+            return
+        waiting, self._early = [*self._early, (topic, type_name, data)], []
+        for message in waiting:
+            try:
+                self._writer.write(*message, now_ns)
+            except DiskError:
+                self.dropped += 1
 
     def subscribe(
         self,
@@ -84,8 +102,8 @@ class BagRecorder:
     ) -> None:
         """Record `topic`; call `receive` with each decoded message, if given.
 
-        In the bag it has the name without this node's namespace, and as if it was not remapped: a
-        bag can be replayed in any namespace.
+        In the bag it has the name of `name_in_bag`: without this node's namespace and as if it was
+        not remapped, so that a bag can be replayed in any namespace.
         """
         module = kind.__module__.split('.')[0]
         type_name = f'{module}/msg/{kind.__name__}'
@@ -114,6 +132,8 @@ class BagRecorder:
         Where the disk does not take its end, it stays as that of a killed recorder.
         """
         writer, self._writer = self._writer, None
+        self.dropped += len(self._early)
+        self._early = []
         if writer is not None:
             try:
                 writer.close()
@@ -122,8 +142,12 @@ class BagRecorder:
 
 
 def name_in_bag(topic: str) -> str:
-    """Return the name in bags of a topic as this package's code names it, relative or not."""
-    return f'/{topic.lstrip("/")}'
+    """Return the name in bags of a topic as this package's code names it, relative or not.
+
+    What moves an arm has another one there (`storage.bag.RECORDED`).
+    """
+    name = f'/{topic.lstrip("/")}'
+    return RECORDED.get(name, name)
 
 
 def _free(folder: Path) -> Path:

@@ -267,6 +267,9 @@ class Demo:
                         total=int(planner.get('configurations', 0)),
                         completed=int(planner.get('configurations_done', 0)),
                     )
+                if planner.get('state') == 'idle' and planner.get('resuming') == 'no':
+                    # It was killed, and could not be certain that its run still lives.
+                    self._trigger('remaster/collect', 'pose_planner')
                 if planner.get('state') == 'failed':
                     raise DeviceError(f'the planner gave up: {planner["message"]}')
                 closed = self.node.summaries.get('recorder', {}).get('exit_status')

@@ -20,7 +20,12 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.fakes.robot import FakeArm, TrajectoryPoint
-from remaster_ros.fakes.setup import default_folder, make_world, open_world
+from remaster_ros.fakes.setup import (
+    default_folder,
+    make_private_folder,
+    make_world,
+    open_world,
+)
 from remaster_ros.nodes.messages import seconds, stamp_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
@@ -57,7 +62,9 @@ class FakeRobotNode(RemasterNode):
         if self.p.world:
             self.world = open_world(self.p.world, self.get_namespace())
         else:
-            self._drawn = default_folder(self.get_namespace())
+            folder = default_folder(self.get_namespace())
+            make_private_folder(folder)
+            self._drawn = folder
             self.world = make_world(self._drawn, read_cell(self.p.cell), self.p.seed, self.p.rate)
         rng = np.random.default_rng([self.world.truth.seed, 2])
         self.arm = FakeArm(self.world, rng)

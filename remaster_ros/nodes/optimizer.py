@@ -117,7 +117,9 @@ class Optimizer(RemasterNode):
         )
         report = save_fit(result, out, figures=self.p.figures)
         self._publish(result.joint_names, result.joint_offsets, result.joint_offsets_std)
-        return report, 'fitted'
+        for line in result.implausible:
+            self.get_logger().warning(line)
+        return report, '; '.join(('fitted', *result.implausible))
 
     def _discover(self) -> tuple[Path, str]:
         # What takes a second to import comes when it is asked for: a node is there at once.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from remaster_ros.core.errors import DiskError
+from remaster_ros.core.errors import DiskError, MovedError
 
 RETRY_S = 1.0
 """How often a full disk is tried again, s of wall time."""
@@ -29,7 +29,13 @@ class Patience:
         self._complain = complain
         self._waiting: Callable[[], object] | None = None
         self._tried = 0.0
+        self._moved = False
         self.full = ''
+
+    @property
+    def why(self) -> str:
+        """What is waited for, in words."""
+        return self.full if self._moved else f'room on the disk: {self.full}'
 
     def write(self, write: Callable[[], object]) -> None:
         """Write; where the disk does not take it, `look` tries it again."""
@@ -40,6 +46,7 @@ class Patience:
             if not self.full:
                 self._complain(str(error))
             self._waiting, self.full = write, str(error)
+            self._moved = isinstance(error, MovedError)
         else:
             self.full = ''
 

@@ -4,19 +4,26 @@
 Without a registration of every sensor the first poses serve the three-point registration.
 
 The plan, the pose under way and what became of each configuration are in the session folder
-before the arm moves. A planner that was killed goes on by itself where it was; where bridge or
-recorder were, it announces what is left of the pose again.
+before the arm moves. A planner that was killed goes on by itself where it was, if the run still
+lives: recorder and bridge hold its token (see `run_token`). Where bridge or recorder were killed,
+it announces what is left of the pose again.
+
+Pause and stop have a thread of their own: neither planning nor the disk keeps them waiting. Their
+state goes out first; what the journal must remember is written afterwards.
 """
 
 from __future__ import annotations
 
+import threading
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import TransformStamped
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -24,15 +31,16 @@ from std_srvs.srv import Trigger
 from remaster_ros.core.errors import InputError, InsufficientDataError, RemasterError
 from remaster_ros.core.tour import REGISTRATION, Stop
 from remaster_ros.core.types import FloatArray
-from remaster_ros.nodes.announcing import Announcer
+from remaster_ros.nodes.announcing import PEERS, Announcer
 from remaster_ros.nodes.clearance import Clearance
 from remaster_ros.nodes.messages import JointOrder, transform_array
 from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.run_token import LivingRun, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, Event, Status, listen
-from remaster_ros.nodes.touring import TourPlanner
+from remaster_ros.nodes.touring import Background, TourPlanner
 from remaster_ros.storage.cell import read_cell
-from remaster_ros.storage.plan_book import PlanBook
+from remaster_ros.storage.plan_book import NO_FREE_PATH, PlanBook
 
 RETRY_WALL_S = 1.0
 """How often a full disk is tried again, wall time."""
@@ -81,6 +89,11 @@ class PosePlanner(RemasterNode):
         self._q: FloatArray | None = None
         self.T_R_N: dict[str, FloatArray] = {}
         self.state, self.phase, self._why = 'idle', REGISTRATION, ''
+        # Of `state` and of what may be published only while it is 'running'.
+        self._lock = threading.RLock()
+        self._run: LivingRun | None = None
+        # The run of a planner before this one, until it is known whether it still lives.
+        self._left = ''
         self._registered = self._described = self._resumed = False
         counts = {
             'optimization': self.p.optimization_candidates,
@@ -89,7 +102,9 @@ class PosePlanner(RemasterNode):
         }
         margin = np.deg2rad(self.p.limit_margin_deg)
         self._tours = TourPlanner(self.cell, self.chain, counts, self.p.seed, margin)
-        self.book = PlanBook(Path(self.p.session), self._settings(), self.chain)
+        self._background = Background()
+        model = self._tours.model
+        self.book = PlanBook(Path(self.p.session), self._settings(), self.chain, model)
         self._tried_wall = 0.0
         self._resume()
         self._announcer = Announcer(self, self.chain)
@@ -98,8 +113,10 @@ class PosePlanner(RemasterNode):
         self.create_subscription(
             TransformStamped, 'remaster/registration', self._on_registration, LATCHED
         )
-        for name in ('collect', 'pause', 'stop'):
-            self.create_service(Trigger, f'remaster/{name}', getattr(self, f'_on_{name}'))
+        at_once = MutuallyExclusiveCallbackGroup()
+        self.create_service(Trigger, 'remaster/collect', self._on_collect)
+        self.create_service(Trigger, 'remaster/pause', self._on_pause, callback_group=at_once)
+        self.create_service(Trigger, 'remaster/stop', self._on_stop, callback_group=at_once)
         self.status = Status(self, self._summary)
         self._clearance, self._cleared = Clearance(self, self.cell), False
         listen(self, self._on_event, self._on_summary)
@@ -129,11 +146,46 @@ class PosePlanner(RemasterNode):
             self.get_logger().warning(book.lost)
         if book.state == 'complete':
             self.state = 'complete'
-        elif book.state == 'running' and book.silent_s <= self.p.resume_within_s:
-            self.state = 'running'
         else:
-            self._why = f'{self._progress()}; /remaster/collect goes on'
+            self._left = book.run if book.state == 'running' else ''
+            self._why = self._unwanted('' if book.state == 'running' else f'it was {book.state}')
         self.get_logger().warning(f'{book.path}: going on; {self._progress()}')
+
+    def _unwanted(self, why: str) -> str:
+        """Return that, and why, this planner does not go on by itself."""
+        reason = f' ({why})' if why else ''
+        return f'{self._progress()}; /remaster/collect goes on{reason}'
+
+    def _take_up_run(self) -> None:
+        """Go on with a run that a killed planner has left, if it is certain that it still lives.
+
+        Somebody may stand beside an arm that has not moved for a while.
+        """
+        passed_s = silence_s(self._left)
+        why = ''
+        if passed_s is None:
+            why = 'its run was in another boot of this computer, or was ended'
+        elif passed_s > self.p.resume_within_s:
+            why = f'its run has been without a planner for {passed_s:.0f} s'
+        elif not all(self._announcer.says(name, 'started') for name in PEERS):
+            self._why = 'waiting for robot_bridge and recorder to confirm the run'
+            return
+        else:
+            says = self._announcer.says
+            other = [name for name in PEERS if says(name, 'run') != self._left]
+            if other:
+                why = f'{" and ".join(other)} did not take part in its run'
+            elif halted := says('robot_bridge', 'halted'):
+                why = f'the arm is halted: {halted}'
+        with self._lock:
+            left, self._left = self._left, ''
+            if left and not why:
+                self._run = LivingRun(left)
+                self._set_state('running')
+        if why:
+            self._why = self._unwanted(why)
+            self.get_logger().warning(self._why)
+            self.status.publish()
 
     def _progress(self) -> str:
         tour = self.book.tour
@@ -151,34 +203,54 @@ class PosePlanner(RemasterNode):
         if self.state in ('complete', 'failed'):
             response.message = f'the collection is {self.state}: {self._why or "start anew"}'
             return response
+        if halted := self._announcer.says('robot_bridge', 'halted'):
+            response.message = f'the arm is halted: {halted}; /remaster/clear_halt, then collect'
+            return response
         if self._announcer.says('recorder', 'exit_status') == 'complete':
             response.message = "the recorder's session is complete; give it a new folder"
             return response
         if self.state != 'running' and self._joint_states is None:
             # The arm may have been stopped, or moved by hand, since it last settled.
             self._joint_states = self._listen_to_the_arm()
-        self._set_state('running')
+        with self._lock:
+            self._left = ''
+            if self.state != 'running':
+                self._run = LivingRun()
+            self._set_state('running')
         response.success = True
         response.message = 'collecting'
         return response
 
     def _on_pause(self, request: Trigger.Request, response: Trigger.Response) -> Any:
-        response.success = self.state in ('running', 'paused')
+        with self._lock:
+            # One that would go on by itself is as good as running.
+            left, self._left = self._left, ''
+            if left or self.state == 'running':
+                self._set_state('paused')
+            response.success = self.state == 'paused'
         response.message = 'paused' if response.success else f'not running, but {self.state}'
-        if response.success:
-            self._set_state('paused')
         return response
 
     def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Any:
-        self._set_state('stopped')
-        self._announcer.stop()
+        with self._lock:
+            self._left = ''
+            # The command first: nothing that fails behind it may keep the arm moving.
+            self._announcer.stop()
+            self._set_state('stopped')
         response.success, response.message = True, 'stopped'
         return response
 
-    def _set_state(self, state: str, why: str = '') -> None:
-        self.state, self._why = state, why
-        self.book.say_state(state)
-        self.status.publish()
+    def _set_state(self, state: str, why: str = '', only_from: str = '') -> bool:
+        """Say a new state; `_step` writes it down. Returns whether the old one was `only_from`."""
+        with self._lock:
+            if only_from and self.state != only_from:
+                return False
+            self.state, self._why = state, why
+            if state != 'running' and self._run is not None:
+                self._run.end()
+                self._run = None
+            self.status.publish()
+            return True
 
     # What comes in
 
@@ -206,7 +278,7 @@ class PosePlanner(RemasterNode):
     def _on_event(self, event: Event) -> None:
         if (event.node, event.event) == ('robot_bridge', 'halted') and self.state == 'running':
             # It goes on when somebody has looked at the arm and calls /remaster/collect.
-            self._set_state('paused', event.message)
+            self._set_state('paused', event.message, only_from='running')
             return
         final = (event.node, event.event) in (
             ('recorder', 'configuration'),
@@ -229,6 +301,8 @@ class PosePlanner(RemasterNode):
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
         self._clearance.on_summary(node, message, values)
         self._announcer.hear(node, values)
+        if node == 'robot_bridge' and values.get('halted'):
+            self._set_state('paused', values['halted'], only_from='running')
         stop = self.book.stop
         if node != 'recorder' or stop is None or self.state in ('complete', 'failed'):
             return
@@ -244,7 +318,12 @@ class PosePlanner(RemasterNode):
 
     def _step(self) -> None:
         """Publish the next pose once every solution of the last one has its outcome."""
-        self.book.stay_alive()
+        run = self._run
+        if run is not None:
+            run.stay_alive()
+        if self._left:
+            self._take_up_run()
+        self._write_state()
         if self.book.trouble and not self._is_written():
             return
         if self.state != 'running' or self._q is None or not self._heard():
@@ -256,18 +335,52 @@ class PosePlanner(RemasterNode):
             stop = self.book.stop
             if stop is not None and stop.ids:
                 if self._announcer.is_lost():
-                    self._publish(stop)
+                    self._announce_rest(stop, self._q)
                 return
             stop = self._next_stop(self._q)
         except RemasterError as error:
-            self._set_state('failed', str(error))
+            self._set_state('failed', str(error), only_from='running')
             self.get_logger().error(str(error))
             return
         if stop is not None:
             self._announcer.close()
             self.book.open_stop(stop)
-            if not self.book.trouble:
+            if stop.ids and not self.book.trouble:
                 self._publish(stop)
+
+    def _announce_rest(self, stop: Stop, q: FloatArray) -> None:
+        """Announce what is left of a stop, by ways that begin where the arm stands now."""
+        tour = self.book.tour
+        assert tour is not None
+        what = (tour, stop.split, stop.pose, stop.ids)
+        found = self._background.ask(what, q, lambda: tour.reroute(stop, q))
+        if found is not None:
+            self.book.reroute(found[0])
+            if found[0].ids and not self.book.trouble:
+                self._publish(found[0])
+
+    def _propose(self, q: FloatArray) -> tuple[Stop | None] | None:
+        """Return the next stop in a tuple, None in it at the end; None while it is planned."""
+        tour = self.book.tour
+        assert tour is not None
+        self._why = ''
+        standing = self._tours.model.trouble(q)
+        if standing:
+            # The bridge halts such an arm and offers a way out; after it the arm is elsewhere.
+            self._why = f'the arm stands too near to something: {standing}'
+            if self._joint_states is None:
+                self._joint_states = self._listen_to_the_arm()
+            return None
+        found = self._background.ask((tour, tour.visited), q, lambda: tour.propose(q))
+        if found is None or found[0] is None:
+            return found
+        return (tour.take(found[0]),)
+
+    def _write_state(self) -> None:
+        """Write down what was said; a stop or pause came in a thread that must not wait for it."""
+        with self._lock:
+            state, run = self.state, '' if self._run is None else self._run.token
+        self.book.say_state(state, run)
 
     def _is_written(self) -> bool:
         """Whether the disk takes what it did not take before; looked at once a second."""
@@ -296,6 +409,9 @@ class PosePlanner(RemasterNode):
         if self.clock_trouble:
             self._why = self.clock_trouble
             return False
+        if not self.status.alone(time.monotonic()):
+            self._why = 'listening whether there is another pose_planner'
+            return False
         matched = self._announcer.matched()
         self._why = '' if matched else 'waiting for robot_bridge and recorder'
         return matched
@@ -314,12 +430,15 @@ class PosePlanner(RemasterNode):
         if self.phase == REGISTRATION:
             return self._next_registration(q)
         if self.book.tour is None or REGISTRATION in self.book.tour.plans:
-            self.book.begin(self._tours.collection(self.T_R_N))
-        assert self.book.tour is not None
-        stop = self.book.tour.next(q)
-        if stop is None:
-            self._set_state('complete')
-        return stop
+            T_R_N = dict(self.T_R_N)
+            planned = self._background.ask('plan', q, lambda: self._tours.collection(T_R_N))
+            if planned is None:
+                return None
+            self.book.begin(planned[0])
+        proposed = self._propose(q)
+        if proposed == (None,):
+            self._set_state('complete', only_from='running')
+        return None if proposed is None else proposed[0]
 
     def _next_registration(self, q: FloatArray) -> Stop | None:
         """Visit poses until the recorder has registered every sensor."""
@@ -331,39 +450,52 @@ class PosePlanner(RemasterNode):
             # The recorder said so; its transforms are on their way.
             return None
         if self.book.tour is None:
-            self.book.begin(self._tours.registration())
-        assert self.book.tour is not None
-        stop = self.book.tour.next(q)
-        if stop is None:
+            planned = self._background.ask('register', q, self._tours.registration)
+            if planned is None:
+                return None
+            self.book.begin(planned[0])
+        proposed = self._propose(q)
+        if proposed == (None,):
+            assert self.book.tour is not None
             raise InsufficientDataError(
                 f'no registration of {", ".join(missing)} after {self.book.tour.visited} poses '
                 f'({self._announcer.says("recorder", "registration")}); the recorder counts why '
                 'readings were rejected'
             )
-        return stop
+        return None if proposed is None else proposed[0]
 
     def _publish(self, stop: Stop) -> None:
         tour = self.book.tour
         if tour is not None and self.phase != REGISTRATION and not self._described:
             self._described = True
             self.status.event('planned', tour.describe())
-        self._announcer.announce(stop, self.book.id, self.status)
+        with self._lock:
+            # Paused or stopped while the pose was chosen and written: collect announces it.
+            if self.state == 'running':
+                self._announcer.announce(stop, self.book.id, self.status)
 
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
-        tour, outcomes = self.book.tour, self.book.outcomes
+        tour, outcomes, run = self.book.tour, dict(self.book.outcomes), self._run
         full = f'waiting for room on the disk: {self.book.trouble}' if self.book.trouble else ''
         dropped = tour.dropped if tour and self.phase != REGISTRATION else {}
+        collecting = tour is not None and self.phase != REGISTRATION
+        solutions = Counter(tour.dropped_solutions if tour and collecting else {})
+        solutions['no free path'] = outcomes.get(NO_FREE_PATH, 0)
         values = {
             'state': 'held' if full and self.state == 'running' else self.state,
             'phase': self.phase,
             'robot': 'silent' if self._q is None else 'heard',
             'poses_done': tour.visited if tour else 0,
             'poses': sum(tour.poses.values()) if tour else 0,
-            'configurations_done': outcomes.total(),
+            'configurations_done': sum(outcomes.values()),
             'configurations': sum(tour.configurations.values()) if tour else 0,
             'plan': self.book.id,
+            'run': '' if run is None else run.token,
+            # Whether it may still go on by itself.
+            'resuming': 'yes' if self._left else 'no',
             **{f'outcome_{name}': count for name, count in sorted(outcomes.items())},
             **{f'dropped_{name}': count for name, count in sorted(dropped.items())},
+            **{f'dropped_solutions_{name}': n for name, n in sorted(solutions.items())},
         }
         why = full or self._why
         level = 'error' if self.state == 'failed' else 'warn' if why else 'ok'
@@ -371,14 +503,15 @@ class PosePlanner(RemasterNode):
 
     def close(self) -> None:
         """Tell the bridge to stop: nobody plans any more."""
-        if self.state == 'running':
-            self._set_state('stopped')
+        self._set_state('stopped', only_from='running')
+        self._write_state()
         self.book.close()
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
-    return run(PosePlanner, args)
+    # One for the tour, one for pause and stop, one for the status.
+    return run(PosePlanner, args, threads=3)
 
 
 if __name__ == '__main__':

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
 from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
@@ -39,7 +40,7 @@ from remaster_ros.nodes.recorder_parameters import Parameters, sensor_rules
 from remaster_ros.nodes.registering import Registrar
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.shots import Shots
-from remaster_ros.nodes.status import JOINT_STATES, Event, Status, receiver
+from remaster_ros.nodes.status import JOINT_STATES, Event, Status, receiver, run_after
 from remaster_ros.nodes.status import TOPIC as STATUS
 from remaster_ros.storage.cell import read_cell
 from remaster_ros.storage.logbook import Logbook
@@ -47,6 +48,8 @@ from remaster_ros.storage.session_writer import ExitStatus
 
 TEMPERATURE_S = 600.0
 """A temperature older than this says nothing of a reading, s."""
+CHECK_S = 1.0
+"""How often it is looked whether the session's files are still the ones that are written, s."""
 BY_HAND = -1_000_000
 """The number of poses that a user drove to for a registration: no planner's."""
 
@@ -96,7 +99,7 @@ class Recorder(RemasterNode):
         )
         self.logbook = Logbook(folder, header)
         self.counts: Counter[str] = Counter()
-        self._trouble = ''
+        self._trouble = self._restored = ''
         self._announcements = Announcements(self.chain.joint_names)
         self._taking: _Taking | None = None
         self._due: deque[tuple[FloatArray, float, int, Announced]] = deque(maxlen=100)
@@ -108,8 +111,11 @@ class Recorder(RemasterNode):
         self._from_q: FloatArray | None = None
         self._temperatures: deque[tuple[float, float]] = deque(maxlen=500)
         self._was_waiting = False
+        # The token of the planner's run; in memory alone, so that it lives no longer than this.
+        self._run = ''
         # Settled where no announced pose has a solution (yet): joints, rad, and when.
         self._unknown: tuple[FloatArray, float] | None = None
+        self._checked_wall = time.monotonic()
         self._disk = Patience(lambda why: self.get_logger().error(f'the arm is held: {why}'))
         self.registrar = Registrar(self, self.cell, self.chain, self.p.max_deviation_m / 2)
         markers = {name: np.array(position) for name, position in self.cell.markers.items()}
@@ -117,7 +123,13 @@ class Recorder(RemasterNode):
         recording = self.p.bag and not self.logbook.closed
         self._bag = BagRecorder(self, folder / 'bag' if recording else None)
         self._subscribe()
-        self.create_service(Trigger, 'remaster/register', self._on_register)
+        # A group of its own: while it waits for the reading, what makes the reading goes on.
+        self.create_service(
+            Trigger,
+            'remaster/register',
+            self._on_register,
+            callback_group=ReentrantCallbackGroup(),
+        )
         self.status = Status(self, self._summary)
         for note in (*self.logbook.notes, *self._bag.notes):
             self.get_logger().warning(note)
@@ -205,6 +217,8 @@ class Recorder(RemasterNode):
                 values.get('started', ''),
                 hidden=values.get('fault') == 'marker',
             )
+        if node == 'pose_planner':
+            self._run = run_after(self._run, values)
         if node == 'pose_planner' and not self._busy() and not self._due:
             state = values.get('state')
             if state == 'complete':
@@ -303,6 +317,7 @@ class Recorder(RemasterNode):
         """Ask, give up, and say at once when a required sensor goes or comes back."""
         absent = self._absent()
         self._disk.look()
+        self._check_files()
         if self._taking is not None:
             self._shots.look(self._taking.pairing, absent)
             self._taking.pairing.give_up(self._now, absent, self._presence.words)
@@ -317,7 +332,7 @@ class Recorder(RemasterNode):
     def _waiting_for(self, absent: Mapping[str, str]) -> str:
         """Say what is missing, and why: room on the disk, required sensors; '' if nothing is."""
         if self._disk.full:
-            return f'room on the disk: {self._disk.full}'
+            return self._disk.why
         wanted = self._wanted()
         gone = [name for name in wanted if name in absent]
         if not gone or (self.p.require == 'any' and len(gone) < len(wanted)):
@@ -432,6 +447,7 @@ class Recorder(RemasterNode):
         now, sensors = time.monotonic(), self.cell.sensors
         waiting_for = self._waiting_for(self._absent())
         trouble = self._trouble or (f'waiting for {waiting_for}' if waiting_for else '')
+        trouble = trouble or self.logbook.beyond_repair or self._restored
         pose = self._announcements.now
         values = {
             'state': state,
@@ -441,6 +457,7 @@ class Recorder(RemasterNode):
             # By these the planner, or one that was started again, takes up where this one is.
             'pose': '' if pose is None else pose.stamp,
             'plan': self.logbook.plan_id,
+            'run': self._run,
             'decided': self.logbook.decided(),
             'registration': self.registrar.describe(),
             'require': self.p.require,
@@ -448,6 +465,7 @@ class Recorder(RemasterNode):
             **{f'waited_s_{name}': f'{s:.1f}' for name, s in self._waited_s.items()},
             **{f'read_age_s_{n}': f'{self._presence.read_age_s(n, now):.1f}' for n in sensors},
             'bag_dropped': self._bag.dropped,
+            'restored': self._restored,
             **dict(sorted(self.counts.items())),
         }
         return ('warn' if trouble else 'ok'), trouble or state, values
@@ -458,6 +476,21 @@ class Recorder(RemasterNode):
         """Whether a configuration is being read or written down."""
         return self._taking is not None or bool(self._disk.full)
 
+    def _check_files(self) -> None:
+        """Notice within a second or two what others did to the session's files."""
+        if time.monotonic() - self._checked_wall < CHECK_S:
+            return
+        self._checked_wall = time.monotonic()
+        if not self._disk.full:
+            self._disk.write(self.logbook.check)
+        self._say_restored()
+
+    def _say_restored(self) -> None:
+        for line in self.logbook.take_restored():
+            self.get_logger().error(line)
+            self._restored = line
+            self.status.publish()
+
     def _reopen(self) -> None:
         self.logbook.reopen()
         self._bag.reopen()
@@ -465,6 +498,12 @@ class Recorder(RemasterNode):
     def _close(self, exit_status: ExitStatus) -> None:
         if not self.logbook.closed:
             self.logbook.close(exit_status)
+            self._say_restored()
+            if self.logbook.closed != exit_status:
+                self.get_logger().error(
+                    f'the session is closed as {self.logbook.closed}, not as {exit_status}: '
+                    f'{self.logbook.beyond_repair}; its observations are all there'
+                )
             self._bag.close()
             waited = ', '.join(f'{name} {s:.1f} s' for name, s in self._waited_s.items())
             self.get_logger().info(f'the arm stood waiting for {waited}')

@@ -1,4 +1,8 @@
-"""Publish a recorded bag again, byte for byte and in its own time, as ``ros2 bag play`` does."""
+"""Publish a recorded bag again, byte for byte and in its own time, as ``ros2 bag play`` does.
+
+Never onto a live graph: where somebody else publishes what robot, bridge and planner publish, or
+where a controller listens, it ends. What the arm was told is left out unless asked for.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +15,33 @@ from typing import Any
 
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from remaster_ros.core.errors import InputError, RemasterError
 from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.storage.bag import LATCHED_TOPICS, BagReader
+from remaster_ros.nodes.status import TOPIC as STATUS
+from remaster_ros.storage.bag import LATCHED_TOPICS, RECORDED, BagReader, live_name
 
 CLOCK = '/clock'
+COMMANDS = '/joint_trajectory_controller/joint_trajectory'
+SOURCES = (
+    'joint_states',
+    COMMANDS.lstrip('/'),
+    'remaster/joint_solutions',
+    'remaster/joint_waypoints',
+    'remaster/settled',
+)
+"""What robot, bridge and planner publish: with one of them there, the graph is live."""
+DISCOVERY_S = 4.0
+"""So long it is looked whether the graph is live before the first message, s: a participant
+announces itself every 3 s, and what it says at first can get lost on a busy machine."""
+NEWCOMER_S = 0.5
+"""How long after its first endpoint all others of a node are known, s."""
+LOOK_S = 1.0
+"""How often it is looked again whether somebody has come, s."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +55,9 @@ class Parameters:
         '', 'a topic whose first subscriber is waited for before the first message'
     )
     wait_s: float = parameter(30.0, 'how long at most', unit='s', low=0.0, high=3600.0)
+    with_commands: bool = parameter(
+        False, 'publish also what the controller was told; a controller that listens is refused'
+    )
 
 
 class Replay(RemasterNode):
@@ -51,14 +76,21 @@ class Replay(RemasterNode):
         )
         self._ending = threading.Event()
         self._clock_sent = 0.0
+        # How many listen to each topic that moves an arm, and were looked at.
+        self._listeners: dict[str, int] = {}
         self.sent = 0
+        # Before anything is published, and again when discovery has had its time.
+        self._refuse_live()
         for topic, type_name in self._reader.topics.items():
-            if topic != CLOCK or self._clock_publisher is None:
-                self._publishers_by_topic[topic] = self._publisher(topic, type_name)
+            name = live_name(topic)
+            left_out = name == COMMANDS and not self.p.with_commands
+            if not left_out and (topic != CLOCK or self._clock_publisher is None):
+                self._publishers_by_topic[topic] = self._publisher(name, type_name)
         self._thread = threading.Thread(target=self._play, daemon=True)
         self._thread.start()
 
     def _publisher(self, topic: str, type_name: str) -> Publisher:
+        """Return a publisher of a topic that was recorded under this name."""
         latched = topic in LATCHED_TOPICS
         qos = QoSProfile(
             depth=1000,
@@ -71,6 +103,7 @@ class Replay(RemasterNode):
     def _play(self) -> None:
         try:
             self._wait_for_subscriber()
+            self._refuse_live()
             self._send_all()
             # Give DDS the time to hand the last messages over.
             self._ending.wait(1.0)
@@ -81,20 +114,57 @@ class Replay(RemasterNode):
     def _wait_for_subscriber(self) -> None:
         topic = self.p.wait_for
         if not topic:
-            self._ending.wait(1.0)
+            self._ending.wait(DISCOVERY_S)
             return
         deadline = time.monotonic() + self.p.wait_s
-        publisher = self._publishers_by_topic.get(f'/{topic.lstrip("/")}')
-        # A topic of the bag is meant as the bag names it, whatever the namespace here.
-        topic = topic if publisher is None else publisher.topic_name
+        # A topic of the bag is meant as it was recorded, whatever the namespace here.
+        for recorded, publisher in self._publishers_by_topic.items():
+            if live_name(recorded) == f'/{topic.lstrip("/")}':
+                topic = publisher.topic_name
         while not self._ending.is_set() and self.count_subscribers(topic) == 0:
             if time.monotonic() > deadline:
                 raise InputError(f'replay: nobody subscribed to {topic} in {self.p.wait_s:g} s')
             time.sleep(0.05)
-        self._ending.wait(1.0)
+        self._ending.wait(DISCOVERY_S)
+
+    def _refuse_live(self) -> None:
+        """Refuse to publish where an arm may move by it.
+
+        Raises
+        ------
+        InputError
+            Naming who is there. A node that was killed stays listed for some 20 s.
+        """
+        own = self.get_name(), self.get_namespace()
+        for topic in SOURCES:
+            name = self.resolve_topic_name(topic)
+            for info in self.get_publishers_info_by_topic(name):
+                if (info.node_name, info.node_namespace) != own:
+                    raise InputError(_live(info, f'publishes {name}'))
+        # Of nodes that publish a summary, recorder and laser tracker only listen to the commands.
+        reporting = {
+            (info.node_name, info.node_namespace)
+            for info in self.get_publishers_info_by_topic(self.resolve_topic_name(STATUS))
+        }
+        name = self.resolve_topic_name(COMMANDS.lstrip('/'))
+        for info in self.get_subscriptions_info_by_topic(name):
+            if (info.node_name, info.node_namespace) not in reporting - {own}:
+                raise InputError(_live(info, f'listens to {name}'))
+
+    def _look_who_listens(self, publisher: Publisher) -> None:
+        """Refuse a new listener of what moves an arm before the next message, if it obeys it."""
+        count = publisher.get_subscription_count()
+        known = self._listeners.get(publisher.topic_name)
+        if count != known:
+            if count:
+                # What else it subscribes to and publishes is known a little later.
+                self._ending.wait(NEWCOMER_S)
+            self._refuse_live()
+            self._listeners[publisher.topic_name] = count
 
     def _send_all(self) -> None:
         start_wall = first = None
+        looked = time.monotonic()
         for topic, _, data, stamp_ns in self._reader:
             if start_wall is None or first is None:
                 start_wall, first = time.monotonic(), stamp_ns
@@ -104,9 +174,14 @@ class Replay(RemasterNode):
                 self._ending.wait(min(ahead, 0.01))
             if self._ending.is_set():
                 return
+            if time.monotonic() - looked > LOOK_S:
+                looked = time.monotonic()
+                self._refuse_live()
             self._publish_clock(stamp_ns)
             publisher = self._publishers_by_topic.get(topic)
             if publisher is not None:
+                if live_name(topic) in RECORDED:
+                    self._look_who_listens(publisher)
                 publisher.publish(data)
                 self.sent += 1
         self.get_logger().info(f'{self.sent} messages published')
@@ -121,6 +196,14 @@ class Replay(RemasterNode):
         """Stop publishing."""
         self._ending.set()
         self._thread.join(2.0)
+
+
+def _live(info: TopicEndpointInfo, does: str) -> str:
+    node = f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+    return (
+        f'replay: this graph is live: {node} {does}; end it, or replay in another ROS domain '
+        '(ROS_DOMAIN_ID) or namespace'
+    )
 
 
 def message_class(type_name: str) -> Any:

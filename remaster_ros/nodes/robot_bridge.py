@@ -67,7 +67,12 @@ class RobotBridge(RemasterNode):
 
     def __init__(self) -> None:
         super().__init__('robot_bridge')
-        self.p = declare(self, Parameters)
+        self.p = declare(self, Parameters, self._on_parameters)
+        if not self.p.cell:
+            raise InputError(
+                'robot_bridge: parameter cell is empty; give the cell file of this arm (demo, the '
+                'shipped one, is for the fakes)'
+            )
         cell = read_cell(self.p.cell)
         self.chain = cell.chain()
         self._order = JointOrder(self.chain.joint_names)
@@ -115,6 +120,8 @@ class RobotBridge(RemasterNode):
         self.create_timer(WATCH_WALL_S, self._watch, clock=self.status.steady)
         if self.supervisor.halted:
             self.get_logger().error(f'halted: {self.supervisor.halted}')
+        for pair in model.left_out:
+            self.get_logger().info(f'collisions: {pair}')
         if not self.p.cartesian_speed_limit_m_s:
             self.get_logger().warning(
                 'no Cartesian speed limit (cartesian_speed_limit_m_s is 0): the joints alone '
@@ -136,6 +143,15 @@ class RobotBridge(RemasterNode):
             self._acceleration,
             p.cartesian_speed_limit_m_s or np.inf,
             float(np.deg2rad(p.limit_margin_deg)),
+        )
+
+    def _on_parameters(self, p: Parameters) -> None:
+        """Go on with other speeds."""
+        self.p = p
+        self._do(self.supervisor.use_limits(self._limits(p), time.monotonic()))
+        self.get_logger().info(
+            f'speed_share is {p.speed_share:g}, cartesian_speed_limit_m_s '
+            f'{p.cartesian_speed_limit_m_s:g}'
         )
 
     # What comes in
@@ -252,10 +268,10 @@ class RobotBridge(RemasterNode):
                     self.counts['failed'] += 1
                     self._event('failed', reason, 'warn', solution=solution, reason=reason)
                 case Halted(reason):
+                    self._disk.submit(partial(self._halt_file.write, reason), self._on_written)
                     self._event('halted', reason, 'error')
                     self.status.publish()
                     self.get_logger().error(f'halted: {reason}')
-                    self._disk.submit(partial(self._halt_file.write, reason), self._on_written)
 
     def _publish(self, admitted: Admitted) -> None:
         """Publish what the gate has admitted; nothing else is ever published to a controller."""

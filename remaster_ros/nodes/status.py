@@ -8,12 +8,14 @@ of its joint solutions. Events are identified by the pose's stamp and the soluti
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -21,6 +23,8 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.rivalry import Rivalry
+from remaster_ros.nodes.qos_mismatch import mismatches
+from remaster_ros.storage.bag_metadata import LATCHED_DEPTH
 
 TOPIC = 'remaster/status'
 RELIABLE = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
@@ -28,7 +32,7 @@ JOINT_STATES = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Of subscribers of joint_states: it matches reliable and best-effort publishers alike, and keeps
 what a busy node has not yet taken, seconds of the fastest stream."""
 LATCHED = QoSProfile(
-    depth=10,
+    depth=LATCHED_DEPTH,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
@@ -40,6 +44,8 @@ LEASED = QoSProfile(
 )
 """Of publishers whose commands move the arm: a killed one stays in the graph for some 20 s, but is
 no longer alive for its subscribers 2 s after its end."""
+QOS_EVERY_S = 3.0
+"""How often the graph is looked at for endpoints that do not match, wall time."""
 LEVELS = {
     'ok': DiagnosticStatus.OK,
     'warn': DiagnosticStatus.WARN,
@@ -75,10 +81,19 @@ class Status:
         self._started, self._started_wall = str(time.time_ns()), time.monotonic()
         self._rivalry = Rivalry(self._started)
         self._publisher = node.create_publisher(DiagnosticArray, TOPIC, RELIABLE)
+        # Where the executor has threads, heartbeats go on while a callback plans or writes.
+        group = MutuallyExclusiveCallbackGroup()
+        # What is published last must have been true last.
+        self._order = threading.Lock()
         # A wall timer: status must go on when the simulated clock stands still.
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(0.5, self.publish, clock=self.steady)
-        listen(node, lambda event: None, self._on_summary)
+        self._timer = node.create_timer(0.5, self.publish, callback_group=group, clock=self.steady)
+        self._qos_trouble = ''
+        self._qos_timer = node.create_timer(
+            QOS_EVERY_S, self._look_at_qos, callback_group=group, clock=self.steady
+        )
+        receive = receiver(lambda event: None, self._on_summary)
+        node.create_subscription(DiagnosticArray, TOPIC, receive, RELIABLE, callback_group=group)
 
     @property
     def alone_since(self) -> float | None:
@@ -94,6 +109,9 @@ class Status:
             `time.monotonic`, s.
         """
         return self._rivalry.alone(now)
+
+    def _look_at_qos(self) -> None:
+        self._qos_trouble = mismatches(self._node)
 
     def _on_summary(self, name: str, message: str, values: dict[str, str]) -> None:
         own = self._node.get_fully_qualified_name()
@@ -125,14 +143,18 @@ class Status:
         return sum((info.node_name, info.node_namespace) == own for info in found)
 
     def publish(self) -> None:
-        """Publish the summary now."""
-        level, message, values = self._summary()
-        own = {
-            'node': self._node.get_fully_qualified_name(),
-            'started': self._started,
-            'uptime_s': f'{time.monotonic() - self._started_wall:.3f}',
-        }
-        self._send(self._node.get_name(), level, message, {**values, **own})
+        """Publish the summary now; from any thread."""
+        with self._order:
+            level, message, values = self._summary()
+            if self._qos_trouble and level == 'ok':
+                level, message = 'warn', self._qos_trouble
+            own = {
+                'qos_trouble': self._qos_trouble,
+                'node': self._node.get_fully_qualified_name(),
+                'started': self._started,
+                'uptime_s': f'{time.monotonic() - self._started_wall:.3f}',
+            }
+            self._send(self._node.get_name(), level, message, {**values, **own})
 
     def event(self, event: str, message: str, level: str = 'ok', **values: Any) -> None:
         """Publish an event now."""
@@ -179,3 +201,23 @@ def listen(
 ) -> None:
     """Subscribe `node` to /remaster/status with a `receiver` of these callbacks."""
     node.create_subscription(DiagnosticArray, TOPIC, receiver(on_event, on_summary), RELIABLE)
+
+
+def run_after(run: str, planner: Mapping[str, str]) -> str:
+    """Return the token to hold after a summary of the planner.
+
+    The recorder and the bridge hold it in memory and publish it as `run`: by that a planner which
+    is started again finds whether its run still lives. A pause or a stop ends the run; a planner
+    that has just been started and has not decided yet (``idle``) does not.
+
+    Parameters
+    ----------
+    run
+        The token held so far, '' for none.
+    planner
+        The values of the planner's summary.
+    """
+    state = planner.get('state', '')
+    if state in ('running', 'held'):
+        return planner.get('run', '') or run
+    return run if state in ('idle', '') else ''

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
@@ -57,7 +57,13 @@ def write_apply(result: FitResult, folder: str | os.PathLike[str]) -> list[Path]
             result.session.urdf,
             result.chain,
             np.where(result.identifiable, result.joint_offsets, 0.0),
-            left_out=left_out(result),
+            notes=(
+                *(f'CHECK FIRST: {line}' for line in result.implausible),
+                *(
+                    f'left out, not identifiable: {joint}: {why}'
+                    for joint, why in left_out(result).items()
+                ),
+            ),
         ),
     }
     for name, text in texts.items():
@@ -90,6 +96,8 @@ def remaster_text(result: FitResult) -> str:
             f'Joint zero-offsets of robot {result.chain.name!r}',
             f'(URDF with SHA-256 {urdf_sha256(result.session)})',
             '',
+            *(f'CHECK FIRST: {line}' for line in result.implausible),
+            *(('',) if result.implausible else ()),
             'The true joint angle is the reported one plus the offset. Use ONE of three ways,',
             'never two at once:',
             '',
@@ -117,6 +125,8 @@ def layer_text(result: FitResult) -> str:
         '#   angle to the planner      = reported angle + offset\n'
         "# Shift the joint limits as well: the controller's limits apply to its own angles.\n"
     )  # fmt: skip
+    for line in result.implausible:
+        head += f'# CHECK FIRST: {line}\n'
     missing = left_out(result)
     for joint, why in missing.items():
         head += f'# Left out, not identifiable: {joint}: {" ".join(why.split())}\n'
@@ -145,7 +155,7 @@ def calibrated_urdf(
     urdf: str,
     chain: SerialChain,
     joint_offsets: FloatArray,
-    left_out: Mapping[str, str] | None = None,
+    notes: Sequence[str] = (),
 ) -> str:
     """Return the URDF whose kinematics at reported angles is that of the true ones.
 
@@ -162,8 +172,8 @@ def calibrated_urdf(
         Its joints.
     joint_offsets
         rad, (k,).
-    left_out
-        Joints that are not corrected -> why, for a comment in the file.
+    notes
+        What else a comment in the file says, such as the joints left out.
     """
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
     root = ElementTree.fromstring(urdf, parser)
@@ -189,11 +199,7 @@ def calibrated_urdf(
                 if mimic.get('joint') == name:
                     share = float(mimic.get('multiplier', '1')) * float(offset)
                     mimic.set('offset', repr(float(mimic.get('offset', '0')) + share))
-    notes = ['joint origins and limits hold the calibrated zero-offsets']
-    notes += [
-        f'left out, not identifiable: {joint}: {why}' for joint, why in (left_out or {}).items()
-    ]
-    for text in reversed(notes):
+    for text in (*reversed(notes), 'joint origins and limits hold the calibrated zero-offsets'):
         # Two hyphens would end the comment.
         note = ElementTree.Comment(f' {re.sub("-(?=-)", "- ", text).rstrip("-")} ')
         note.tail = '\n  '

@@ -28,6 +28,25 @@ LATCHED_TOPICS = frozenset(
     {'/remaster/joint_offsets', '/remaster/joint_offsets_std', '/remaster/registration'}
 )
 
+RECORDED = {
+    f'/{name}': f'/remaster/recorded/{name.rpartition("/")[2]}'
+    for name in (
+        'joint_trajectory_controller/joint_trajectory',
+        'remaster/joint_solutions',
+        'remaster/joint_waypoints',
+    )
+}
+"""What moves an arm -> its name in bags. A controller obeys the one and a bridge the other,
+whoever publishes it: a player that takes a bag as it is must not drive an arm."""
+
+
+def live_name(topic: str) -> str:
+    """Return the name that a topic of a bag had when it was recorded."""
+    return _LIVE.get(topic, topic)
+
+
+_LIVE = {recorded: live for live, recorded in RECORDED.items()}
+
 
 class BagMessage(NamedTuple):
     """One recorded message.

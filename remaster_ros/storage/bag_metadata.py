@@ -11,6 +11,8 @@ METADATA_FILE = 'metadata.yaml'
 
 # rosbag2 writes an empty bag's start, and QoS "for ever", as these.
 _NEVER_NS = 2**63 - 1
+LATCHED_DEPTH = 10
+"""How many messages of a latched topic a late joiner gets: as the nodes' publishers have it."""
 _FOREVER = {'sec': 9223372036, 'nsec': 854775807}
 
 
@@ -93,7 +95,8 @@ def _qos(latched: bool) -> list[dict[str, Any]]:
     return [
         {
             'history': 'keep_last',
-            'depth': 1 if latched else 10,
+            # As the publishers offer it: who joins late gets the registration of every sensor.
+            'depth': LATCHED_DEPTH if latched else 10,
             'reliability': 'reliable',
             'durability': 'transient_local' if latched else 'volatile',
             # Copies: YAML would write a shared object as an alias.

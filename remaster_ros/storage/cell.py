@@ -19,7 +19,8 @@ from remaster_ros.core.errors import InputError
 from remaster_ros.core.planning import LineOfSight, PoseRanges
 from remaster_ros.core.transforms import matrix_from_rpy, transform
 from remaster_ros.core.types import FloatArray
-from remaster_ros.core.urdf_geometry import chain_bodies
+from remaster_ros.core.urdf_geometry import MeshReader, chain_bodies
+from remaster_ros.storage.cell_units import unit_problem
 from remaster_ros.storage.files import decode_text, read_limited
 from remaster_ros.storage.meshes import mesh_reader
 from remaster_ros.storage.safe_yaml import YamlError, load_yaml
@@ -136,8 +137,8 @@ class Cell(msgspec.Struct, forbid_unknown_fields=True):
     sensors: dict[str, CellSensor]
     aim_at: str
     marker_std_m: float = 0.5e-3
-    held_joint: str = ''
-    held_values_deg: list[float] = []
+    held_joint: str | None = ''
+    held_values_deg: list[float] | None = []
     poses: CellPoses = msgspec.field(default_factory=CellPoses)
     link_radius_m: float = 0.075
     obstacles: dict[str, CellBox] = {}
@@ -166,7 +167,7 @@ class Cell(msgspec.Struct, forbid_unknown_fields=True):
         if not self.held_joint:
             return None
         index = chain.joint_names.index(self.held_joint)
-        return {index: tuple(np.deg2rad(self.held_values_deg))}
+        return {index: tuple(np.deg2rad(self.held_values_deg or []))}
 
     def acceleration_limits(self, chain: SerialChain) -> FloatArray:
         """Return each joint's acceleration limit, rad/s², (k,)."""
@@ -174,7 +175,11 @@ class Cell(msgspec.Struct, forbid_unknown_fields=True):
         return np.broadcast_to(given, (len(chain),)).copy()
 
     def collision_model(
-        self, chain: SerialChain, unknown_offset_rad: float | None = None
+        self,
+        chain: SerialChain,
+        unknown_offset_rad: float | None = None,
+        *,
+        without_meshes: bool = False,
     ) -> CollisionModel:
         """Return the arm with tool, markers and obstacles, for collision checks.
 
@@ -184,6 +189,9 @@ class Cell(msgspec.Struct, forbid_unknown_fields=True):
             The arm of this cell.
         unknown_offset_rad
             What a joint's zero-offset may still be off by, rad; `unknown_offset_deg` where None.
+        without_meshes
+            Take capsules in place of meshes, which then need not be there: for simulated arms,
+            never for one that moves.
 
         Raises
         ------
@@ -192,7 +200,9 @@ class Cell(msgspec.Struct, forbid_unknown_fields=True):
         """
         folder = Path(self.file).parent
         urdf = folder / self.robot.urdf
-        read_mesh = mesh_reader(urdf, [folder / path for path in self.mesh_path])
+        read_mesh: MeshReader = mesh_reader(urdf, [folder / path for path in self.mesh_path])
+        if without_meshes:
+            read_mesh = _no_mesh
         last = len(chain)
         bodies = chain_bodies(self.urdf_text, chain, read_mesh)
         bodies += [part.body(f'tool {name}', chain) for name, part in self.tool.items()]
@@ -222,6 +232,10 @@ class Cell(msgspec.Struct, forbid_unknown_fields=True):
             for name, sensor in self.sensors.items()
             if name in sensors_R
         ]
+
+
+def _no_mesh(name: str) -> None:
+    """Leave a mesh out."""
 
 
 def config_path(name: str) -> Path:
@@ -261,9 +275,11 @@ def read_cell(path: str | Path) -> Cell:
         raise InputError(f'{path}: {error}') from None
     urdf = path.parent / cell.robot.urdf
     cell.file = str(path)
-    cell.urdf_text = decode_text(
-        read_limited(urdf, URDF_LIMIT, f'robot.urdf in {path} names it'), urdf
+    missing = (
+        f'robot.urdf in {path} is {cell.robot.urdf!r}, which is relative to that file; copy the '
+        'URDF there, or give its absolute path'
     )
+    cell.urdf_text = decode_text(read_limited(urdf.resolve(), URDF_LIMIT, missing), urdf)
     _check(path, cell)
     return cell
 
@@ -271,7 +287,10 @@ def read_cell(path: str | Path) -> Cell:
 def _check(path: Path, cell: Cell) -> None:
     """Refuse names that point nowhere and values that cannot be."""
     _require_finite(path, '', msgspec.to_builtins(cell))
-    chain = cell.chain()
+    try:
+        chain = cell.chain()
+    except InputError as error:
+        raise InputError(f'{path.parent / cell.robot.urdf}: {error}') from None
     names = chain.joint_names
     if cell.held_joint and cell.held_joint not in names:
         raise InputError(f'{path}: held_joint {cell.held_joint!r} is none of {", ".join(names)}')
@@ -289,6 +308,8 @@ def _check(path: Path, cell: Cell) -> None:
         raise InputError(
             f'{path}: aim_at {cell.aim_at!r} is none of the sensors {", ".join(cell.sensors)}'
         )
+    if problem := unit_problem(cell):
+        raise InputError(f'{path}: {problem}')
     if not (cell.marker_std_m > 0 and cell.link_radius_m > 0):
         raise InputError(f'{path}: marker_std_m and link_radius_m must be positive')
     _check_collision(path, cell, chain)

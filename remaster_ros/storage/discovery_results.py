@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import Any, Literal
@@ -78,8 +79,8 @@ def discovery_to_dict(
 
     Beyond the contract it holds for each effect ``size_m`` (RMS at the marker after absorption)
     and ``share`` (of the gain, the effects added in their order), ``metrics`` before and after,
-    ``untestable`` effects with the reason, ``joint_offsets_before``, and with ``--confirm``
-    the ``confirmation``.
+    ``untestable`` effects with the reason, ``joint_offsets_before``, with ``--confirm``
+    the ``confirmation``, and ``rows_searched`` for a session of which the search saw a part.
     """
     fit = fit_to_dict(discovery.fit)
     before, before_std = discovery.offsets_before
@@ -116,6 +117,8 @@ def discovery_to_dict(
         'joint_offsets_after': fit['joint_offsets'],
         'sampler': fit['sampler'],
     }
+    if discovery.thinning is not None:
+        content['rows_searched'] = dataclasses.asdict(discovery.thinning)
     if confirmation is not None:
         content['confirmation'] = {
             'rms_before_m': confirmation.rms_before_m,

@@ -42,8 +42,22 @@ def read_limited(path: Path, limit: int, missing: str) -> bytes:
     return data
 
 
+def refuse_utf16(data: bytes, path: Path) -> None:
+    """Raise an `InputError` for text in UTF-16 (or 32), which Windows programs like to save.
+
+    Of Latin text every second byte is zero there, with or without a byte order mark.
+    """
+    even, odd = data[:64:2], data[1:64:2]
+    marked = data.startswith((b'\xff\xfe', b'\xfe\xff'))
+    latin = len(data) > 3 and sorted((any(even), any(odd))) == [False, True]
+    # A text that a power cut ended has zeros behind it, not between.
+    if marked or (latin and (all(even) or all(odd))):
+        raise InputError(f'{path}: this is UTF-16 text; save the file as UTF-8')
+
+
 def decode_text(data: bytes, path: Path) -> str:
     """Decode UTF-8, with or without a byte order mark; an `InputError` names the line."""
+    refuse_utf16(data, path)
     try:
         return data.decode('utf-8-sig')
     except UnicodeDecodeError as error:

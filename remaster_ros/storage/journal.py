@@ -8,8 +8,8 @@ and the file is refused.
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
+import hashlib
 import json
 import os
 import zlib
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from remaster_ros.core.errors import InputError
-from remaster_ros.storage.files import AppendFile, cannot_write, read_limited
+from remaster_ros.storage.files import AppendFile, cannot_write, read_limited, write_atomically
 
 JOURNAL_LIMIT = 1024**3
 
@@ -76,9 +76,43 @@ class Journal:
             if torn:
                 self._file.truncate(size)
             self._before = self._file.size
+            whole = read_limited(path, JOURNAL_LIMIT, 'it was there a moment ago')[:size]
+            self._sum = self._sum_before = hashlib.sha256(whole)
         except BaseException:
             self._file.close()
             raise
+
+    @property
+    def sha256(self) -> str:
+        """Checksum of all that was written, in hexadecimal."""
+        return self._sum.hexdigest()
+
+    @property
+    def names(self) -> int:
+        """How many names the open file has: 0 after it was removed."""
+        return os.fstat(self._file.descriptor).st_nlink
+
+    def holds(self, data: bytes) -> bool:
+        """Tell whether these bytes are what was written."""
+        return hashlib.sha256(data).hexdigest() == self.sha256
+
+    def restore(self) -> None:
+        """Write every record again, where the file is no longer the one that was opened.
+
+        Raises
+        ------
+        DiskError
+            The disk does not take it.
+        InputError
+            Another process writes the file that is there.
+        """
+        data = b''.join(map(format_record, self.records))
+        write_atomically(self.path, data)
+        self._file.close()
+        self._file = AppendFile(self.path)
+        self._lock()
+        self._before = self._file.size
+        self._sum = self._sum_before = hashlib.sha256(data)
 
     def _lock(self) -> None:
         try:
@@ -98,19 +132,17 @@ class Journal:
         DiskError
             The disk does not take it; the file is as it was before.
         """
-        self._before = self._file.size
-        self._file.append(format_record(record))
+        line = format_record(record)
+        self._before, self._sum_before = self._file.size, self._sum.copy()
+        self._file.append(line)
+        self._sum.update(line)
         self.records.append(record)
 
     def take_back(self) -> None:
         """Cut off the record that was appended last; `InputError` where that is not possible."""
         self._file.truncate(self._before)
+        self._sum = self._sum_before
         self.records.pop()
-
-    def touch(self) -> None:
-        """Renew the file's time of change, as a sign of life; it need not last."""
-        with contextlib.suppress(OSError):
-            os.utime(self._file.descriptor)
 
     def close(self) -> None:
         """Close the file and let others open it; closing again does nothing."""

@@ -66,6 +66,7 @@ class Logbook:
         self._results: dict[tuple[int, int], str] = {}
         self._last_pose: int | None = None
         self._shift_s = 0.0
+        self._told = 0
         self.reopen()
 
     def reopen(self) -> None:
@@ -76,7 +77,7 @@ class Logbook:
             self.closed = 'complete'
             self.notes = [f'{self.folder}: this session is complete; name a new folder to record']
             return
-        self._writer = SessionWriter(self.folder, self._header, resume=True)
+        self._writer, self._told = SessionWriter(self.folder, self._header, resume=True), 0
         self.closed, self.notes = '', []
         self.observations = self._writer.observations
         if self._writer.resumed:
@@ -222,11 +223,31 @@ class Logbook:
         self._shift_s = shift_s
         self.notes.append(f'the clock ran backwards: stamps are shifted by {self._shift_s:.3f} s')
 
-    def close(self, exit_status: ExitStatus) -> None:
-        """Close the session; closing again does nothing. `DiskError` where it remains open."""
+    def check(self) -> None:
+        """Restore what others did to the files; `DiskError` where that is not possible (yet)."""
         if not self.closed and self._writer is not None:
-            self._writer.close(exit_status)
-            self.closed = exit_status
+            self._writer.check()
+
+    def take_restored(self) -> list[str]:
+        """Return what was restored since the last call, a line each."""
+        lines, self._told = self._restored()[self._told :], len(self._restored())
+        return lines
+
+    def _restored(self) -> list[str]:
+        return [] if self._writer is None else self._writer.restored
+
+    @property
+    def beyond_repair(self) -> str:
+        """Why the session cannot be complete any more; '' where it can."""
+        return '' if self._writer is None else self._writer.beyond_repair
+
+    def close(self, exit_status: ExitStatus) -> None:
+        """Close the session; closing again does nothing. `DiskError` where it remains open.
+
+        `closed` is what it was closed as; see `SessionWriter.close`.
+        """
+        if not self.closed and self._writer is not None:
+            self.closed = self._writer.close(exit_status)
 
 
 def is_complete(folder: Path) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from remaster_ros.core.errors import InputError
@@ -55,7 +55,18 @@ def write_manifest(folder: Path, names: Iterable[str]) -> None:
     InputError
         A file cannot be read, or the folder not written to.
     """
-    lines = [f'{sha256_of(folder / name)}  {name}\n' for name in sorted(names)]
+    write_sums(folder, {name: sha256_of(folder / name) for name in names})
+
+
+def write_sums(folder: Path, sums: Mapping[str, str]) -> None:
+    """Write down checksums by name of the file, of what the caller put there.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to.
+    """
+    lines = [f'{checksum}  {name}\n' for name, checksum in sorted(sums.items())]
     write_atomically(folder / MANIFEST, ''.join(lines))
 
 

@@ -11,9 +11,10 @@ from typing import IO
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Chunk
-from mcap.stream_reader import get_chunk_data_stream
 
-CHUNK_LIMIT = 1024**3
+CHUNK_LIMIT = 256 * 1024**2
+"""Bytes of an unpacked chunk: recorders begin a new one after one or a few megabytes, and only a
+single larger message makes a larger one."""
 
 
 class CutOffError(Exception):
@@ -65,19 +66,38 @@ def unchunked(records: Iterator[tuple[int, bytes]]) -> Iterator[tuple[int, bytes
             yield opcode, body
             continue
         chunk = Chunk.read(ReadDataStream(BytesIO(body)))
-        if max(chunk.uncompressed_size, _zstd_size(chunk)) > CHUNK_LIMIT:
-            raise ValueError(f'a chunk says it holds more than {CHUNK_LIMIT} bytes')
-        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+        data = _unpacked(chunk)
         try:
-            yield from frames(BytesIO(stream.read(length)), length, crc=None, solid=length)
+            yield from frames(BytesIO(data), len(data), crc=None, solid=len(data))
         except CutOffError:
             raise ValueError('a record does not fit its chunk') from None
 
 
-def _zstd_size(chunk: Chunk) -> int:
-    """Return the size that a zstd frame announces, which may differ from what the chunk says."""
-    if chunk.compression != 'zstd':
-        return 0
-    import zstandard
+def _unpacked(chunk: Chunk) -> bytes:
+    """Unpack a chunk, and never more of it than it says that it holds.
 
-    return zstandard.frame_content_size(chunk.data)
+    A few megabytes of zeros, packed, are gigabytes; they are refused before they are in memory.
+    """
+    stated = chunk.uncompressed_size
+    if stated > CHUNK_LIMIT:
+        raise ValueError(f'a chunk says it holds more than {CHUNK_LIMIT} bytes')
+    # One byte more than stated tells that there is more.
+    if chunk.compression == 'zstd':
+        import zstandard
+
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
+            data = reader.read(stated + 1)
+    elif chunk.compression == 'lz4':
+        import lz4.frame
+
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=stated + 1)
+    elif chunk.compression == '':
+        data = chunk.data
+    else:
+        raise ValueError(f'a chunk is packed as {chunk.compression!r}, which is not known')
+    if len(data) != stated:
+        more = 'more' if len(data) > stated else 'less'
+        raise ValueError(f'a chunk holds {more} than the {stated} bytes that it states')
+    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+        raise ValueError('the checksum of a chunk does not match')
+    return data

@@ -85,8 +85,9 @@ def read_mesh(path: Path) -> FloatArray:
     try:
         loaded = trimesh.load_scene(BytesIO(content), file_type=kind[1:], skip_materials=True)
         # Instances in their places; COLLADA says how long its unit is.
-        parts: list[Any] = [getattr(part, 'vertices', []) for part in loaded.dump()]
-        vertices = np.concatenate([np.reshape(part, (-1, 3)) for part in parts] or [[]])
+        parts: list[Any] = [getattr(part, 'vertices', ()) for part in loaded.dump()]
+        vertices = np.array([point for part in parts for point in part], dtype=float)
+        vertices = vertices.reshape(-1, 3)
     except Exception as error:
         # Whatever a parser of foreign bytes raises, one line comes out.
         raise InputError(f'{path}: no {kind[1:].upper()} mesh ({_line(error)})') from None

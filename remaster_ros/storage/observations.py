@@ -15,7 +15,7 @@ from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.types import FARTHEST_M, FloatArray, Measurements, Observation
 from remaster_ros.storage.csv_table import Table, split_line
-from remaster_ros.storage.files import decode_text
+from remaster_ros.storage.files import decode_text, refuse_utf16
 from remaster_ros.storage.sequence_rules import (
     SPLITS,
     RowKeys,
@@ -90,6 +90,8 @@ def parse_observations(
     InputError
         One line naming file, line, column and remedy.
     """
+    # Before its zeros are taken for those that a power cut leaves.
+    refuse_utf16(data, path)
     end = _whole_lines(data, most=len(sensors))
     if end < len(data):
         torn = data.count(b'\n', 0, end) + 1
@@ -99,6 +101,7 @@ def parse_observations(
         lines.pop()
     if not lines:
         raise InputError(f'{path}: no header line; the first line names the columns')
+    _refuse_other_separators(lines[0], path)
     names = split_line(lines[0], path, 1)
     columns = Columns(len(chain))
     with_effort = _check_names(names, columns, path)
@@ -113,6 +116,16 @@ def parse_observations(
                 raise InputError(f'{path}, line {row.line}, {problem}')
             rules.accept(row)
     return measurements
+
+
+def _refuse_other_separators(header: str, path: Path) -> None:
+    """Name the separator of a header that has one, but not the comma."""
+    for separator, name in ((';', 'semicolons'), ('\t', 'tabs')):
+        if header.count(separator) > header.count(','):
+            raise InputError(
+                f'{path}, line 1: columns are separated by {name}; save it with commas between '
+                'them, and with points in the numbers'
+            )
 
 
 def _whole_lines(data: bytes, most: int) -> int:

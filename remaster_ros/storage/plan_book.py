@@ -7,25 +7,27 @@ the tour where it was.
 
 from __future__ import annotations
 
-import time
 import uuid
 from collections import Counter, deque
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.collision import CollisionModel
 from remaster_ros.core.errors import DiskError, InputError
 from remaster_ros.core.planning import Plan, PlannedPose
 from remaster_ros.core.tour import REGISTRATION, Stop, Tour
-from remaster_ros.storage.files import make_folder, reason
+from remaster_ros.core.types import FloatArray
+from remaster_ros.storage.files import make_folder
 from remaster_ros.storage.journal import Journal, Record
 from remaster_ros.storage.session_writer import PLAN
 
-ALIVE_S = 1.0
-"""How often a running planner touches the file, s."""
+NO_FREE_PATH = 'no_free_path'
+"""Outcome of a configuration that the arm cannot get to without hitting something."""
 
 
 class PlanBook:
@@ -39,6 +41,10 @@ class PlanBook:
         The session's; the file is made when there is something to remember.
     settings
         What the plan depends on, plain data by name.
+    chain
+        The arm.
+    model
+        What the arm must not hit on its way; handed on to the tour.
 
     Attributes
     ----------
@@ -52,8 +58,8 @@ class PlanBook:
         How many configurations of the collection came to which end.
     state
         What the planner last said it does, '' before.
-    silent_s
-        For how long no planner has been running, s.
+    run
+        The token of the run in which it said so, '' where none was under way.
     lost
         What a crash has cut off, in words; '' where nothing was.
     trouble
@@ -66,24 +72,25 @@ class PlanBook:
         damaged.
     """
 
-    def __init__(self, folder: Path, settings: Mapping[str, Any], chain: SerialChain) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        settings: Mapping[str, Any],
+        chain: SerialChain,
+        model: CollisionModel | None = None,
+    ) -> None:
         self.path = folder / PLAN
-        self._settings, self._chain = dict(settings), chain
+        self._settings, self._chain, self._model = dict(settings), chain, model
         self._journal: Journal | None = None
-        self.id = self.state = self.lost = self.trouble = ''
+        self.id = self.state = self.run = self.lost = self.trouble = ''
         self._unwritten: deque[Record] = deque()
         self.tour: Tour | None = None
         self.stop: Stop | None = None
         self.outcomes: Counter[str] = Counter()
-        self.silent_s = 0.0
-        self._touched = 0.0
         if self.path.exists():
             self._open()
 
     def _open(self) -> Journal:
-        new = not self.path.exists()
-        if not new:
-            self.silent_s = self._age_s()
         self._journal = Journal(self.path)
         self.lost = self._journal.lost
         if not self._journal.records:
@@ -103,12 +110,6 @@ class PlanBook:
                 ) from None
             raise
         return self._journal
-
-    def _age_s(self) -> float:
-        try:
-            return time.time() - self.path.stat().st_mtime
-        except OSError as error:
-            raise InputError(f'{self.path}: cannot be read ({reason(error)})') from None
 
     def _check(self, record: Record) -> None:
         self.id = record['id']
@@ -131,14 +132,30 @@ class PlanBook:
                 plans,
                 in_order=record['in_order'],
                 one_solution=record['one_solution'],
+                model=self._model,
             )
             self.stop = None
         elif kind == 'stop' and self.tour is not None:
-            self.stop = self.tour.go_to(record['split'], record['index'], record['ids'])
+            route = _route(record, len(self._chain))
+            self._take(self.tour.go_to(record['split'], record['index'], *route))
+        elif kind == 'route' and self.stop is not None and self.tour is not None:
+            ids, paths, unreached = _route(record, len(self._chain))
+            pose = self.tour.plans[self.stop.split].poses[self.stop.index]
+            solutions = pose.solutions[list(ids)]
+            self._take(
+                replace(self.stop, solutions=solutions, ids=ids, paths=paths, unreached=unreached)
+            )
         elif kind == 'outcome':
             self._close_solution(record['id'], record['result'])
         elif kind == 'state':
-            self.state = record['state']
+            self.state, self.run = record['state'], record.get('run', '')
+
+    def _take(self, stop: Stop) -> None:
+        """Go to a stop; the solutions that nothing leads to have their outcome with it."""
+        if stop.split != REGISTRATION and stop.unreached:
+            self.outcomes[NO_FREE_PATH] += len(stop.unreached)
+        # Counted once.
+        self.stop = replace(stop, unreached=())
 
     def _close_solution(self, solution: int, result: str) -> None:
         assert self.stop is not None
@@ -174,15 +191,18 @@ class PlanBook:
             }
         )
         # Said before there was a file to keep it in.
-        self._append({'kind': 'state', 'state': self.state})
+        self._append({'kind': 'state', 'state': self.state, 'run': self.run})
         self.tour, self.stop = tour, None
 
     def open_stop(self, stop: Stop) -> None:
         """Remember the next stop, before the arm is sent there."""
-        self._append(
-            {'kind': 'stop', 'split': stop.split, 'index': stop.index, 'ids': list(stop.ids)}
-        )
-        self.stop = stop
+        self._append({'kind': 'stop', 'split': stop.split, 'index': stop.index, **_ways(stop)})
+        self._take(stop)
+
+    def reroute(self, stop: Stop) -> None:
+        """Remember other ways to what is left of the open stop, before the arm is sent there."""
+        self._append({'kind': 'route', **_ways(stop)})
+        self._take(stop)
 
     def outcome(self, solution: int, result: str) -> None:
         """Remember what became of a solution of the open stop; one that has its outcome keeps it.
@@ -192,25 +212,19 @@ class PlanBook:
         solution
             One of the stop's `ids`.
         result
-            ``recorded``, ``partial``, ``rejected`` or ``failed``.
+            ``recorded``, ``partial``, ``rejected`` or ``failed``; what cannot be reached without
+            hitting something is counted as ``no_free_path`` when its stop is opened.
         """
         if self.stop is None or solution not in self.stop.ids:
             return
         self._append({'kind': 'outcome', 'id': solution, 'result': result})
         self._close_solution(solution, result)
 
-    def say_state(self, state: str) -> None:
-        """Remember what the planner does, once there is a plan."""
-        if self._journal is not None and state != self.state:
-            self._append({'kind': 'state', 'state': state})
-        self.state = state
-
-    def stay_alive(self) -> None:
-        """Leave a sign of life, by which a planner started again knows how long nobody ran."""
-        now = time.monotonic()
-        if self._journal is not None and now - self._touched > ALIVE_S:
-            self._touched = now
-            self._journal.touch()
+    def say_state(self, state: str, run: str = '') -> None:
+        """Remember what the planner does, and in which run, once there is a plan."""
+        before, (self.state, self.run) = (self.state, self.run), (state, run)
+        if self._journal is not None and before != (state, run):
+            self._append({'kind': 'state', 'state': state, 'run': run})
 
     def close(self) -> None:
         """Let others go on with the plan."""
@@ -225,7 +239,27 @@ def _content(plan: Plan) -> dict[str, Any]:
             for pose in plan.poses
         ],
         'dropped': dict(plan.dropped),
+        'dropped_solutions': dict(plan.dropped_solutions),
     }
+
+
+def _ways(stop: Stop) -> dict[str, Any]:
+    """Return a stop's solutions and the ways to them, as they are written."""
+    return {
+        'ids': list(stop.ids),
+        'paths': {str(i): way.tolist() for i, way in zip(stop.ids, stop.paths) if len(way)},
+        'unreached': list(stop.unreached),
+    }
+
+
+def _route(
+    record: Record, joints: int
+) -> tuple[tuple[int, ...], tuple[FloatArray, ...], tuple[int, ...]]:
+    """Read what `_ways` wrote: ids, paths, unreached."""
+    written = record.get('paths', {})
+    ids = tuple(record['ids'])
+    paths = tuple(np.array(written.get(str(i), []), float).reshape(-1, joints) for i in ids)
+    return ids, paths, tuple(record.get('unreached', ()))
 
 
 def _plan(content: Mapping[str, Any]) -> Plan:
@@ -233,4 +267,4 @@ def _plan(content: Mapping[str, Any]) -> Plan:
         PlannedPose(np.array(pose['T_R_T'], float), np.array(pose['solutions'], float))
         for pose in content['poses']
     )
-    return Plan(poses, content['dropped'])
+    return Plan(poses, content['dropped'], content.get('dropped_solutions', {}))

@@ -92,6 +92,8 @@ def _finish_session(folder: Path, recovery: Recovery) -> None:
     )
     writer = SessionWriter(folder, session, resume=True, even_complete=True)
     _note(recovery, writer.lost)
+    for restored in writer.restored:
+        _note(recovery, restored)
     try:
         writer.close(header.exit_status or 'aborted')
     finally:

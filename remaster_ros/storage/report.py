@@ -7,12 +7,14 @@ import gzip
 import importlib.resources
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
 
+from remaster_ros.core.noise_check import NoiseCheck
 from remaster_ros.storage.figures import draw_figures
 from remaster_ros.storage.files import make_folder, write_atomically
 from remaster_ros.storage.pages import inlined, page
@@ -99,6 +101,7 @@ def verdict(result: FitResult) -> Verdict:
     gain = before / max(after, 1e-9)
     where = 'on poses it never fitted' if validated else 'on the fitted poses'
     change = f'{before:.3f} mm to {after:.3f} mm {where}'
+    unexplained = [check for check in result.noise_checks if not check.explained]
     if not result.sampler.converged:
         mood = 'bad'
         headline = (
@@ -106,20 +109,27 @@ def verdict(result: FitResult) -> Verdict:
             f'for now the mean position error goes from {change}.'
         )
     elif gain >= NOTICEABLE_GAIN:
-        mood = 'good'
         times = f'{gain:.1f} times' if gain < 10 else f'{gain:.0f} times'
         headline = f'The mean position error falls from {change}: {times} smaller.'
+        mood = 'good'
+        if unexplained:
+            mood = 'caution'
+            headline += f' {_dominated(unexplained)}'
     elif gain > 1 / NOTICEABLE_GAIN:
         mood = 'caution'
         headline = (
             f'The zero-offsets hardly matter here: the mean position error goes from {change}. '
-            'Other errors dominate; "remaster discover" looks for them.'
+            + (_dominated(unexplained) if unexplained else 'That is what noise explains.')
         )
     else:
         mood = 'bad'
         headline = f'The offsets make it worse: the mean position error goes from {change}.'
 
-    points = []
+    points = [_compared(check) for check in unexplained]
+    if result.implausible:
+        mood = 'bad'
+        headline += ' Do not apply the offsets yet: they are larger than a mastering is off by.'
+        points = [*result.implausible, *points]
     if not validated:
         mood = 'caution' if mood == 'good' else mood
         points.append(
@@ -153,6 +163,39 @@ def verdict(result: FitResult) -> Verdict:
             'they are listed below.'
         )
     return Verdict(mood, headline, points)
+
+
+def _dominated(unexplained: Sequence[NoiseCheck]) -> str:
+    """Return why the error after is no success, and what to do."""
+    if all(check.noise_m is None for check in unexplained):
+        return 'Whether noise explains what is left, this session cannot tell.'
+    return (
+        'But noise does not explain what is left: other errors dominate; run "remaster discover".'
+    )
+
+
+def _compared(check: NoiseCheck) -> str:
+    """Return the figures of a sensor whose error noise does not explain."""
+    if check.noise_error_m is None:
+        return (
+            f'{check.sensor}: no reading has a standard deviation, and no pose was seen in two '
+            f'joint solutions, so nothing tells how much of the {1e3 * check.error_m:.3f} mm is '
+            'noise: measure poses in all their joint solutions.'
+        )
+    sources = [
+        f'{1e3 * std:.3f} mm per axis {what}'
+        for std, what in (
+            (check.stated_m, 'stated by the sensor'),
+            (check.within_m, 'within a pose'),
+        )
+        if std is not None
+    ]
+    return (
+        f'{check.sensor}: the error after is {1e3 * check.error_m:.3f} mm; noise '
+        f'({", ".join(sources)}) makes {1e3 * check.noise_error_m:.3f} mm. A sensor or base that '
+        'was moved during the session, a soft joint or a worn gear leave such errors, and the '
+        'offsets take up a part of them.'
+    )
 
 
 def _accuracy_rows(result: FitResult) -> list[dict[str, Any]]:

@@ -8,13 +8,14 @@ and observations.csv does not is added when the session is opened again.
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Literal
 
-from remaster_ros.core.errors import InputError
+from remaster_ros.core.errors import InputError, MovedError
 from remaster_ros.core.types import Observation, Session
 from remaster_ros.storage.files import (
     AppendFile,
@@ -31,7 +32,7 @@ from remaster_ros.storage.manifest import (
     check_file,
     read_manifest,
     remove_manifest,
-    write_manifest,
+    write_sums,
 )
 from remaster_ros.storage.observations import check_row, format_header, format_observation
 from remaster_ros.storage.safe_yaml import dump_yaml, load_yaml
@@ -44,6 +45,7 @@ from remaster_ros.storage.session import (
     URDF_LIMIT,
     read_chain,
 )
+from remaster_ros.storage.session_guard import SessionGuard, set_aside
 from remaster_ros.storage.session_yaml import YAML_LIMIT, parse_header, write_header
 
 JOURNAL = 'journal.jsonl'
@@ -52,6 +54,10 @@ PLAN = 'plan.jsonl'
 ExitStatus = Literal['complete', 'stopped', 'aborted']
 
 _COMPARED = ('robot', 'markers', 'sensors', 'settle_s', 'marker_std_m', 'base_prior')
+
+
+class ChangedError(InputError):
+    """observations.csv is not what the journal has, and no crash made it so."""
 
 
 class SessionWriter:
@@ -85,6 +91,11 @@ class SessionWriter:
         The next free numbers.
     last_stamp_s
         Time of the last observation, s; None before the first.
+    restored
+        What `check` found changed by others and restored, a line each.
+    beyond_repair
+        What others destroyed and the journal has not; '' where nothing is. Such a session is not
+        closed as complete.
 
     Raises
     ------
@@ -118,16 +129,33 @@ class SessionWriter:
         else:
             self._begin(header.urdf)
         self._closed = False
+        self._closed_as: ExitStatus = 'aborted'
+        self.restored: list[str] = []
+        self.beyond_repair = ''
+        self._urdf = header.urdf.encode()
         self._journal = Journal(self.folder / JOURNAL)
+        holds = {
+            HEADER: lambda data: data == self._text.encode(),
+            URDF: lambda data: data == self._urdf,
+            ROWS: lambda data: data == self._wanted_rows(),
+            JOURNAL: self._journal.holds,
+        }
         try:
-            self._rows = AppendFile(self._rows_path)
+            self._guard = SessionGuard(self.folder, holds)
         except InputError:
             self._journal.close()
             raise
         try:
+            self._rows = AppendFile(self._rows_path)
+        except InputError:
+            self._journal.close()
+            self._guard.close()
+            raise
+        try:
             if self.resumed:
                 self._reopen(even_complete)
-            self._restore()
+            self._restore(even_complete)
+            self._guard.note_all()
         except BaseException:
             self.release()
             raise
@@ -201,11 +229,22 @@ class SessionWriter:
     def _read_rows(self) -> bytes:
         return read_limited(self._rows_path, OBSERVATIONS_LIMIT, f'a session folder holds {ROWS}')
 
-    def _restore(self) -> None:
+    def _wanted_rows(self) -> bytes:
+        """Return what observations.csv must be: the rows of the journal, all acknowledged."""
+        rows = (row for record in self.records for row in record.get('rows', ()))
+        return ''.join((self._header_line, *(f'{row}\n' for row in rows))).encode()
+
+    def _restore(self, even_changed: bool) -> None:
         """Bring observations.csv up to the journal, and learn the numbers to go on with."""
         self.lost = self._journal.lost
         rows = [row for record in self.records for row in record.get('rows', ())]
-        missing = self._missing(rows)
+        try:
+            missing = self._missing(rows)
+        except ChangedError:
+            if not even_changed:
+                raise
+            self._note_restored(ROWS, 'was changed', self._restore_rows())
+            missing = b''
         if missing:
             self._rows.append(missing)
         self._rules = SequenceRules()
@@ -229,9 +268,10 @@ class SessionWriter:
         # Only the last piece can be torn; it never reaches beyond what was being written.
         if start < torn_from or len(data) > len(wanted):
             line = data.count(b'\n', 0, start) + 1
-            raise InputError(
+            raise ChangedError(
                 f'{self._rows_path}, line {line}: not as {JOURNAL} has it; the session cannot be '
-                'resumed from a file that was changed: undo that, or name a new folder'
+                'resumed from a file that was changed: undo that, let `remaster recover` restore '
+                'it, or name a new folder'
             )
         self._rows.truncate(start)
         return wanted[start:]
@@ -259,11 +299,13 @@ class SessionWriter:
         """
         if self._closed:
             raise InputError(f'{self.folder}: the session is closed; start a new one')
+        self.check()
         rows = [format_observation(observation).rstrip('\n') for observation in observations]
         keys = self._checked(rows)
         if rows:
             record = {**record, 'rows': rows}
         self._journal.append(record)
+        self._guard.note(JOURNAL)
         if not rows:
             return
         try:
@@ -271,12 +313,77 @@ class SessionWriter:
         except InputError:
             try:
                 self._journal.take_back()
+                self._guard.note(JOURNAL)
             except InputError:
                 # It is ahead now: only opening the session again brings the two together.
                 self.release()
             raise
+        self._guard.note(ROWS)
         for key in keys:
             self._accept(key)
+
+    def check(self, *, content: bool = False) -> None:
+        """Notice what others did to the files, and restore them; `restored` tells what.
+
+        A file that was replaced, removed or changed is written again from what is in memory: all
+        that was acknowledged. What is found in its place is renamed to ``NAME.changed``. A folder
+        that was removed is made again, though the bag and the plan in it are lost.
+
+        Parameters
+        ----------
+        content
+            Compare every byte; else files of the same size and time of change pass.
+
+        Raises
+        ------
+        MovedError, DiskError
+            The folder was renamed or replaced; or the disk does not take what is to be restored.
+            Nothing may be recorded until it is as before: try again.
+        """
+        if self._closed:
+            return
+        if not self._guard.is_in_place():
+            self._make_folder_again()
+        for name, what in self._guard.differing(content=content).items():
+            if name == ROWS:
+                aside = self._restore_rows()
+            else:
+                aside = set_aside(self.folder / name)
+                if name == JOURNAL:
+                    self._journal.restore()
+                else:
+                    data = self._text if name == HEADER else self._urdf
+                    write_atomically(self.folder / name, data)
+            self._guard.note(name)
+            self._note_restored(name, what, aside)
+            self._journal.append({'kind': 'restored', 'file': name, 'what': what, 'aside': aside})
+            self._guard.note(JOURNAL)
+
+    def _restore_rows(self) -> str:
+        """Write observations.csv again; return the name of what was found there."""
+        aside = set_aside(self._rows_path)
+        write_atomically(self._rows_path, self._wanted_rows())
+        self._rows.close()
+        self._rows = AppendFile(self._rows_path)
+        return aside
+
+    def _note_restored(self, name: str, what: str, aside: str) -> None:
+        kept = f'; what was found there is {aside}' if aside else ''
+        self.restored.append(
+            f'{self.folder / name}: {what} while the session was written; it was restored with '
+            f'all that was acknowledged{kept}'
+        )
+
+    def _make_folder_again(self) -> None:
+        """Make the folder again if it was removed; `MovedError` if it lives on elsewhere."""
+        if self._journal.names:
+            raise MovedError(
+                f'{self.folder}: the session folder was renamed, replaced or unmounted while the '
+                'session is written; put it back under its name, and the run goes on'
+            )
+        make_folder(self.folder)
+        self._guard.take_place()
+        self.beyond_repair = 'the folder was removed, and with it the bag and the plan'
 
     def _checked(self, rows: Sequence[str]) -> list[RowKeys]:
         """Hold the rows of one record to what the reader will demand of them."""
@@ -299,10 +406,17 @@ class SessionWriter:
         self.configurations = max(self.configurations, key.configuration + 1)
         self.last_stamp_s = key.stamp_s
 
-    def close(self, exit_status: ExitStatus = 'complete') -> None:
+    def close(self, exit_status: ExitStatus = 'complete') -> ExitStatus:
         """Say in session.yaml how the session ended, and write the checksums of its files.
 
-        Closing again does nothing.
+        Before that every byte of them is compared with what was acknowledged (`check`), and the
+        checksums are of that. Closing again does nothing.
+
+        Returns
+        -------
+        str
+            What it was closed as: ``aborted`` instead of ``complete`` where something is
+            `beyond_repair`.
 
         Raises
         ------
@@ -311,17 +425,33 @@ class SessionWriter:
             remains readable, as aborted or without checksums.
         """
         if self._closed:
-            return
-        write_atomically(self.folder / HEADER, with_exit_status(self._text, exit_status))
-        write_manifest(self.folder, (HEADER, URDF, ROWS, JOURNAL))
+            return self._closed_as
+        self.check(content=True)
+        if self.beyond_repair and exit_status == 'complete':
+            exit_status = 'aborted'
+        self._text = with_exit_status(self._text, exit_status)
+        write_atomically(self.folder / HEADER, self._text)
+        self._guard.note(HEADER)
+        sums = {
+            name: hashlib.sha256(data).hexdigest()
+            for name, data in (
+                (HEADER, self._text.encode()),
+                (URDF, self._urdf),
+                (ROWS, self._wanted_rows()),
+            )
+        }
+        write_sums(self.folder, {**sums, JOURNAL: self._journal.sha256})
+        self._closed_as = exit_status
         # Behind the checksums: nobody else may write as long as they are not there.
         self.release()
+        return exit_status
 
     def release(self) -> None:
         """Let others go on with the session as it is on the disk, closed or not."""
         self._closed = True
         self._rows.close()
         self._journal.close()
+        self._guard.close()
 
     def __enter__(self) -> SessionWriter:
         return self

@@ -19,6 +19,8 @@ from remaster_ros.storage.safe_yaml import YamlError, dump_yaml, load_yaml
 
 FORMAT = 'remaster-session/1'
 YAML_LIMIT = 256 * 1024
+LARGEST_MARKER_STD_M = 0.4
+"""A session may say that the nominal places of its markers tell nothing, m."""
 
 log = logging.getLogger('remaster_ros')
 
@@ -176,6 +178,11 @@ def _problem(header: SessionHeader) -> str:
                 f'sensors.{sensor}.marker: {entry.marker!r} is not among the markers '
                 f'({", ".join(header.markers)}); correct the name'
             )
+    if header.marker_std_m > LARGEST_MARKER_STD_M:
+        return (
+            f'marker_std_m: {header.marker_std_m:g} m is no marker on a tool; if millimetres were '
+            f'meant, write {header.marker_std_m:g}e-3; 0.3 says that nothing is known'
+        )
     numbers = {'settle_s': header.settle_s, 'marker_std_m': header.marker_std_m}
     for sensor, prior in header.base_prior.items():
         where = f'base_prior.{sensor}'

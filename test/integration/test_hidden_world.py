@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
+pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
+
 from hidden_arm import PinocchioArm
 from hidden_oracle import Oracle
 from hidden_tours import robot, visits, world

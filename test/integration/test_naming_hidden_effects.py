@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
+pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
+
 from hidden_judge import judge
 from hidden_sessions import NOISES, Recipe, another_session, held_out_noise_m, hidden_session
 

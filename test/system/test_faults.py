@@ -98,6 +98,14 @@ def test_one_fault_after_the_other_and_the_run_completes(start, client, tmp_path
     assert rows.read_text() == before
     assert call(client, '/remaster/collect').success
 
+    def halted_until_a_person_clears_it():
+        inject(world, {})
+        listener.stands()
+        assert call(client, '/remaster/collect').success is False
+        assert call(client, '/remaster/clear_halt').success
+        listener.stands()
+        assert call(client, '/remaster/collect').success
+
     held = [
         ({'robot': {'nan': 1}}, 'robot_bridge', 'joint_states are not finite'),
         ({'robot': {'renamed': 1}}, 'robot_bridge', 'joint_states lacks joint_1'),
@@ -110,20 +118,21 @@ def test_one_fault_after_the_other_and_the_run_completes(start, client, tmp_path
         inject(world, faults)
         listener.says(node, reason)
         listener.stands()
-        inject(world, {})
+        if 'robot' in faults:
+            halted_until_a_person_clears_it()
+        else:
+            inject(world, {})
 
     listener.moves()
     inject(world, {'robot': {'estop': 1}})
     # On its way, before it had begun, or between the two: halted in each case.
-    reasons = 'the robot ', 'configurations not reached'
+    reasons = 'the robot ', 'arrived elsewhere'
     listener.until(
         lambda: any(text in listener.summaries.get('pose_planner', '') for text in reasons),
         90,
         'a halt',
     )
-    inject(world, {})
-    listener.stands()
-    assert call(client, '/remaster/collect').success
+    halted_until_a_person_clears_it()
 
     listener.moves()
     inject(world, {'mocap': {'swapped': 0.2}})

@@ -126,3 +126,19 @@ def test_a_node_that_ends_while_callbacks_are_queued_says_nothing(ros_environmen
         check=False,
     )
     assert (done.returncode, done.stderr) == (0, '')
+
+
+def test_a_link_where_the_fakes_meet(start, ros_environment, tmp_path, monkeypatch):
+    """In a temporary directory that is open to all, another user may have put it there."""
+    import os
+
+    victim = tmp_path / 'home'
+    victim.mkdir()
+    name = f'remaster_world_{os.getuid()}_{ros_environment["ROS_DOMAIN_ID"]}'
+    (tmp_path / name).symlink_to(victim)
+    monkeypatch.setitem(ros_environment, 'TMPDIR', str(tmp_path))
+    assert 'is a link, which is not followed' in refuse(start, 'fake_robot')
+    assert not list(victim.iterdir())
+    (tmp_path / name).unlink()
+    (tmp_path / name).mkdir(mode=0o755)
+    assert 'open to other users' in refuse(start, 'fake_optitrack')

@@ -1,183 +1,300 @@
-"""The bridge as the only thing between a plan and a real arm: limits, heartbeat, order."""
+"""The bridge as a process between a plan and an arm that obeys everything: what it commands."""
 
+import json
 import time
 
 import numpy as np
 import pytest
-from conftest import wait_until
+
+pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+pytest.importorskip('pinocchio', reason='the judge needs pinocchio (pip install .[test])')
+
+from hostile_bench import Bench
+from hostile_lines import EMERGENCY
+from hostile_process import environment
+from hostile_scene import HOME
+from simple_cells import write_cell
 
 from remaster_ros.storage.cell import read_cell
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(150)]
 
 CHAIN = read_cell('demo').chain()
-HOME = np.array([0.0, 0.3, 0.0, 1.0, 0.0, 0.5, 0.0])
-
-
-class Surroundings:
-    """Stands in for planner, recorder and a robot that is wherever it was last told to be."""
-
-    def __init__(self, client):
-        from diagnostic_msgs.msg import DiagnosticArray
-        from sensor_msgs.msg import JointState
-        from trajectory_msgs.msg import JointTrajectory
-
-        from remaster_ros.nodes.status import RELIABLE, TOPIC, receiver
-
-        self.client = client
-        self.q, self.rng = HOME.copy(), np.random.default_rng(1)
-        self.commands, self.events, self.settled = [], [], []
-        self.talking = {'pose_planner', 'recorder'}
-        self.states = client.create_publisher(JointState, '/joint_states', RELIABLE)
-        self.status = client.create_publisher(DiagnosticArray, TOPIC, RELIABLE)
-        self.solutions = client.create_publisher(
-            JointTrajectory, '/remaster/joint_solutions', RELIABLE
-        )
-        self.listen()
-        client.create_subscription(JointState, '/remaster/settled', self.settled.append, RELIABLE)
-        self.summaries = {}
-        client.create_subscription(
-            DiagnosticArray, TOPIC, receiver(self.events.append, self._summary), RELIABLE
-        )
-        self._spoken = 0.0
-
-    def _summary(self, node, message, values):
-        self.summaries[node] = message
-
-    def listen(self):
-        """Be a controller."""
-        from trajectory_msgs.msg import JointTrajectory
-
-        from remaster_ros.nodes.status import RELIABLE
-
-        topic = '/joint_trajectory_controller/joint_trajectory'
-        self.controller = self.client.create_subscription(
-            JointTrajectory, topic, self._obey, RELIABLE
-        )
-
-    def _obey(self, message):
-        columns = [list(message.joint_names).index(name) for name in CHAIN.joint_names]
-        target = np.array(message.points[-1].positions)[columns]
-        # The probe before the first move goes a micrometre.
-        if np.max(np.abs(target - self.q)) > 1e-4:
-            self.commands.append(message)
-            self.q = target
-
-    def say(self, name, **values):
-        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-
-        pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        self.status.publish(DiagnosticArray(status=[DiagnosticStatus(name=name, values=pairs)]))
-
-    def live(self):
-        """One turn: joint states in reverse order, heartbeats of those that still talk."""
-        from sensor_msgs.msg import JointState
-
-        q = self.q + self.rng.normal(0.0, 1e-6, 7)
-        message = JointState(name=list(CHAIN.joint_names)[::-1], position=q[::-1].tolist())
-        message.header.stamp = self.client.get_clock().now().to_msg()
-        self.states.publish(message)
-        if time.monotonic() - self._spoken > 0.3:
-            self._spoken = time.monotonic()
-            for name in self.talking:
-                self.say(name, state='running')
-        self.client.spin_some()
-
-    def send(self, solutions):
-        from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
-
-        message = JointTrajectory(joint_names=list(CHAIN.joint_names))
-        message.header.stamp = self.client.get_clock().now().to_msg()
-        message.points = [JointTrajectoryPoint(positions=list(map(float, q))) for q in solutions]
-        self.solutions.publish(message)
-        return f'{message.header.stamp.sec}.{message.header.stamp.nanosec:09d}'
-
-    def until(self, condition, timeout_s, what):
-        def turn():
-            self.live()
-            return condition()
-
-        wait_until(turn, timeout_s, what)
+FAST = {'settle_s': 0.5, 'heartbeat_s': 1.0, 'reaction_s': 1.0, 'cartesian_speed_limit_m_s': 0.5}
 
 
 @pytest.fixture
-def around(start, client):
-    start(
-        'remaster_ros.nodes.robot_bridge',
-        '--ros-args', '-p', 'settle_s:=0.5', '-p', 'heartbeat_s:=1.0', '-p', 'speed_share:=1.0',
-    )  # fmt: skip
-    surroundings = Surroundings(client)
-    surroundings.until(
-        lambda: (
-            surroundings.solutions.get_subscription_count() == 1
-            and surroundings.states.get_subscription_count() == 1
-        ),
-        30,
-        'the bridge',
-    )
-    for _ in range(50):
-        surroundings.live()
-    surroundings.commands.clear()
-    return surroundings
+def bridge(tmp_path, ros_environment):
+    """Return a function that starts a bridge with these parameters in its surroundings."""
+    benches = []
+
+    def begin(home=None, running=True, start=True, **parameters):
+        domain = int(ros_environment['ROS_DOMAIN_ID'])
+        bench = Bench(
+            environment(domain, tmp_path / 'ros'),
+            CHAIN.joint_names,
+            HOME if home is None else home,
+            np.random.default_rng(1),
+            {'cell': 'demo', 'speed_share': 1.0, **FAST, **parameters},
+            tmp_path / 'bridge.log',
+        )
+        benches.append(bench)
+        if start:
+            bench.start()
+        assert bench.until(lambda: bench.seen.summaries, 30), bench.log.read_text()
+        if running:
+            bench.plan_state('running')
+        return bench
+
+    yield begin
+    for bench in benches:
+        bench.close()
 
 
-def test_nothing_outside_the_limits_is_ever_commanded(around):
+def moves(bench, since=0.0):
+    """The commands of more than the micrometre of the probe."""
+    return [c for c in bench.commands_since(since) if np.max(np.abs(c.q - c.start_q)) > 1e-4]
+
+
+def failures(bench):
+    return [(values['solution'], values['reason'], values['stamp'])
+            for _, event, _, values in bench.seen.events if event == 'failed']  # fmt: skip
+
+
+def wait(bench, condition, timeout_s=30):
+    assert bench.until(condition, timeout_s), bench.log.read_text()[-2000:]
+
+
+def settle(bench, seconds):
+    end = time.monotonic() + seconds
+    bench.until(lambda: time.monotonic() > end, seconds + 1)
+
+
+def test_nothing_outside_the_limits_is_ever_commanded(bridge):
     """Outside by 0.1 degree, far outside, not a number: refused by name; the good one is not."""
+    bench = bridge()
     outside, far, nothing = HOME.copy(), HOME.copy(), HOME.copy()
     outside[1] = CHAIN.upper[1] + np.deg2rad(0.1)
     far[6] = -20.0
     nothing[3] = np.nan
-    good = HOME + 0.2
-    stamp = around.send([outside, far, nothing, good])
-    around.until(lambda: around.settled, 30, 'the good solution')
-    refused = [e for e in around.events if e.event == 'failed']
-    assert [e.values['solution'] for e in refused] == ['0', '1', '2']
-    for event, joint in zip(refused, ('joint_2', 'joint_7', 'joint_4')):
-        assert event.values['reason'].startswith(joint)
-        assert event.values['stamp'] == stamp
-    assert len(around.commands) == 1
-    points = np.array([point.positions for point in around.commands[0].points])
-    assert np.all((points >= CHAIN.lower) & (points <= CHAIN.upper))
-    np.testing.assert_allclose(points[-1], good)
-    assert list(around.commands[0].points[-1].velocities) == [0.0] * 7
-    np.testing.assert_allclose(around.settled[0].position, good, atol=1e-5)
+    good = HOME + 0.1
+    stamp = bench.send([outside, far, nothing, good])
+    wait(bench, lambda: bench.seen.settled)
+    assert [solution for solution, *_ in failures(bench)] == ['0', '1', '2']
+    for (_, reason, named), joint in zip(failures(bench), ('joint_2', 'joint_7', 'joint_4')):
+        assert reason.startswith(joint)
+        assert named == stamp
+    (command,) = moves(bench)
+    assert np.all((command.q >= CHAIN.lower) & (command.q <= CHAIN.upper))
+    np.testing.assert_allclose(command.q[-1], good)
+    assert np.all(command.v[-1] == 0.0)
+    np.testing.assert_allclose(bench.seen.settled[0][1], good, atol=1e-3)
 
 
-def test_one_configuration_at_a_time_and_only_after_the_recorder_has_spoken(around):
+def test_one_configuration_at_a_time_and_only_after_the_answer_for_this_pose(bridge):
+    bench = bridge()
+    bench.answers = False
     first, second = HOME + 0.1, HOME - 0.1
-    stamp = around.send([first, second])
-    around.until(lambda: around.settled, 30, 'the first solution')
-    waited = time.monotonic()
-    around.until(lambda: time.monotonic() > waited + 1.5, 10, 'time')
-    assert len(around.commands) == 1, 'it went on without the recorder'
-    around.say('recorder: configuration', stamp=stamp, solution=0, result='recorded')
-    around.until(lambda: len(around.settled) == 2, 30, 'the second solution')
-    np.testing.assert_allclose(around.settled[1].position, second, atol=1e-5)
+    stamp = bench.send([first, second])
+    wait(bench, lambda: bench.seen.settled)
+
+    def answer(named, solution):
+        bench._say('recorder: configuration', stamp=named, solution=solution, result='recorded')
+
+    answer('1.000000000', '0')
+    answer(stamp, '1')
+    answer(stamp, 'garbage')
+    settle(bench, 1.5)
+    assert len(moves(bench)) == 1, 'it went on without the answer'
+    answer(stamp, '0')
+    wait(bench, lambda: len(bench.seen.settled) == 2)
+    np.testing.assert_allclose(bench.seen.settled[1][1], second, atol=1e-3)
+
+
+def test_solutions_are_taken_by_the_names_of_the_joints(bridge):
+    """The planner's message has the joints in another order: another one must move."""
+    bench = bridge()
+    target = HOME + np.array([0.1, 0.05, -0.1, 0.02, 0.15, -0.05, 0.3])
+    bench.names = bench.names[::-1]
+    bench.send([target[::-1]])
+    bench.names = bench.names[::-1]
+    wait(bench, lambda: bench.seen.settled)
+    np.testing.assert_allclose(moves(bench)[0].q[-1], target, atol=1e-9)
 
 
 @pytest.mark.parametrize('silent', ['pose_planner', 'recorder'])
-def test_silence_holds_the_arm_and_speech_lets_it_go_on(around, silent):
-    around.talking.discard(silent)
-    quiet = time.monotonic()
-    around.until(lambda: time.monotonic() > quiet + 1.5, 10, 'time')
-    around.commands.clear()
-    around.send([HOME + 0.1])
-    asked = time.monotonic()
-    around.until(lambda: time.monotonic() > asked + 1.0, 10, 'time')
-    assert not around.commands
-    around.talking.add(silent)
-    around.until(lambda: around.settled, 30, 'the solution, once everyone is heard')
+def test_silence_holds_the_arm_and_it_goes_on_by_itself(bridge, silent):
+    bench = bridge()
+    bench.silent.add(silent)
+    settle(bench, 1.6)
+    bench.send([HOME + 0.1])
+    settle(bench, 1.0)
+    assert not moves(bench)
+    bench.silent.clear()
+    wait(bench, lambda: bench.seen.settled)
 
 
-def test_nothing_is_commanded_before_a_controller_listens(around):
-    """As after a restart of either: a command that nobody hears would count as one dropped."""
-    around.client.destroy_subscription(around.controller)
-    silent = 'no controller listens to'
-    around.until(lambda: silent in around.summaries.get('robot_bridge', ''), 30, 'the reason')
-    around.send([HOME + 0.1])
-    asked = time.monotonic()
-    around.until(lambda: time.monotonic() > asked + 1.0, 10, 'time')
-    assert not [event for event in around.events if event.event == 'commanded']
-    around.listen()
-    around.until(lambda: around.settled, 30, 'the solution')
-    assert len(around.commands) == 1
+@pytest.mark.parametrize(('sign', 'allowed'), [(1.0, False), (-1.0, True)])
+def test_offsets_in_use_shift_the_limits(bridge, tmp_path, sign, allowed):
+    """True angle = reported + offset: with +2 degrees at joint 2 the last two degrees are out."""
+    path = tmp_path / 'fit.json'
+    path.write_text(json.dumps(fit_with({'joint_2': sign * 2.0})))
+    bench = bridge(offsets=str(path), limit_margin_deg=0.0)
+    q = HOME.copy()
+    q[1] = CHAIN.upper[1] - np.deg2rad(1.0)
+    bench.send([q])
+    wait(bench, lambda: failures(bench) or moves(bench))
+    refused = any('outside its limits' in reason for _, reason, _ in failures(bench))
+    assert refused != allowed
+
+
+def fit_with(offsets_deg):
+    joints = [
+        {
+            'joint': name,
+            'mean_deg': offsets_deg.get(name, 0.0),
+            'std_deg': 0.01,
+            'interval95_deg': [-0.02, 0.02],
+            'identifiable': True,
+            'why': '',
+        }
+        for name in CHAIN.joint_names
+    ]
+    empty = {'gauge': [], 'registration': {}, 'markers': {}, 'noise': {}, 'left_out': []}
+    sampler = {'name': 'x', 'chains': 1, 'draws': 1}
+    sampler |= dict.fromkeys(('r_hat_max', 'ess_min', 'seconds'))
+    accuracy = {'optimization': None, 'validation': None}
+    return {
+        'format': 'remaster-fit/1',
+        'joint_offsets': joints,
+        'sampler': sampler,
+        'accuracy': accuracy,
+        **empty,
+    }
+
+
+def test_a_halt_survives_a_restart_and_only_a_person_ends_it(bridge):
+    """An emergency stop in motion; a restart, a new pose, a planner that runs: no motion."""
+    bench = bridge()
+    bench.send([HOME + np.array([0.9, 0, 0, 0, 0, 0, 0])])
+    wait(bench, lambda: bench.arm.speed() > 0.1)
+    bench.arm.stop_by_brakes(time.monotonic())
+    wait(bench, bench.seen.halted)
+    files = bench.log.parent / 'ros' / 'remaster_ros'
+    wait(bench, lambda: list(files.glob('halt_*')))
+    bench.arm.release(time.monotonic())
+    after = time.monotonic()
+    bench.kill()
+    bench.start()
+    wait(bench, lambda: bench.seen.halted(after))
+    assert 'before this bridge was started' in bench.seen.halted(after)
+    bench.plan_state('paused')
+    bench.plan_state('running')
+    bench.send([HOME + 0.1])
+    settle(bench, 2.0)
+    assert not bench.commands_since(after)
+    assert bench.clear_halt()
+    bench.send([HOME + 0.1])
+    settle(bench, 1.5)
+    assert not bench.commands_since(after), 'it moved before /remaster/collect'
+    bench.plan_state('paused')
+    settle(bench, 0.5)
+    bench.plan_state('running')
+    wait(bench, lambda: bench.seen.settled)
+    assert not list(files.glob('halt_*'))
+    assert bench.clear_halt() is False, 'there was nothing to clear'
+
+
+def test_an_emergency_stop_topic_that_is_silent_means_no_motion(bridge):
+    bench = bridge(emergency_stop_topic=EMERGENCY)
+    bench.send([HOME + 0.1])
+    wait(bench, lambda: 'is silent' in bench.seen.summaries[-1][1])
+    settle(bench, 1.5)
+    assert not bench.commands_since(0.0)
+    bench.show_emergency(False)
+    wait(bench, lambda: bench.seen.settled)
+    bench.show_emergency(True)
+    wait(bench, bench.seen.halted)
+    assert bench.clear_halt() is False
+    bench.show_emergency(False)
+    settle(bench, 0.5)
+    assert bench.clear_halt() is True
+
+
+def test_an_arm_in_a_margin_leaves_slowly_and_only_after_a_person_said_so(bridge, tmp_path):
+    """A box that nearly touches the tool where the arm stands."""
+    tool = CHAIN.forward(HOME)[:3, 3]
+    obstacle = {'center_m': (tool - np.array([0.0, 0.0, 0.3])).tolist(), 'size_m': [0.2, 0.2, 0.1]}
+    cell = write_cell(tmp_path / 'cell.yaml', obstacles={'box': obstacle})
+    bench = bridge(cell=cell)
+    # On which side the box lies decides which of the two can be reached.
+    bench.send([HOME + np.array([0, turn, 0, 0, 0, 0, 0]) for turn in (-0.5, 0.5)])
+    wait(bench, bench.seen.halted)
+    reason = bench.seen.halted()
+    assert 'stands where it must not' in reason
+    assert 'clear_halt' in reason
+    assert not bench.commands_since(0.0)
+    assert bench.clear_halt()
+    cleared = time.monotonic()
+    bench.plan_state('paused')
+    settle(bench, 0.5)
+    bench.plan_state('running')
+    wait(bench, lambda: bench.commands_since(cleared))
+    way_out = bench.commands_since(cleared)[0]
+    _, speeds, _ = way_out.spline().sample()
+    assert np.all(np.abs(speeds) <= 0.1 * CHAIN.velocity_limits + 1e-9)
+    wait(bench, lambda: bench.seen.settled, 60)
+    assert not bench.seen.halted()
+
+
+def test_a_stop_leaves_within_50_ms_of_its_request(bridge):
+    """Beside the search for a path that takes seconds: another pose is asked for meanwhile."""
+    bench = bridge(speed_share=0.3)
+    late = []
+    for sign in (1, -1, 1, -1, 1, -1):
+        bench.send([HOME + np.array([sign * 0.9, 0, 0, 0, 0, 0, 0])])
+        wait(bench, lambda: bench.arm.speed() > 0.15)
+        asked = bench.plan_state('paused')
+        assert bench.until(lambda t=asked: bench.commands_since(t), 5)
+        late.append(bench.commands_since(asked)[0].arrival_s - asked)
+        wait(bench, lambda: bench.arm.speed() < 1e-3)
+        bench.plan_state('running')
+    print(f'from request to command: {np.round(1e3 * np.array(late), 1)} ms')
+    # A busy machine may keep a single one waiting.
+    assert np.median(late) < 0.05
+
+
+def test_a_speed_that_is_changed_holds_at_once(bridge):
+    """By the parameter service, as `ros2 param set` does: slower from the same move on."""
+    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+    from rcl_interfaces.srv import SetParameters
+
+    bench = bridge(speed_share=0.3)
+    client = bench.node.create_client(SetParameters, '/robot_bridge/set_parameters')
+    assert client.wait_for_service(10)
+
+    def set_to(name, value):
+        kind = ParameterType.PARAMETER_DOUBLE
+        wanted = Parameter(name=name, value=ParameterValue(type=kind, double_value=value))
+        future = client.call_async(SetParameters.Request(parameters=[wanted]))
+        wait(bench, future.done)
+        return future.result().results[0]
+
+    target = HOME + np.array([0.9, 0, 0, 0, 0, 0, 0])
+    bench.send([target])
+    wait(bench, lambda: bench.arm.speed() > 0.2)
+    refused = set_to('speed_share', 5.0)
+    assert not refused.successful
+    assert 'speed_share' in refused.reason
+    refused = set_to('settle_s', 1.0)
+    assert not refused.successful
+    changed = time.monotonic()
+    assert set_to('speed_share', 0.05).successful
+    wait(bench, lambda: bench.arm.speed() < 1e-3)
+    stopped = time.monotonic()
+    wait(bench, lambda: moves(bench, stopped))
+    _, speeds, _ = moves(bench, stopped)[0].spline().sample()
+    assert np.all(np.abs(speeds) <= 0.05 * CHAIN.velocity_limits * 1.001)
+    assert bench.arm.fastest(stopped, CHAIN.velocity_limits) < 0.06
+    np.testing.assert_allclose(moves(bench, stopped)[0].q[-1], target)
+    assert len(bench.commands_since(changed)) == 2

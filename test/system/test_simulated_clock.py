@@ -4,13 +4,16 @@ A node that is started again in a running simulation hears the clock late; what 
 then would be stamped with the beginning of time.
 """
 
+import signal
 import socket
 
 import pytest
+import yaml
 from conftest import call, node_arguments, wait_until
 
 from remaster_ros.fakes.setup import make_world
 from remaster_ros.nodes.demo import free_ports
+from remaster_ros.storage.bag import BagReader
 from remaster_ros.storage.cell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
@@ -109,3 +112,42 @@ def test_the_bar_publishes_nothing_without_it(start, client, said, world):
     turn = follow_the_clock(client, said, node)
     wait_until(lambda: turn() or stamps, 30, 'a reading')
     assert min(stamps) >= TIME_S - 1
+
+
+def test_a_bag_begins_with_the_clock_and_keeps_what_came_before(start, client, said, tmp_path):
+    """At time 0 it would last as long as the simulation has been running."""
+    from rosgraph_msgs.msg import Clock
+    from sensor_msgs.msg import JointState
+
+    session = tmp_path / 'session'
+    node = start(
+        'remaster_ros.nodes.recorder',
+        *node_arguments(use_sim_time=True, cell='demo', session=session, call_measure=False),
+    )
+    until_it_says(client, said, 'recorder', None, '')
+    joints = client.create_publisher(JointState, '/joint_states', 10)
+    wait_until(lambda: client.spin_some() or joints.get_subscription_count(), 20, 'the recorder')
+    for _ in range(5):
+        message = JointState(name=[f'joint_{i}' for i in range(1, 8)], position=[0.1] * 7)
+        message.header.stamp.sec = TIME_S
+        joints.publish(message)
+    for _ in range(20):
+        client.spin_some()
+    clock = client.create_publisher(Clock, '/clock', 10)
+    wait_until(lambda: client.spin_some() or clock.get_subscription_count(), 20, 'the recorder')
+    for i in range(150):
+        tick(client, clock, 0.02 * i)
+    node.send_signal(signal.SIGINT)
+    assert node.wait(20) == 0
+    reader = BagReader(session / 'bag')
+    assert reader.start_ns >= TIME_S * 10**9
+    assert reader.end_ns - reader.start_ns < 20 * 10**9
+    messages = list(reader)
+    # The first says that the recorder began, which a replay must know first.
+    assert messages[0][0] == '/remaster/status'
+    assert b'recorder: began' in messages[0][2]
+    assert sum(topic == '/joint_states' for topic, *_ in messages) == 5
+    text = (session / 'bag' / 'metadata.yaml').read_text(encoding='utf-8')
+    information = yaml.safe_load(text)['rosbag2_bagfile_information']
+    assert information['starting_time']['nanoseconds_since_epoch'] == reader.start_ns
+    assert information['duration']['nanoseconds'] < 20 * 10**9

@@ -6,6 +6,7 @@ from remaster_ros.cli.discover import summary
 from remaster_ros.core.discovery_causes import FoundEffect, LookAlike
 from remaster_ros.core.discovery_confirm import Confirmation
 from remaster_ros.core.discovery_gain import Gain
+from remaster_ros.core.discovery_thin import Thinning
 
 EFFECT = FoundEffect(
     name='joint_compliance',
@@ -23,10 +24,10 @@ EFFECT = FoundEffect(
 )
 
 
-def found(effects, gain, untestable):
+def found(effects, gain, untestable, thinning=None):
     verdict = 'effects' if effects else 'none'
     return types.SimpleNamespace(
-        verdict=verdict, effects=effects, gain=gain, untestable=untestable
+        verdict=verdict, effects=effects, gain=gain, untestable=untestable, thinning=thinning
     )
 
 
@@ -43,6 +44,12 @@ def test_nothing_found_and_what_cannot_be_tested_are_said():
     assert 'nothing beyond the zero-offsets' in text
     assert 'not testable: backlash: no from_q' in text
     assert 'held out' not in text
+
+
+def test_what_was_searched_of_a_large_session_is_said():
+    part = Thinning(10_000, 80_000, 0.42e-3, 0.39e-3)
+    text = summary(found((), Gain(None, None, 0.1e-3, {}), {}, part))
+    assert 'searched: 10000 of 80000 rows; the others fall from 0.420 to 0.390 mm RMS' in text
 
 
 def test_a_cause_that_was_cured_is_not_confirmed():

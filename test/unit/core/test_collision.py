@@ -1,4 +1,4 @@
-"""Configurations and paths: distances against closed forms, clearance, sweeps, what is left out."""
+"""Configurations and paths: distances by closed forms, clearance, sweeps, what is left out."""
 
 from pathlib import Path
 
@@ -136,9 +136,10 @@ def test_folded_arm_hits_itself(q, hits):
 
 def test_no_joint_alone_within_its_limits_makes_the_arm_hit_itself(lwr):
     model = capsules(lwr, floor_z=None)
+    margin = np.deg2rad(1.0)  # as the planner keeps
     for joint in range(7):
         q = np.zeros((50, 7))
-        q[:, joint] = np.linspace(lwr.lower[joint], lwr.upper[joint], 50)
+        q[:, joint] = np.linspace(lwr.lower[joint] + margin, lwr.upper[joint] - margin, 50)
         assert model.free_mask(q).all()
 
 
@@ -173,14 +174,22 @@ def test_tool_and_markers_are_seen_where_the_links_are_free(lwr):
 
 
 def test_a_tool_of_250_mm_is_part_of_the_arm(lwr):
-    q = np.deg2rad([0, 80.0, 0, -60, 0, 95, 0])
     tool = Body('probe', 7, cylinder(0.02, 0.25), lwr.T_fixed[-1] @ at(0, 0, 0.125), 'tool')
-    tip = lwr.forward(q) @ [0, 0, 0.25, 1]
     bare, long = capsules(lwr, **EXACT), capsules(lwr, 0.075, tool, **EXACT)
-    assert tip[2] < 0.0
-    assert bare.trouble(q) == ''
-    assert 'probe reaches' in long.trouble(q)
-    assert 'the floor' in long.trouble(q)
+    q = np.random.default_rng(8).uniform(lwr.lower, lwr.upper, (3000, 7))
+    was_free = bare.free_mask(q)
+    tips = lwr.positions(q, [0, 0, 0.25])
+    below = was_free & (tips[:, 2] < 0.0)
+    assert below.sum() > 20
+    assert not long.free_mask(q)[below].any()
+    # Folded at the elbow it reaches the shoulder, which the arm without it does not.
+    folded = q.copy()
+    folded[:, 3] = np.deg2rad(-118.0)
+    found = long.shortfalls(folded[bare.free_mask(folded)])
+    assert ('the link of joint_1', 'probe') in {long._pair_names(s.pair) for s in found}
+    words = long.trouble(q[below][0])
+    assert 'probe reaches' in words
+    assert 'the floor' in words
 
 
 # What is kept
@@ -253,6 +262,20 @@ def test_neighbours_and_what_always_overlaps_are_left_out_and_named(lwr):
     assert ('the link of joint_3', 'the link of joint_4') not in names
 
 
+def test_what_is_always_near_is_kept_from_touching_only():
+    """A collar 3 mm above the base: nearer than is kept wherever it turns, and no contact."""
+    chain = planar_arm(2, axis='0 0 1', limit=3.0)
+    bodies = [
+        Body('base', 0, cylinder(0.05, 0.1), at(0, 0, 0.05)),
+        Body('collar', 2, cylinder(0.05, 0.1), at(0, 0, -0.6 + 0.153)),
+    ]
+    model = CollisionModel(chain, bodies, floor_z=None)
+    assert model.left_out == ('base and collar: checked for contact',)
+    q = np.random.default_rng(0).uniform(-3, 3, (50, 2))
+    assert model.free_mask(q, collision.RESERVE_M).all()
+    assert model.path_trouble(q, collision.RESERVE_M) == ''
+
+
 def test_a_tool_is_checked_against_the_link_before_its_own():
     """A hook that bends back over the last joint hits the link before it."""
     chain = planar_arm(2, limit=3.0)
@@ -306,7 +329,7 @@ def test_sweeps_agree_with_the_finest_sampling(lwr, seed):
         obstacle('pole', [-0.4, 0.3, 0.5], [0.05, 0.05, 1.0]),
     ]
     model = capsules(lwr, 0.06, *things)
-    q = rng.uniform(lwr.lower, lwr.upper, (400, 7))
+    q = rng.uniform(lwr.lower, lwr.upper, (160, 7))
     q = q[model.free_mask(q)]
     outcomes = []
     for start, goal in zip(q[::2], q[1::2]):
@@ -336,13 +359,14 @@ def test_joint_limits_are_part_of_a_path(lwr):
 
 
 def test_words_name_both_bodies_and_the_distance(lwr):
-    q = np.deg2rad([0, 95.0, 0, 0, 0, 0, 0])
+    q = np.deg2rad([0, 110.0, 0, 0, 0, 0, 0])
     words = capsules(lwr).trouble(q)
     assert 'the link of joint_7' in words
     assert 'into the floor' in words
-    up = capsules(lwr, floor_z=-0.25).trouble(q)
-    assert ' mm from the floor, ' in up
-    assert up.endswith('mm is kept')
+    lowest = -min(d for (other, _), d in distances(capsules(lwr), q).items() if 'floor' in other)
+    above = capsules(lwr, floor_z=-lowest - 0.012).trouble(q)
+    assert above.startswith('the link of joint_7 12 mm from the floor, ')
+    assert above.endswith(' mm is kept')
 
 
 # What the motion gate takes

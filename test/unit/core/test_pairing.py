@@ -113,6 +113,28 @@ def test_a_single_shot_waits_for_the_joint_state_that_vouches_for_it():
     assert (reading.samples, reading.std, reading.stamp_s) == (1, None, 11.0)
 
 
+def test_of_two_shots_the_first_counts():
+    """The instrument measured when it was asked; the second may be of an arm on its way."""
+    pairing = Pairing(10.0, Q, (SHOT,))
+    pairing.add_reading('tracker', MarkerReading(11.0, np.full(3, 2.0)))
+    pairing.add_reading('tracker', MarkerReading(11.5, np.full(3, 3.0)))
+    pairing.add_joint_state(11.6, Q)
+    reading = pairing.decided['tracker']
+    np.testing.assert_array_equal(reading.position, [2.0, 2.0, 2.0])
+    assert (reading.samples, reading.stamp_s) == (1, 11.0)
+
+
+def test_the_joints_of_a_reading_are_the_mean_of_its_dwell():
+    pairing = Pairing(10.0, Q, (STREAM,))
+    for i in range(40):
+        stamp = 10.0 + 0.02 * (i + 1)
+        pairing.add_reading('mocap', MarkerReading(stamp, np.full(3, 1e-6 * i)))
+        pairing.add_joint_state(stamp, Q + 1e-6 * i)
+    reading = pairing.decided['mocap']
+    # The 25 reports from settling to the end of the dwell, half a second later.
+    np.testing.assert_allclose(reading.q, Q + 1e-6 * np.arange(25).mean(), atol=1e-12)
+
+
 def test_two_sensors_are_decided_on_apart():
     pairing = run(Pairing(10.0, Q, (STREAM, SHOT)))
     assert set(pairing.decided) == {'mocap'}

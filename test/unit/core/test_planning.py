@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from remaster_ros.core import planning
+from remaster_ros.core import collision, planning
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.collision import CollisionModel, arm_bodies
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.inverse import InverseKinematics
+from remaster_ros.core.line_of_sight import LinkCapsules
 from remaster_ros.core.planning import (
     LineOfSight,
     PoseRanges,
@@ -134,11 +135,11 @@ def test_each_reason_is_counted(ik):
     assert only_reason(ik, [pose_facing_up(3.0, 0.5)]) == planning.OUT_OF_REACH
     assert only_reason(ik, [pose_facing_up(0.45, 0.05)]) == planning.JOINT_LIMITS
     reachable = [ik.chain.forward([0.4, 0.7, 0, -1.2, 0.3, 0.9, 0.2])]
-    assert only_reason(ik, reachable, floor_z=1.0) == planning.FLOOR
+    assert only_reason(ik, reachable, floor_z=1.0) == collision.FLOOR
     # Half of this pose's solutions are outside the limits, half are too narrow at the elbow.
     folded = [ik.chain.forward([0.4, -0.5, 0, -2.0, 0.3, 0.9, 0.2])]
     thick = {'radius': 0.09, 'floor_z': None}
-    assert only_reason(ik, folded, **thick) == planning.SELF_COLLISION
+    assert only_reason(ik, folded, **thick) == collision.SELF_COLLISION
     behind = reachable[0] @ [0, 0, -1, 1]
     sight = LineOfSight('tracker', behind[:3], np.array([0.1, 0, 0.02]))
     assert only_reason(ik, reachable, [sight]) == 'no line of sight to tracker'
@@ -149,7 +150,7 @@ def test_a_link_in_the_line_of_sight_drops_the_solution(ik):
     T = ik.chain.forward(q)
     marker = np.array([0.1, 0, 0.02])
     arm = capsules(ik.chain)
-    elbow = arm.points(q)[4]
+    elbow = LinkCapsules(ik.chain).points(q)[4]
     at = ik.chain.positions(q, marker)
     sight = LineOfSight('mocap', at + 3 * (elbow - at), marker, max_angle_rad=np.pi)
     plan = plan_poses(ik, arm, T[None], [sight])

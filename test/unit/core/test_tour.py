@@ -2,10 +2,20 @@
 
 import numpy as np
 import pytest
+from arms import planar_arm
 
+from remaster_ros.core.bodies import obstacle
+from remaster_ros.core.collision import RESERVE_M, CollisionModel, arm_bodies
 from remaster_ros.core.errors import InsufficientDataError
-from remaster_ros.core.planning import Plan, PlannedPose
-from remaster_ros.core.tour import Tour, nearest_solution, registration_tour
+from remaster_ros.core.inverse import InverseKinematics
+from remaster_ros.core.planning import (
+    Plan,
+    PlannedPose,
+    PoseRanges,
+    candidate_poses,
+    plan_poses,
+)
+from remaster_ros.core.tour import Tour, free_order, nearest_solution, registration_tour
 from remaster_ros.core.transforms import transform
 from remaster_ros.storage.cell import read_cell
 
@@ -100,3 +110,127 @@ def test_the_pose_is_where_the_plan_has_it():
     T = transform(np.eye(3), np.array([0.3, 0.1, 0.5]))
     plan = Plan((PlannedPose(T, np.zeros((1, 7))),))
     np.testing.assert_array_equal(Tour(CHAIN, {'optimization': plan}).next(np.zeros(7)).T_R_T, T)
+
+
+# Among obstacles
+
+
+def walled():
+    """The demo arm, a wall to its left, and nothing else."""
+    wall = obstacle('wall', [0.0, 0.6, 0.5], [0.05, 0.5, 1.0])
+    return CollisionModel(CHAIN, [*arm_bodies(CHAIN, [], 0.075), wall])
+
+
+def free_plan(model, seed, poses, solutions=4):
+    """A plan whose every configuration is free."""
+    q = np.random.default_rng(seed).uniform(CHAIN.lower, CHAIN.upper, (400, 7))
+    q = q[model.free_mask(q, RESERVE_M)][: poses * solutions].reshape(poses, solutions, 7)
+    return Plan(tuple(PlannedPose(CHAIN.forward(own[0]), own) for own in q))
+
+
+@pytest.mark.parametrize('seed', [1, 2])
+def test_every_move_of_a_tour_is_free_and_none_is_forgotten(seed):
+    print('seed', seed)
+    model = walled()
+    plan = free_plan(model, seed, 8)
+    tour = Tour(CHAIN, {'optimization': plan}, model=model)
+    here, seen, around = np.zeros(7), 0, 0
+    while (stop := tour.next(here)) is not None:
+        assert len(stop.paths) == len(stop.solutions) == len(stop.ids)
+        assert sorted([*stop.ids, *stop.unreached]) == [0, 1, 2, 3]
+        seen += len(stop.ids) + len(stop.unreached)
+        for way, solution in zip(stop.paths, stop.solutions):
+            assert way.shape[1] == 7
+            around += len(way) > 0
+            assert model.path_trouble(np.vstack((here, way, solution))) == ''
+            here = solution
+    assert seen == sum(tour.configurations.values())
+    assert around > 0
+    # Without the model some of the same moves go through the wall.
+    blind, here, hits = Tour(CHAIN, {'optimization': plan}), np.zeros(7), 0
+    while (stop := blind.next(here)) is not None:
+        for solution in stop.solutions:
+            hits += bool(model.path_trouble(np.array([here, solution])))
+            here = solution
+    assert hits > 0
+
+
+def test_a_solution_behind_a_free_one_waits_and_one_that_is_shut_in_is_unreached():
+    """On a circle with two posts: the nearer solution lies behind the post, the other is free."""
+    chain = planar_arm(1, limit=3.0)
+    post = obstacle('post', [0.25 * np.sin(0.5), 0, 0.3 + 0.25 * np.cos(0.5)], [0.01, 0.4, 0.01])
+    model = CollisionModel(chain, [*arm_bodies(chain, [], 0.02), post], floor_z=None)
+    solutions = np.array([[1.0], [-1.5]])
+    rng = np.random.default_rng(0)
+    order, paths = free_order(model, np.array([0.0]), solutions, np.ones(1), rng)
+    assert order == [1]
+    assert [len(path) for path in paths] == [0]
+    assert free_order(None, np.array([0.0]), solutions, np.ones(1), rng)[0] == [0, 1]
+    plan = Plan((PlannedPose(chain.forward(solutions[0]), solutions),))
+    stop = Tour(chain, {'optimization': plan}, model=model).next(np.array([0.0]))
+    assert (stop.ids, stop.unreached) == ((1,), (0,))
+    # Where one is enough, the free one is it, and nothing is lost.
+    one = Tour(chain, {'optimization': plan}, one_solution=True, model=model)
+    stop = one.next(np.array([0.0]))
+    assert (stop.ids, stop.unreached) == ((1,), ())
+    shut = Tour(
+        chain,
+        {'optimization': Plan((PlannedPose(chain.forward([1.0]), solutions[:1]),))},
+        one_solution=True,
+        model=model,
+    )
+    stop = shut.next(np.array([0.0]))
+    assert (stop.ids, stop.unreached) == ((), (0,))
+
+
+def test_what_is_left_of_a_stop_is_reached_from_elsewhere():
+    model = walled()
+    tour = Tour(CHAIN, {'optimization': free_plan(model, 3, 2)}, model=model)
+    stop = tour.next(np.zeros(7))
+    left = stop.only(stop.ids[1:])
+    assert len(left.paths) == len(left.ids)
+    elsewhere = np.deg2rad([-150.0, 20, 0, 60, 0, 30, 0])
+    again = tour.reroute(left, elsewhere)
+    assert sorted([*again.ids, *again.unreached]) == sorted(left.ids)
+    assert again.pose == stop.pose
+    here = elsewhere
+    for way, solution, number in zip(again.paths, again.solutions, again.ids):
+        assert model.path_trouble(np.vstack((here, way, solution))) == ''
+        np.testing.assert_array_equal(
+            solution, tour.plans['optimization'].poses[stop.index].solutions[number]
+        )
+        here = solution
+
+
+def test_proposing_changes_nothing():
+    tour = Tour(CHAIN, {'optimization': plan_of(random_joints(1, 3))})
+    first, second = tour.propose(np.zeros(7)), tour.propose(np.zeros(7))
+    assert (first.index, first.pose, tour.visited) == (second.index, second.pose, 0)
+    taken = tour.take(first)
+    assert (taken.index, taken.pose, tour.visited) == (first.index, 0, 1)
+    assert tour.propose(np.zeros(7)).pose == 1
+
+
+@pytest.mark.parametrize('held', [(0.0,), (-1.0, 0.0, 1.0)])
+def test_low_poses_are_not_reached_through_the_floor(held):
+    """Straight moves between nearest solutions sweep far: some went through the floor."""
+    chain = CHAIN
+    model = CollisionModel(chain, arm_bodies(chain, [], 0.075))
+    low = PoseRanges(height_m=(0.1, 0.6))
+    candidates = candidate_poses(150, low, [1.9, 0.0, 1.1], np.random.default_rng(4))
+    inverse = InverseKinematics(chain, {2: held})
+    plan = plan_poses(inverse, model, candidates, limit_margin_rad=0.02)
+
+    def troubles(tour):
+        here, found = np.zeros(7), []
+        while (stop := tour.next(here)) is not None:
+            for way, solution in zip(stop.paths, stop.solutions):
+                found.append(model.path_trouble(np.vstack((here, way, solution))))
+                here = solution
+        return found
+
+    blind = troubles(Tour(chain, {'optimization': plan}))
+    assert sum('floor' in trouble for trouble in blind) > 0
+    seeing = troubles(Tour(chain, {'optimization': plan}, model=model))
+    assert len(seeing) > 0.9 * len(blind)
+    assert set(seeing) == {''}

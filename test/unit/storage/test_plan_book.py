@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -89,24 +89,21 @@ def test_a_registration_tour_keeps_its_order_and_its_numbers(chain, tmp_path):
     book.close()
 
 
-def test_the_state_and_the_time_of_silence_are_known(chain, tmp_path):
+def test_the_state_and_its_run_are_known(chain, tmp_path):
     book = PlanBook(tmp_path, SETTINGS, chain)
-    book.say_state('running')
+    book.say_state('running', 'abc')
     assert not book.path.exists()
     book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
     with pytest.raises(InputError, match='another process'):
         PlanBook(tmp_path, SETTINGS, chain)
     book.close()
-    then = os.stat(book.path).st_mtime - 50.0
-    os.utime(book.path, (then, then))
-    book = PlanBook(tmp_path, SETTINGS, chain)
-    assert book.state == 'running'
-    assert 49.0 < book.silent_s < 200.0
-    book.stay_alive()
-    book.close()
-    book = PlanBook(tmp_path, SETTINGS, chain)
-    assert book.silent_s < 30.0
-    book.close()
+    for state, run in (('running', 'abc'), ('running', 'def'), ('paused', '')):
+        book = PlanBook(tmp_path, SETTINGS, chain)
+        book.say_state(state, run)
+        book.close()
+        book = PlanBook(tmp_path, SETTINGS, chain)
+        assert (book.state, book.run) == (state, run)
+        book.close()
 
 
 @pytest.mark.parametrize(
@@ -162,3 +159,43 @@ def test_what_a_full_disk_does_not_take_is_kept(chain, tmp_path, full_disk):
     assert book.stop.ids == left == stop.ids[1:]
     assert book.outcomes['recorded'] == 1
     book.close()
+
+
+def test_ways_and_what_has_none_survive_a_restart(chain, tmp_path):
+    rng = np.random.default_rng(5)
+    book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+    book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 4)}))
+    way = rng.uniform(-1, 1, (2, len(chain)))
+    straight = np.empty((0, len(chain)))
+    stop = book.tour.go_to('optimization', 0, [2, 0], [way, straight], [1, 3])
+    book.open_stop(stop)
+    assert dict(book.outcomes) == {'no_free_path': 2}
+    book.outcome(2, 'recorded')
+    book.close()
+
+    book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+    assert dict(book.outcomes) == {'no_free_path': 2, 'recorded': 1}
+    assert book.stop.ids == (0,)
+    other = rng.uniform(-1, 1, (1, len(chain)))
+    book.reroute(replace(book.stop, paths=(other,)))
+    book.close()
+
+    book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+    np.testing.assert_array_equal(book.stop.paths[0], other)
+    assert (book.stop.ids, book.stop.pose) == ((0,), stop.pose)
+    # From where the arm stands now nothing leads there: its outcome, and the totals add up.
+    book.reroute(replace(book.stop.only([]), unreached=(0,)))
+    book.close()
+    book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+    assert book.stop.ids == ()
+    assert book.outcomes.total() == 4
+    assert book.tour.plans['optimization'].dropped_solutions == {}
+
+
+def test_the_counts_of_dropped_solutions_survive_a_restart(chain, tmp_path):
+    plan = replace(plan_of(chain, 1, 2, 2), dropped_solutions={'self-collision': 3})
+    book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+    book.begin(Tour(chain, {'optimization': plan}))
+    book.close()
+    book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+    assert book.tour.dropped_solutions == {'self-collision': 3}

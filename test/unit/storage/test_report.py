@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from remaster_ros.core.noise_check import NoiseCheck
 from remaster_ros.core.result import NoiseEstimate
 from remaster_ros.core.transforms import apply
 from remaster_ros.storage.report import report_html, verdict
@@ -206,6 +207,37 @@ def test_the_verdict_is_honest(fit_result, split, before, after, converged, mood
     told = ' '.join(judged.points)
     assert ('fit again with more draws' in told) != converged
     assert ('no validation poses' in told) == (split == 'optimization')
+
+
+MOVED = NoiseCheck('tracker', 2.337e-3, None, 0.11e-3, poses=12)
+UNTOLD = NoiseCheck('tracker', 0.3e-3, None, None, poses=12)
+
+
+@pytest.mark.parametrize('after', [2.337, 4.3])
+@pytest.mark.parametrize('check', [MOVED, UNTOLD], ids=['moved', 'untold'])
+def test_an_error_that_noise_does_not_explain_is_never_green(fit_result, check, after):
+    result = replace(with_accuracy(fit_result, 'validation', 4.395, after), noise_checks=(check,))
+    judged = verdict(result)
+    assert judged.mood == 'caution'
+    told = f'{judged.headline} {judged.points[0]}'
+    if check is MOVED:
+        assert 'other errors dominate; run "remaster discover"' in judged.headline
+        assert '0.110 mm per axis within a pose' in told
+        assert 'makes 0.176 mm' in told
+    else:
+        assert 'this session cannot tell' in judged.headline
+        assert 'measure poses in all their joint solutions' in told
+    assert judged.points[0].startswith('tracker: ')
+    html = report_html(replace(fit_result, noise_checks=(check,)), {})
+    assert 'verdict caution' in html
+
+
+def test_offsets_that_hardly_matter_where_noise_explains_the_rest(fit_result):
+    assert all(check.explained for check in fit_result.noise_checks)
+    judged = verdict(with_accuracy(fit_result, 'validation', 0.4, 0.39))
+    assert judged.mood == 'caution'
+    assert 'That is what noise explains' in judged.headline
+    assert 'discover' not in judged.headline
 
 
 def test_a_session_without_validation_has_a_report(fit_result):

@@ -1,0 +1,168 @@
+"""Do the planner's moves hit anything? Twelve cells, judged by what shares nothing with it.
+
+Each cell is planned as the planner node does it, stop by stop; every move of the tours, from the
+first on, is given to an independent judge (benchmarks/path_judges.py): sampled at 1 mm, with
+bodies grown by half of that. Also printed: what is dropped and why, ways around, and the time of
+planning 60 + 60 candidates with all their ways.
+
+    python benchmarks/bench_paths.py [--tours N] [--cells WORD …] [--workers N]
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from common import in_parallel, machine, table
+from path_cells import SPECS, CellSpec, make_cell
+from path_judges import collides
+
+from remaster_ros.core.collision import FLOOR, OBSTACLE, SELF_COLLISION
+from remaster_ros.core.types import FloatArray
+from remaster_ros.nodes.touring import TourPlanner
+from remaster_ros.storage.cell import Cell
+
+
+class Tally(NamedTuple):
+    """What became of the tours of a cell."""
+
+    name: str
+    moves: int
+    around: int
+    hits: int
+    ends_hit: int
+    straight_hits: int
+    configurations: int
+    dropped: Counter[str]
+    no_path: int
+    planning_s: list[float]
+    ways_s: list[float]
+    slowest_s: float
+    samples: int
+
+
+def tours(
+    cell: Cell, seeds: range, candidates: int = 60
+) -> tuple[list[FloatArray], Counter[str], int, list[float], list[float], float]:
+    """Return every move (n, k) of tours of a cell, what was dropped, and the times."""
+    chain = cell.chain()
+    moves, dropped, no_path = [], Counter[str](), 0
+    planning, ways, slowest = [], [], 0.0
+    for seed in seeds:
+        counts = {'registration': 3, 'optimization': candidates, 'validation': candidates}
+        T_R_N = {}
+        for name, sensor in cell.sensors.items():
+            T_R_N[name] = np.eye(4)
+            T_R_N[name][:3, 3] = sensor.rough_position_m
+        start = time.thread_time()
+        planner = TourPlanner(cell, chain, counts, seed, np.deg2rad(1.0))
+        tour = planner.collection(T_R_N)
+        planning.append(time.thread_time() - start)
+        dropped.update(tour.dropped_solutions)
+        here = np.clip(np.zeros(len(chain)), chain.lower, chain.upper)
+        if planner.model.trouble(here):
+            here = next(iter(tour.plans['optimization'].poses)).solutions[0]
+        ways.append(0.0)
+        while True:
+            start = time.thread_time()
+            stop = tour.next(here)
+            took = time.thread_time() - start
+            ways[-1] += took
+            slowest = max(slowest, took)
+            if stop is None:
+                break
+            no_path += len(stop.unreached)
+            for way, solution in zip(stop.paths, stop.solutions):
+                moves.append(np.vstack((here, way, solution)))
+                here = solution
+    return moves, dropped, no_path, planning, ways, slowest
+
+
+def judge_cell(job: tuple[CellSpec, int]) -> Tally:
+    """Plan tours of a cell and have every move judged."""
+    spec, count = job
+    with tempfile.TemporaryDirectory() as folder:
+        cell, judge = make_cell(spec, Path(folder))
+        moves, dropped, no_path, planning, ways, slowest = tours(cell, range(count))
+        hits = ends_hit = samples = straight_hits = 0
+        for path in moves:
+            hit, looked_at, _ = collides(judge, path)
+            hits += hit
+            samples += looked_at
+            ends_hit += judge.distance(path[-1]) <= 0.0
+            if len(path) > 2:
+                straight_hits += collides(judge, path[[0, -1]])[0]
+    return Tally(
+        spec.name,
+        len(moves),
+        sum(len(path) > 2 for path in moves),
+        hits,
+        ends_hit,
+        straight_hits,
+        len(moves) + no_path,
+        dropped,
+        no_path,
+        planning,
+        ways,
+        slowest,
+        samples,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--tours', type=int, default=1, help='tours of 60 + 60 candidates a cell')
+    parser.add_argument('--cells', nargs='*', default=[], help='only cells with these in the name')
+    parser.add_argument('--workers', type=int, default=1)
+    given = parser.parse_args()
+    specs = [s for s in SPECS if all(word in s.name for word in given.cells)]
+    print(machine())
+    jobs = [(spec, given.tours) for spec in specs]
+    rows = []
+    total = Counter[str]()
+    for tally in in_parallel(judge_cell, jobs, given.workers):
+        lost = {reason: tally.dropped[reason] for reason in (SELF_COLLISION, FLOOR, OBSTACLE)}
+        planning = np.array(tally.planning_s) + tally.ways_s
+        rows.append(
+            (
+                tally.name,
+                tally.moves,
+                tally.around,
+                tally.straight_hits,
+                tally.hits,
+                ' / '.join(str(n) for n in lost.values()),
+                tally.no_path,
+                f'{np.mean(tally.planning_s):.2f} + {np.mean(tally.ways_s):.2f}',
+                f'{planning.max():.1f}',
+                f'{tally.slowest_s:.2f}',
+            )
+        )
+        print(rows[-1], flush=True)
+        total.update(moves=tally.moves, hits=tally.hits, ends=tally.ends_hit)
+        total.update(around=tally.around, no_path=tally.no_path, samples=tally.samples)
+    header = (
+        'cell',
+        'moves',
+        'around something',
+        'their straight way hits',
+        'in collision',
+        'dropped: self / floor / obstacle',
+        'no free path',
+        'planning + ways, s',
+        'most, s',
+        'slowest stop, s',
+    )
+    print(table(header, rows))
+    print(
+        f'{total["moves"]} moves, {total["around"]} around something, {total["samples"]} samples: '
+        f'{total["hits"]} in collision; {total["no_path"]} configurations without a free path'
+    )
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,118 @@
+"""How an arm that is on a line comes to rest on it.
+
+Where on the line the arm is, is known to a stretch of time only: it lags behind the reference that
+its controller follows, and a controller may begin a new command at the one or the other. The same
+stop is right from all of this stretch: from each place and speed on it, the cubic to the stop's
+end stays on the line, within its end, its cruising speed and the accelerations, and never goes
+back. With x and v the share gone and its rate, r the cruising rate and T the time of the stop that
+is where
+
+    x + v T/3 <= end <= min(x + 2/3 r T, 1).
+
+A stretch that reaches into the last moments of the line has no such stop: who is slow needs time,
+and who is fast would pass the end in it. The end is then put so far before the line's that nobody
+passes that, and who was fast comes back by a little.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from remaster_ros.core.types import FloatArray
+from remaster_ros.motion.limits import MotionLimits
+from remaster_ros.motion.trajectory import HEADROOM, Line, Waypoint
+
+STOP_S = 0.4
+"""A stop takes at least so long, s."""
+END_OF_STOP_S = 0.1
+"""A stop in the last moments of a line takes at least so long, s."""
+LONGEST_S, LONGEST_SHARE = 4.0, 6.0
+"""A stop takes no longer, s; or times the stretch, where that is longer."""
+TRIED = 80
+"""So many times of a stop are tried."""
+PLACES = 33
+"""On so many places of the stretch a stop is looked at, and where the speed changes besides."""
+ROUNDS = 32
+"""So often the interval of ends is halved that nobody passes."""
+
+
+def stop_on_line(line: Line, low_s: float, high_s: float, limits: MotionLimits) -> Waypoint:
+    """Return where and when an arm on a line comes to rest that is to stop now.
+
+    Parameters
+    ----------
+    line
+        The line.
+    low_s, high_s
+        The arm is where the line is at some time from `low_s` to `high_s`, s since its start.
+    limits
+        For the accelerations.
+    """
+    stretch = _Stretch(line, low_s, high_s, limits)
+    longest = max(LONGEST_S, LONGEST_SHARE * (high_s - low_s))
+    early = np.geomspace(END_OF_STOP_S, STOP_S, TRIED // 4, endpoint=False)
+    late = np.geomspace(STOP_S, longest, TRIED)
+    # The shortest one that takes its time; else the slowest of the quick ones.
+    found = stretch.first(late) or stretch.first(early[::-1])
+    time, end = found or stretch.rest_of_line()
+    return Waypoint(time, line.start + end * line.way, np.zeros_like(line.end))
+
+
+class _Stretch:
+    """The places on a line where an arm may be, and the stops from all of them."""
+
+    def __init__(self, line: Line, low_s: float, high_s: float, limits: MotionLimits) -> None:
+        kinks = [time for time in line.kinks_s if low_s < time < high_s]
+        times = [*np.linspace(low_s, high_s, PLACES), *kinks]
+        self._x, self._v = np.array([line.share(time) for time in times]).T
+        self._here = line.share(high_s)
+        self._rate, self._left_s = line.rate, line.duration_s - low_s
+        self._hardness = float(np.max(np.abs(line.way) / limits.acceleration))
+
+    def first(self, times: FloatArray) -> tuple[float, float] | None:
+        """Return time (s) and end (share) of the first stop that is right; None if none is."""
+        x, v, T = self._x[:, None], self._v[:, None], times
+        least = np.max(x + v * T / 3, axis=0)
+        most = np.minimum(np.min(x + self._rate * T * 2 / 3, axis=0), 1.0)
+        # Braked evenly from the reference on, or what is gentler on all.
+        share, rate = self._here
+        even = np.clip(share + 0.5 * rate * T, least, np.maximum(least, most))
+        for time, low, high, end in zip(times, least, most, even):
+            if low > high:
+                continue
+            for tried in (end, 0.5 * (low + high)):
+                if self._acceleration(time, tried) <= HEADROOM:
+                    return float(time), float(tried)
+        return None
+
+    def rest_of_line(self) -> tuple[float, float]:
+        """Return time and end of a stop in the time that the slowest has left on the line."""
+        time = max(self._left_s, 1.5 * (1.0 - self._x[0]) / self._rate, END_OF_STOP_S)
+        low, high = -1.0, 1.0
+        if self._farthest(time, high) <= 1.0:
+            return time, high
+        for _ in range(ROUNDS):
+            end = 0.5 * (low + high)
+            low, high = (low, end) if self._farthest(time, end) > 1.0 else (end, high)
+        return time, low
+
+    def _coefficients(self, time: float, end: float) -> tuple[FloatArray, FloatArray]:
+        """Return second and third coefficients of the cubics, of powers of the time's share."""
+        gap, v = end - self._x, self._v * time
+        return 3 * gap - 2 * v, v - 2 * gap
+
+    def _acceleration(self, time: float, end: float) -> float:
+        """Return the largest acceleration, as a share of what is allowed."""
+        second, third = self._coefficients(time, end)
+        largest = np.maximum(np.abs(2 * second), np.abs(2 * second + 6 * third))
+        return float(np.max(largest)) / time**2 * self._hardness
+
+    def _farthest(self, time: float, end: float) -> float:
+        """Return the largest share that any of the cubics reaches."""
+        second, third = self._coefficients(time, end)
+        # Its speed is zero at the end, and at the share v T / (3 third).
+        with np.errstate(divide='ignore', invalid='ignore'):
+            turn = np.nan_to_num(self._v * time / (3 * third), posinf=0.0, neginf=0.0)
+        share = np.clip(turn, 0.0, 1.0)
+        place = self._x + share * (self._v * time + share * (second + share * third))
+        return float(np.max(place, initial=end))

@@ -1,0 +1,383 @@
+"""A bridge process between stand-ins and a hostile arm, over real DDS.
+
+`Lines` are the man in the middle: what becomes of joint states on their way out, and of commands
+on their way in. `Bench` runs them in threads of the test's process, with the planner's and the
+recorder's messages, and starts, pauses and kills the bridge.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped
+from hostile_arm import Command, HostileArm
+from hostile_lines import (
+    COMMANDS,
+    EMERGENCY,
+    INTRUDER,
+    LATCHED,
+    LEASED,
+    RELIABLE,
+    STATUS_PERIOD_S,
+    Lines,
+    Seen,
+)
+from hostile_process import BridgeProcess
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from remaster_ros.core.types import FloatArray
+
+
+class Bench(BridgeProcess):
+    """The bridge's surroundings.
+
+    Parameters
+    ----------
+    environment
+        Of the bridge's process: its DDS domain, its path, its ROS_HOME.
+    names
+        The arm's joints, base to tip.
+    home
+        Where it stands first, rad, (k,).
+    rng
+        Source of all randomness.
+    parameters
+        Of the bridge.
+    log
+        The bridge's output is appended there.
+    rate
+        joint_states a second.
+    arm
+        Options of `HostileArm`.
+    """
+
+    def __init__(
+        self,
+        environment: dict[str, str],
+        names: Sequence[str],
+        home: FloatArray,
+        rng: np.random.Generator,
+        parameters: dict[str, Any],
+        log: Path,
+        rate: float = 100.0,
+        clock_s: float = 0.0,
+        stamp_noise_s: float = 0.0,
+        **arm: bool,
+    ) -> None:
+        super().__init__(environment, parameters, log)
+        self.names, self.rng = list(names), rng
+        self.arm = HostileArm(home, time.monotonic(), **arm)
+        self.calm = Lines(clock_s=clock_s, stamp_noise_s=stamp_noise_s)
+        self.lines = self.calm
+        self.seen = Seen()
+        self.planner, self.waiting_for, self.silent = 'waiting', '', set[str]()
+        self.emergency_shown: bool | None = None
+        self.answers = True
+        self.worst_gap_s = 0.0
+        self.running_since: list[tuple[float, str]] = [(0.0, 'waiting')]
+        self.order = rng.permutation(len(home))
+        self.period_s = 1.0 / rate
+        self._once: list[Callable[[FloatArray], FloatArray]] = []
+        self._due: list[tuple[float, int, JointState]] = []
+        self._due_commands: list[tuple[float, int, JointTrajectory]] = []
+        self._numbers = itertools.count()
+        self._frozen: FloatArray | None = None
+        self._stopped_stamp: float | None = None
+        self._ending = threading.Event()
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=int(environment['ROS_DOMAIN_ID']))
+        self._open()
+
+    def _open(self) -> None:
+        self.node = node = rclpy.create_node('hostile_controller', context=self._context)
+        self.intruder = rclpy.create_node(INTRUDER, context=self._context)
+        self._states = node.create_publisher(JointState, '/joint_states', RELIABLE)
+        self._status = node.create_publisher(DiagnosticArray, '/remaster/status', RELIABLE)
+        self._poses = node.create_publisher(PoseStamped, '/remaster/target_pose', LEASED)
+        self._solutions = node.create_publisher(
+            JointTrajectory, '/remaster/joint_solutions', LEASED
+        )
+        self._waypoints = node.create_publisher(
+            JointTrajectory, '/remaster/joint_waypoints', LEASED
+        )
+        # Only where a bridge is told of it: a topic that is configured must not be silent.
+        self._emergency = node.create_publisher(Bool, EMERGENCY, LATCHED)
+        node.create_subscription(JointTrajectory, COMMANDS, self._on_command, RELIABLE)
+        node.create_subscription(
+            JointState,
+            '/remaster/settled',
+            lambda m: self.seen.settled.append((time.monotonic(), np.array(m.position))),
+            RELIABLE,
+        )
+        node.create_subscription(DiagnosticArray, '/remaster/status', self._on_status, RELIABLE)
+        self._clear = node.create_client(Trigger, '/remaster/clear_halt')
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(node)
+        self._threads = [
+            threading.Thread(target=self._spin, daemon=True),
+            threading.Thread(target=self._pump, daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """End the bridge and everything here."""
+        self.end()
+        self._ending.set()
+        for thread in self._threads:
+            thread.join()
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self.intruder.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    # What is said and done to it
+
+    def disturb(self, **values: Any) -> float:
+        """Change the lines from now on; returns the time."""
+        self._frozen = self._stopped_stamp = None
+        self.lines = replace(self.lines, **values)
+        return time.monotonic()
+
+    def once(self, change: Callable[[FloatArray], FloatArray]) -> None:
+        """Let `change` work on the next message of joint_states alone."""
+        self._once.append(change)
+
+    def peace(self) -> None:
+        """End every disturbance; the emergency stop too."""
+        self._frozen = self._stopped_stamp = None
+        self.lines = self.calm
+        self.silent.clear()
+        self.waiting_for = ''
+        if self.emergency_shown:
+            self.emergency_shown = False
+        if self.arm.emergency:
+            self.arm.release(time.monotonic())
+
+    def plan_state(self, state: str) -> float:
+        """Let the planner be in a state, published at once; returns the time."""
+        # The time before: the message may arrive before this thread runs again.
+        now = time.monotonic()
+        self.running_since.append((now, state))
+        self.planner = state
+        self._say('pose_planner', state=state, run='hostile', phase='collection')
+        return now
+
+    def was_running(self, time_s: float) -> bool:
+        """Whether the planner's newest state at a time was running."""
+        return [state for t, state in self.running_since if t <= time_s][-1] == 'running'
+
+    def send(self, solutions: Sequence[FloatArray]) -> str:
+        """Publish a pose with these solutions; returns its stamp as the events name it."""
+        stamp = self._stamp(0.0)
+        message = JointTrajectory(joint_names=self.names)
+        message.header.stamp = stamp
+        message.points = [JointTrajectoryPoint(positions=list(map(float, q))) for q in solutions]
+        pose = PoseStamped()
+        pose.header.stamp = stamp
+        pose.header.frame_id = 'base_link'
+        # No way around anything: the straight one to each solution.
+        ways = JointTrajectory(joint_names=self.names)
+        ways.header.stamp = stamp
+        self._waypoints.publish(ways)
+        self._poses.publish(pose)
+        self._solutions.publish(message)
+        return f'{stamp.sec}.{stamp.nanosec:09d}'
+
+    def clear_halt(self, timeout_s: float = 5.0) -> bool | None:
+        """Call the service as a person would; None where the bridge has none."""
+        if not self._clear.service_is_ready():
+            return None
+        future = self._clear.call_async(Trigger.Request())
+        return self.until(future.done, timeout_s) and future.result().success
+
+    def on_its_way(self) -> bool:
+        """Whether the arm is in the middle of a move: one that is being stopped is not."""
+        now = time.monotonic()
+        begun = max(t for t, state in self.running_since if state == 'running')
+        newest = self.commands_since(begun)[-1:]
+        return bool(newest) and now < newest[0].end_s - 0.1 and self.arm.speed() > 0.05
+
+    def gap(self) -> float:
+        """Longest time since the last call in which nothing was published here, s."""
+        gap, self.worst_gap_s = self.worst_gap_s, 0.0
+        return gap
+
+    def until(self, condition: Callable[[], Any], timeout_s: float) -> bool:
+        """Wait for a condition; returns whether it came true in time."""
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.005)
+        return True
+
+    def commands_since(self, time_s: float) -> list[Command]:
+        """Return the bridge's commands that arrived after a time."""
+        with self.arm.lock:
+            found = [c for c in self.arm.commands if c.arrival_s > time_s]
+        return [c for c in found if not c.foreign]
+
+    def reset_arm(self, q: FloatArray) -> None:
+        """Put the arm somewhere else; only while no bridge runs."""
+        with self.arm.lock:
+            old = self.arm
+            self.arm = HostileArm(q, time.monotonic(), old.exact, old.open_loop)
+            self.arm.commands = old.commands
+
+    # Threads
+
+    def _spin(self) -> None:
+        while not self._ending.is_set():
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def _pump(self) -> None:
+        now = next_state = next_status = time.monotonic()
+        while not self._ending.is_set():
+            before, now = now, time.monotonic()
+            self.worst_gap_s = max(self.worst_gap_s, now - before)
+            self.arm.advance(now)
+            if now >= next_state:
+                next_state = max(next_state + self.period_s, now)
+                self._report(now)
+            while self._due and self._due[0][0] <= now:
+                self._states.publish(heapq.heappop(self._due)[2])
+            while self._due_commands and self._due_commands[0][0] <= now:
+                self._obey(heapq.heappop(self._due_commands)[2], foreign=True)
+            if now >= next_status:
+                next_status = now + STATUS_PERIOD_S
+                self._heartbeat()
+            time.sleep(0.002)
+
+    def _heartbeat(self) -> None:
+        if 'pose_planner' not in self.silent:
+            self._say('pose_planner', state=self.planner, run='hostile', phase='collection')
+        if 'recorder' not in self.silent:
+            self._say('recorder', state='waiting', run='hostile', waiting_for=self.waiting_for)
+        if self.emergency_shown is not None:
+            self._emergency.publish(Bool(data=self.emergency_shown))
+
+    def show_emergency(self, stopped: bool) -> None:
+        """Publish the robot's own word at once, and from now on."""
+        self.emergency_shown = stopped
+        self._emergency.publish(Bool(data=stopped))
+
+    def _say(self, name: str, **values: str) -> None:
+        pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+        message = DiagnosticArray(status=[DiagnosticStatus(name=name, values=pairs)])
+        message.header.stamp = self._stamp(0.0)
+        self._status.publish(message)
+
+    def _stamp(self, ahead_s: float) -> Time:
+        ns = time.time_ns() + round(1e9 * ahead_s)
+        return Time(sec=ns // 10**9, nanosec=ns % 10**9)
+
+    def state_message(self, q: FloatArray, v: FloatArray, ahead_s: float = 0.0) -> JointState:
+        """Return joint states as this robot publishes them: its own order, noise of encoders."""
+        q = q + self.rng.normal(0.0, 1e-6, len(q))
+        message = JointState(name=[self.names[i] for i in self.order])
+        message.position = q[self.order].tolist()
+        message.velocity = v[self.order].tolist()
+        message.header.stamp = self._stamp(ahead_s)
+        return message
+
+    def _report(self, now: float) -> None:
+        lines, rng = self.lines, self.rng
+        if lines.silent:
+            return
+        with self.arm.lock:
+            q, v, sampled = self.arm.q, self.arm.v, self.arm.time_s
+        if lines.frozen:
+            if self._frozen is None:
+                self._frozen = q
+            q, v = self._frozen, np.zeros_like(v)
+        if lines.wrap is not None:
+            q = q + lines.wrap
+        if lines.nan is not None:
+            q = np.where(np.arange(len(q)) == lines.nan, np.nan, q)
+        while self._once:
+            q = self._once.pop()(q)
+        # The stamp is the sample's own time, as joint_state_broadcaster gives it.
+        sampled += lines.stamp_noise_s * rng.normal()
+        if lines.stopped_stamps:
+            if self._stopped_stamp is None:
+                self._stopped_stamp = sampled
+            sampled = self._stopped_stamp
+        message = self.state_message(q, v, lines.clock_s + sampled - time.monotonic())
+        for _ in range(2 if rng.random() < lines.double else 1):
+            if rng.random() >= lines.loss:
+                due = now + lines.delay_s + lines.jitter_s * rng.random()
+                heapq.heappush(self._due, (due, next(self._numbers), message))
+
+    def _on_command(self, message: JointTrajectory) -> None:
+        now, lines = time.monotonic(), self.lines
+        for _ in range(2 if lines.command_double else 1):
+            if lines.command_delay_s == 0.0:
+                self._obey(message)
+            else:
+                # It is judged by where the arm was when the bridge sent it.
+                self._obey(message, withheld=True)
+                due = now + lines.command_delay_s * (0.5 + self.rng.random())
+                heapq.heappush(self._due_commands, (due, next(self._numbers), message))
+
+    def _obey(
+        self, message: JointTrajectory, withheld: bool = False, foreign: bool = False
+    ) -> None:
+        names = list(message.joint_names)
+        columns = [names.index(name) for name in self.names]
+        points = message.points
+
+        def rows(key: str) -> FloatArray | None:
+            if not all(len(getattr(point, key)) == len(names) for point in points):
+                return None
+            return np.array([getattr(point, key) for point in points])[:, columns]
+
+        times = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in points]
+        q = rows('positions')
+        if q is None or not len(q):
+            return
+        lost = withheld or self.rng.random() < self.lines.command_loss
+        self.arm.take(
+            time.monotonic(),
+            np.array(times),
+            q,
+            rows('velocities'),
+            rows('accelerations'),
+            lost,
+            foreign=foreign or message.header.frame_id == INTRUDER,
+        )
+
+    def _on_status(self, array: DiagnosticArray) -> None:
+        now = time.monotonic()
+        for status in array.status:
+            name, _, event = status.name.partition(': ')
+            if name != 'robot_bridge':
+                continue
+            values = {pair.key: pair.value for pair in status.values}
+            if not event:
+                self.seen.summaries.append((now, status.message, values))
+                continue
+            self.seen.events.append((now, event, status.message, values))
+            if event == 'settled' and self.answers:
+                self._say(
+                    'recorder: configuration',
+                    stamp=values.get('stamp', ''),
+                    solution=values.get('solution', ''),
+                    result='recorded',
+                    reason='',
+                )

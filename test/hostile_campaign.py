@@ -1,0 +1,244 @@
+"""Many injections at random moments, several in the life of one bridge."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from multiprocessing import Queue, get_context
+from pathlib import Path
+
+import numpy as np
+from hostile_bench import Bench
+from hostile_injections import INJECTIONS, WITH_TOPIC, Injection, restart
+from hostile_judge import GRACE_S, Body, Judge, Rules, after
+from hostile_lines import EMERGENCY
+from hostile_outcomes import Outcome
+from hostile_scene import HOME, Scene, begin, bench_of, demo_body, target
+
+HALT_WITHIN_S = 4.0
+"""A halt not shown so long after the injection was not made, s: see `hostile_scene.FAST`."""
+
+
+class Campaign:
+    """Random injections into one bridge after the other.
+
+    Parameters
+    ----------
+    seed
+        Of all randomness.
+    domain
+        DDS domain.
+    folder
+        Logs and the bridges' ROS_HOME.
+    body, rules
+        What the judge takes for the truth.
+    injections
+        Kinds to draw from; all of them by default.
+    per_process
+        Injections in the life of a bridge (it is also restarted where an injection kills it).
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        domain: int,
+        folder: Path,
+        body: Body,
+        rules: Rules,
+        injections: Iterable[Injection] = (),
+        per_process: int = 20,
+    ) -> None:
+        self.seed, self.domain, self.folder = seed, domain, folder
+        self.body, self.rules = body, rules
+        self.injections, self.per_process = tuple(injections), per_process
+        self.rng = np.random.default_rng(seed)
+        self.outcomes: list[Outcome] = []
+        self._bench: Bench | None = None
+        self._life = 0
+
+    # Running
+
+    def run(self, count: int, deadline_s: float = np.inf) -> list[Outcome]:
+        """Make so many injections, or as many as fit into the time; returns their outcomes."""
+        try:
+            for kind in self._draw(count):
+                if time.monotonic() > deadline_s:
+                    break
+                if self._bench is None:
+                    self._bench = self._open()
+                outcome = self._inject(self._bench, kind)
+                self.outcomes.append(outcome)
+                lost = not outcome.moved or not self._recover(self._bench)
+                if lost or len(self.outcomes) % self.per_process == 0:
+                    self._bench.close()
+                    self._bench = None
+        finally:
+            if self._bench is not None:
+                self._bench.close()
+                self._bench = None
+        return self.outcomes
+
+    def _draw(self, count: int) -> Iterable[Injection]:
+        """Every kind in turn while that is fair, the rest by weight."""
+        kinds = self.injections or INJECTIONS + WITH_TOPIC
+        weights = np.array([kind.weight for kind in kinds])
+        shares = weights / weights.sum() * count
+        whole = [kind for kind, share in zip(kinds, shares) for _ in range(int(share))]
+        rest = self.rng.choice(len(kinds), count - len(whole), p=weights / weights.sum())
+        drawn = [*whole, *(kinds[i] for i in rest)]
+        self.rng.shuffle(drawn)  # type: ignore[arg-type]
+        return drawn
+
+    def _open(self) -> Bench:
+        rng = self.rng
+        self._life += 1
+        bench = bench_of(
+            self.domain,
+            self.folder / f'life_{self.seed}_{self._life}',
+            # Its own: its threads draw at times that nothing repeats.
+            np.random.default_rng(rng.integers(2**32)),
+            self.rules,
+            rate=float(rng.choice([50.0, 100.0, 250.0])),
+            clock_s=float(rng.choice([0.0, 0.0, 37.2, -12.5])),
+            stamp_noise_s=float(rng.choice([0.0, 0.0, 2e-4])),
+            exact=bool(rng.random() < 0.3),
+            open_loop=bool(rng.random() < 0.3),
+            emergency_stop_topic=EMERGENCY,
+        )
+        bench.emergency_shown = False
+        bench.start()
+        bench.until(lambda: bench.seen.summaries, 30.0)
+        # As in a cell: everything has been up for a while before the collection is begun.
+        time.sleep(3.0)
+        return bench
+
+    def _inject(self, bench: Bench, kind: Injection) -> Outcome:
+        rng, judge = self.rng, Judge(self.body, self.rules)
+        outcome = Outcome(kind.name, kind.expected)
+        began = time.monotonic()
+        bench.gap()
+        goals = [target(self.body, bench.arm.q, rng)]
+        outcome.moved = begin(bench, goals)
+        if not outcome.moved and bench.seen.halted() and self._recover(bench):
+            # What the last injection left behind may halt the bridge after everything was made
+            # right again; a person clears that too.
+            goals = [target(self.body, bench.arm.q, rng)]
+            outcome.moved = begin(bench, goals)
+        settled = len(bench.seen.settled)
+        newest = bench.commands_since(began)
+        left = max(newest[-1].end_s - time.monotonic(), 0.0) if newest else 0.0
+        scene = Scene(bench, self.body, rng, goals, left)
+        if outcome.moved:
+            scene.left_s -= scene.wait(0.0, 0.55 * left)
+            self._act(kind, scene, outcome, settled)
+        else:
+            # Why not, in the bridge's own words.
+            failed = [
+                text for t, event, text, _ in bench.seen.events if t > began and event == 'failed'
+            ]
+            scene.note = '; '.join(
+                [*failed[-2:], *(text for _, text, _ in bench.seen.summaries[-1:])]
+            )
+        arm = bench.arm
+        options = [f'{1 / bench.period_s:.0f} Hz', *(('exact',) if arm.exact else ())]
+        options += ['open loop'] if arm.open_loop else []
+        outcome.note = f'({", ".join(options)}) {scene.note}'.strip()
+        outcome.latencies = scene.latencies
+        outcome.gap_s = bench.gap()
+        outcome.arm_share = bench.arm.fastest(began, self.rules.speed_share * self.body.velocity)
+        commands = bench.commands_since(began)
+        outcome.judgements = [judge.judge(c, bench.was_running(c.arrival_s)) for c in commands]
+        return outcome
+
+    def _act(self, kind: Injection, scene: Scene, outcome: Outcome, settled: int) -> None:
+        bench, since = scene.bench, time.monotonic()
+        kind.act(scene)
+        shown_from = since if scene.note != 'restarted' else time.monotonic() - 0.5
+        if kind.expected == 'halt':
+            bench.until(lambda: bench.seen.halted(shown_from), HALT_WITHIN_S)
+        elif kind.expected == 'go on':
+            bench.until(
+                lambda: bench.seen.halted(since) or len(bench.seen.settled) > settled, 12.0
+            )
+            outcome.settled = len(bench.seen.settled) > settled
+        else:
+            time.sleep(1.0)
+        outcome.halted = bench.seen.halted(shown_from)
+        silent_from = scene.silent_from
+        if outcome.halted:
+            silent_from = silent_from or bench.seen.halt_time(shown_from)
+            # No word of a node ends a halt.
+            bench.plan_state('paused')
+            time.sleep(0.15)
+            bench.plan_state('running')
+            time.sleep(0.5)
+        if silent_from is not None:
+            late = after(bench.commands_since(since), silent_from + GRACE_S, np.inf)
+            outcome.late_commands = len(late)
+
+    def _recover(self, bench: Bench) -> bool:
+        """Make everything right again, as a person would; returns whether it could be."""
+        bench.peace()
+        bench.answers = True
+        bench.plan_state('stopped')
+        bench.send([])
+        time.sleep(0.4)
+        q = bench.arm.q
+        low, high = self.body.lower, self.body.upper
+        if bool(np.any((q < low) | (q > high))) or not self.body.clear(q):
+            bench.kill()
+            bench.reset_arm(HOME)
+            restart(bench)
+        if not bench.until(lambda: bench.arm.speed() < 1e-3, 10.0):
+            return False
+        if bench.seen.halted():
+            if bench.clear_halt() is False:
+                return False
+            # Only a collection that is begun after that goes on.
+            bench.plan_state('stopped')
+            time.sleep(0.1)
+        bench.arm.history.clear()
+        return bench.process is not None and bench.process.poll() is None
+
+
+_domain = 0
+
+
+def _take_domain(domains: Queue[int]) -> None:
+    global _domain
+    _domain = domains.get()
+
+
+def _chunk(work: tuple[int, int, Path, Rules, float]) -> tuple[list[Outcome], str]:
+    seed, count, folder, rules, deadline_s = work
+    campaign = Campaign(seed, _domain, folder, demo_body(), rules)
+    try:
+        return campaign.run(count, deadline_s), ''
+    except Exception as error:  # A bridge that never starts must not end the others' work.
+        return campaign.outcomes, f'seed {seed}: {type(error).__name__}: {error}'
+
+
+def in_parallel(
+    seed: int,
+    count: int,
+    folder: Path,
+    rules: Rules,
+    domains: Iterable[int],
+    deadline_s: float = np.inf,
+    chunk: int = 20,
+) -> Iterator[tuple[list[Outcome], str]]:
+    """Make `count` injections with one process per DDS domain; yields outcomes as they come.
+
+    Each chunk is a `Campaign` of its own with a seed from `seed`. The second value tells what
+    broke the test itself; '' if nothing.
+    """
+    domains = list(domains)
+    context = get_context('spawn')
+    queue = context.Queue()
+    for domain in domains:
+        queue.put(domain)
+    sizes = [min(chunk, count - first) for first in range(0, count, chunk)]
+    seeds = np.random.SeedSequence(seed).generate_state(len(sizes))
+    work = [(int(s), n, folder, rules, deadline_s) for s, n in zip(seeds, sizes)]
+    with context.Pool(len(domains), _take_domain, (queue,)) as pool:
+        yield from pool.imap_unordered(_chunk, work)

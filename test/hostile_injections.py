@@ -1,0 +1,404 @@
+"""What can go wrong between a bridge and its arm, at random moments of a move under way.
+
+Each injection is a function of the scene; it returns from when on the arm must hear nothing more
+(`SILENT`), where that is so. What is expected of the bridge stands beside it: `halt`, `go on`
+(a control, or something that must not disturb) or `any` (both are right; what is commanded
+is judged as always).
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from hostile_bench import Bench
+from hostile_lines import COMMANDS, INTRUDER, RELIABLE
+from hostile_scene import ANSWER_S, HOME, SPREAD, Scene
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from remaster_ros.core.types import FloatArray
+
+
+def control(s: Scene) -> None:
+    """Nothing is wrong."""
+
+
+def pauses(s: Scene) -> None:
+    for _ in range(s.rng.integers(1, 4)):
+        s.pause()
+        s.wait(0.0, 0.5)
+        s.bench.plan_state('running')
+        s.wait(0.1, 0.8)
+
+
+def pose_taken_back(s: Scene) -> None:
+    moving = s.bench.on_its_way()
+    asked = time.monotonic()
+    s.bench.send([])
+    if moving:
+        came = s.bench.until(lambda: s.bench.commands_since(asked), ANSWER_S)
+        first = s.bench.commands_since(asked)[0].arrival_s if came else np.inf
+        s.latencies.append(first - asked)
+    s.wait(0.3, 0.6)
+    s.bench.send(s.solutions)
+
+
+def planner_silent(s: Scene) -> None:
+    s.bench.silent.add('pose_planner')
+    s.wait(1.3, 2.0)
+    s.bench.silent.clear()
+
+
+def recorder_silent(s: Scene) -> None:
+    s.bench.silent.add('recorder')
+    s.wait(1.3, 2.0)
+    s.bench.silent.clear()
+
+
+def sensor_missing(s: Scene) -> None:
+    s.bench.waiting_for = 'mocap'
+    s.wait(0.3, 1.0)
+    s.bench.waiting_for = ''
+
+
+def lost_states(s: Scene) -> None:
+    s.bench.disturb(loss=s.rng.uniform(0.2, 0.6))
+    s.wait(0.5, 1.5)
+    s.bench.disturb(loss=0.0)
+
+
+def short_silence(s: Scene) -> None:
+    s.bench.disturb(silent=True)
+    s.wait(0.02, 0.12)
+    s.bench.disturb(silent=False)
+
+
+def a_little_late(s: Scene) -> None:
+    s.bench.disturb(delay_s=s.rng.uniform(0.005, 0.05))
+    s.maybe_pause(0.5)
+    s.wait(0.2, 0.6)
+    s.bench.disturb(delay_s=0.0)
+
+
+def command_doubled(s: Scene) -> None:
+    s.bench.disturb(command_double=True)
+    s.maybe_pause(0.8)
+
+
+def _emergency(s: Scene, silent: bool) -> None:
+    s.silent_from = time.monotonic()
+    s.bench.arm.stop_by_brakes(s.silent_from)
+    if silent:
+        s.bench.disturb(silent=True)
+
+
+def emergency(s: Scene) -> None:
+    _emergency(s, silent=False)
+    s.maybe_pause(1.5)
+
+
+def emergency_driver_silent(s: Scene) -> None:
+    _emergency(s, silent=True)
+    s.maybe_pause(1.5)
+
+
+def emergency_released(s: Scene) -> None:
+    """Pressed and released again before anybody looked."""
+    _emergency(s, silent=bool(s.rng.random() < 0.5))
+    s.wait(0.3, 1.2)
+    s.bench.arm.release(time.monotonic())
+    s.bench.disturb(silent=False)
+
+
+def emergency_topic(s: Scene) -> None:
+    _emergency(s, silent=bool(s.rng.random() < 0.5))
+    s.bench.show_emergency(True)
+    s.maybe_pause(1.0)
+
+
+def emergency_topic_blinks(s: Scene) -> None:
+    """The robot's own circuit shows it for a moment only."""
+    _emergency(s, silent=False)
+    s.bench.show_emergency(True)
+    s.wait(0.1, 0.3)
+    s.bench.arm.release(time.monotonic())
+    s.bench.show_emergency(False)
+
+
+def _settle(s: Scene) -> bool:
+    """Wait until the arm is being measured; the recorder does not answer."""
+    s.bench.answers = False
+    before = len(s.bench.seen.settled)
+    return s.bench.until(lambda: len(s.bench.seen.settled) > before, s.left_s + 3.0)
+
+
+def emergency_while_measuring(s: Scene) -> None:
+    s.note = '' if _settle(s) else 'did not settle'
+    _emergency(s, silent=True)
+    s.wait(1.1, 1.6)
+    s.bench.answers = True
+
+
+def emergency_while_paused(s: Scene) -> None:
+    s.bench.plan_state('paused')
+    s.wait(0.4, 0.7)
+    _emergency(s, silent=True)
+    s.wait(1.2, 1.6)
+    s.bench.plan_state('running')
+
+
+def process_paused(s: Scene) -> None:
+    s.bench.signal(signal.SIGSTOP)
+    s.note = f'{s.wait(0.1, 2.5):.2f} s'
+    if s.rng.random() < 0.5:
+        s.bench.plan_state('paused')
+    s.bench.signal(signal.SIGCONT)
+    s.wait(0.2, 0.5)
+    s.bench.plan_state('running')
+
+
+def process_paused_emergency(s: Scene) -> None:
+    s.bench.signal(signal.SIGSTOP)
+    s.wait(0.02, 0.3)
+    _emergency(s, silent=bool(s.rng.random() < 0.5))
+    s.note = f'{s.wait(0.3, 2.5):.2f} s'
+    s.bench.signal(signal.SIGCONT)
+    s.maybe_pause(0.5)
+
+
+def process_killed(s: Scene) -> None:
+    s.bench.kill()
+    s.wait(0.0, 0.6)
+    restart(s.bench)
+    s.bench.send(s.solutions)
+
+
+def killed_while_halted(s: Scene) -> None:
+    _emergency(s, silent=False)
+    s.bench.until(lambda: s.bench.seen.halted(s.silent_from), 4.0)
+    s.wait(0.0, 0.3)
+    s.bench.kill()
+    s.bench.arm.release(time.monotonic())
+    restart(s.bench)
+    s.bench.send(s.solutions)
+    # Nothing that was shown before the kill counts.
+    s.note = 'restarted'
+
+
+def restart(bench: Bench) -> None:
+    """Start the bridge again and wait until it is there."""
+    since = time.monotonic()
+    bench.start()
+    bench.until(lambda: bench.seen.summaries and bench.seen.summaries[-1][0] > since + 0.5, 15.0)
+
+
+def late_states(s: Scene) -> None:
+    delay = s.rng.uniform(0.4, 2.0)
+    s.note = f'{delay:.2f} s'
+    s.bench.disturb(delay_s=delay)
+    s.maybe_pause(delay + 0.5)
+    s.wait(0.8, 1.2)
+
+
+def somewhat_late(s: Scene) -> None:
+    delay = s.rng.uniform(0.1, 0.4)
+    s.note = f'{delay:.2f} s'
+    s.bench.disturb(delay_s=delay)
+    s.maybe_pause(0.8)
+
+
+def late_from_the_start(s: Scene) -> None:
+    """A bridge that never had them in time, as if the clocks of two hosts were apart."""
+    delay = s.rng.uniform(0.2, 2.0)
+    s.note = f'{delay:.2f} s'
+    s.bench.kill()
+    s.bench.plan_state('stopped')
+    s.bench.disturb(delay_s=delay)
+    restart(s.bench)
+    s.wait(2.5, 3.0)
+    since = time.monotonic()
+    s.bench.plan_state('running')
+    s.bench.send([s.another_goal()])
+    if s.bench.until(lambda: s.bench.commands_since(since) and s.bench.arm.speed() > 0.1, 4.0):
+        s.maybe_pause(2.0)
+
+
+def early_stamps(s: Scene) -> None:
+    s.bench.disturb(clock_s=s.bench.calm.clock_s + s.rng.uniform(0.3, 2.0))
+    s.maybe_pause(0.6)
+
+
+def clock_set_back(s: Scene) -> None:
+    s.bench.disturb(clock_s=s.bench.calm.clock_s - s.rng.uniform(0.3, 2.0))
+    s.maybe_pause(0.6)
+
+
+def doubled_states(s: Scene) -> None:
+    s.bench.disturb(double=1.0)
+    s.maybe_pause(0.6)
+    s.wait(0.2, 0.5)
+
+
+def reordered_states(s: Scene) -> None:
+    s.bench.disturb(jitter_s=s.rng.uniform(0.015, 0.1))
+    s.maybe_pause(0.6)
+    s.wait(0.2, 0.5)
+
+
+def silence(s: Scene) -> None:
+    """The driver is silent, and the arm goes on."""
+    s.silent_from = time.monotonic()
+    s.bench.disturb(silent=True)
+    s.wait(1.3, 1.8)
+
+
+def wrapped_once(s: Scene) -> None:
+    turn = s.turn()
+    s.bench.once(lambda q: q + turn)
+    if s.rng.random() < 0.7:
+        # With the message before the next one: that is when the bridge believes it.
+        time.sleep(s.bench.period_s)
+        s.bench.plan_state('paused')
+        s.wait(0.1, 0.4)
+        s.bench.plan_state('running')
+
+
+def wrapped(s: Scene) -> None:
+    s.bench.disturb(wrap=s.turn())
+    s.maybe_pause(0.6)
+
+
+def nan_once(s: Scene) -> None:
+    joint = int(s.rng.integers(len(HOME)))
+    s.bench.once(lambda q: np.where(np.arange(len(q)) == joint, np.nan, q))
+    s.maybe_pause(0.3)
+
+
+def nan_states(s: Scene) -> None:
+    s.bench.disturb(nan=int(s.rng.integers(len(HOME))))
+    s.maybe_pause(0.6)
+
+
+def frozen_states(s: Scene) -> None:
+    s.bench.disturb(frozen=True)
+    s.maybe_pause(1.0)
+
+
+def stopped_stamps(s: Scene) -> None:
+    s.bench.disturb(stopped_stamps=True)
+    s.maybe_pause(0.8)
+
+
+def _foreign_states(s: Scene, draw: Callable[[], FloatArray]) -> None:
+    publisher = s.bench.intruder.create_publisher(JointState, '/joint_states', RELIABLE)
+    try:
+        s.bench.until(lambda: publisher.get_subscription_count() > 0, 2.0)
+        end = time.monotonic() + s.rng.uniform(0.3, 1.2)
+        paused = end - 0.25 if s.rng.random() < 0.67 else np.inf
+        while time.monotonic() < end:
+            q = draw()
+            publisher.publish(s.bench.state_message(q, np.zeros_like(q), s.bench.calm.clock_s))
+            if time.monotonic() > paused:
+                s.bench.plan_state('paused')
+                paused = np.inf
+            time.sleep(0.01)
+        if s.rng.random() < 0.5:
+            q = np.full(len(HOME), np.nan)
+            publisher.publish(s.bench.state_message(q, np.zeros_like(q)))
+            time.sleep(0.1)
+        s.bench.plan_state('running')
+        s.wait(0.2, 0.4)
+    finally:
+        s.bench.intruder.destroy_publisher(publisher)
+
+
+def foreign_states(s: Scene) -> None:
+    """Another robot's: plausible values."""
+    q = HOME + SPREAD * s.rng.uniform(-1.0, 1.0, len(HOME))
+    _foreign_states(s, lambda: q)
+
+
+def foreign_garbage(s: Scene) -> None:
+    _foreign_states(s, lambda: s.rng.uniform(-50.0, 50.0, len(HOME)))
+
+
+def foreign_commands(s: Scene) -> None:
+    """Somebody else commands the arm to hold where it is."""
+    publisher = s.bench.intruder.create_publisher(JointTrajectory, COMMANDS, RELIABLE)
+    try:
+        s.bench.until(lambda: publisher.get_subscription_count() > 0, 2.0)
+        message = JointTrajectory(joint_names=s.bench.names)
+        message.header.frame_id = INTRUDER
+        end = s.bench.arm.q + 0.2 * s.bench.arm.v
+        point = JointTrajectoryPoint(positions=end.tolist(), velocities=[0.0] * len(HOME))
+        point.time_from_start.nanosec = 400_000_000
+        message.points = [point]
+        if s.rng.random() < 0.5:
+            publisher.publish(message)
+        s.maybe_pause(0.6)
+        # A bridge that has the graph's word only now and then must still see it.
+        s.wait(1.0, 1.5)
+    finally:
+        s.bench.intruder.destroy_publisher(publisher)
+
+
+def commands_late(s: Scene) -> None:
+    """From the next command on: the stop, and the move after it."""
+    s.bench.disturb(command_delay_s=s.rng.uniform(0.05, 0.4))
+    s.bench.plan_state('paused')
+    s.wait(0.1, 0.8)
+    s.bench.plan_state('running')
+    s.wait(0.2, 0.8)
+    s.maybe_pause(0.3)
+
+
+def commands_lost(s: Scene) -> None:
+    s.bench.disturb(command_loss=float(s.rng.choice([0.5, 1.0])))
+    for _ in range(2):
+        s.bench.plan_state('paused')
+        s.wait(0.1, 0.5)
+        s.bench.plan_state('running')
+        s.wait(0.2, 0.8)
+
+
+@dataclass(frozen=True)
+class Injection:
+    """A kind: what is done, what the bridge has to do, and how often it is drawn."""
+
+    act: Callable[[Scene], None]
+    expected: str
+    weight: float = 1.0
+
+    @property
+    def name(self) -> str:
+        """Its name in tables."""
+        return self.act.__name__.replace('_', ' ')
+
+
+INJECTIONS = (
+    *(Injection(act, 'go on') for act in (control, planner_silent, recorder_silent)),
+    *(Injection(act, 'go on') for act in (sensor_missing, lost_states, short_silence)),
+    *(Injection(act, 'go on') for act in (a_little_late, command_doubled, pose_taken_back)),
+    Injection(pauses, 'go on', 3.0),
+    Injection(process_killed, 'go on', 0.5),
+    *(Injection(act, 'halt', 1.5) for act in (emergency, emergency_driver_silent)),
+    *(Injection(act, 'halt') for act in (emergency_released, emergency_while_measuring)),
+    *(Injection(act, 'halt') for act in (emergency_while_paused, process_paused_emergency)),
+    Injection(killed_while_halted, 'halt', 0.5),
+    *(Injection(act, 'halt') for act in (late_states, silence, wrapped, nan_states)),
+    *(Injection(act, 'halt') for act in (frozen_states, stopped_stamps)),
+    *(Injection(act, 'halt') for act in (foreign_states, foreign_garbage, foreign_commands)),
+    Injection(late_from_the_start, 'any', 0.5),
+    *(Injection(act, 'any') for act in (process_paused, somewhat_late, early_stamps)),
+    *(Injection(act, 'any') for act in (clock_set_back, doubled_states, reordered_states)),
+    *(Injection(act, 'any') for act in (wrapped_once, nan_once, commands_late, commands_lost)),
+)
+WITH_TOPIC = (
+    Injection(emergency_topic, 'halt', 1.5),
+    Injection(emergency_topic_blinks, 'halt'),
+)
+"""Where the bridge has an emergency_stop_topic, these are drawn too."""

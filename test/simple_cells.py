@@ -1,0 +1,16 @@
+"""Cell files for tests: the shipped demo cell with changes."""
+
+from pathlib import Path
+
+import yaml
+
+from remaster_ros.storage.cell import config_path
+
+
+def write_cell(path: Path, **changes) -> Path:
+    """Write the demo cell with these keys changed; its URDF by an absolute path."""
+    demo = config_path('cells/demo.yaml')
+    cell = yaml.safe_load(demo.read_text())
+    cell['robot']['urdf'] = str((demo.parent / cell['robot']['urdf']).resolve())
+    path.write_text(yaml.safe_dump({**cell, **changes}))
+    return path

@@ -1,0 +1,48 @@
+"""A real bridge and an arm that obeys everything: nothing it commands may be what it must not be.
+
+The arm, the man in the middle and the judge are the tests' own: hostile_arm, hostile_bench,
+hostile_judge. benchmarks/check_hostile_motion.py runs a thousand and more of the random
+injections, and the known situations with their figures.
+"""
+
+import os
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+pytest.importorskip('pinocchio', reason='the judge needs pinocchio (pip install .[test])')
+
+from hostile_campaign import in_parallel
+from hostile_judge import Rules
+from hostile_known import known_situations, situations
+from hostile_outcomes import report
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(400)]
+
+# The demo cell states no bound of acceleration, so that the cautious default holds, rad/s².
+RULES = Rules(speed_share=0.3, cartesian_m_s=0.25, acceleration=np.full(7, 5.0))
+# The other system tests take the domains below these.
+DOMAINS = range(192 + 4 * (os.getpid() % 9), 196 + 4 * (os.getpid() % 9))
+SEED = int(os.environ.get('HOSTILE_SEED', '9'))
+
+
+@pytest.mark.parametrize('name', [name for name, *_ in situations()])
+def test_a_situation_in_which_the_first_bridge_commanded_what_must_not_be(name, tmp_path):
+    (situation,) = known_situations(tmp_path, RULES, DOMAINS[0], wanted=name)
+    assert not situation.outcome.wrong(RULES), situation.cells(RULES)
+
+
+def test_random_injections(tmp_path):
+    """HOSTILE_SEED=n draws others; the moments are never the same."""
+    outcomes, broken = [], []
+    for some, error in in_parallel(SEED, 40, tmp_path, RULES, DOMAINS, chunk=10):
+        outcomes += some
+        broken += [error] if error else []
+    print(f'seed {SEED}')
+    print(report(outcomes, RULES))
+    assert not broken
+    assert len(outcomes) == 40
+    assert sum(len(outcome.judgements) for outcome in outcomes) >= 40, 'hardly anything moved'
+    wrong = [f'{o.kind}: {"; ".join(o.wrong(RULES))}' for o in outcomes if o.wrong(RULES)]
+    assert not wrong

@@ -1,0 +1,84 @@
+"""config/sros2/policy.xml allows what the nodes do, and nothing else: compared with real nodes."""
+
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+from conftest import ROOT, node_arguments, wait_until
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(180)]
+
+POLICY = ROOT / 'config' / 'sros2' / 'policy.xml'
+NODES = (
+    'pose_planner',
+    'robot_bridge',
+    'optitrack_markers',
+    'laser_tracker_markers',
+    'recorder',
+    'optimizer',
+)
+OWN = {
+    'optitrack_markers': {'start_timeout_s': 600.0},
+    'laser_tracker_markers': {'start_timeout_s': 600.0},
+}
+
+
+def resolved(name, namespace, node):
+    """Write a name of the policy in full, as sros2 does."""
+    if name.startswith('~'):
+        return f'{namespace.rstrip("/")}/{node}{name[1:]}'
+    return name if name.startswith('/') else f'{namespace.rstrip("/")}/{name}'
+
+
+def allowed(node):
+    """Return {(what, name)} of a node's profile."""
+    (profile,) = ElementTree.parse(POLICY).iterfind(f".//profile[@node='{node}']")
+    found = set()
+    for expressions in profile:
+        for what in ('publish', 'subscribe', 'reply', 'request'):
+            if expressions.get(what) == 'ALLOW':
+                found |= {(what, resolved(e.text, profile.get('ns'), node)) for e in expressions}
+    return found
+
+
+def used(client, node):
+    """Return {(what, name)} that the graph shows of a node."""
+    asked = {
+        'publish': client.get_publisher_names_and_types_by_node,
+        'subscribe': client.get_subscriber_names_and_types_by_node,
+        'reply': client.get_service_names_and_types_by_node,
+        'request': client.get_client_names_and_types_by_node,
+    }
+    return {(what, name) for what, ask in asked.items() for name, _ in ask(node, '/')}
+
+
+def test_the_policy_is_what_the_nodes_use(start, client, tmp_path):
+    """A name too few and a secured node fails; one too many and the lock stands open."""
+    for name in NODES:
+        values = {'use_sim_time': False, **OWN.get(name, {})}
+        if name in ('pose_planner', 'recorder', 'optimizer'):
+            values['session'] = tmp_path / 'session'
+        own = {f'{name}:{key}': value for key, value in values.items()}
+        start(f'remaster_ros.nodes.{name}', *node_arguments(ROOT / 'config' / 'fake.yaml', **own))
+    looks = []
+
+    def the_same_for_long():
+        """All are up when what they show has not grown for 40 looks."""
+        client.spin_some()
+        present = dict(client.get_node_names_and_namespaces())
+        looks.append({name: used(client, name) for name in NODES if name in present})
+        now = looks[-1]
+        up = [name for name in now if ('publish', '/remaster/status') in now[name]]
+        return len(up) == len(NODES) and len(looks) > 40 and looks[-40] == now
+
+    wait_until(the_same_for_long, 60.0, 'six nodes')
+    for name in NODES:
+        own, shown = allowed(name), looks[-1][name]
+        assert shown - own == set(), f'{name} uses what the policy does not allow'
+        assert own - shown == set(), f'{name} is allowed what it does not use'
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_nobody_but_the_bridge_may_command(node):
+    commands = ('publish', '/joint_trajectory_controller/joint_trajectory')
+    assert (commands in allowed(node)) == (node == 'robot_bridge')
+    assert ('publish', '/joint_states') not in allowed(node)

@@ -1,0 +1,165 @@
+"""A replay moves no arm: on a live graph it ends with status 2, and it leaves commands out."""
+
+import pytest
+from conftest import node_arguments, wait_until
+
+from remaster_ros.storage.bag import BagReader
+from remaster_ros.storage.bag_writer import BagWriter
+from remaster_ros.storage.cell import read_cell
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
+
+COMMANDS = '/joint_trajectory_controller/joint_trajectory'
+STATE, TRAJECTORY = 'sensor_msgs/msg/JointState', 'trajectory_msgs/msg/JointTrajectory'
+NAMES = list(read_cell('demo').chain().joint_names)
+
+
+@pytest.fixture(params=['old', 'new'])
+def bag(request, tmp_path):
+    """Two seconds of an arm and of what it was told, as bags have held it before, and do now."""
+    from rclpy.serialization import serialize_message
+    from sensor_msgs.msg import JointState
+    from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+    commands = COMMANDS if request.param == 'old' else '/remaster/recorded/joint_trajectory'
+    trajectory = JointTrajectory(joint_names=NAMES)
+    trajectory.points = [JointTrajectoryPoint(positions=[0.5] * 7)]
+    with BagWriter(tmp_path / 'bag') as writer:
+        for number in range(40):
+            stamp_ns = 10**18 + number * 5 * 10**7
+            state = JointState(name=NAMES, position=[0.1] * 7)
+            state.header.stamp.sec = number + 1
+            data = serialize_message(state)
+            writer.write('/joint_states', STATE, data, stamp_ns)
+            data = serialize_message(trajectory)
+            writer.write(commands, TRAJECTORY, data, stamp_ns)
+    return tmp_path / 'bag'
+
+
+@pytest.fixture
+def old_bag(bag, request):
+    if request.node.callspec.params['bag'] != 'old':
+        pytest.skip('one of the two is enough')
+    return bag
+
+
+def until(client, condition, timeout_s, what):
+    def turn():
+        for _ in range(5):
+            client.spin_some()
+        return condition()
+
+    wait_until(turn, timeout_s, what)
+
+
+def refusal(process):
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 2, out + err
+    (line,) = (line for line in err.splitlines() if line.startswith('error:'))
+    assert 'Traceback' not in err
+    return line
+
+
+def spun(client, process):
+    until(client, lambda: process.poll() is not None, 60, 'the replay to end')
+    return process
+
+
+def test_commands_are_left_out(start, client, bag):
+    from sensor_msgs.msg import JointState
+
+    heard = []
+    client.create_subscription(JointState, '/joint_states', heard.append, 100)
+    process = start('remaster_ros.cli.main', 'replay', bag, '--wait-for', '/joint_states')
+    until(client, lambda: heard, 60, 'the joint states')
+    assert not client.get_publishers_info_by_topic(COMMANDS)
+    until(client, lambda: process.poll() is not None, 60, 'the end')
+    assert process.returncode == 0, process.communicate()
+    assert len(heard) == 40
+
+
+@pytest.mark.parametrize('more', [(), ('--with-commands',)])
+def test_a_controller_that_listens_is_never_told(start, client, bag, more):
+    from trajectory_msgs.msg import JointTrajectory
+
+    heard = []
+    client.create_subscription(JointTrajectory, COMMANDS, heard.append, 100)
+    process = start('remaster_ros.cli.main', 'replay', bag, *more)
+    line = refusal(spun(client, process))
+    assert f'this graph is live: /test_client listens to {COMMANDS}' in line
+    assert not heard
+
+
+def test_a_controller_that_comes_later_is_never_told(start, client, old_bag):
+    """Not one message reaches it: who is matched is looked at before each command."""
+    from sensor_msgs.msg import JointState
+    from trajectory_msgs.msg import JointTrajectory
+
+    heard, told = [], []
+    client.create_subscription(JointState, '/joint_states', heard.append, 100)
+    process = start('remaster_ros.cli.main', 'replay', old_bag, '--rate', '0.1', '--with-commands')
+    until(client, lambda: heard, 60, 'the joint states')
+    client.create_subscription(JointTrajectory, COMMANDS, told.append, 100)
+    assert f'/test_client listens to {COMMANDS}' in refusal(spun(client, process))
+    assert not told
+
+
+def test_a_robot_is_refused(start, client, old_bag):
+    from sensor_msgs.msg import JointState
+
+    client.create_publisher(JointState, '/joint_states', 10)
+    process = start('remaster_ros.cli.main', 'replay', old_bag)
+    line = refusal(spun(client, process))
+    assert 'this graph is live: /test_client publishes /joint_states' in line
+
+
+def test_a_robot_that_comes_later_ends_it(start, client, old_bag):
+    from sensor_msgs.msg import JointState
+
+    heard = []
+    client.create_subscription(JointState, '/joint_states', heard.append, 100)
+    process = start('remaster_ros.cli.main', 'replay', old_bag, '--rate', '0.1')
+    until(client, lambda: heard, 60, 'the joint states')
+    client.create_publisher(JointState, '/joint_states', 10)
+    assert '/test_client publishes /joint_states' in refusal(spun(client, process))
+
+
+def test_a_bridge_is_refused(start, client, old_bag):
+    start('remaster_ros.nodes.robot_bridge', *node_arguments(cell='demo'))
+    until(client, lambda: client.get_publishers_info_by_topic('/remaster/settled'), 60, 'it')
+    line = refusal(spun(client, start('remaster_ros.cli.main', 'replay', old_bag)))
+    assert '/robot_bridge' in line
+
+
+def test_a_recorder_only_listens_and_writes_commands_under_another_name(
+    start, client, bag, tmp_path
+):
+    session = tmp_path / 'again'
+    recorder = start(
+        'remaster_ros.nodes.recorder', *node_arguments(session=session, call_measure=False)
+    )
+    until(client, lambda: client.get_subscriptions_info_by_topic(COMMANDS), 60, 'the recorder')
+    process = start(
+        'remaster_ros.cli.main', 'replay', bag, '--with-commands', '--wait-for', '/joint_states'
+    )
+    assert spun(client, process).returncode == 0, process.communicate()
+    recorder.terminate()
+    assert recorder.wait(20) == 0
+    counts = BagReader(session / 'bag').counts
+    assert counts['/remaster/recorded/joint_trajectory'] == counts['/joint_states'] == 40
+    assert COMMANDS not in counts
+
+
+def test_another_namespace_is_another_graph(start, client, old_bag):
+    """A robot in /left does not keep a replay in /right from playing, nor hears it."""
+    from sensor_msgs.msg import JointState
+
+    heard = {'left': [], 'right': []}
+    client.create_publisher(JointState, '/left/joint_states', 10)
+    for name, messages in heard.items():
+        client.create_subscription(JointState, f'/{name}/joint_states', messages.append, 100)
+    arguments = node_arguments(bag=old_bag, wait_for='/joint_states')
+    process = start('remaster_ros.nodes.replay', *arguments, '-r', '__ns:=/right')
+    until(client, lambda: process.poll() is not None, 60, 'the end')
+    assert process.returncode == 0, process.communicate()
+    assert (len(heard['left']), len(heard['right'])) == (0, 40)
