@@ -327,15 +327,17 @@ class Bench:
             took.append('clear_halt')
             cleared = time.monotonic()
             self.until(lambda: not self.halted, 5, 'the end of the halt')
-            if self.planner == 'running':
-                self.call('pause')
-            # The bridge wants to hear of a planner that does not run before one that runs again.
             latest = self.observer.latest
-            self.until(
-                lambda: latest['pose_planner'][0] > cleared and self.planner != 'running',
-                10,
-                'a planner that does not run',
-            )
+
+            def stands() -> bool:
+                # The bridge wants to hear of a planner that does not run before it runs again.
+                if latest['pose_planner'][0] < cleared:
+                    return False
+                if self.planner == 'running':
+                    self.call('pause', 2.0)
+                return self.planner != 'running'
+
+            self.until(stands, 20, 'a planner that does not run')
             time.sleep(0.2)
         if self.planner != 'running':
             response = self.call('collect')
