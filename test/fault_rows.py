@@ -41,6 +41,10 @@ REFUSED = {
 COLUMNS = 'who', 'fault', 'what is said', 'what is commanded', 'how it goes on'
 
 
+class TooBusyError(Exception):
+    """The machine was too busy to see what became of a fault."""
+
+
 @dataclass(frozen=True)
 class Row:
     """A fault.
@@ -93,14 +97,20 @@ class Seen:
 
 
 def observe(bench: Bench, row: Row) -> Seen:
-    """Try a row; return what was seen. On a machine that was too busy for it, try again."""
+    """Try a row; return what was seen. On a machine that was too busy for it, try again.
+
+    Raises
+    ------
+    TooBusyError
+        It was too busy every time.
+    """
     for _ in range(TRIES):
         began = time.monotonic()
         seen = _observe(bench, row)
         if row.times or not any(_refused(bench, kind, began) for kind in ('late', 'early')):
-            break
+            return seen
         print(f'{row.fault}: once more, joint_states came late without a fault: {seen.said}')
-    return seen
+    raise TooBusyError(f'{TRIES} times joint_states came late without a fault: {seen.said}')
 
 
 def _observe(bench: Bench, row: Row) -> Seen:

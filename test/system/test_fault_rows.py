@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 ALL = bool(fault_page.MODE)
 TRIED = [row for row in fault_rows.ROWS if ALL or row.quick]
 TRIED.sort(key=lambda row: (list(fault_rows.BENCHES).index(row.bench), not row.quick))
-ENOUGH = 6
+ENOUGH = 12
 """So many configurations must be left for another row."""
 FIVE_HEADING = 'situation', 'commanded before', 'commanded now', 'what is said', 'how it goes on'
 BAD_FITS = {'no gauge': '{"format": "remaster-fit/1", "joint_offsets": []}', 'garbage': '\0{"f'}
@@ -115,7 +115,11 @@ def cells(row, seen):
 def test_row(benches, row):
     bench = benches.of(row.bench)
     benches.broken = True
-    seen = fault_rows.observe(bench, row)
+    try:
+        seen = fault_rows.observe(bench, row)
+    except fault_rows.TooBusyError as busy:
+        benches.broken = False
+        pytest.skip(str(busy))
     benches.broken = False
     section, line = cells(row, seen)
     print(line)
