@@ -194,8 +194,15 @@ class Rig:
             'the nodes to find each other',
         )
 
+    def quiet(self):
+        """End the bridge's timers: it looks and reports only when it is told to, or has to."""
+        for timer in list(self.bridge.timers):
+            timer.cancel()
+
     def close(self):
         self.end_bridge()
+        if not self.context.ok():
+            return
         self._spinner.shutdown()
         self.peer.destroy_node()
         rclpy.shutdown(context=self.context)

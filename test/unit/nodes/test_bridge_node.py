@@ -529,6 +529,8 @@ def test_reports_without_a_joint_halt_a_collection(rig):
 
 def test_the_halt_is_shown_at_once_and_with_its_level(rig):
     r = rig()
+    r.quiet()
+    r.spin(5)
     count = len(r.summaries)
     r.alter = lambda m: setattr(m, 'position', [float('nan')] * 7) or m
     r.run(1.0, r.halted)

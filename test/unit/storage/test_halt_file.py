@@ -2,12 +2,15 @@
 
 import json
 import re
+import time
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
 from remaster_ros.core.errors import RemasterError
-from remaster_ros.storage.halt_file import LIMIT, HaltFile
+from remaster_ros.storage import halt_file
+from remaster_ros.storage.halt_file import HaltFile
 
 
 @pytest.fixture
@@ -19,6 +22,8 @@ def test_it_is_named_by_home_domain_and_node(tmp_path, monkeypatch):
     environment = {'ROS_HOME': str(tmp_path), 'ROS_DOMAIN_ID': '7'}
     folder = tmp_path / 'remaster_ros'
     assert HaltFile('/robot_bridge', environment).path == folder / 'halt_7_robot_bridge.json'
+    nested = HaltFile('/left/robot_bridge', environment).path
+    assert nested == folder / 'halt_7_left.robot_bridge.json'
     monkeypatch.setenv('HOME', str(tmp_path / 'me'))
     expected = tmp_path / 'me' / '.ros' / 'remaster_ros' / 'halt_0_robot_bridge.json'
     assert HaltFile('/robot_bridge', {}).path == expected
@@ -31,7 +36,7 @@ def test_it_is_named_by_home_domain_and_node(tmp_path, monkeypatch):
 def test_no_two_bridges_have_the_same_file(tmp_path):
     """The halt of one cell must not be cleared with that of another."""
     environment = {'ROS_HOME': str(tmp_path)}
-    names = ['/a/b/bridge', '/a_b/bridge', '/a/b_bridge', '/a_b_bridge', '/bridge']
+    names = ['/a/b/bridge', '/a_b/bridge', '/a/b_bridge', '/a_b_bridge', '/bridge', '/X/bridge']
     assert len({HaltFile(name, environment).path for name in names}) == len(names)
     assert all(
         HaltFile(name, environment).path.parent == tmp_path / 'remaster_ros' for name in names
@@ -67,7 +72,7 @@ def test_clearing_where_nothing_was_ever_written_is_fine(file):
         (b'{"halted": "x"}', 'since'),
         (b'{"halted": 3, "since": "x"}', 'str'),
         (b'\xff\xfe', 'malformed'),
-        (b'"' + b' ' * LIMIT, f'larger than {LIMIT} bytes'),
+        (b' ' * 65537, 'larger than 65536 bytes'),
     ],
 )
 def test_a_damaged_file_is_a_halt(file, content, reason):
@@ -76,6 +81,7 @@ def test_a_damaged_file_is_a_halt(file, content, reason):
     found = file.read()
     assert found.startswith(f'{file.path}: a halt that cannot be read (')
     assert reason in found
+    assert found.endswith(')')
     file.clear()
     assert file.read() == ''
 
@@ -99,6 +105,29 @@ def test_a_folder_that_cannot_be_made_is_one_error(tmp_path):
     file = HaltFile('/robot_bridge', {'ROS_HOME': str(tmp_path / 'home')})
     with pytest.raises(RemasterError, match='home'):
         file.write('x')
+
+
+def test_its_time_is_utc(file, monkeypatch):
+    monkeypatch.setenv('TZ', 'XXX-9')
+    time.tzset()
+    try:
+        file.write('x')
+        since = json.loads(file.path.read_text())['since']
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    then = datetime.strptime(since, '%Y-%m-%d %H:%M:%S UTC').replace(tzinfo=UTC)
+    assert abs((datetime.now(UTC) - then).total_seconds()) < 600
+
+
+def test_a_halt_that_was_cleared_does_not_come_back_after_a_power_cut(file, monkeypatch):
+    file.write('x')
+    synced = []
+    monkeypatch.setattr(
+        halt_file, 'sync_folder', lambda folder: synced.append((folder, file.path.exists()))
+    )
+    file.clear()
+    assert synced == [(file.path.parent, False)]
 
 
 def test_the_folder_may_be_there_with_others_in_it(file):
