@@ -102,12 +102,22 @@ class ArmSupervisor:
 
     # What comes in
 
-    def planner_is(self, state: str, wall_s: float) -> list[Action]:
-        """Take the planner's state; anything but ``running`` stops the arm."""
+    def planner_is(self, state: str, wall_s: float, run: str = '') -> list[Action]:
+        """Take the planner's state; anything but ``running`` stops the arm.
+
+        Parameters
+        ----------
+        state
+            As in its summary.
+        wall_s
+            Now, s.
+        run
+            Names the run of a collection: by another one a person's /remaster/collect is known.
+        """
         reason = '' if state == 'running' else f'planner is {state}'
-        if reason and not self.halted:
-            self._interlocks.must_collect, self._failures = False, 0
-        return self._hear('planner', reason, wall_s)
+        if self._interlocks.planner(reason, run, wall_s, halted=bool(self.halted)):
+            self._failures = 0
+        return self.tick(wall_s)
 
     def recorder_waits(self, waiting_for: str, wall_s: float) -> list[Action]:
         """Take the recorder's sign of life, and which required sensor it misses ('' for none)."""
@@ -176,7 +186,7 @@ class ArmSupervisor:
         """Take a report of the joints."""
         wall_s = report.wall_s
         if not self.reports.believes(report):
-            return self._doubt(self.reports.trouble, wall_s)
+            return self._doubt(self.reports.trouble, wall_s, self.reports.kind)
         self._doubted_wall = None
         gap = self._gap(report)
         self._excuse_gap(report)
@@ -294,14 +304,14 @@ class ArmSupervisor:
         self._interlocks.hear(name, reason, wall_s)
         return self.tick(wall_s)
 
-    def _doubt(self, why: str, wall_s: float) -> list[Action]:
+    def _doubt(self, why: str, wall_s: float, kind: str = '') -> list[Action]:
         """Take a report that is not believed; where that goes on it halts a collection."""
         if self._doubted_wall is None:
             self._doubted_wall = wall_s
         if wall_s - self._doubted_wall <= DOUBT_S:
             return self.tick(wall_s)
         self._interlocks.set('robot', why)
-        jumped = self._seen is not None and self.reports.kind in ('too_fast', 'outside_limits')
+        jumped = self._seen is not None and kind in ('too_fast', 'outside_limits')
         if (self._engaged or jumped) and not self.halted:
             return self._halt(why, wall_s)
         # Nothing moves, so that what is usual can be learned anew: a driver that was restarted, a

@@ -30,6 +30,7 @@ class Interlocks:
 
     def __init__(self, heartbeat_s: float, *, must_collect: bool) -> None:
         self.must_collect = must_collect
+        self._run = ''
         self._heartbeat_s = heartbeat_s
         self._heard: dict[str, float] = {}
         self._reasons: dict[str, str] = {}
@@ -38,6 +39,27 @@ class Interlocks:
     def hear(self, name: str, reason: str, wall_s: float) -> None:
         """Take a sign of life, and why the arm must not move; '' if it may."""
         self._heard[name], self._reasons[name] = wall_s, reason
+
+    def planner(self, reason: str, run: str, wall_s: float, *, halted: bool) -> bool:
+        """Take the planner's state; return whether a collection was begun, or is not running.
+
+        Parameters
+        ----------
+        reason
+            Why the arm must not move; '' while a collection runs.
+        run
+            Names the run; another one than before was begun by a person since.
+        wall_s
+            Now, s.
+        halted
+            A halt is not cleared yet: what is begun before it is does not count.
+        """
+        begun = bool(reason) or (run != self._run and bool(self._run))
+        self._run = run if run and not reason else self._run
+        if begun and not halted:
+            self.must_collect = False
+        self.hear('planner', reason, wall_s)
+        return begun
 
     def set(self, name: str, reason: str) -> None:
         """Take why the arm must not move; '' if it may."""

@@ -175,7 +175,7 @@ class RobotBridge(RemasterNode):
             if state == 'running':
                 # By it a planner that is started again sees that this bridge was there all along.
                 self._run = values.get('run', '')
-            self._do(self.supervisor.planner_is(state, now))
+            self._do(self.supervisor.planner_is(state, now, values.get('run', '')))
         elif node == 'recorder':
             self._do(self.supervisor.recorder_waits(values.get('waiting_for', ''), now))
 

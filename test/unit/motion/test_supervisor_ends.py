@@ -8,7 +8,6 @@ from supervisor_rig import LIMITS, Rig
 
 from remaster_ros.fakes import motion as servo
 from remaster_ros.motion.actions import Drive, Failed, Halted, Settled, Stop
-from remaster_ros.motion.following import STOPPED_ON_ITS_WAY
 
 
 @pytest.fixture
@@ -28,7 +27,7 @@ def test_an_emergency_stop_just_before_the_end_halts(rig):
     rig.run(5.0, lambda: np.max(np.abs(rig.arm.at(rig.t)[0] - target)) < 0.07)
     freeze(rig)
     rig.run(5.0, lambda: rig.said(Halted))
-    assert rig.last(Halted).reason == STOPPED_ON_ITS_WAY
+    assert rig.last(Halted).reason.startswith('the robot stands 0.06')
     assert not rig.said(Failed, Stop)
 
 
@@ -90,3 +89,26 @@ def test_the_reasons_are_given_in_an_order(rig):
     rig.do(arm.planner_is('paused', rig.wall))
     assert arm.blocked(rig.wall) == 'planner is paused'
     assert arm.blocked(rig.wall + 3.5) == 'no sign of planner, recorder, robot for 3 s'
+
+
+def test_a_collection_that_is_begun_at_once_after_the_halt_was_cleared_goes_on(rig):
+    """The planner's pause after the halt was heard before it was cleared; another run tells."""
+
+    def planner(state, run):
+        rig.do(rig.supervisor.planner_is(state, rig.wall, run))
+
+    rig.alive.discard('planner')
+    planner('running', 'first')
+    rig.plan([0.9, -1.9])
+    rig.run(0.8)
+    freeze(rig)
+    rig.run(2.0, lambda: rig.said(Halted))
+    planner('paused', 'first')
+    assert rig.supervisor.clear_halt(rig.wall) == ''
+    count = len(rig.said(Drive))
+    planner('running', 'first')
+    rig.run(1.0)
+    assert len(rig.said(Drive)) == count, 'the run that was halted is no word of a person'
+    planner('running', 'second')
+    rig.run(1.0)
+    assert len(rig.said(Drive)) > count
