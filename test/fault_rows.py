@@ -408,7 +408,7 @@ def nothing(bench: Bench) -> None:
 
 
 def _common(name: str) -> tuple[Row, ...]:
-    quick = {'pose_planner': 'restarted', 'recorder': 'stuck', 'robot_bridge': ''}
+    quick = {'pose_planner': 'stuck', 'recorder': 'stuck', 'robot_bridge': ''}
     sensor = name in SENSOR_OF
     rows = (
         ('off', 'killed, and started after 6 s', killed(name), started(name), 6.0),

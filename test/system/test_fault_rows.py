@@ -164,7 +164,7 @@ def test_offsets_that_are_none(fault, tmp_path):
     path = tmp_path / 'fit.json'
     path.write_text(BAD_FITS[fault])
     done = subprocess.run(
-        [*command, '-p', f'offsets:={path}'],
+        [*command, '-p', 'cell:=demo', '-p', f'offsets:={path}'],
         env=environment, capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 2, done.stderr
