@@ -91,8 +91,9 @@ def test_the_reasons_are_given_in_an_order(rig):
     assert arm.blocked(rig.wall + 3.5) == 'no sign of planner, recorder, robot for 3 s'
 
 
-def test_a_collection_that_is_begun_at_once_after_the_halt_was_cleared_goes_on(rig):
-    """The planner's pause after the halt was heard before it was cleared; another run tells."""
+@pytest.mark.parametrize('paused', [True, False])
+def test_a_collection_that_is_begun_at_once_after_the_halt_was_cleared_goes_on(rig, paused):
+    """By a planner that did not run when it was cleared, or by another run."""
 
     def planner(state, run):
         rig.do(rig.supervisor.planner_is(state, rig.wall, run))
@@ -103,12 +104,14 @@ def test_a_collection_that_is_begun_at_once_after_the_halt_was_cleared_goes_on(r
     rig.run(0.8)
     freeze(rig)
     rig.run(2.0, lambda: rig.said(Halted))
-    planner('paused', 'first')
+    if paused:
+        planner('paused', 'first')
     assert rig.supervisor.clear_halt(rig.wall) == ''
     count = len(rig.said(Drive))
-    planner('running', 'first')
-    rig.run(1.0)
-    assert len(rig.said(Drive)) == count, 'the run that was halted is no word of a person'
+    if not paused:
+        planner('running', 'first')
+        rig.run(1.0)
+        assert len(rig.said(Drive)) == count, 'the run that was halted goes on'
     planner('running', 'second')
     rig.run(1.0)
     assert len(rig.said(Drive)) > count
