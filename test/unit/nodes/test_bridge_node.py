@@ -534,8 +534,9 @@ def test_the_halt_is_shown_at_once_and_with_its_level(rig):
     count = len(r.summaries)
     r.alter = lambda m: setattr(m, 'position', [float('nan')] * 7) or m
     r.run(1.0, r.halted)
-    r.wait(lambda: len(r.summaries) > count, 'a summary of the halt')
-    level, text, values = r.summaries[-1]
+    shown = lambda: [s for s in r.summaries[count:] if s[2]['halted']]  # noqa: E731
+    r.wait(shown, 'a summary of the halt')
+    level, text, values = shown()[0]
     assert (level, text) == ('error', 'joint_states are not finite')
     assert values['halted'] == values['joints_trouble'] == text
     for _ in range(3):
