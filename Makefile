@@ -5,7 +5,7 @@
 #   make check    lint, types, layers; CI runs this and make test
 #   make bench    the benchmarks, small (BENCH='bench_speed …' chooses, FULL=1 for all sizes)
 #   make docs     docs/parameters.md from the code
-#   make faults   the tables of docs/faults.md from what the tests observe
+#   make faults   the tables of docs/faults.md from what the tests observe (FAULTS=add keeps the old)
 # The first of them makes a virtual environment. With ROS 2 Jazzy sourced its rclpy is used and the
 # system's NumPy kept; else the ROS 2 wheels are installed. PYTHON=... chooses the interpreter.
 
@@ -75,8 +75,8 @@ docs: $(VENV)/installed
 	$(BIN)/python docs/make_parameters.py
 
 faults: $(VENV)/installed
-	FAULTS_PAGE=write PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest -q \
-		-p pytest_timeout test/integration/test_fault_matrix.py
+	FAULTS_PAGE=$(or $(FAULTS),write) PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest -q \
+		-p pytest_timeout test/integration/test_device_faults.py test/system/test_fault_rows.py
 
 format: $(VENV)/installed
 	$(BIN)/ruff check --fix .

@@ -31,6 +31,7 @@ JUDGES = [
     'CESAPI==1.1.3',
     'mcap-ros2-support>=0.5',
     'arviz-stats>=0.4',
+    'python-fcl>=0.7',
 ]
 
 
@@ -100,7 +101,13 @@ setup(
             *JUDGES,
         ],
         # What the benchmarks compare with; figaroh and pybotics get environments of their own.
-        'bench': ['emcee>=3.1', 'numpyro>=0.15', 'jax>=0.4.30'],
+        # PyBullet has wheels up to Python 3.11; without it the paths of its iiwa are not judged.
+        'bench': [
+            'emcee>=3.1',
+            'numpyro>=0.15',
+            'jax>=0.4.30',
+            'pybullet>=3.2.7; python_version < "3.12"',
+        ],
         'check': ['ruff', 'mypy', 'types-PyYAML', 'import-linter'],
     },
     zip_safe=False,

@@ -20,8 +20,24 @@ from collections import Counter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-MODULES = ('motion', 'visiting', 'settling', 'preflight')
-TESTS = [f'test/unit/core/test_{name}.py' for name in MODULES]
+LEFT_OUT = ('__init__', 'path_search')
+"""Path search is a dozen lines around the collision model, and has its tests there."""
+MODULES = [
+    *(
+        f'remaster_ros/motion/{path.name}'
+        for path in sorted((ROOT / 'remaster_ros' / 'motion').glob('*.py'))
+        if path.stem not in LEFT_OUT
+    ),
+    'remaster_ros/core/preflight.py',
+]
+TESTS = [
+    *(
+        str(path.relative_to(ROOT))
+        for path in sorted((ROOT / 'test' / 'unit' / 'motion').glob('test_*.py'))
+        if path.stem.removeprefix('test_') not in LEFT_OUT
+    ),
+    'test/unit/core/test_preflight.py',
+]
 CONFIG = """\
 [mutmut]
 source_paths=remaster_ros
@@ -40,38 +56,45 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split('\n', 1)[0])
     parser.add_argument('--children', type=int, default=os.cpu_count() or 1)
     parser.add_argument('--keep', type=Path, help='work in this folder and leave it')
+    parser.add_argument('--only', nargs='+', default=[''], help='parts of the names of modules')
+    parser.add_argument('--tests', nargs='+', default=[''], help='parts of the names of tests')
+    parser.add_argument('--no-mutants', action='store_true', help='coverage only')
     args = parser.parse_args()
+    modules = [name for name in MODULES if any(part in name for part in args.only)]
+    tests = [name for name in TESTS if any(part in name for part in args.tests)]
     folder = args.keep or Path(tempfile.mkdtemp(prefix='motion_code_'))
     try:
-        prepare(folder)
-        missed = coverage(folder)
-        survivors = mutants(folder, args.children)
+        prepare(folder, modules, tests)
+        missed = coverage(folder, modules, tests)
+        survivors = 0 if args.no_mutants else mutants(folder, args.children)
     finally:
         if args.keep is None:
             shutil.rmtree(folder, ignore_errors=True)
     return 1 if missed or survivors else 0
 
 
-def prepare(folder: Path) -> None:
+def prepare(folder: Path, modules: list[str], tests: list[str]) -> None:
     """Copy what the tests need."""
     folder.mkdir(exist_ok=True)
-    for name in ('remaster_ros', 'config', 'test/unit/core'):
+    for name in ('remaster_ros', 'config', 'test/unit/core', 'test/unit/motion'):
         shutil.copytree(
-            ROOT / name, folder / name, ignore=shutil.ignore_patterns('__pycache__', 'mutants')
+            ROOT / name,
+            folder / name,
+            ignore=shutil.ignore_patterns('__pycache__', 'mutants'),
+            dirs_exist_ok=True,
         )
     shutil.copy(ROOT / 'pytest.ini', folder)
-    modules = '\n    '.join(f'remaster_ros/core/{name}.py' for name in MODULES)
     (folder / 'setup.cfg').write_text(
-        CONFIG.format(modules=modules, tests='\n    '.join(TESTS)), encoding='utf-8'
+        CONFIG.format(modules='\n    '.join(modules), tests='\n    '.join(tests)), encoding='utf-8'
     )
 
 
-def coverage(folder: Path) -> bool:
+def coverage(folder: Path, modules: list[str], tests: list[str]) -> bool:
     """Run the tests under coverage.py; return whether anything is not reached."""
-    include = ','.join(f'remaster_ros/core/{name}.py' for name in MODULES)
+    include = ','.join(modules)
     python = [sys.executable, '-m']
     run(folder, *python, 'coverage', 'run', '--branch', f'--include={include}', '-m', 'pytest',
-        '-q', *TESTS)  # fmt: skip
+        '-q', *tests)  # fmt: skip
     report = run(
         folder, *python, 'coverage', 'report', '--show-missing', '--fail-under=100', check=False
     )

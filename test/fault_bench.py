@@ -1,349 +1,398 @@
-"""The whole loop in one process and in stepped time, to spoil one part of it at a time.
+"""Real nodes on fake devices in a ROS domain of their own, to spoil one part of it at a time.
 
-The rules of the bridge, the pairing and the plausibility are the product's own; the arm is the
-fake one, and so are its faults. What stands in for planner and recorder says what they would say,
-unless the fault under test keeps it from doing so.
+Every node is a process as in `remaster demo`. The bench's own node observes (`fault_observer`),
+publishes what strangers would, and, where asked, stands between two nodes and hands on what the
+one tells the other, spoiled. An operator calls the services that a person would.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from fault_observer import Observer
 
 from remaster_ros.core import transforms
-from remaster_ros.core.motion import MotionLimits
-from remaster_ros.core.pairing import PairedReading, Pairing, Rejection, SensorRules
-from remaster_ros.core.plausibility import Plausibility
-from remaster_ros.core.presence import Presence
-from remaster_ros.core.settling import SettleRules
-from remaster_ros.core.tour import nearest_solution
-from remaster_ros.core.types import MarkerReading
-from remaster_ros.core.visiting import (
-    PROBE,
-    Drive,
-    Failed,
-    Halted,
-    Settled,
-    Stop,
-    Visitor,
-    VisitRules,
-)
-from remaster_ros.fakes import faults
-from remaster_ros.fakes.robot import FakeArm, TrajectoryPoint
+from remaster_ros.fakes.faults import inject
 from remaster_ros.fakes.setup import make_world
-from remaster_ros.fakes.world import World
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.nodes.demo import free_ports
+from remaster_ros.storage.cell import config_path, read_cell
+from remaster_ros.storage.session import read_session
 
-CELL = read_cell('demo')
-CHAIN = CELL.chain()
-STEP_S = 0.05
-NODES = ('pose_planner', 'robot_bridge', 'recorder', 'optitrack_markers', 'laser_tracker_markers')
+ROOT = Path(__file__).parents[1]
+SEED, RATE, SPEED_SHARE = 11, 4.0, 0.2
 SENSOR_OF = {'optitrack_markers': 'mocap', 'laser_tracker_markers': 'tracker'}
-RULES = VisitRules(settle=SettleRules(settle_s=1.0), arrive_timeout_s=6.0, answer_timeout_s=30.0)
-SENSORS = (
-    SensorRules('mocap', 'sir', dwell_s=0.5, min_samples=5, timeout_s=3.0),
-    SensorRules('tracker', 'smr', single_shot=True, timeout_s=8.0),
-)
-TURNS = np.array([[0.1, 0.0, 0.0, -0.1, 0, 0, 0.2], [-0.1, 0.05, 0, 0.1, 0.1, 0, 0], [0.0] * 7])
+NODES = ('pose_planner', 'robot_bridge', 'recorder', *SENSOR_OF)
+FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
+EMERGENCY = 'safety/emergency_stop'
+RELAYED = {
+    'pose_planner': 'remaster/joint_solutions',
+    'robot_bridge': 'remaster/settled',
+    'optitrack_markers': 'optitrack/marker',
+    'laser_tracker_markers': 'laser_tracker/marker',
+}
+"""Node -> the topic between it and the others, where relays are wanted."""
 
 
-class SteppedWorld(World):
-    """A World whose time the test sets."""
-
-    time_s = 100.0
-
-    def now(self) -> float:
-        return self.time_s
-
-
-@dataclass
-class Node:
-    """A node under test: what kind of fault it has while `faulty`."""
-
-    name: str = ''
-    kind: str = ''
-    faulty: bool = False
-
-
-class Bench:
-    """One run over three configurations.
+class Relay:
+    """Hand messages on, as they are or spoiled.
 
     Attributes
     ----------
-    reasons
-        Everything that was said about it, each once, in its order.
-    recorded
-        Solution -> sensor -> the accepted reading.
+    spoil
+        Returns what becomes of a message; None hands it on.
+    delay_s
+        How much later it is handed on, wall time.
     """
 
-    def __init__(self, folder: Path, seed: int = 1, require: str = 'all') -> None:
-        made = make_world(folder / 'world', CELL, seed, 1.0)
-        self.world = SteppedWorld.open(made.folder)
-        made.close()
-        self.rng = np.random.default_rng(seed)
-        self.arm = FakeArm(self.world, np.random.default_rng(seed + 1))
-        self.limits = MotionLimits.of(CHAIN, 0.1)
-        self.node, self.require = Node(), require
-        self.visitor = Visitor(self.limits, RULES)
-        self.presence = Presence(SENSOR_OF.values(), 3.0)
-        markers = {name: np.array(place) for name, place in CELL.markers.items()}
-        self.plausibility = Plausibility(CHAIN, markers)
-        self.state, self.said = 'running', dict.fromkeys(NODES, -np.inf)
-        self.solutions = self.world.start_q + TURNS
-        self.open = set(range(len(TURNS)))
-        self.planned, self.sent = False, self.solutions
-        self.pairing: Pairing | None = None
-        self.taking, self.settled_s = -1, 0.0
-        self.late: list[tuple[float, Callable[[], object]]] = []
-        self.last_reading: dict[str, np.ndarray] = {}
-        self.reasons: list[str] = []
-        self.recorded: dict[int, dict[str, PairedReading]] = {}
-        self.gave_up: set[int] = set()
-        self.commands: list[np.ndarray] = []
+    def __init__(self, node, topic: str, kind) -> None:
+        from remaster_ros.nodes.status import LEASED, RELIABLE
+
+        self.spoil: Callable | None = None
+        self.delay_s, self._last = 0.0, None
+        self._publisher = node.create_publisher(kind, topic, LEASED)
+        # The planner counts two that listen to it: bridge and recorder.
+        for callback in (self._take, lambda message: None):
+            node.create_subscription(kind, f'bench/{topic}', callback, RELIABLE)
+
+    def _take(self, message) -> None:
+        self._last = message
+        if self.delay_s:
+            threading.Timer(self.delay_s, self._send, [message]).start()
+        else:
+            self._send(message)
+
+    def _send(self, message) -> None:
+        self._publisher.publish(self.spoil(message) if self.spoil else message)
+
+    def say_again(self) -> None:
+        """Send the last message again."""
+        self._send(self._last)
+
+
+class Bench:
+    """One collection of real nodes.
+
+    Parameters
+    ----------
+    folder
+        Everything that is written.
+    domain
+        ROS_DOMAIN_ID.
+    relays
+        Whether the bench stands between the nodes.
+    emergency
+        Whether the bridge is given an `emergency_stop_topic`, which the bench publishes.
+    require
+        Of the recorder.
+    candidates
+        Candidate poses for optimization.
+    """
+
+    def __init__(
+        self, folder: Path, domain: int, *, relays=False, emergency=False, require='all',
+        candidates=32,
+    ) -> None:  # fmt: skip
+        self.folder, self.session = folder, folder / 'session'
+        self.world = make_world(folder / 'world', read_cell('demo'), SEED, RATE)
+        (folder / 'log').mkdir()
+        path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get('PYTHONPATH'))))
+        self._environment = {
+            **os.environ,
+            'PYTHONPATH': path,
+            'ROS_DOMAIN_ID': str(domain),
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+            'ROS_HOME': str(folder / 'home'),
+            'OMP_NUM_THREADS': '1',
+        }
+        command, data, tracker = free_ports(
+            socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM
+        )
+        ports = {'command_port': command, 'data_port': data}
+        hidden = {'world': str(folder / 'world')}
+        self._values = {
+            'fake_robot': hidden,
+            'fake_optitrack': {**hidden, **ports, 'rate': 20.0},
+            'fake_laser_tracker': {**hidden, 'port': tracker},
+            'pose_planner': {
+                'session': str(self.session), 'optimization_candidates': candidates,
+                'validation_candidates': 1, 'registration_candidates': 6, 'seed': SEED,
+            },
+            'robot_bridge': {
+                'speed_share': SPEED_SHARE, 'settle_s': 0.6, 'answer_timeout_s': 30.0,
+                **({'emergency_stop_topic': EMERGENCY} if emergency else {}),
+            },
+            'recorder': {'session': str(self.session), 'require': require, 'bag': False},
+            'optitrack_markers': ports,
+            'laser_tracker_markers': {'port': tracker},
+        }  # fmt: skip
+        self.processes: dict[str, subprocess.Popen] = {}
+        self._callers: dict[str, object] = {}
+        self.relays: dict[str, Relay] = {}
+        self.strangers: list = []
+        self._open_node(domain)
+        if relays:
+            self._open_relays()
+        if emergency:
+            self._open_emergency()
+        for name in (*FAKES, *NODES):
+            self.start(name)
+
+    # The bench's own node
+
+    def _open_node(self, domain: int) -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = rclpy.create_node('stranger', context=self._context)
+        self.observer = Observer(self.node, self.world, SPEED_SHARE)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._thread = threading.Thread(target=self._executor.spin, daemon=True)
+        self._thread.start()
+
+    def _open_relays(self) -> None:
+        from geometry_msgs.msg import PointStamped
+        from sensor_msgs.msg import JointState
+        from trajectory_msgs.msg import JointTrajectory
+
+        kinds = {'pose_planner': JointTrajectory, 'robot_bridge': JointState}
+        for name, topic in RELAYED.items():
+            self.relays[name] = Relay(self.node, topic, kinds.get(name, PointStamped))
+
+    def _open_emergency(self) -> None:
+        from std_msgs.msg import Bool
+
+        self.pressed: bool | None = False
+        publisher = self.node.create_publisher(Bool, EMERGENCY, 10)
+
+        def tell() -> None:
+            if self.pressed is not None:
+                publisher.publish(Bool(data=self.pressed))
+
+        self.node.create_timer(0.2, tell)
+
+    def foreign(self, topic: str, kind):
+        """Return a publisher of the bench's own on a topic that belongs to another."""
+        publisher = self.node.create_publisher(kind, topic, 10)
+        self.strangers.append(publisher)
+        return publisher
+
+    # Processes
+
+    def start(self, name: str) -> None:
+        """Start a node (again)."""
+        command = [sys.executable, '-m', 'remaster_ros.nodes', name, '--ros-args']
+        command += ['--params-file', str(config_path('fake.yaml'))]
+        for key, value in self._values[name].items():
+            command += ['-p', f'{name}:{key}:={json.dumps(value)}']
+        if name in self.relays:
+            topic = RELAYED[name]
+            for written in (topic, f'/{topic}'):
+                command += ['-r', f'{written}:=/bench/{topic}']
+        with (self.folder / 'log' / f'{name}.log').open('ab') as log:
+            self.processes[name] = subprocess.Popen(
+                command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+                env=self._environment,
+            )  # fmt: skip
+
+    def send(self, name: str, signum: int) -> None:
+        """Send a signal to a node's process."""
+        self.processes[name].send_signal(signum)
+
+    def kill(self, name: str) -> None:
+        """End a node as SIGKILL does."""
+        self.processes[name].kill()
+        self.processes[name].wait()
+
+    def stutter(self, name: str, seconds: float, on_s: float = 0.06, off_s: float = 0.06) -> None:
+        """Let a node run only now and then, as on a machine that is far too busy."""
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            self.send(name, signal.SIGSTOP)
+            time.sleep(off_s)
+            self.send(name, signal.SIGCONT)
+            time.sleep(on_s)
+
+    def inject(self, **devices: dict[str, float]) -> None:
+        """Replace the faults of the fakes; with none they end."""
+        inject(self.world.folder, devices)
 
     # Time
 
+    def until(self, condition: Callable[[], object], timeout_s: float, what: str) -> None:
+        """Wait; fail where it takes longer, or where a process has ended by itself."""
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            for name, process in self.processes.items():
+                status = process.poll()
+                assert status is None or status < 0, f'{name} ended: {self._log(name)}'
+            said = {name: latest[1] for name, latest in self.observer.latest.items()}
+            assert time.monotonic() < deadline, f'waited {timeout_s} s for {what}: {said}'
+            time.sleep(0.01)
+
+    def _log(self, name: str) -> str:
+        return (self.folder / 'log' / f'{name}.log').read_text()[-500:]
+
+    def begin(self) -> None:
+        """Wait for the nodes, begin, and see the registration through."""
+        says = self.observer.says
+        self.until(lambda: says('pose_planner', 'robot') == 'heard', 90, 'the robot')
+        self.call('collect')
+
+        halts: list[str] = []
+
+        def registered() -> bool:
+            if self.halted:
+                # A machine that is far too busy as the nodes start; no row has begun yet.
+                halts.append(self.halted)
+                assert len(halts) <= 3, f'halted without a fault: {halts}'
+                time.sleep(1.0)
+                self.operate()
+            return says('pose_planner', 'phase') == 'collection'
+
+        self.until(registered, 120, 'a registration')
+
+    def under_way(self) -> None:
+        """Wait until the arm has gone a third of a long move."""
+        began = time.monotonic()
+
+        def on_its_way() -> bool:
+            moves = [c for c in self.observer.since(began) if c.is_move]
+            if not moves or moves[-1].duration_s < 0.9 * RATE:
+                return False
+            gone_s = (time.monotonic() - moves[-1].wall_s) * RATE
+            return gone_s > 0.3 * moves[-1].duration_s
+
+        self.until(on_its_way, 60, 'a long move')
+
+    def settled(self) -> None:
+        """Wait until a reading begins."""
+        began = time.monotonic()
+        found = self.observer.find
+        self.until(lambda: found('robot_bridge', 'settled', since_s=began), 60, 'a reading')
+
+    def left(self) -> int:
+        """Return how many configurations are still to be visited."""
+        says = self.observer.says
+        planned = int(says('pose_planner', 'configurations') or 0)
+        return planned - int(says('pose_planner', 'configurations_done') or 0)
+
+    # The operator
+
+    def call(self, service: str, timeout_s: float = 10.0):
+        """Call a service of the planner or the bridge; None where it does not answer."""
+        from std_srvs.srv import Trigger
+
+        if service not in self._callers:
+            self._callers[service] = self.node.create_client(Trigger, f'remaster/{service}')
+        caller = self._callers[service]
+        if not caller.wait_for_service(timeout_sec=timeout_s):
+            return None
+        future = caller.call_async(Trigger.Request())
+        deadline = time.monotonic() + timeout_s
+        while not future.done() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        return future.result() if future.done() else None
+
     @property
-    def t(self) -> float:
-        return self.world.time_s
+    def halted(self) -> str:
+        """Why the bridge keeps the arm where it is; ''."""
+        return self.observer.says('robot_bridge', 'halted')
 
-    def run(self, seconds: float, until: Callable[[], object] = lambda: False) -> bool:
-        """Go on; returns whether `until` came true."""
-        end = self.t + seconds
-        while self.t < end:
-            self.step()
-            if until():
-                return True
-        return False
+    @property
+    def planner(self) -> str:
+        """The planner's state."""
+        return self.observer.says('pose_planner', 'state')
 
-    def step(self) -> None:
-        self.world.time_s += STEP_S
-        due = [what for when, what in self.late if when <= self.t]
-        self.late = [(when, what) for when, what in self.late if when > self.t]
-        for what in due:
-            what()
-        self._speak()
-        state = self.arm.joint_state()
-        if state is not None:
-            self._report(*state)
-        self._sense()
-        if self._alive('robot_bridge'):
-            self.do(self.visitor.tick(self.t))
-            blocked = self.visitor.blocked(self.t)
-            # Before the first configuration everybody is only just coming up.
-            if blocked and self.recorded and self.state == 'running':
-                self.note(blocked)
+    def operate(self) -> list[str]:
+        """Do what a person does who has looked at the arm; return what it took."""
+        took = []
+        if self.halted:
+            response = self.call('clear_halt')
+            if response is None or not response.success:
+                return []
+            took.append('clear_halt')
+            cleared = time.monotonic()
+            self.until(lambda: not self.halted, 5, 'the end of the halt')
+            latest = self.observer.latest
 
-    def is_faulty(self, name: str, *kinds: str) -> bool:
-        return self.node.faulty and self.node.name == name and self.node.kind in kinds
+            def stands() -> bool:
+                # The bridge wants to hear of a planner that does not run before it runs again.
+                if latest['pose_planner'][0] < cleared:
+                    return False
+                if self.planner == 'running':
+                    self.call('pause', 2.0)
+                return self.planner != 'running'
 
-    def _alive(self, name: str) -> bool:
-        node = self.node
-        if not node.faulty or node.name != name:
-            return True
-        if node.kind == 'intermittent':
-            return not faults.is_out(4.0, self.t)
-        return node.kind not in ('off', 'stuck', 'restarted')
+            self.until(stands, 20, 'a planner that does not run')
+            time.sleep(0.2)
+        if self.planner != 'running':
+            response = self.call('collect')
+            if response is None or not response.success:
+                # It was started just now: the operator tries again.
+                return took
+            took.append('collect')
+            self.until(lambda: self.planner == 'running', 5, 'the collection')
+        return took
 
-    def _due(self, name: str) -> bool:
-        every_s = 2.0 if self.is_faulty(name, 'slow') else 0.5
-        if not self._alive(name) or self.t - self.said[name] < every_s:
-            return False
-        self.said[name] = self.t
-        return True
-
-    def _send(self, name: str, what: Callable[[], object]) -> None:
-        """Deliver a word of a node, late where that is its fault."""
-        if self.is_faulty(name, 'delayed'):
-            self.late.append((self.t + 1.5, what))
-        else:
-            what()
-
-    # Planner and recorder
-
-    def _speak(self) -> None:
-        bridge = self._alive('robot_bridge')
-        if self._due('pose_planner') and bridge:
-            state = self.state
-            self._send('pose_planner', lambda: self.do(self.visitor.planner_says(state, self.t)))
-            if not self.planned:
-                self.planned = True
-                self.plan(self.solutions)
-        for node, sensor in SENSOR_OF.items():
-            if self._due(node):
-                self._send(node, lambda s=sensor: self.presence.says(s, True, '', self.t))
-        if self._due('recorder') and bridge:
-            absent = {
-                name: why
-                for name, why in self.presence.absent(self.t).items()
-                if self.require in ('all', name)
-            }
-            word = '; '.join(f'{name}: {why}' for name, why in absent.items())
-            if word:
-                self.note(f'waiting for {word}')
-            self._send('recorder', lambda: self.do(self.visitor.recorder_says(word, self.t)))
-
-    def plan(self, solutions: np.ndarray) -> None:
-        def deliver() -> None:
-            self.sent = solutions
-            self.do(self.visitor.plan(solutions, self.t))
-
-        self._send('pose_planner', deliver)
-
-    def announce_again(self) -> None:
-        """What is left of the pose, as the planner does when bridge or recorder has lost it."""
-        self.plan(self.solutions[sorted(self.open)])
-
-    def _which(self, solution: int) -> int:
-        """The number in the whole pose of a solution that was announced."""
-        return int(np.argmin(np.max(np.abs(self.solutions - self.sent[solution]), axis=1)))
-
-    def _report(self, stamp: float, names: list[str], q: np.ndarray, v: np.ndarray) -> None:
-        missing = [name for name in CHAIN.joint_names if name not in names]
-        if self._alive('robot_bridge'):
-            if missing:
-                self.do(self.visitor.unreadable(f'joint_states lacks {missing[0]}', self.t))
-            else:
-                q = q[[names.index(name) for name in CHAIN.joint_names]]
-                self.do(self.visitor.report(stamp, q, self.t))
-        if self.pairing is not None and not missing and self._alive('recorder'):
-            self.pairing.add_joint_state(stamp, q)
-            self.pairing.give_up(stamp, self.presence.absent(self.t))
-
-    def _sense(self) -> None:
-        """Readings of both sensors, as their nodes would publish them."""
-        for node, name in SENSOR_OF.items():
-            # Only while somebody listens: what a sensor sees is dear to compute.
-            waits_s = self.t - self.settled_s
-            if self.pairing is None or (name == 'tracker' and waits_s <= 1.0):
-                continue
-            if self.is_faulty(node, 'slow') and round(self.t / STEP_S) % 10:
-                continue
-            if not self._alive(node) or not self.world.line_of_sight(name, self.t):
-                continue
-            place = self.world.marker_in_sensor(name, self.t) + self.rng.normal(0, 3e-5, 3)
-            if self.is_faulty(node, 'wrong', 'garbage', 'stray', 'frozen'):
-                place = self._spoil(node, name, place)
-            else:
-                self.last_reading[name] = place
-            reading = MarkerReading(self.t, place)
-            self._send(node, lambda n=name, r=reading: self._read(n, r))
-        pairing = self.pairing
-        if pairing is not None and pairing.complete and self._alive('recorder'):
-            self._finish(pairing)
-
-    def _spoil(self, node: str, name: str, place: np.ndarray) -> np.ndarray:
-        kind = self.node.kind
-        if kind == 'garbage':
-            return place * np.nan
-        if kind == 'wrong':
-            return place + np.array([0.2, 0, 0])
-        # A stray that stands where the marker was last seen, or that reading again and again.
-        stands = self.last_reading[name]
-        return stands + (self.rng.normal(0, 3e-5, 3) if kind == 'stray' else 0.0)
-
-    def _read(self, name: str, reading: MarkerReading) -> None:
-        if not np.all(np.isfinite(reading.position)):
-            self.note(f'{name}: readings that are not finite are dropped')
-        elif self.pairing is not None and self._alive('recorder'):
-            self.pairing.add_reading(name, reading)
-
-    def _finish(self, pairing: Pairing) -> None:
-        pairing.finish()
-        good = {}
-        for name, item in pairing.decided.items():
-            T_R_N = self.world.truth.sensors[name].T_R_N
-            item = (
-                self.plausibility.judge(item, T_R_N) if isinstance(item, PairedReading) else item
-            )
-            if isinstance(item, Rejection):
-                self.note(f'{name}: {item.reason}: {item.detail}')
-            else:
-                good[name] = item
-        solution, self.pairing = self.taking, None
-        which = self._which(solution)
-        assert which not in self.recorded, 'recorded twice'
-        self.recorded[which] = good
-        self.open.discard(which)
-        self.answer(solution)
-
-    def answer(self, solution: int) -> None:
-        if self.is_faulty('recorder', 'wrong'):
-            solution = 7
-        wait_s = {'slow': 5.0, 'delayed': 40.0}.get(self.node.kind, 0.0)
-        if self.node.name == 'recorder' and self.node.faulty and wait_s:
-            self.late.append(
-                (self.t + wait_s, lambda: self.do(self.visitor.answered(solution, self.t)))
-            )
-        elif not self.is_faulty('recorder', 'garbage'):
-            self.do(self.visitor.answered(solution, self.t))
-
-    # What the bridge does
-
-    def do(self, actions: list) -> None:
-        for action in actions:
-            match action:
-                case Drive(solution, waypoints):
-                    assert solution == PROBE or not self.visitor.blocked(self.t)
-                    self.command(waypoints)
-                case Stop(waypoint, reason):
-                    self.note(reason)
-                    self.command((waypoint,))
-                case Settled(solution, stamp_s, q):
-                    if self._alive('recorder'):
-                        self._take(solution, stamp_s, q)
-                case Failed(solution, reason):
-                    self.note(reason)
-                    if 'outside its limits' not in reason:
-                        which = self._which(solution)
-                        self.gave_up |= {which} - set(self.recorded)
-                        self.open.discard(which)
-                case Halted(reason):
-                    self.note(reason)
-                    self.state = 'paused'
-
-    def _take(self, solution: int, stamp_s: float, q: np.ndarray) -> None:
-        if nearest_solution(self.solutions, q) is None:
-            self.note('settled at no joint solution of the announced pose')
-            return
-        self.taking, self.settled_s = solution, self.t
-        self.pairing = Pairing(stamp_s, q, SENSORS, require=self.require)
-
-    def command(self, waypoints: tuple) -> None:
-        points = [TrajectoryPoint(p.time_s, list(p.q), list(p.velocity)) for p in waypoints]
-        for point in waypoints:
-            self.commands.append(point.q)
-        self.arm.command(CHAIN.joint_names, points)
-
-    def note(self, reason: str) -> None:
-        if reason not in self.reasons:
-            self.reasons.append(reason)
-
-    # What must hold whatever happens
-
-    def done(self) -> bool:
-        return not self.open and self.pairing is None
-
-    def inject(self, **numbers: float) -> None:
-        faults.inject(self.world.folder, {'robot': numbers})
-
-    def speed(self) -> float:
-        return self.world.joint_speed(self.t)
-
-    def check(self) -> None:
-        """No wrong observation, no command outside the limits."""
-        for q in self.commands:
-            assert self.limits.outside(q) == ''
-        truth = self.world.truth
-        for readings in self.recorded.values():
-            for name, reading in readings.items():
-                sensor = truth.sensors[name]
-                marker_R = CHAIN.positions(reading.q, sensor.marker, truth.joint_offsets)
-                expected = transforms.apply(transforms.inverse(sensor.T_R_N), marker_R)
-                assert np.linalg.norm(reading.position - expected) < 1e-3, name
+    # The end
 
     def close(self) -> None:
+        """End every process, and the node."""
+        for process in self.processes.values():
+            if process.poll() is None:
+                process.send_signal(signal.SIGCONT)
+                process.send_signal(signal.SIGINT)
+        deadline = time.monotonic() + 8.0
+        for process in self.processes.values():
+            try:
+                process.wait(max(0.1, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        import rclpy
+
+        self._executor.shutdown()
+        self._thread.join(5.0)
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
         self.world.close()
+
+    def check_session(self) -> None:
+        """Assert that each row is where the truth has its marker, once, and none is missing."""
+        session, truth = read_session(self.session), self.world.truth
+        m, chain = session.measurements, self.world.chain
+        for index, name in enumerate(session.sensor_names):
+            sensor, mine = truth.sensors[name], m.sensor == index
+            marker_R = chain.positions(m.q[mine], sensor.marker, truth.joint_offsets)
+            expected = transforms.apply(transforms.inverse(sensor.T_R_N), marker_R)
+            wrong = np.linalg.norm(m.position[mine] - expected, axis=1)
+            assert np.all(wrong < 1e-3), (name, wrong.max())
+        pairs = list(zip(m.configuration.tolist(), m.sensor.tolist()))
+        assert len(set(pairs)) == len(pairs), 'recorded twice'
+        poses = {
+            event.values['stamp']: (event.values['pose'], event.values['ids'].split())
+            for _, event in self.observer.find('pose_planner', 'pose')
+            if event.values['split'] != 'registration'
+        }
+        recorded = set()
+        for _, event in self.observer.find('recorder', 'configuration'):
+            pose, ids = poses.get(event.values['stamp'], ('', []))
+            if pose and event.values['result'] == 'recorded':
+                recorded.add((pose, ids[int(event.values['solution'])]))
+        assert len(set(m.configuration.tolist())) >= len(recorded), 'lost'
+        for log in (self.folder / 'log').iterdir():
+            assert 'Traceback' not in log.read_text(), log

@@ -9,10 +9,6 @@ from __future__ import annotations
 
 import heapq
 import itertools
-import os
-import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -37,6 +33,7 @@ from hostile_lines import (
     Lines,
     Seen,
 )
+from hostile_process import BridgeProcess
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
@@ -45,10 +42,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.core.types import FloatArray
 
-ROOT = Path(__file__).resolve().parents[1]
 
-
-class Bench:
+class Bench(BridgeProcess):
     """The bridge's surroundings.
 
     Parameters
@@ -84,8 +79,8 @@ class Bench:
         stamp_noise_s: float = 0.0,
         **arm: bool,
     ) -> None:
-        self.names, self.rng, self.environment = list(names), rng, environment
-        self.parameters, self.log = parameters, log
+        super().__init__(environment, parameters, log)
+        self.names, self.rng = list(names), rng
         self.arm = HostileArm(home, time.monotonic(), **arm)
         self.calm = Lines(clock_s=clock_s, stamp_noise_s=stamp_noise_s)
         self.lines = self.calm
@@ -97,7 +92,6 @@ class Bench:
         self.running_since: list[tuple[float, str]] = [(0.0, 'waiting')]
         self.order = rng.permutation(len(home))
         self.period_s = 1.0 / rate
-        self.process: subprocess.Popen[bytes] | None = None
         self._once: list[Callable[[FloatArray], FloatArray]] = []
         self._due: list[tuple[float, int, JointState]] = []
         self._due_commands: list[tuple[float, int, JointTrajectory]] = []
@@ -141,38 +135,9 @@ class Bench:
         for thread in self._threads:
             thread.start()
 
-    # The bridge's process
-
-    def start(self) -> None:
-        """Start the bridge."""
-        command = [sys.executable, '-m', 'remaster_ros.nodes.robot_bridge', '--ros-args']
-        for name, value in self.parameters.items():
-            command += ['-p', f'{name}:={value}']
-        with self.log.open('ab') as log:
-            self.process = subprocess.Popen(
-                command, env=self.environment, stdout=log, stderr=log, cwd=ROOT
-            )
-
-    def signal(self, number: int) -> None:
-        """Send the bridge a signal."""
-        assert self.process is not None
-        self.process.send_signal(number)
-
-    def kill(self) -> None:
-        """Kill the bridge."""
-        self.signal(signal.SIGKILL)
-        assert self.process is not None
-        self.process.wait()
-
     def close(self) -> None:
         """End the bridge and everything here."""
-        if self.process is not None and self.process.poll() is None:
-            self.signal(signal.SIGCONT)
-            self.signal(signal.SIGINT)
-            try:
-                self.process.wait(10)
-            except subprocess.TimeoutExpired:
-                self.kill()
+        self.end()
         self._ending.set()
         for thread in self._threads:
             thread.join()
@@ -416,16 +381,3 @@ class Bench:
                     result='recorded',
                     reason='',
                 )
-
-
-def environment(domain: int, home: Path) -> dict[str, str]:
-    """Return the environment of a bridge with a DDS domain and a ROS_HOME of its own."""
-    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get('PYTHONPATH'))))
-    return {
-        **os.environ,
-        'PYTHONPATH': path,
-        'ROS_DOMAIN_ID': str(domain),
-        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-        'ROS_HOME': str(home),
-        'PYTHONUNBUFFERED': '1',
-    }

@@ -119,6 +119,11 @@ class Campaign:
         bench.gap()
         goals = [target(self.body, bench.arm.q, rng)]
         outcome.moved = begin(bench, goals)
+        if not outcome.moved and bench.seen.halted() and self._recover(bench):
+            # What the last injection left behind may halt the bridge after everything was made
+            # right again; a person clears that too.
+            goals = [target(self.body, bench.arm.q, rng)]
+            outcome.moved = begin(bench, goals)
         settled = len(bench.seen.settled)
         newest = bench.commands_since(began)
         left = max(newest[-1].end_s - time.monotonic(), 0.0) if newest else 0.0

@@ -211,6 +211,22 @@ def somewhat_late(s: Scene) -> None:
     s.maybe_pause(0.8)
 
 
+def late_from_the_start(s: Scene) -> None:
+    """A bridge that never had them in time, as if the clocks of two hosts were apart."""
+    delay = s.rng.uniform(0.2, 2.0)
+    s.note = f'{delay:.2f} s'
+    s.bench.kill()
+    s.bench.plan_state('stopped')
+    s.bench.disturb(delay_s=delay)
+    restart(s.bench)
+    s.wait(2.5, 3.0)
+    since = time.monotonic()
+    s.bench.plan_state('running')
+    s.bench.send([s.another_goal()])
+    if s.bench.until(lambda: s.bench.commands_since(since) and s.bench.arm.speed() > 0.1, 4.0):
+        s.maybe_pause(2.0)
+
+
 def early_stamps(s: Scene) -> None:
     s.bench.disturb(clock_s=s.bench.calm.clock_s + s.rng.uniform(0.3, 2.0))
     s.maybe_pause(0.6)
@@ -241,7 +257,7 @@ def silence(s: Scene) -> None:
 
 
 def wrapped_once(s: Scene) -> None:
-    turn = s.joint()
+    turn = s.turn()
     s.bench.once(lambda q: q + turn)
     if s.rng.random() < 0.7:
         # With the message before the next one: that is when the bridge believes it.
@@ -252,7 +268,7 @@ def wrapped_once(s: Scene) -> None:
 
 
 def wrapped(s: Scene) -> None:
-    s.bench.disturb(wrap=s.joint())
+    s.bench.disturb(wrap=s.turn())
     s.maybe_pause(0.6)
 
 
@@ -376,6 +392,7 @@ INJECTIONS = (
     *(Injection(act, 'halt') for act in (late_states, silence, wrapped, nan_states)),
     *(Injection(act, 'halt') for act in (frozen_states, stopped_stamps)),
     *(Injection(act, 'halt') for act in (foreign_states, foreign_garbage, foreign_commands)),
+    Injection(late_from_the_start, 'any', 0.5),
     *(Injection(act, 'any') for act in (process_paused, somewhat_late, early_stamps)),
     *(Injection(act, 'any') for act in (clock_set_back, doubled_states, reordered_states)),
     *(Injection(act, 'any') for act in (wrapped_once, nan_once, commands_late, commands_lost)),

@@ -122,15 +122,18 @@ def report(outcomes: Sequence[Outcome], rules: Rules) -> str:
     """Return the table, latencies, and what was wrong, a line each."""
     latencies = [t for o in outcomes for t in o.latencies]
     found = [t for t in latencies if np.isfinite(t)]
+    prompt = [t for o in outcomes if o.gap_s < 0.02 for t in o.latencies if np.isfinite(t)]
     lines = [
         table(outcomes, rules),
         f'from a request to the stop: {percentiles(found)}; '
         f'not sent: {len(latencies) - len(found)}',
+        f'of these where the test itself stalled less than 20 ms: {percentiles(prompt)}',
         f'the test itself stalled beyond {STALLED_S} s in '
         f'{sum(o.gap_s >= STALLED_S for o in outcomes)} injections',
     ]
     for number, outcome in enumerate(outcomes):
         wrong = outcome.wrong(rules)
         if wrong:
-            lines.append(f'{number}: {outcome.kind} {outcome.note}: {"; ".join(wrong)}')
+            stalled = f', test stalled {outcome.gap_s:.2f} s' if outcome.gap_s > 0.05 else ''
+            lines.append(f'{number}: {outcome.kind} {outcome.note}{stalled}: {"; ".join(wrong)}')
     return '\n'.join(lines)

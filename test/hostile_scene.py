@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from hostile_bench import Bench, environment
+from hostile_bench import Bench
 from hostile_judge import Body, Rules
+from hostile_process import environment
 
 from remaster_ros.core.types import FloatArray
 from remaster_ros.storage.cell import read_cell
@@ -72,7 +73,8 @@ def begin(bench: Bench, solutions: Sequence[FloatArray], timeout_s: float = 15.0
         bench.plan_state('running')
     since = time.monotonic()
     bench.send(solutions)
-    return bench.until(lambda: moving(bench, since), timeout_s)
+    bench.until(lambda: moving(bench, since) or bench.seen.halted(since + 0.2), timeout_s)
+    return moving(bench, since)
 
 
 def moving(bench: Bench, since_s: float) -> bool:
@@ -137,7 +139,11 @@ class Scene:
             self.wait(0.05, 0.4)
             self.bench.plan_state('running')
 
-    def joint(self) -> FloatArray:
+    def another_goal(self) -> FloatArray:
+        """Draw another goal from where the arm is now, rad, (k,)."""
+        return target(self.body, self.bench.arm.q, self.rng)
+
+    def turn(self) -> FloatArray:
         """Return a full turn of one random joint, rad, (k,)."""
         out = np.zeros(len(self.bench.names))
         out[self.rng.integers(len(out))] = self.rng.choice([-1, 1]) * 2 * np.pi

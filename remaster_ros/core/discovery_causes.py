@@ -257,7 +257,7 @@ def _size(
     wheres = dict(zip(solution.cells, solution.slices(), strict=True))
     shift = np.zeros((len(data), 3))
     for cell in group:
-        shift += data.columns([cell])[data.rows.source] @ solution.parameters[wheres[cell]]
+        shift += data.row_columns([cell]) @ solution.parameters[wheres[cell]]
     flat, base = shift.ravel(), data.base.reshape(3 * len(data), -1)
     left = flat - base @ (base.T @ flat)
     return float(np.sqrt(np.sum(left**2) / len(data)))

@@ -27,6 +27,8 @@ from remaster_ros.core.types import BoolArray, FloatArray, IntArray
 ROUNDING = 1e-8
 # Bytes of displacements that are kept for the next fit; only those of large sessions are more.
 KEPT_BYTES = 1 << 28
+# Rows of the session for each row worked on, from where that is a part.
+PART = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,19 +176,50 @@ class Residuals:
         parts = [self._displacement(cell) for cell in cells]
         return np.concatenate([np.zeros((len(self.scene), 3, 0)), *parts], axis=2)
 
+    def row_columns(self, cells: Sequence[Cell]) -> FloatArray:
+        """Return the same as `columns` in the rows worked on, (n, 3, c)."""
+        if not self.is_part:
+            return self.columns(cells)[self.rows.source]
+        kept = self._row_displacements
+        for cell in cells:
+            if cell not in kept:
+                kept[cell] = self._computed(cell)[self.rows.source]
+        parts = [kept[cell] for cell in cells]
+        joined = np.concatenate([np.zeros((len(self), 3, 0)), *parts], axis=2)
+        _forget(kept)
+        return joined
+
+    @property
+    def is_part(self) -> bool:
+        """Whether the rows are few of the session's: columns of all of them are not kept then."""
+        return len(self.scene) > PART * len(self)
+
+    @cached_property
+    def _row_displacements(self) -> dict[Cell, FloatArray]:
+        return {}
+
     def _displacement(self, cell: Cell) -> FloatArray:
+        if self.is_part:
+            return self._computed(cell)
         kept = self._displacements
         if cell not in kept:
-            kept[cell] = cell.columns(self.scene).displacement(self.scene)
-            while len(kept) > 1 and sum(values.nbytes for values in kept.values()) > KEPT_BYTES:
-                del kept[next(iter(kept))]
+            kept[cell] = self._computed(cell)
+            _forget(kept)
         return kept[cell]
+
+    def _computed(self, cell: Cell) -> FloatArray:
+        return cell.columns(self.scene).displacement(self.scene)
 
     def unexplained(self, fit: Fit) -> FloatArray:
         """Return what a fit leaves of the errors in every row of the session, m, (all rows, 3)."""
-        return (
-            self.full_errors - self.full_base @ fit.base - self.columns(fit.cells) @ fit.parameters
-        )
+        left: FloatArray = self.full_errors - self.full_base @ fit.base
+        if not self.is_part:
+            return left - self.columns(fit.cells) @ fit.parameters
+        start = 0
+        for cell in fit.cells:
+            left -= self._computed(cell) @ fit.parameters[start : start + cell.size]
+            start += cell.size
+        return left
 
     def whitened(self, values: NDArray[Any], noise: Noise) -> NDArray[Any]:
         """Return values (n, ...) in units of the noise: independent of variance 1 in all rows."""
@@ -201,3 +234,9 @@ class Residuals:
         scale = 1.0 / noise.sigma[sensor][rows.group_of_row]
         white = flat * scale[:, None].astype(flat.dtype) - common[rows.group_of_row]
         return white.reshape(values.shape)
+
+
+def _forget(kept: dict[Cell, FloatArray]) -> None:
+    """Drop the oldest of what is kept until it fits; the last one stays."""
+    while len(kept) > 1 and sum(values.nbytes for values in kept.values()) > KEPT_BYTES:
+        del kept[next(iter(kept))]

@@ -189,7 +189,7 @@ class _Projection:
     """Takes out what base and given cells explain, in units of the noise."""
 
     def __init__(self, data: Residuals, given: Solution) -> None:
-        columns = data.columns(given.cells)[data.rows.source]
+        columns = data.row_columns(given.cells)
         joined = np.concatenate((data.base, columns), axis=2)
         white = data.whitened(joined, given.noise).reshape(3 * len(data), -1)
         # Penalties are rows of their own, in which the candidates are zero.

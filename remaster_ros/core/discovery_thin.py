@@ -2,8 +2,8 @@
 
 The search tries hundreds of causes on hundreds of surrogates, in memory that grows with the rows:
 0.1 MB each. An effect stands out of the noise with the root of their number, so beyond
-`MOST_ROWS` rows little is gained: an effect that 100,000 rows just show is a third of the size
-of one that 10,000 just show, a few hundredths of the noise of one reading. So the search is given
+`MOST_ROWS` rows little is gained: an effect that 100,000 rows just show is a quarter of the size
+of one that 5,000 just show, a few hundredths of the noise of one reading. So the search is given
 a part of them, drawn evenly over time and sensors. Everything else works on all rows: the offsets
 before, the sampled model with the causes, the gain. And the rows that the search has not seen
 tell whether its causes, frozen, hold.
@@ -19,8 +19,8 @@ from remaster_ros.core.discovery_evidence import Solution
 from remaster_ros.core.discovery_noise import Residuals
 from remaster_ros.core.types import FloatArray, IntArray, Measurements
 
-MOST_ROWS = 10_000
-"""A search on so many takes 1.2 GiB; sessions of fewer are searched whole."""
+MOST_ROWS = 5_000
+"""Sessions of fewer are searched whole."""
 FEWEST_POSES = 500
 """Of the poses that the same sensors saw: rather fewer rows of each than fewer poses."""
 FEWEST_ROWS = 2

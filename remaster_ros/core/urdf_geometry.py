@@ -15,8 +15,10 @@ from remaster_ros.core.transforms import inverse
 from remaster_ros.core.types import FloatArray
 from remaster_ros.core.urdf import attribute, numbers, origin_of, parse_urdf
 
-MeshReader = Callable[[str], FloatArray]
-"""Takes a mesh's file name as the URDF writes it; returns its vertices, m, (n, 3)."""
+MeshReader = Callable[[str], FloatArray | None]
+"""Takes a mesh's file name as the URDF writes it; returns its vertices, m, (n, 3).
+
+None leaves that shape out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +57,8 @@ def link_shapes(text: str, read_mesh: MeshReader) -> list[LinkShape]:
                 shape = _shape(geometry[0], where, read_mesh)
             except InputError as error:
                 raise InputError(_with_place(str(error), where)) from None
-            found.append(LinkShape(name, origin_of(element, where), shape))
+            if shape is not None:
+                found.append(LinkShape(name, origin_of(element, where), shape))
     return found
 
 
@@ -63,7 +66,7 @@ def _with_place(message: str, where: str) -> str:
     return message if where in message else f'URDF: {where}: {message}'
 
 
-def _shape(element: ElementTree.Element, where: str, read_mesh: MeshReader) -> Shape:
+def _shape(element: ElementTree.Element, where: str, read_mesh: MeshReader) -> Shape | None:
     if element.tag == 'box':
         return box(numbers(attribute(element, 'size', where), 3, f'the size of {where}'))
     if element.tag == 'sphere':
@@ -79,6 +82,8 @@ def _shape(element: ElementTree.Element, where: str, read_mesh: MeshReader) -> S
         return Shape('capsule', ends, ball=float(radius[0]))
     if element.tag == 'mesh':
         vertices = read_mesh(attribute(element, 'filename', where))
+        if vertices is None:
+            return None
         scale = numbers(element.get('scale', '1 1 1'), 3, f'the scale of {where}')
         return hull(np.asarray(vertices, dtype=float) * scale)
     raise InputError(

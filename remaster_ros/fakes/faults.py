@@ -20,6 +20,12 @@ The robot:
 ``drift``          creeps to and fro by so many rad
 ``copy``           reports what was commanded
 ``clock``          has a clock that is off by so many seconds
+``lost``           every n-th report arrives, the others are lost
+``doubled``        sends every report twice
+``repeated``       sends the last report again and again, with its old stamp
+``frozen``         reports where it was when the fault began, with new stamps
+``wrapped``        reports the joint of this number (from 1) a turn too far
+``wrapped_once``   the same, in one report
 =================  =====================================================
 
 An OptiTrack server:

@@ -44,7 +44,8 @@ def plan_tour(
         No closed form for this robot, or no pose to fit that it can take.
     """
     inverse = InverseKinematics(chain, cell.held(chain))
-    arm = cell.collision_model(chain)
+    # Nobody stands beside a simulated arm, and its meshes may be on another machine.
+    arm = cell.collision_model(chain, without_meshes=True)
     sights = cell.lines_of_sight({name: T_R_N[:3, 3] for name, T_R_N in places.items()})
     aim = places[cell.aim_at][:3, 3]
     plans = {}

@@ -46,6 +46,9 @@ class FakeArm:
         self._order = rng.permutation(len(self.names))
         self._commanded: tuple[float, FloatArray] | None = None
         self._braked = False
+        self._last: tuple[float, list[str], FloatArray, FloatArray] | None = None
+        self._reports = 0
+        self._wrapped_once = False
 
     def command(
         self, names: Sequence[str], points: Sequence[TrajectoryPoint], start_s: float = 0.0
@@ -111,15 +114,19 @@ class FakeArm:
     def joint_state(self) -> tuple[float, list[str], FloatArray, FloatArray] | None:
         """Report now: time (s), names, positions (rad), velocities (rad/s), in its own order.
 
-        None for a robot that is off.
+        None where nothing is reported: a robot that is off, or a report that is lost.
         """
         now, faults = self.world.now(), self.world.faults('robot')
         if 'estop' not in faults:
             self._braked = False
         elif not self._braked:
             self._brake(now)
-        if 'off' in faults or is_out(faults.get('intermittent'), now):
+        self._reports += 1
+        lost = 'lost' in faults and self._reports % int(faults['lost']) != 0
+        if lost or 'off' in faults or is_out(faults.get('intermittent'), now):
             return None
+        if 'repeated' in faults and self._last is not None:
+            return self._last
         now -= faults.get('late', 0.0)
         q, velocity = self.world.reported(now)
         q = q + self._rng.normal(0.0, self.world.truth.encoder_rad, len(q))
@@ -131,10 +138,30 @@ class FakeArm:
             q = np.where(np.arange(len(q)) == 2, np.nan, q)
         if 'reordered' in faults:
             self._order = self._rng.permutation(len(q))
+        q = q + self._wrap(faults)
         order = self._order
         prefix = 'other_' if 'renamed' in faults else ''
         names = [prefix + self.names[i] for i in order]
-        return now + faults.get('clock', 0.0), names, q[order], velocity[order]
+        stamp, q, velocity = now + faults.get('clock', 0.0), q[order], velocity[order]
+        if 'frozen' in faults and self._last is not None:
+            _, names, q, velocity = self._last
+        self._last = stamp, names, q, velocity
+        return self._last
+
+    @property
+    def copies(self) -> int:
+        """How often each report is sent."""
+        return 2 if 'doubled' in self.world.faults('robot') else 1
+
+    def _wrap(self, faults: Numbers) -> FloatArray:
+        """Return what a joint that is a turn off adds to the positions, rad, (k,)."""
+        turn = np.zeros(len(self.names))
+        if 'wrapped' in faults:
+            turn[int(faults['wrapped']) - 1] = 2 * np.pi
+        if 'wrapped_once' in faults and not self._wrapped_once:
+            turn[int(faults['wrapped_once']) - 1] = 2 * np.pi
+        self._wrapped_once = 'wrapped_once' in faults
+        return turn
 
     def _brake(self, now: float) -> None:
         """Stand still at once, as an emergency stop does."""

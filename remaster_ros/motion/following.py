@@ -50,11 +50,11 @@ class Seen:
     time: float
     stands_at: FloatArray
     stands_since: float
-    late_s: float = 0.0
+    late_s: float
 
     @classmethod
     def after(
-        cls, last: Seen | None, report: JointReport, rules: SupervisorRules, late_s: float = 0.0
+        cls, last: Seen | None, report: JointReport, rules: SupervisorRules, late_s: float
     ) -> Seen:
         """Follow robot time and standstill; a gap begins the standstill anew."""
         q, stamp, wall = report.q, report.stamp_s, report.wall_s
@@ -90,6 +90,11 @@ class Following:
         When, robot time and wall time, s.
     rules
         How far it may lag and how long a command may take to be seen.
+
+    Attributes
+    ----------
+    reacted
+        Whether the arm has left its start, or goes too short a way for that to be seen.
     """
 
     def __init__(
@@ -97,7 +102,7 @@ class Following:
     ) -> None:
         self.trajectory, self._rules = trajectory, rules
         self._sent, self._sent_wall = sent, sent_wall
-        self._reacted = False
+        self.reacted = False
         self._lag_s = 0.0
         self._allowed_s = rules.lag_s
         self._astray = ''
@@ -131,13 +136,15 @@ class Following:
 
         The later one is where the controller's reference is: a stop takes as long to get there as
         the move did, give or take `JITTER_S`. Where the last report came late, it has gone on for
-        so long. The earlier one is where an arm is that lags.
+        so long. The earlier one is where an arm is that lags, and that has been stopped by itself
+        since the last report.
         """
-        elapsed, jitter = self.elapsed_s(seen.now(wall_s, rate)), JITTER_S * rate
+        reported, jitter = self.elapsed_s(seen.time), JITTER_S * rate
+        elapsed = self.elapsed_s(seen.now(wall_s, rate))
         # In a rest the lag is what the arm still has to the end of the line.
-        index, since_s = self.trajectory.line_at(elapsed)
+        index, since_s = self.trajectory.line_at(reported)
         rested_s = max(since_s - self.trajectory.lines[index].duration_s, 0.0)
-        return elapsed - rested_s - self._lag_s - jitter, elapsed + seen.late_s + jitter
+        return reported - rested_s - self._lag_s - jitter, elapsed + seen.late_s + jitter
 
     def has_ended(self, seen: Seen, wall_s: float, rate: float) -> bool:
         """Whether the arm is at the end of the trajectory, or will be without any command."""
@@ -146,14 +153,14 @@ class Following:
 
     def _look(self, seen: Seen, elapsed: float) -> str:
         """Return how the arm is off its path, '' where it follows; note how far it lags."""
-        if not self._reacted:
+        if not self.reacted:
             still = self._is_still_at_start(seen)
             if still and seen.wall - self._sent_wall <= self._rules.reaction_s:
                 self._lag_s = max(elapsed, 0.0)
                 return ''
             if still:
                 return 'the robot does not take commands: see its controller, and its driver'
-            self._reacted = True
+            self.reacted = True
         lag, off, is_near = self._lag(elapsed, seen.q)
         self._lag_s = float(np.clip(lag, 0.0, self._allowed_s))
         if off <= ON_PATH_RAD and (is_near or -EARLY_S - LATENCY_S <= lag <= self._allowed_s):

@@ -28,10 +28,13 @@ LATE_S = 0.15
 """A report may come so much later than the others, s of the node's time."""
 LATE_WALL_S = 0.1
 """And so much, s of wall time: a busy machine delays by wall time, however fast a clock runs."""
-DRIFT = 2e-3
+DRIFT = 2e-4
 """Two clocks may run apart by so many seconds a second."""
-LEARN = 5
-"""So many reports are needed to learn how long one usually takes."""
+LEARN, LEARN_WALL_S = 5, 1.0
+"""By so many reports at least, over so much wall time (s), is learned how long one takes.
+
+The shortest counts: those that waited in a queue while this process was starting took longer.
+"""
 RATE_WINDOW_S = 2.0
 """The rate of the node's clock is taken over so much wall time, s."""
 RATE_LEAST_S = 0.3
@@ -126,7 +129,7 @@ class JointReports:
     def forget(self) -> None:
         """Learn anew what is usual: somebody has seen to the robot, or its clock was set."""
         self._last: JointReport | None = None
-        self._delays: list[float] = []
+        self._delays: list[tuple[float, float]] = []
         self._delay: float | None = None
         self.late_s = 0.0
 
@@ -182,9 +185,10 @@ class JointReports:
         """Follow how long a report usually takes; a drift of the clocks, but no jump."""
         delay = report.clock_s - report.stamp_s
         if self._delay is None:
-            self._delays.append(delay)
-            if len(self._delays) >= LEARN:
-                self._delay = float(np.median(self._delays))
+            self._delays.append((report.wall_s, delay))
+            since_wall, _ = self._delays[0]
+            if len(self._delays) >= LEARN and report.wall_s - since_wall >= LEARN_WALL_S:
+                self._delay = min(delay for _, delay in self._delays)
             return
         assert self._last is not None
         passed = min(report.wall_s - self._last.wall_s, 1.0)

@@ -13,9 +13,14 @@ from remaster_ros.nodes.parameters import parameter
 class Parameters:
     """Parameters of the bridge."""
 
-    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
+    cell: str = parameter('', 'cell file: a path, or the name of a shipped one; must be given')
     speed_share: float = parameter(
-        0.3, 'share of each joint velocity limit that is used', low=0.01, high=1.0
+        0.3,
+        'share of each joint velocity limit that is used; while the arm moves, it is stopped and '
+        'goes on with the new one',
+        low=0.01,
+        high=1.0,
+        live=True,
     )
     cartesian_speed_limit_m_s: float = parameter(
         0.25,
@@ -24,6 +29,7 @@ class Parameters:
         unit='m/s',
         low=0.0,
         high=10.0,
+        live=True,
     )
     limit_margin_deg: float = parameter(
         0.5, 'distance kept from the joint limits', unit='deg', low=0.0, high=45.0

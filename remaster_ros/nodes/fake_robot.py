@@ -106,7 +106,8 @@ class FakeRobotNode(RemasterNode):
         now, names, q, velocity = state
         message = JointState(name=names, position=q.tolist(), velocity=velocity.tolist())
         message.header.stamp = stamp_of(now)
-        self._states.publish(message)
+        for _ in range(self.arm.copies):
+            self._states.publish(message)
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         points = [

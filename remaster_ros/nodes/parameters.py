@@ -1,16 +1,23 @@
 """A node's parameters: one frozen dataclass, each field with unit, range and description.
 
 A value of the wrong type, outside its range, or a name that the node does not know is refused at
-start with one line.
+start with one line. While the node runs, what is declared `live` can be changed, with the same
+checks; everything else is read-only, `use_sim_time` as well: what was answered "successful" and
+changed nothing would be believed.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.node import Node
 
 from remaster_ros.core.errors import InputError
@@ -29,6 +36,7 @@ def parameter(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] = (),
+    live: bool = False,
 ) -> Any:
     """Return a dataclass field that describes a node parameter.
 
@@ -42,6 +50,8 @@ def parameter(
         Smallest and largest allowed value, both included.
     choices
         The allowed words of a text parameter.
+    live
+        Whether it can be changed while the node runs, where the node has an `on_change`.
     """
     metadata = {
         'description': description,
@@ -49,12 +59,23 @@ def parameter(
         'low': low,
         'high': high,
         'choices': choices,
+        'live': live,
     }
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def declare(node: Node, kind: type[T]) -> T:
+def declare(node: Node, kind: type[T], on_change: Callable[[T], None] | None = None) -> T:
     """Declare the fields of `kind` on `node` and return their values.
+
+    Parameters
+    ----------
+    node
+        The node.
+    kind
+        Its dataclass of parameters.
+    on_change
+        Called with all parameters when live ones are to change, in an executor's thread; from its
+        return on the new ones hold. `InputError` refuses the change, with its text as the reason.
 
     Raises
     ------
@@ -73,9 +94,41 @@ def declare(node: Node, kind: type[T]) -> T:
     for name, field in fields.items():
         value = overrides[name].value if name in overrides else field.default
         values[name] = check(node.get_name(), field, value)
-        node.declare_parameter(name, field.default, _descriptor(field), ignore_override=True)
-        node.set_parameters([_as_parameter(name, values[name])])
-    return kind(**values)
+        descriptor = _descriptor(field)
+        descriptor.read_only = on_change is None or not field.metadata['live']
+        node.declare_parameter(name, values[name], descriptor, ignore_override=True)
+    current = kind(**values)
+
+    def change(parameters: list[Any]) -> SetParametersResult:
+        nonlocal current
+        try:
+            new = _changed(node.get_name(), fields, current, parameters)
+            if new != current and on_change is not None:
+                on_change(new)
+        except InputError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        current = new
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(change)
+    return current
+
+
+def _changed(
+    node_name: str,
+    fields: Mapping[str, dataclasses.Field[Any]],
+    current: T,
+    parameters: Sequence[Any],
+) -> T:
+    """Return the parameters with new values of live ones; refuse all others by name."""
+    for item in parameters:
+        if item.name not in fields or not fields[item.name].metadata['live']:
+            raise InputError(
+                f'{node_name}: {item.name} is read when the node starts; start it again with '
+                'another value'
+            )
+    values = {item.name: check(node_name, fields[item.name], item.value) for item in parameters}
+    return dataclasses.replace(current, **values)  # type: ignore[type-var]
 
 
 def check(node_name: str, field: dataclasses.Field[Any], value: Any) -> Any:
@@ -97,12 +150,6 @@ def check(node_name: str, field: dataclasses.Field[Any], value: Any) -> Any:
     if choices and value not in choices:
         raise InputError(f'{where} is {value!r}; it must be one of {", ".join(choices)}')
     return value
-
-
-def _as_parameter(name: str, value: Any) -> Any:
-    from rclpy.parameter import Parameter
-
-    return Parameter(name, value=value)
 
 
 def _descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:

@@ -234,8 +234,9 @@ class PosePlanner(RemasterNode):
     def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Any:
         with self._lock:
             self._left = ''
-            self._set_state('stopped')
+            # The command first: nothing that fails behind it may keep the arm moving.
             self._announcer.stop()
+            self._set_state('stopped')
         response.success, response.message = True, 'stopped'
         return response
 
@@ -374,6 +375,7 @@ class PosePlanner(RemasterNode):
         if found is None or found[0] is None:
             return found
         return (tour.take(found[0]),)
+
     def _write_state(self) -> None:
         """Write down what was said; a stop or pause came in a thread that must not wait for it."""
         with self._lock:

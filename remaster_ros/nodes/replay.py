@@ -31,6 +31,7 @@ SOURCES = (
     'joint_states',
     COMMANDS.lstrip('/'),
     'remaster/joint_solutions',
+    'remaster/joint_waypoints',
     'remaster/settled',
 )
 """What robot, bridge and planner publish: with one of them there, the graph is live."""

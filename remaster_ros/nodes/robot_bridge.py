@@ -71,7 +71,12 @@ class RobotBridge(RemasterNode):
 
     def __init__(self) -> None:
         super().__init__('robot_bridge')
-        self.p = declare(self, Parameters)
+        self.p = declare(self, Parameters, self._on_parameters)
+        if not self.p.cell:
+            raise InputError(
+                'robot_bridge: parameter cell is empty; give the cell file of this arm (demo, the '
+                'shipped one, is for the fakes)'
+            )
         cell = read_cell(self.p.cell)
         self.chain = cell.chain()
         self._order = JointOrder(self.chain.joint_names)
@@ -121,6 +126,8 @@ class RobotBridge(RemasterNode):
         self.create_timer(WATCH_WALL_S, self._watch, clock=self.status.steady)
         if self.supervisor.halted:
             self.get_logger().error(f'halted: {self.supervisor.halted}')
+        for pair in model.left_out:
+            self.get_logger().info(f'collisions: {pair}')
         if not self.p.cartesian_speed_limit_m_s:
             self.get_logger().warning(
                 'no Cartesian speed limit (cartesian_speed_limit_m_s is 0): the joints alone '
@@ -150,6 +157,15 @@ class RobotBridge(RemasterNode):
             float(np.deg2rad(p.limit_margin_deg)),
         )
 
+    def _on_parameters(self, p: Parameters) -> None:
+        """Go on with other speeds."""
+        self.p = p
+        self._do(self.supervisor.use_limits(self._limits(p), time.monotonic()))
+        self.get_logger().info(
+            f'speed_share is {p.speed_share:g}, cartesian_speed_limit_m_s '
+            f'{p.cartesian_speed_limit_m_s:g}'
+        )
+
     # What comes in
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
@@ -159,7 +175,7 @@ class RobotBridge(RemasterNode):
             if state == 'running':
                 # By it a planner that is started again sees that this bridge was there all along.
                 self._run = values.get('run', '')
-            self._do(self.supervisor.planner_is(state, now))
+            self._do(self.supervisor.planner_is(state, now, values.get('run', '')))
         elif node == 'recorder':
             self._do(self.supervisor.recorder_waits(values.get('waiting_for', ''), now))
 

@@ -67,8 +67,8 @@ class RemasterNode(Node):
         self._name_lock.release()
 
     # rclpy gives every endpoint an event handler that only warns of QoS mismatches, and looks at
-    # each of them for every message: half of what a message costs. All endpoints here are
-    # reliable; what does not match shows as "no sign of …" in /remaster/status.
+    # each of them for every message: half of what a message costs. The status says now and then
+    # what the graph shows not to match (`qos_mismatch`).
 
     def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
         """As in rclpy, without default event handlers."""

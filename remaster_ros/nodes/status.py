@@ -23,6 +23,7 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.rivalry import Rivalry
+from remaster_ros.nodes.qos_mismatch import mismatches
 from remaster_ros.storage.bag_metadata import LATCHED_DEPTH
 
 TOPIC = 'remaster/status'
@@ -43,6 +44,8 @@ LEASED = QoSProfile(
 )
 """Of publishers whose commands move the arm: a killed one stays in the graph for some 20 s, but is
 no longer alive for its subscribers 2 s after its end."""
+QOS_EVERY_S = 3.0
+"""How often the graph is looked at for endpoints that do not match, wall time."""
 LEVELS = {
     'ok': DiagnosticStatus.OK,
     'warn': DiagnosticStatus.WARN,
@@ -85,6 +88,10 @@ class Status:
         # A wall timer: status must go on when the simulated clock stands still.
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(0.5, self.publish, callback_group=group, clock=self.steady)
+        self._qos_trouble = ''
+        self._qos_timer = node.create_timer(
+            QOS_EVERY_S, self._look_at_qos, callback_group=group, clock=self.steady
+        )
         receive = receiver(lambda event: None, self._on_summary)
         node.create_subscription(DiagnosticArray, TOPIC, receive, RELIABLE, callback_group=group)
 
@@ -102,6 +109,9 @@ class Status:
             `time.monotonic`, s.
         """
         return self._rivalry.alone(now)
+
+    def _look_at_qos(self) -> None:
+        self._qos_trouble = mismatches(self._node)
 
     def _on_summary(self, name: str, message: str, values: dict[str, str]) -> None:
         own = self._node.get_fully_qualified_name()
@@ -136,7 +146,10 @@ class Status:
         """Publish the summary now; from any thread."""
         with self._order:
             level, message, values = self._summary()
+            if self._qos_trouble and level == 'ok':
+                level, message = 'warn', self._qos_trouble
             own = {
+                'qos_trouble': self._qos_trouble,
                 'node': self._node.get_fully_qualified_name(),
                 'started': self._started,
                 'uptime_s': f'{time.monotonic() - self._started_wall:.3f}',

@@ -30,7 +30,11 @@ LATCHED_TOPICS = frozenset(
 
 RECORDED = {
     f'/{name}': f'/remaster/recorded/{name.rpartition("/")[2]}'
-    for name in ('joint_trajectory_controller/joint_trajectory', 'remaster/joint_solutions')
+    for name in (
+        'joint_trajectory_controller/joint_trajectory',
+        'remaster/joint_solutions',
+        'remaster/joint_waypoints',
+    )
 }
 """What moves an arm -> its name in bags. A controller obeys the one and a bridge the other,
 whoever publishes it: a player that takes a bag as it is must not drive an arm."""

@@ -19,7 +19,7 @@ from remaster_ros.core.errors import InputError
 from remaster_ros.core.planning import LineOfSight, PoseRanges
 from remaster_ros.core.transforms import matrix_from_rpy, transform
 from remaster_ros.core.types import FloatArray
-from remaster_ros.core.urdf_geometry import chain_bodies
+from remaster_ros.core.urdf_geometry import MeshReader, chain_bodies
 from remaster_ros.storage.cell_units import unit_problem
 from remaster_ros.storage.files import decode_text, read_limited
 from remaster_ros.storage.meshes import mesh_reader
@@ -175,7 +175,11 @@ class Cell(msgspec.Struct, forbid_unknown_fields=True):
         return np.broadcast_to(given, (len(chain),)).copy()
 
     def collision_model(
-        self, chain: SerialChain, unknown_offset_rad: float | None = None
+        self,
+        chain: SerialChain,
+        unknown_offset_rad: float | None = None,
+        *,
+        without_meshes: bool = False,
     ) -> CollisionModel:
         """Return the arm with tool, markers and obstacles, for collision checks.
 
@@ -185,6 +189,9 @@ class Cell(msgspec.Struct, forbid_unknown_fields=True):
             The arm of this cell.
         unknown_offset_rad
             What a joint's zero-offset may still be off by, rad; `unknown_offset_deg` where None.
+        without_meshes
+            Take capsules in place of meshes, which then need not be there: for simulated arms,
+            never for one that moves.
 
         Raises
         ------
@@ -193,7 +200,9 @@ class Cell(msgspec.Struct, forbid_unknown_fields=True):
         """
         folder = Path(self.file).parent
         urdf = folder / self.robot.urdf
-        read_mesh = mesh_reader(urdf, [folder / path for path in self.mesh_path])
+        read_mesh: MeshReader = mesh_reader(urdf, [folder / path for path in self.mesh_path])
+        if without_meshes:
+            read_mesh = _no_mesh
         last = len(chain)
         bodies = chain_bodies(self.urdf_text, chain, read_mesh)
         bodies += [part.body(f'tool {name}', chain) for name, part in self.tool.items()]
@@ -223,6 +232,10 @@ class Cell(msgspec.Struct, forbid_unknown_fields=True):
             for name, sensor in self.sensors.items()
             if name in sensors_R
         ]
+
+
+def _no_mesh(name: str) -> None:
+    """Leave a mesh out."""
 
 
 def config_path(name: str) -> Path:

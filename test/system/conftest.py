@@ -15,8 +15,8 @@ _domains = itertools.count(110 + os.getpid() % 80)
 
 
 @pytest.fixture(scope='module')
-def ros_environment():
-    """Return an environment with a DDS domain of its own, on this machine only."""
+def ros_environment(tmp_path_factory):
+    """Return an environment with a DDS domain and a ROS_HOME of its own, on this machine only."""
     pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
     path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get('PYTHONPATH'))))
     return {
@@ -24,6 +24,8 @@ def ros_environment():
         'PYTHONPATH': path,
         'ROS_DOMAIN_ID': str(next(_domains)),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        # A halt is kept there: none of another test's.
+        'ROS_HOME': str(tmp_path_factory.mktemp('ros_home')),
     }
 
 

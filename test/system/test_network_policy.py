@@ -20,12 +20,6 @@ OWN = {
     'optitrack_markers': {'start_timeout_s': 600.0},
     'laser_tracker_markers': {'start_timeout_s': 600.0},
 }
-NOT_YET = {
-    ('reply', '/remaster/clear_halt'),
-    ('publish', '/remaster/joint_waypoints'),
-    ('subscribe', '/remaster/joint_waypoints'),
-}
-"""Allowed for parts of the nodes that are still to come; nothing else may be allowed in vain."""
 
 
 def resolved(name, namespace, node):
@@ -80,7 +74,7 @@ def test_the_policy_is_what_the_nodes_use(start, client, tmp_path):
     for name in NODES:
         own, shown = allowed(name), looks[-1][name]
         assert shown - own == set(), f'{name} uses what the policy does not allow'
-        assert own - shown <= NOT_YET, f'{name} is allowed what it does not use'
+        assert own - shown == set(), f'{name} is allowed what it does not use'
 
 
 @pytest.mark.parametrize('node', NODES)

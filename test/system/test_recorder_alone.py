@@ -262,7 +262,7 @@ def register(rig, q, shift):
         assert time.monotonic() < deadline, f'no answer: {rig.message} {rig.summary}'
         time.sleep(0.005)
         rig.t += 0.02
-        rig.read(q, np.asarray(shift) + (1e-6 * (i % 7), 0.0, 0.0))
+        rig.read(q, np.add(shift, (1e-6 * (i % 7), 0.0, 0.0)))
         rig.report(q)
         rig.spin()
         if future.done():
@@ -272,7 +272,8 @@ def register(rig, q, shift):
 def test_three_points_that_do_not_agree_register_nothing(rig):
     """Off by 0.15 m: not the marker, and far from what an arm to be calibrated is off by."""
     rig = rig('mocap')
-    places = [Q, Q + [0.5, 0, 0, 0, 0, 0, 0], Q + [0.25, 0.4, 0, 0, 0, 0, 0], Q - 0.3]
+    turned = [[0.5, 0, 0, 0, 0, 0, 0], [0.25, 0.4, 0, 0, 0, 0, 0]]
+    places = [Q, *np.add(Q, turned), Q - 0.3]
     for q, shift in zip(places[:2], ((0.0, 0.0, 0.0), (0.0, 0.0, 0.15)), strict=True):
         assert register(rig, q, shift).success
     answer = register(rig, places[2], (0.0, 0.0, 0.0))

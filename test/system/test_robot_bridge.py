@@ -9,7 +9,9 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 pytest.importorskip('pinocchio', reason='the judge needs pinocchio (pip install .[test])')
 
-from hostile_bench import EMERGENCY, Bench, environment
+from hostile_bench import Bench
+from hostile_lines import EMERGENCY
+from hostile_process import environment
 from hostile_scene import HOME
 from simple_cells import write_cell
 
@@ -260,3 +262,39 @@ def test_a_stop_leaves_within_50_ms_of_its_request(bridge):
     print(f'from request to command: {np.round(1e3 * np.array(late), 1)} ms')
     # A busy machine may keep a single one waiting.
     assert np.median(late) < 0.05
+
+
+def test_a_speed_that_is_changed_holds_at_once(bridge):
+    """By the parameter service, as `ros2 param set` does: slower from the same move on."""
+    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+    from rcl_interfaces.srv import SetParameters
+
+    bench = bridge(speed_share=0.3)
+    client = bench.node.create_client(SetParameters, '/robot_bridge/set_parameters')
+    assert client.wait_for_service(10)
+
+    def set_to(name, value):
+        kind = ParameterType.PARAMETER_DOUBLE
+        wanted = Parameter(name=name, value=ParameterValue(type=kind, double_value=value))
+        future = client.call_async(SetParameters.Request(parameters=[wanted]))
+        wait(bench, future.done)
+        return future.result().results[0]
+
+    target = HOME + np.array([0.9, 0, 0, 0, 0, 0, 0])
+    bench.send([target])
+    wait(bench, lambda: bench.arm.speed() > 0.2)
+    refused = set_to('speed_share', 5.0)
+    assert not refused.successful
+    assert 'speed_share' in refused.reason
+    refused = set_to('settle_s', 1.0)
+    assert not refused.successful
+    changed = time.monotonic()
+    assert set_to('speed_share', 0.05).successful
+    wait(bench, lambda: bench.arm.speed() < 1e-3)
+    stopped = time.monotonic()
+    wait(bench, lambda: moves(bench, stopped))
+    _, speeds, _ = moves(bench, stopped)[0].spline().sample()
+    assert np.all(np.abs(speeds) <= 0.05 * CHAIN.velocity_limits * 1.001)
+    assert bench.arm.fastest(stopped, CHAIN.velocity_limits) < 0.06
+    np.testing.assert_allclose(moves(bench, stopped)[0].q[-1], target)
+    assert len(bench.commands_since(changed)) == 2

@@ -10,7 +10,6 @@ import re
 import runpy
 import subprocess
 import sys
-import types
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -225,36 +224,6 @@ def test_parameters_page_is_up_to_date() -> None:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     assert module.PAGE.read_text(encoding='utf-8') == module.page(), 'run: make docs'
-
-
-@pytest.mark.parametrize(
-    ('name', 'others'),
-    [('real', set()), ('fake', {'fake_robot', 'fake_optitrack', 'fake_laser_tracker'})],
-)
-def test_launch_files_start_the_six_nodes(
-    name: str, others: set[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Run with stand-ins for launch, which is not on every machine that runs this."""
-    nodes: list[dict[str, Any]] = []
-    stand_ins = {
-        'launch': {'LaunchDescription': list},
-        'launch.actions': {'DeclareLaunchArgument': lambda *args, **kwargs: args},
-        'launch.substitutions': {'LaunchConfiguration': str},
-        'launch_ros': {},
-        'launch_ros.actions': {'Node': lambda **arguments: nodes.append(arguments)},
-        'ament_index_python': {},
-        'ament_index_python.packages': {'get_package_share_directory': lambda package: ROOT},
-    }
-    for module, members in stand_ins.items():
-        monkeypatch.setitem(sys.modules, module, types.SimpleNamespace(**members))
-    declared = runpy.run_path(str(ROOT / 'launch' / f'{name}.launch.py'))[
-        'generate_launch_description'
-    ]()
-    six = EXECUTABLES - {'replay', 'demo', 'fake_robot', 'fake_optitrack', 'fake_laser_tracker'}
-    assert {node['executable'] for node in nodes} == six | others
-    assert all(node['name'] == node['executable'] for node in nodes)
-    assert ('params',) in declared
-    assert (ROOT / 'config' / f'{name}.yaml').is_file()
 
 
 def test_links_in_the_pages_lead_somewhere() -> None:

@@ -117,3 +117,18 @@ def test_forgotten_displacements_are_computed_again(monkeypatch):
     assert len(forgotten.residuals._displacements) == 1
     assert forgotten.effects[0].parameters == kept.effects[0].parameters
     assert forgotten.selection.solution.log_evidence == kept.selection.solution.log_evidence
+
+
+def test_columns_of_a_part_are_those_of_the_whole(monkeypatch):
+    """Of a part only its rows are kept; a whole is worked on as it is."""
+    found = findings(session_with(21, sagging))
+    data, solution = found.residuals, found.selection.solution
+    assert not data.is_part
+    wanted = data.columns(solution.cells)[data.rows.source]
+    left = data.unexplained(solution)
+    monkeypatch.setattr(discovery_noise, 'PART', 0)
+    part = data.only(data.rows.source, np.array([np.eye(4)] * data.sensors))
+    assert part.is_part
+    np.testing.assert_array_equal(part.row_columns(solution.cells), wanted)
+    np.testing.assert_allclose(part.unexplained(solution), left, atol=1e-15)
+    assert not part._displacements

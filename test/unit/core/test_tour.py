@@ -7,7 +7,14 @@ from arms import planar_arm
 from remaster_ros.core.bodies import obstacle
 from remaster_ros.core.collision import RESERVE_M, CollisionModel, arm_bodies
 from remaster_ros.core.errors import InsufficientDataError
-from remaster_ros.core.planning import Plan, PlannedPose
+from remaster_ros.core.inverse import InverseKinematics
+from remaster_ros.core.planning import (
+    Plan,
+    PlannedPose,
+    PoseRanges,
+    candidate_poses,
+    plan_poses,
+)
 from remaster_ros.core.tour import Tour, free_order, nearest_solution, registration_tour
 from remaster_ros.core.transforms import transform
 from remaster_ros.storage.cell import read_cell
@@ -202,3 +209,28 @@ def test_proposing_changes_nothing():
     taken = tour.take(first)
     assert (taken.index, taken.pose, tour.visited) == (first.index, 0, 1)
     assert tour.propose(np.zeros(7)).pose == 1
+
+
+@pytest.mark.parametrize('held', [(0.0,), (-1.0, 0.0, 1.0)])
+def test_low_poses_are_not_reached_through_the_floor(held):
+    """Straight moves between nearest solutions sweep far: some went through the floor."""
+    chain = CHAIN
+    model = CollisionModel(chain, arm_bodies(chain, [], 0.075))
+    low = PoseRanges(height_m=(0.1, 0.6))
+    candidates = candidate_poses(150, low, [1.9, 0.0, 1.1], np.random.default_rng(4))
+    inverse = InverseKinematics(chain, {2: held})
+    plan = plan_poses(inverse, model, candidates, limit_margin_rad=0.02)
+
+    def troubles(tour):
+        here, found = np.zeros(7), []
+        while (stop := tour.next(here)) is not None:
+            for way, solution in zip(stop.paths, stop.solutions):
+                found.append(model.path_trouble(np.vstack((here, way, solution))))
+                here = solution
+        return found
+
+    blind = troubles(Tour(chain, {'optimization': plan}))
+    assert sum('floor' in trouble for trouble in blind) > 0
+    seeing = troubles(Tour(chain, {'optimization': plan}, model=model))
+    assert len(seeing) > 0.9 * len(blind)
+    assert set(seeing) == {''}

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from remaster_ros.core.chain import SerialChain
+from remaster_ros.fakes.faults import inject
 from remaster_ros.fakes.robot import FakeArm, TrajectoryPoint
 from remaster_ros.fakes.world import SensorTruth, Truth, World
 from remaster_ros.storage.cell import config_path
@@ -122,3 +123,46 @@ def test_the_marker_is_where_offsets_put_it(world):
     expected = T @ [*truth.sensors['mocap'].marker, 1.0]
     seen = truth.sensors['mocap'].T_R_N @ [*world.marker_in_sensor('mocap', 100.0), 1.0]
     np.testing.assert_allclose(seen, expected, atol=1e-12)
+
+
+def reports(world, arm, count, step_s=0.05):
+    """Return that many reports, each by joint name."""
+    found = []
+    for _ in range(count):
+        world.time_s += step_s
+        state = arm.joint_state()
+        if state is not None:
+            stamp, names, q, _ = state
+            found.append((stamp, np.array([dict(zip(names, q))[name] for name in arm.names])))
+    return found
+
+
+def spoiled(world, arm, count=6, **faults):
+    """Return reports of a moving arm: before a fault, and with it."""
+    inject(world.folder, {})
+    go(arm, np.full(7, 0.5), seconds=20.0)
+    before = reports(world, arm, 10)
+    inject(world.folder, {'robot': faults})
+    return before, reports(world, arm, count)
+
+
+def test_a_joint_that_is_a_turn_off(world, arm):
+    before, after = spoiled(world, arm, wrapped=3)
+    turn = np.array([0, 0, 2 * np.pi, 0, 0, 0, 0])
+    assert all(np.allclose(q - turn, before[-1][1], atol=0.1) for _, q in after)
+    before, after = spoiled(world, arm, wrapped_once=3)
+    assert np.allclose(after[0][1] - turn, before[-1][1], atol=0.1)
+    assert all(np.allclose(q, before[-1][1], atol=0.1) for _, q in after[1:])
+
+
+def test_reports_that_are_lost_doubled_repeated_or_frozen(world, arm):
+    assert len(spoiled(world, arm, lost=3)[1]) == 2
+    before, after = spoiled(world, arm, repeated=1)
+    assert all(stamp == before[-1][0] for stamp, _ in after)
+    before, after = spoiled(world, arm, frozen=1)
+    assert np.all(np.diff([stamp for stamp, _ in after]) > 0)
+    assert all(np.array_equal(q, before[-1][1]) for _, q in after)
+    assert not np.array_equal(before[-1][1], before[-2][1])
+    assert arm.copies == 1
+    spoiled(world, arm, doubled=1)
+    assert arm.copies == 2

@@ -11,7 +11,7 @@ SWAY = 5e-5
 
 def test_the_settled_position_is_the_mean_and_not_the_last_report():
     rig = Rig()
-    target = HOME + [0.2, -0.1]
+    target = HOME + np.array([0.2, -0.1])
     seen = []
 
     def sway(t, q):

@@ -192,6 +192,9 @@ def test_a_cell_with_meshes(tmp_path):
     path = write_cell(tmp_path, robot=robot)
     with pytest.raises(InputError, match=r'package://lwr/link_3\.stl'):
         model_of(path)
+    cell = read_cell(path)
+    simulated = cell.collision_model(cell.chain(), without_meshes=True)
+    assert 'the link of joint_3' in {body.name for body in simulated.bodies}
     (tmp_path / 'meshes').rename(tmp_path / 'lwr')
     model = model_of(write_cell(tmp_path, robot=robot, mesh_path=['.']))
     kinds = {body.name: body.shape.kind for body in model.bodies}

@@ -1,41 +1,35 @@
-"""Every device and node x every kind of fault: what happens, and the table of it in the docs.
+"""The devices at their wires x every kind of fault: what their drivers make of it.
 
-In stepped time where the loop is at stake (`fault_bench`), over real sockets where it is a
-driver's business. Whatever happens: no wrong observation, no command outside the limits, an arm
-that stands while it must not move, and a run that ends once the fault is over. `make faults`
-writes the table.
+Real drivers and real sockets, fake devices that do the wrong things. Whatever happens: no reading
+from where the marker never was, and readings again once the fault is over. `make faults` writes
+the tables of docs/faults.md; what the nodes make of faults is in test/system/test_fault_rows.py.
 """
 
 from __future__ import annotations
 
-import os
 import re
 import threading
 import time
-from pathlib import Path
 
-import fault_bench
+import fault_page
 import numpy as np
 import optitrack_world
 import pytest
 import tracker_world
-from fault_bench import NODES, SENSOR_OF, Bench, Node
 
 from remaster_ros.core import transforms
-from remaster_ros.core.errors import DeviceError, InputError, InsufficientDataError
+from remaster_ros.core.errors import DeviceError, InsufficientDataError
 from remaster_ros.core.registration import register_agreeing
-from remaster_ros.core.visiting import Visitor
 from remaster_ros.drivers.laser_tracker import LaserTrackerClient, LaserTrackerSettings
 from remaster_ros.drivers.natnet import MarkerChoice, NatNetClient, NatNetSettings
 from remaster_ros.drivers.natnet_diagnosis import warning
 from remaster_ros.fakes.laser_tracker import FakeLaserTracker
 from remaster_ros.fakes.laser_tracker_settings import TrackerBehaviour
 from remaster_ros.fakes.optitrack import FakeOptiTrackServer
-from remaster_ros.storage.results import joint_offsets_rad, read_fit
+from remaster_ros.fakes.setup import make_world
+from remaster_ros.storage.cell import read_cell
 
-PAGE = Path(__file__).parents[2] / 'docs' / 'faults.md'
 KINDS = ('off', 'stuck', 'wrong', 'slow', 'delayed', 'intermittent', 'garbage', 'restarted')
-BEGIN, END = '<!-- observed by the tests: {} -->', '<!-- end -->'
 observed: dict[str, dict[str, str]] = {}
 
 
@@ -48,211 +42,6 @@ def observe(who: str, kind: str, text: str) -> None:
     text = re.sub(lost, 'impossible: the connection is lost', text)
     text = re.sub(r'no answer to the [a-z ]+ within', 'no answer within', text)
     observed.setdefault(who, {})[kind] = text[0].upper() + text[1:]
-
-
-# The robot, and everything that talks with the bridge: in stepped time
-
-
-ROBOT = {
-    'off': {'off': 1},
-    'stuck': {'dropped': 1},
-    'wrong': {'elsewhere': 0.02},
-    'slow': {'slow': 3.0},
-    'delayed': {'late': 1.0},
-    'intermittent': {'intermittent': 5.0},
-    'garbage': {'nan': 1},
-    'restarted': {'off': 1},
-}
-NAMED = {
-    'emergency stop': {'estop': 1},
-    'drops a command': {'dropped': 1},
-    'arrives elsewhere': {'elsewhere': 0.02},
-    'never arrives': {'slow': 20.0},
-    'drifts while settling': {'drift': 1e-3},
-    'stops publishing': {'off': 1},
-    'publishes commanded as measured': {'copy': 1},
-    'reports NaN': {'nan': 1},
-    'joints renamed': {'renamed': 1},
-    'joints reordered': {'reordered': 1},
-    'clock jumps an hour ahead': {'clock': 3600.0},
-    'clock jumps an hour back': {'clock': -3600.0},
-}
-
-
-@pytest.fixture
-def bench(tmp_path):
-    bench = Bench(tmp_path)
-    yield bench
-    bench.close()
-
-
-def under_way(bench: Bench) -> None:
-    """Let the first configuration be recorded and the second one begin."""
-    assert bench.run(60.0, lambda: len(bench.recorded) == 1)
-    assert bench.run(20.0, lambda: bench.speed() > 0.02)
-    bench.run(0.3)
-
-
-def tell(bench: Bench) -> str:
-    """Let the run end, starting it again where it was halted; say what happened."""
-    collected = False
-    for _ in range(6):
-        if bench.run(90.0, lambda: bench.done() or bench.state == 'paused') and bench.done():
-            break
-        bench.run(2.0)
-        collected, bench.state = True, 'running'
-    assert bench.done(), f'it did not end: {bench.reasons}, open {bench.open}'
-    bench.check()
-    assert set(bench.recorded) | bench.gave_up == {0, 1, 2}
-    missing = [
-        f'{name} missing at one configuration'
-        for name in SENSOR_OF.values()
-        if any(name not in readings for readings in bench.recorded.values())
-    ]
-    lost = sorted(bench.gave_up - set(bench.recorded))
-    given_up = [f'{len(lost)} of 3 configurations given up'] if lost else []
-    end = 'goes on after /remaster/collect' if collected else 'goes on by itself'
-    if not bench.reasons:
-        return 'no harm: nothing is lost and nothing stops'
-    result = '; '.join(missing + given_up) or 'nothing lost'
-    return f'{"; ".join(bench.reasons)}; {end}, {result}'
-
-
-def stands_if_it_must(bench: Bench) -> None:
-    if bench.visitor.blocked(bench.t):
-        late = [bench.speed() for _ in range(20) if bench.step() is None]
-        if bench.visitor.blocked(bench.t):
-            assert max(late) < 1e-3
-
-
-@pytest.mark.parametrize('kind', KINDS)
-def test_robot(bench, kind):
-    under_way(bench)
-    bench.inject(**ROBOT[kind])
-    bench.run(8.0)
-    stands_if_it_must(bench)
-    bench.inject(**({'reordered': 1} if kind == 'restarted' else {}))
-    observe('robot', kind, tell(bench))
-
-
-@pytest.mark.parametrize('fault', NAMED)
-def test_named_faults_of_the_robot(bench, fault):
-    under_way(bench)
-    bench.inject(**NAMED[fault])
-    bench.run(14.0)
-    stands_if_it_must(bench)
-    bench.inject()
-    observe('named', f'robot: {fault}', tell(bench))
-
-
-def test_an_emergency_stop_that_is_released_does_not_let_the_arm_go(bench):
-    under_way(bench)
-    bench.inject(estop=1)
-    bench.run(3.0)
-    bench.inject()
-    assert bench.visitor.halted
-    speeds = [bench.speed() for _ in range(200) if bench.step() is None]
-    assert max(speeds) < 1e-3
-
-
-@pytest.mark.parametrize('fault', ['the first command is copied', 'no motion before it'])
-def test_commanded_as_measured_is_found_before_the_first_motion(bench, fault):
-    bench.inject(copy=1)
-    start = bench.world.reported(bench.t)[0]
-    assert bench.run(20.0, lambda: bench.visitor.halted)
-    assert 'to the last bit' in bench.visitor.halted
-    assert np.max(np.abs(bench.world.reported(bench.t)[0] - start)) < 1e-4
-    assert not bench.recorded
-
-
-@pytest.mark.parametrize('kind', KINDS)
-@pytest.mark.parametrize('name', NODES)
-def test_node(bench, name, kind):
-    under_way(bench)
-    bench.node = Node(name, kind, faulty=True)
-    wrong = {
-        'wrong': bench.solutions[sorted(bench.open)] + np.deg2rad([0, 400, 0, 0, 0, 0, 0]),
-        'garbage': bench.solutions[sorted(bench.open)] * np.nan,
-    }
-    if name == 'pose_planner' and kind in wrong:
-        bench.plan(wrong[kind])
-    elif name == 'robot_bridge':
-        break_bridge(bench, kind)
-    elif name == 'recorder' and kind in ('off', 'restarted'):
-        bench.pairing = None
-    bench.run(12.0)
-    stands_if_it_must(bench)
-    bench.node = Node()
-    if name == 'robot_bridge' and kind in ('off', 'restarted', 'garbage', 'wrong'):
-        bench.visitor = Visitor(bench.limits, fault_bench.RULES)
-    if kind in ('off', 'restarted') and name in ('pose_planner', 'robot_bridge', 'recorder'):
-        bench.run(1.5)
-        bench.announce_again()
-    elif name in ('pose_planner', 'robot_bridge') and kind in wrong:
-        bench.announce_again()
-    observe(name, kind, tell(bench))
-
-
-@pytest.mark.parametrize(
-    ('node', 'kind', 'fault'),
-    [
-        ('optitrack_markers', 'stray', 'OptiTrack: marker swapped with a stray'),
-        ('laser_tracker_markers', 'stray', 'laser tracker: locked on another reflector'),
-        ('laser_tracker_markers', 'frozen', 'laser tracker: the same reading again and again'),
-    ],
-)
-def test_a_marker_that_is_another_or_frozen_is_no_observation(bench, node, kind, fault):
-    under_way(bench)
-    bench.node = Node(node, kind, faulty=True)
-    assert bench.run(60.0, lambda: len(bench.recorded) == 2)
-    bench.node = Node()
-    assert SENSOR_OF[node] not in bench.recorded[1]
-    observe('named', fault, tell(bench))
-
-
-def test_a_stray_during_the_registration(bench):
-    """At the second of three points a stray is taken for the marker; a fourth point decides."""
-    rng, truth = np.random.default_rng(4), bench.world.truth
-    sensor = truth.sensors['mocap']
-    turns = np.array([[0.0] * 7, [0.5, 0.2] + [0.0] * 5, [-0.3, 0.4] + [0.0] * 5, [0.2] * 7])
-    q = bench.world.start_q + turns
-    model_R = fault_bench.CHAIN.positions(q, np.array(fault_bench.CELL.markers['sir']))
-    marker_R = fault_bench.CHAIN.positions(q, sensor.marker, truth.joint_offsets)
-    seen = transforms.apply(transforms.inverse(sensor.T_R_N), marker_R)
-    seen = seen + rng.normal(0, 3e-5, seen.shape)
-    seen[1] = seen[0] + [0.1, 0.0, 0.0]
-    with pytest.raises(InsufficientDataError) as refusal:
-        register_agreeing(model_R[:3], seen[:3], 0.025)
-    T_R_N, agree = register_agreeing(model_R, seen, 0.025)
-    assert agree.tolist() == [True, False, True, True]
-    assert np.linalg.norm(T_R_N[:3, 3] - sensor.T_R_N[:3, 3]) < 0.05
-    text = f'{refusal.value}; the next point decides, and the stray is left out'
-    observe('named', 'OptiTrack: marker swapped with a stray at the registration', text)
-
-
-def break_bridge(bench: Bench, kind: str) -> None:
-    """What the others see of a bridge that does not do its part."""
-    if kind == 'wrong':
-        bench._take(0, bench.t, bench.solutions[0] + 0.5)
-    elif kind == 'garbage':
-        bench._take(0, bench.t, bench.solutions[0] * np.nan)
-
-
-@pytest.mark.parametrize(('require', 'waits'), [('all', True), ('mocap', False), ('any', False)])
-def test_the_arm_waits_for_a_dead_sensor_only_where_it_is_required(tmp_path, require, waits):
-    """The tracker's node dies for good: with `all` the arm stands, else the bar is enough."""
-    bench = Bench(tmp_path, require=require)
-    bench.node = Node('laser_tracker_markers', 'off', faulty=True)
-    bench.presence.says('tracker', True, '', bench.t)
-    assert bench.run(60.0, bench.done) == (not waits)
-    bench.check()
-    if waits:
-        assert bench.reasons == ['waiting for tracker: its node has been silent for 3 s']
-        assert bench.speed() < 1e-3
-    else:
-        assert all(set(readings) == {'mocap'} for readings in bench.recorded.values())
-        assert set(bench.recorded) == {0, 1, 2}
-    bench.close()
 
 
 # The devices at their wires
@@ -543,59 +332,46 @@ def test_laser_tracker(kind):
     observe(row, name, '; '.join([*parts, 'measures again by itself']))
 
 
-# The optimizer takes no part in the collection; what it can do wrong is hand on wrong offsets
+def test_a_stray_during_the_registration(tmp_path):
+    """At the second of three points a stray is taken for the marker; a fourth point decides."""
+    cell = read_cell('demo')
+    world, chain = make_world(tmp_path, cell, 1, 1.0), cell.chain()
+    rng, truth = np.random.default_rng(4), world.truth
+    sensor = truth.sensors['mocap']
+    turns = np.array([[0.0] * 7, [0.5, 0.2] + [0.0] * 5, [-0.3, 0.4] + [0.0] * 5, [0.2] * 7])
+    q = world.start_q + turns
+    model_R = chain.positions(q, np.array(cell.markers['sir']))
+    marker_R = chain.positions(q, sensor.marker, truth.joint_offsets)
+    seen = transforms.apply(transforms.inverse(sensor.T_R_N), marker_R)
+    seen = seen + rng.normal(0, 3e-5, seen.shape)
+    seen[1] = seen[0] + [0.1, 0.0, 0.0]
+    with pytest.raises(InsufficientDataError) as refusal:
+        register_agreeing(model_R[:3], seen[:3], 0.025)
+    T_R_N, agree = register_agreeing(model_R, seen, 0.025)
+    assert agree.tolist() == [True, False, True, True]
+    assert np.linalg.norm(T_R_N[:3, 3] - sensor.T_R_N[:3, 3]) < 0.05
+    text = f'{refusal.value}; the next point decides, and the stray is left out'
+    observe('named', 'OptiTrack: marker swapped with a stray at the registration', text)
 
 
-FIT = """{"format": "remaster-fit/1", "joint_offsets": [%s]}"""
+# The tables
 
 
-@pytest.mark.parametrize('kind', KINDS)
-def test_optimizer(bench, kind, tmp_path):
-    under_way(bench)
-    text = tell(bench)
-    if kind in ('wrong', 'garbage'):
-        path = tmp_path / 'fit.json'
-        path.write_text(FIT % '' if kind == 'wrong' else '\0\xff{"format": NaN')
-        with pytest.raises(InputError) as refusal:
-            joint_offsets_rad(read_fit(path), fault_bench.CHAIN.joint_names)
-        message = str(refusal.value).replace(f'{path}: ', '')
-        text = f'the bridge refuses such offsets and does not start: {message}'
-    observe('optimizer', kind, text)
-
-
-# The table
-
-
-def table(rows: dict[str, dict[str, str]]) -> str:
-    """Return the matrix."""
-    lines = ['| | ' + ' | '.join(KINDS) + ' |', '|---' * (len(KINDS) + 1) + '|']
-    for who, cells in rows.items():
-        lines.append('| ' + ' | '.join([f'**{who}**', *(cells[kind] for kind in KINDS)]) + ' |')
-    return '\n'.join(lines)
-
-
-def listing(cells: dict[str, str]) -> str:
-    """Return the list of the faults that have a name."""
-    return '\n'.join(
-        ['| fault | what happens |', '|---|---|', *(f'| {k} | {v} |' for k, v in cells.items())]
-    )
-
-
-def test_the_page_says_what_was_observed():
+def test_the_page_has_what_was_observed():
     """Written anew with FAULTS_PAGE=write; else compared. Needs the whole file to have run."""
-    named = observed.get('named', {})
-    rows = {who: cells for who, cells in observed.items() if who != 'named'}
-    expected = {'robot', *NODES, 'OptiTrack', 'laser tracker', 'optimizer'}
-    if set(rows) != expected or any(set(cells) != set(KINDS) for cells in rows.values()):
-        pytest.skip('only a part of the matrix has run')
-    text = PAGE.read_text()
-    for name, body in (('matrix', table(rows)), ('named', listing(named))):
-        begin = BEGIN.format(name)
-        head, rest = text.split(begin)
-        old, tail = rest.split(END, 1)
-        if os.environ.get('FAULTS_PAGE') == 'write':
-            text = f'{head}{begin}\n\n{body}\n\n{END}{tail}'
-        else:
-            assert old.strip() == body, f'{PAGE.name} is not what was observed: make faults'
-    if os.environ.get('FAULTS_PAGE') == 'write':
-        PAGE.write_text(text)
+    named = observed.pop('named', {})
+    if set(observed) != {'OptiTrack', 'laser tracker'} or any(
+        set(cells) != set(KINDS) for cells in observed.values()
+    ):
+        pytest.skip('only a part of the faults has run')
+    matrix = [(f'**{who}**', *(cells[kind] for kind in KINDS)) for who, cells in observed.items()]
+    tables = {
+        'matrix': fault_page.table(('', *KINDS), matrix),
+        'named': fault_page.table(('fault', 'what happens'), list(named.items())),
+    }
+    for name, text in tables.items():
+        if fault_page.MODE:
+            fault_page.replace(name, text)
+        assert fault_page.body(name) == text, (
+            'docs/faults.md is not what was observed: make faults'
+        )

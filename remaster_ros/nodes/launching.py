@@ -1,0 +1,176 @@
+"""What the launch files start: which nodes, with which parameters and names.
+
+No launch in here, so that it is tested where launch is not installed; the launch files turn the
+result into its actions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from remaster_ros.core.errors import InputError
+from remaster_ros.storage.cell import YAML_LIMIT, read_cell
+from remaster_ros.storage.files import decode_text, read_limited
+from remaster_ros.storage.safe_yaml import YamlError, load_yaml
+
+CORE = ('pose_planner', 'robot_bridge', 'recorder', 'optimizer')
+SENSORS = ('optitrack_markers', 'laser_tracker_markers')
+FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
+ALL = 'all'
+RESPAWN_DELAY_S = 1.0
+MAX_RESPAWNS = 5
+"""How often a node that was killed, or crashed, is started again."""
+WRONG = 2
+"""The exit status of a node that is configured wrongly, or whose device does not answer."""
+COMMANDS = 'joint_trajectory_controller/joint_trajectory'
+
+
+@dataclass(frozen=True)
+class NodeToStart:
+    """A node of a launch file.
+
+    Attributes
+    ----------
+    executable, name
+        What runs, and the node's name.
+    parameters
+        A parameter file, then values that override it.
+    remappings
+        From and to; relative names, so that they hold in a namespace.
+    """
+
+    executable: str
+    name: str
+    parameters: tuple[str | dict[str, Any], ...]
+    remappings: tuple[tuple[str, str], ...] = field(default=())
+
+
+def real_nodes(
+    cell: str,
+    params: str,
+    sensors: str = ALL,
+    namespace: str = '',
+    controller: str = '',
+    joint_states: str = '',
+) -> list[NodeToStart]:
+    """Return the nodes of a real cell.
+
+    Parameters
+    ----------
+    cell, params
+        Paths of the cell file and of the parameter file.
+    sensors
+        ``all``, or names of the cell file's sensors with commas.
+    namespace
+        Of the nodes.
+    controller, joint_states
+        The arm's controller and the topic of its joint states; empty for ros2_control's usual
+        names in the namespace.
+
+    Raises
+    ------
+    InputError
+        A file is missing or wrong, or a node would run on its defaults.
+    """
+    for name, path in (('cell', cell), ('params', params)):
+        if not Path(path).is_file():
+            raise InputError(f'{name}:={path}: there is no such file; name your own')
+    known = read_cell(cell).sensors
+    wanted = list(known) if sensors == ALL else [name.strip() for name in sensors.split(',')]
+    unknown = [name for name in wanted if name not in known]
+    if unknown:
+        raise InputError(
+            f'sensors:={sensors}: {cell} has no sensor {unknown[0]!r}; it has {", ".join(known)}'
+        )
+    sections = read_sections(params, namespace)
+    missing = [name for name in CORE if name not in sections]
+    if missing:
+        raise InputError(
+            f'{params}: no section for {missing[0]}{_where(namespace)}, it would run on its '
+            f'defaults; add /**/{missing[0]}'
+        )
+    by_sensor = {values.get('sensor'): name for name, values in sections.items()}
+    own: dict[str, Any] = {'cell': str(Path(cell).resolve())}
+    # One that is not started is not to be waited for.
+    require = {'require': wanted[0]} if len(wanted) == 1 < len(known) else {}
+    remappings = tuple(
+        pair
+        for pair in (
+            (COMMANDS, f'{controller}/joint_trajectory' if controller else ''),
+            ('joint_states', joint_states),
+        )
+        if pair[1]
+    )
+    nodes = []
+    for name in CORE:
+        values = {} if name == 'optimizer' else {**own, **(require if name == 'recorder' else {})}
+        parameters = (params, values) if values else (params,)
+        nodes.append(NodeToStart(name, name, parameters, remappings))
+    for sensor in wanted:
+        node = by_sensor.get(sensor, '')
+        kind = next((kind for kind in SENSORS if node.startswith(kind)), '')
+        if not kind:
+            raise InputError(
+                f'{params}: no node for the sensor {sensor!r}{_where(namespace)}; give it a '
+                f'section /**/{" or /**/".join(SENSORS)} with "sensor: {sensor}", or leave it '
+                'out with sensors:='
+            )
+        nodes.append(NodeToStart(kind, node, (params, own), remappings))
+    return nodes
+
+
+def fake_nodes(params: str) -> list[NodeToStart]:
+    """Return the nodes of a fake cell and its fakes, whose clock is the namespace's own."""
+    if not Path(params).is_file():
+        raise InputError(f'params:={params}: there is no such file')
+    return [
+        NodeToStart(name, name, (params,), (('/clock', 'clock'),))
+        for name in (*FAKES, *CORE, *SENSORS)
+    ]
+
+
+def read_sections(params: str, namespace: str = '') -> dict[str, Mapping[str, Any]]:
+    """Return the sections of a parameter file that hold in a namespace, by node.
+
+    Raises
+    ------
+    InputError
+        It is no parameter file, or has a section for none of our nodes in this namespace: that
+        node would run on its defaults.
+    """
+    path = Path(params)
+    try:
+        data = load_yaml(decode_text(read_limited(path, YAML_LIMIT, 'name a file'), path))
+    except YamlError as error:
+        raise InputError(f'{path}: {error}') from None
+    if not isinstance(data, dict):
+        raise InputError(f'{path}: no parameter file; begin with a copy of config/real.yaml')
+    space = namespace.strip('/')
+    found: dict[str, Mapping[str, Any]] = {}
+    for key, section in data.items():
+        values = section.get('ros__parameters') if isinstance(section, dict) else None
+        if not isinstance(values, dict):
+            raise InputError(f'{path}: section {key} has no ros__parameters')
+        place, _, name = str(key).rpartition('/')
+        if name == '**':
+            continue
+        if place == '/**' or place.strip('/') == space:
+            found[name] = values
+        elif name.startswith((*CORE, *SENSORS, *FAKES)):
+            raise InputError(
+                f'{path}: section {key} is not for the nodes{_where(namespace)}, which would run '
+                f'on their defaults; call it /**/{name}'
+            )
+    return found
+
+
+def exit_ends_launch(returncode: int | None) -> bool:
+    """Return whether the end of a node ends them all: started again it would say the same."""
+    return returncode == WRONG
+
+
+def _where(namespace: str) -> str:
+    return f' in the namespace /{namespace.strip("/")}' if namespace.strip('/') else ''

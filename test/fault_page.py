@@ -1,0 +1,75 @@
+"""The tables of docs/faults.md, which the tests write (FAULTS_PAGE=write or add) or compare.
+
+``write`` replaces the rows that were tried; ``add`` keeps what they were before as well: where a
+fault ends differently from time to time, the page has a line for each.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+PAGE = Path(__file__).parents[1] / 'docs' / 'faults.md'
+BEGIN, END = '<!-- observed by the tests: {} -->', '<!-- end -->'
+MODE = os.environ.get('FAULTS_PAGE', '')
+
+
+def body(name: str) -> str:
+    """Return a section as it stands on the page."""
+    _, rest = PAGE.read_text().split(BEGIN.format(name))
+    return rest.split(END, 1)[0].strip()
+
+
+def replace(name: str, text: str) -> None:
+    """Put another text into a section."""
+    begin = BEGIN.format(name)
+    head, rest = PAGE.read_text().split(begin)
+    _, tail = rest.split(END, 1)
+    PAGE.write_text(f'{head}{begin}\n\n{text}\n\n{END}{tail}')
+
+
+def rows(name: str) -> list[tuple[str, ...]]:
+    """Return the cells of a section's table, without its heading."""
+    lines = [line for line in body(name).splitlines() if line.startswith('|')][2:]
+    return [tuple(cell.strip() for cell in line.strip('|').split(' | ')) for line in lines]
+
+
+def table(heading: tuple[str, ...], cells: list[tuple[str, ...]]) -> str:
+    """Return a table."""
+    lines = ['| ' + ' | '.join(heading) + ' |', '|---' * len(heading) + '|']
+    return '\n'.join([*lines, *('| ' + ' | '.join(row) + ' |' for row in cells)])
+
+
+def same(first: tuple[str, ...], second: tuple[str, ...]) -> bool:
+    """Whether two rows are the same but for their numbers."""
+    return [_masked(cell) for cell in first] == [_masked(cell) for cell in second]
+
+
+def allows(page: list[tuple[str, ...]], seen: tuple[str, ...], said: int) -> bool:
+    """Whether the page's lines of a fault have what was seen of it.
+
+    What is commanded and how it goes on must be as in one of them. Of several reasons not each is
+    told every time, as the first one may be over when a node looks again: none may be new.
+
+    Parameters
+    ----------
+    page
+        The lines of this fault.
+    seen
+        As a line.
+    said
+        The column of reasons.
+    """
+    rest = {tuple(_masked(c) for i, c in enumerate(row) if i != said) for row in page}
+    known = {part for row in page for part in _parts(row[said])}
+    mine = tuple(_masked(c) for i, c in enumerate(seen) if i != said)
+    return mine in rest and _parts(seen[said]) <= known
+
+
+def _parts(said: str) -> set[str]:
+    return {part.lower() for part in _masked(said).split('; ')}
+
+
+def _masked(cell: str) -> str:
+    return re.sub(r'\d+(\.\d+)?', '…', cell)

@@ -1,0 +1,188 @@
+"""Every verdict of every verb that judges, by the real command, with its figures and its report.
+
+A verdict that is rare is where a page is seldom tried.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from command_line import refusal, remaster
+
+from remaster_ros.core.fit import fit_session
+from remaster_ros.core.types import Session
+from remaster_ros.storage.session import read_session, write_session
+
+SIZE = ('--poses', 16, '--validation', 8, '--sensors', 'mocap', '--quiet')
+
+
+def simulated(folder: Path, *options: object) -> Path:
+    process = remaster('simulate', folder, *SIZE, *options)
+    assert process.returncode == 0, process.stderr
+    return folder
+
+
+@pytest.fixture(scope='module')
+def healthy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulated(tmp_path_factory.mktemp('healthy') / 'session', '--seed', 3)
+
+
+def changed(session: Path, folder: Path, change: object) -> Path:
+    write_session(folder / 'changed', change(read_session(session)))  # type: ignore[operator]
+    return folder / 'changed'
+
+
+def page_of(out: Path) -> tuple[str, str, set[str]]:
+    """Return a report's text, its verdict's mood, and its figures, all of which must be whole."""
+    page = (out / 'report.html').read_text(encoding='utf-8')
+    assert not re.findall(r'(?:src|href)="(?!#)[^"]', page)
+    names = {path.stem for path in (out / 'figures').glob('*.svg')}
+    for name in names:
+        ElementTree.parse(out / 'figures' / f'{name}.svg')
+        assert f'id="{name}-' in page, name
+    mood = re.search(r'class="verdict (\w+)"', page)
+    assert mood is not None
+    return page, mood[1], names
+
+
+def with_positions(session: Session, position: np.ndarray) -> Session:
+    return replace(session, measurements=replace(session.measurements, position=position))
+
+
+def only_fitted(session: Session) -> Session:
+    return session.select(~session.measurements.is_validation)
+
+
+def worse_where_held_out(session: Session) -> Session:
+    """Mirror what the offsets do on the held-out poses: there they have the wrong sign."""
+    result = fit_session(session, rng=np.random.default_rng(0), draws=500)
+    gain = result.residuals_before - result.residuals_after
+    held = session.measurements.is_validation[:, None]
+    return with_positions(session, session.measurements.position - np.where(held, 1.6 * gain, 0.0))
+
+
+FIT = {
+    # name: (options of fit, change of the session, mood, words in the headline)
+    'good': ((), lambda s: s, 'good', 'The mean position error falls from'),
+    'no validation': ((), only_fitted, 'caution', 'on the fitted poses'),
+    'worse': ((), worse_where_held_out, 'bad', 'The offsets make it worse'),
+    'few draws': (
+        ('--draws', 100, '--chains', 2),
+        lambda s: s,
+        'bad',
+        'The chains have not converged',
+    ),
+    'paper': (('--sampler', 'paper', '--draws', 2000), lambda s: s, 'bad', 'have not converged'),
+}
+
+
+@pytest.mark.parametrize('case', FIT)
+def test_fit(case: str, healthy: Path, tmp_path: Path) -> None:
+    options, change, mood, words = FIT[case]
+    session, out = changed(healthy, tmp_path, change), tmp_path / 'fit'
+    process = remaster('fit', session, '--out', out, *options)
+    assert process.returncode == 0, process.stderr
+    page, found, names = page_of(out)
+    assert names == {'posteriors', 'traces', 'errors', 'residuals'}
+    assert found == mood if mood else found != 'good'
+    assert re.search(words, page)
+    assert 'written: ' in process.stdout
+    fit = json.loads((out / 'fit.json').read_text(encoding='utf-8'))
+    assert (fit['accuracy']['validation'] is None) == (case == 'no validation')
+    # And every verb that takes a fit takes this one.
+    judged = remaster('accuracy', session, '--offsets', out / 'fit.json', '--out', out / 'a.json')
+    assert judged.returncode == 0, judged.stderr
+    assert 'mean error [95 % interval], mm' in judged.stdout
+    accuracy = json.loads((out / 'a.json').read_text(encoding='utf-8'))['accuracy']
+    assert accuracy['optimization'] is not None
+
+
+def test_offsets_that_are_corrected_hardly_matter(healthy: Path, tmp_path: Path) -> None:
+    """The fit of an arm that was corrected: nothing is left to gain, and that is said."""
+    out = tmp_path / 'fit'
+    assert remaster('fit', healthy, '--out', out, '--no-figures').returncode == 0
+    urdf = (out / 'apply' / 'robot_calibrated.urdf').read_text(encoding='utf-8')
+    session = changed(healthy, tmp_path, lambda s: replace(s, urdf=urdf))
+    again = tmp_path / 'again'
+    assert remaster('fit', session, '--out', again).returncode == 0
+    page, mood, _ = page_of(again)
+    assert mood == 'caution'
+    assert 'The zero-offsets hardly matter here' in page
+    assert 'That is what noise explains' in page
+
+
+def test_a_fit_that_the_data_do_not_allow(healthy: Path, tmp_path: Path) -> None:
+    session = changed(healthy, tmp_path, lambda s: s.select(s.measurements.pose < 2))
+    for verb in ('fit', 'discover'):
+        line = refusal(verb, session, '--out', tmp_path / verb, status=1)
+        assert 'at least 3 are needed' in line
+        assert not (tmp_path / verb / 'report.html').exists()
+
+
+DISCOVER = {
+    'none': ((), 'none', 'good', 'Nothing is there beyond the zero-offsets'),
+    'effects': (
+        ('--effect', 'joint_axis_tilt@3:0.4'),
+        'effects',
+        'good',
+        'Beyond the zero-offsets there',
+    ),
+    'undetermined': (
+        ('--effect', 'encoder_scale@2:0.4'),
+        'undetermined',
+        'caution',
+        'two explanations fit equally well',
+    ),
+}
+
+
+@pytest.mark.parametrize('case', DISCOVER)
+def test_discover(case: str, tmp_path: Path) -> None:
+    options, verdict, mood, words = DISCOVER[case]
+    session = simulated(tmp_path / 'session', '--seed', 3, *options)
+    out = tmp_path / 'causes'
+    process = remaster('discover', session, '--out', out)
+    assert process.returncode == 0, process.stderr
+    assert f'verdict: {verdict}' in process.stdout
+    found = json.loads((out / 'discovery.json').read_text(encoding='utf-8'))
+    assert found['verdict'] == verdict
+    page, seen, names = page_of(out)
+    assert seen == mood
+    assert words in page
+    assert names == {'gain', 'drivers'} | ({'causes'} if found['effects'] else set())
+    for effect in found['effects']:
+        for other in effect['confusable_with']:
+            assert other['separate_by'] in page
+
+
+@pytest.mark.parametrize('case', ['none', 'effects'])
+def test_discover_with_a_session_that_confirms(case: str, tmp_path: Path) -> None:
+    options = DISCOVER[case][0]
+    session = simulated(tmp_path / 'session', '--seed', 3, *options)
+    out = tmp_path / 'causes'
+    process = remaster('discover', session, '--out', out, '--confirm', session)
+    assert process.returncode == 0, process.stderr
+    assert 'other session: ' in process.stdout
+    page, _, _ = page_of(out)
+    assert 'In the other session' in page
+    found = json.loads((out / 'discovery.json').read_text(encoding='utf-8'))
+    assert found['confirmation']['rms_before_m'] > 0.0
+
+
+def test_discover_without_validation(healthy: Path, tmp_path: Path) -> None:
+    session = changed(healthy, tmp_path, only_fitted)
+    out = tmp_path / 'causes'
+    assert remaster('discover', session, '--out', out).returncode == 0
+    page, _, _ = page_of(out)
+    assert 'No validation poses: the gain is not proven' in page
+
+
+def test_recover_has_nothing_to_do(healthy: Path) -> None:
+    """Its other answers are in test_recover.py."""
+    assert remaster('recover', healthy).returncode in (0, 2)

@@ -1,0 +1,177 @@
+"""Faults in running collections of real nodes, and the page of them.
+
+`make faults` tries every row and writes docs/faults.md; `make test` tries those marked quick, and
+compares. What is injected, and what must hold whatever happens, is in `fault_rows`.
+"""
+
+import itertools
+import os
+import subprocess
+import sys
+
+import fault_observer
+import fault_page
+import fault_rows
+import numpy as np
+import pytest
+from conftest import ROOT, _domains
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
+
+ALL = bool(fault_page.MODE)
+TRIED = [row for row in fault_rows.ROWS if ALL or row.quick]
+TRIED.sort(key=lambda row: (list(fault_rows.BENCHES).index(row.bench), not row.quick))
+ENOUGH = 12
+"""So many configurations must be left for another row."""
+FIVE_HEADING = 'situation', 'commanded before', 'commanded now', 'what is said', 'how it goes on'
+BAD_FITS = {'no gauge': '{"format": "remaster-fit/1", "joint_offsets": []}', 'garbage': '\0{"f'}
+
+
+COPIED = 'robot', 'publishes what was commanded as measured, from the start'
+NO_OFFSETS = 'offsets that are none: {}'
+OTHERS = [COPIED, *(('optimizer', NO_OFFSETS.format(fault)) for fault in BAD_FITS)]
+
+
+class Benches:
+    """Sets of nodes, one at a time, each for as many rows as it lasts."""
+
+    def __init__(self, folders):
+        self._folders, self._numbers = folders, itertools.count()
+        self._kind, self._bench, self.broken = '', None, False
+
+    def of(self, kind):
+        if self._bench is not None and (
+            self.broken or kind != self._kind or self._bench.left() < ENOUGH
+        ):
+            self.close()
+        if self._bench is None:
+            from fault_bench import Bench
+
+            folder = self._folders.mktemp(f'faults_{next(self._numbers)}')
+            self._kind, self.broken = kind, True
+            self._bench = Bench(folder, next(_domains), **fault_rows.BENCHES[kind])
+            self._bench.begin()
+        return self._bench
+
+    def close(self):
+        bench, self._bench = self._bench, None
+        if bench is not None:
+            bench.close()
+            if not self.broken:
+                bench.check_session()
+
+
+@pytest.fixture(scope='module')
+def benches(tmp_path_factory):
+    pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+    benches = Benches(tmp_path_factory)
+    yield benches
+    benches.close()
+
+
+def write(section, seen):
+    """Put a row that was seen beside, or in the place of, what the page has of it."""
+    keys = 1 if section == 'five' else 2
+    order = [(row.fault,) if keys == 1 else (row.who, row.fault) for row in fault_rows.ROWS]
+    rows = fault_page.rows(section)
+    if fault_page.MODE == 'write':
+        rows = [row for row in rows if row[:keys] != seen[:keys]]
+    known = [row for row in rows if row[:keys] == seen[:keys]]
+    if not any(fault_page.same(seen, other) for other in known):
+        rows.append(seen)
+    order += OTHERS
+    rows = [row for row in rows if row[:keys] in order]
+    rows.sort(key=lambda row: order.index(row[:keys]))
+    heading = FIVE_HEADING if keys == 1 else fault_rows.COLUMNS
+    fault_page.replace(section, fault_page.table(heading, rows))
+
+
+def compare(section, row):
+    """See that the page has this row, or write it there."""
+    if fault_page.MODE:
+        write(section, row)
+        return
+    keys = 1 if section == 'five' else 2
+    page = [other for other in fault_page.rows(section) if other[:keys] == row[:keys]]
+    heading = FIVE_HEADING if section == 'five' else fault_rows.COLUMNS
+    said = heading.index('what is said')
+    assert fault_page.allows(page, row, said), (
+        f'docs/faults.md is not what was observed (make faults writes it):\n{row}\n{page}'
+    )
+
+
+def cells(row, seen):
+    """Return the section and the line of the page."""
+    texts = seen.said[0].upper() + seen.said[1:], seen.goes_on
+    if row not in fault_rows.FIVE:
+        return 'nodes', (row.who, row.fault, texts[0], seen.commanded, texts[1])
+    commanded = seen.commanded
+    if seen.share:
+        commanded += f' ({seen.travel_deg:.1f}° onward, {100 * seen.share:.0f} %)'
+    return 'five', (row.fault, fault_rows.BEFORE[row.fault], commanded, *texts)
+
+
+@pytest.mark.parametrize('row', TRIED, ids=lambda row: f'{row.who}: {row.fault}')
+def test_row(benches, row):
+    bench = benches.of(row.bench)
+    benches.broken = True
+    try:
+        seen = fault_rows.observe(bench, row)
+    except fault_rows.TooBusyError as busy:
+        benches.broken = False
+        pytest.skip(str(busy))
+    benches.broken = False
+    section, line = cells(row, seen)
+    print(line)
+    compare(section, line)
+
+
+@pytest.mark.skipif(not ALL, reason='needs a set of nodes of its own: make faults')
+def test_a_robot_that_copies_its_commands_never_moves(tmp_path):
+    """Found by a probe of a micrometre, before the first motion."""
+    from fault_bench import Bench
+
+    bench = Bench(tmp_path, next(_domains))
+    try:
+        bench.inject(robot={'copy': 1})
+        bench.until(lambda: bench.observer.says('pose_planner', 'robot') == 'heard', 90, 'it')
+        bench.call('collect')
+        bench.until(lambda: bench.halted, 90, 'a halt')
+        moved = bench.world.reported(bench.world.now())[0] - bench.world.start_q
+        assert np.max(np.abs(moved)) < 1e-4
+        assert all(command.travel_rad < 1e-4 for command in bench.observer.commands)
+        said = fault_observer.plain(bench.halted)
+        bench.inject()
+        took = bench.operate()
+        bench.until(lambda: any(c.is_move for c in bench.observer.commands), 60, 'a move')
+        bench.observer.judge(bench.observer.commands)
+    finally:
+        bench.close()
+    goes_on = f'after {" and ".join(took)}'
+    compare('nodes', (*COPIED, said[0].upper() + said[1:], 'a micrometre', goes_on))
+
+
+@pytest.mark.parametrize('fault', BAD_FITS)
+def test_offsets_that_are_none(fault, tmp_path):
+    """The optimizer takes no part in a collection; what it can do is hand on wrong offsets."""
+    environment = {
+        **os.environ,
+        'PYTHONPATH': os.pathsep.join(filter(None, (str(ROOT), os.environ.get('PYTHONPATH')))),
+        'ROS_DOMAIN_ID': str(next(_domains)),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+    }
+    command = [sys.executable, '-m', 'remaster_ros.nodes', 'robot_bridge', '--ros-args']
+    path = tmp_path / 'fit.json'
+    path.write_text(BAD_FITS[fault])
+    done = subprocess.run(
+        [*command, '-p', 'cell:=demo', '-p', f'offsets:={path}'],
+        env=environment, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith('error:')]
+    said = line.removeprefix('error: ').replace(f'{path}: ', '')
+    row = (
+        'optimizer', NO_OFFSETS.format(fault), f'The bridge does not start: {said}',
+        'nothing', 'with a fit.json',
+    )  # fmt: skip
+    compare('nodes', row)
