@@ -4,8 +4,10 @@ Changes the node and what it is made of, one small change at a time (see mutants
 their tests against each in a process of its own, forked after everything else was imported: DDS
 does not outlive a fork, so no test has run before. The tests must fail, or not end. Ends with
 status 1 where a mutant survives that `bridge_mutants.yaml` does not explain.
+Each mutant meets the tests that reach its lines (coverage.py), those of module level all of them.
 
     python benchmarks/check_bridge_node.py [--only robot_bridge] [--children 2] [--resume FILE]
+                                           (pip install coverage)
 """
 
 from __future__ import annotations
@@ -29,7 +31,12 @@ from types import CodeType
 from typing import Any
 
 import yaml
+from coverage import Coverage, CoverageData
+from diagnostic_msgs.msg import DiagnosticArray
 from mutants import Mutant, mutants_of
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
 
 ROOT = Path(__file__).resolve().parents[1]
 NODES = 'test/unit/nodes'
@@ -53,13 +60,14 @@ BEFORE = (
     'rclpy.executors',
     'rclpy.node',
     'remaster_ros.core.paths',
+    'remaster_ros.motion.arm_supervisor',
+    'remaster_ros.nodes.announcements',
+    'remaster_ros.nodes.parameters',
+    'remaster_ros.nodes.running',
+    'remaster_ros.nodes.status',
     'remaster_ros.storage.cell',
     'remaster_ros.storage.results',
-    'sensor_msgs.msg',
     'simple_cells',
-    'std_srvs.srv',
-    'trajectory_msgs.msg',
-    'diagnostic_msgs.msg',
 )
 """Imported before the forks: slow, and nothing of what is changed."""
 DOMAIN = 216
@@ -97,6 +105,9 @@ def main() -> int:
     sys.path[:0] = [str(ROOT), str(ROOT / 'test'), str(ROOT / NODES)]
     for name in BEFORE:
         importlib.import_module(name)
+    for kind in (JointState, JointTrajectory, DiagnosticArray, Trigger):
+        # Else rclpy loads the libraries of a message when it is first used.
+        type(kind).__import_type_support__()
     explained = yaml.safe_load(EXPLAINED.read_text()) if EXPLAINED.exists() else {}
     left = 0
     for module, tests in MODULES.items():
@@ -113,11 +124,7 @@ def judge(
     path = ROOT / (module.replace('.', '/') + '.py')
     text = path.read_text(encoding='utf-8')
     began = time.monotonic()
-    if (
-        wait_for({start(module, path, text, tests, 0): (0, None, time.monotonic())})[2]
-        != 'survived'
-    ):
-        sys.exit(f'{module}: its tests fail without any change')
+    reached = reach(module, path, text, tests)
     alone_s = time.monotonic() - began
     known = results_before(args.resume, module)
     fates: dict[str, str] = {}
@@ -131,7 +138,7 @@ def judge(
         else:
             todo.append(mutant)
     lines = {mutant.name: mutant.line for mutant in mutants_of(text)}
-    for mutant, fate in run_all(module, path, tests, todo, args.children):
+    for mutant, fate in run_all(module, path, reached, todo, args.children):
         fates[mutant.name] = fate
         if args.resume:
             with args.resume.open('a', encoding='utf-8') as file:
@@ -153,6 +160,29 @@ def judge(
     return len(left)
 
 
+def reach(module: str, path: Path, text: str, tests: list[str]) -> dict[int, list[str]]:
+    """Run the tests without a change; return which of them reach each line.
+
+    Line 0 has all of them, in their order.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        data = Path(folder) / 'coverage'
+        pid = start(module, path, text, tests, 0, data)
+        if wait_for({pid: (0, None, time.monotonic())})[2] != 'survived':
+            sys.exit(f'{module}: its tests fail without any change')
+        found = CoverageData(basename=str(data))
+        found.read()
+        contexts = found.contexts_by_lineno(str(path))
+    files = {Path(test).stem: test for test in tests}
+    reached: dict[int, list[str]] = {0: tests}
+    for line, names in contexts.items():
+        parts = sorted(name.rpartition('.')[::2] for name in names)
+        # What is run as the module is imported is reached by every test.
+        if all(stem in files for stem, _ in parts):
+            reached[line] = [f'{files[stem]}::{test}' for stem, test in parts]
+    return reached
+
+
 def results_before(file: Path | None, module: str) -> dict[str, str]:
     """Return the fates that a former run has kept."""
     if file is None or not file.exists():
@@ -162,7 +192,7 @@ def results_before(file: Path | None, module: str) -> dict[str, str]:
 
 
 def run_all(
-    module: str, path: Path, tests: list[str], todo: Sequence[Mutant], children: int
+    module: str, path: Path, reached: dict[int, list[str]], todo: Sequence[Mutant], children: int
 ) -> Any:
     """Yield each mutant with its fate; some run at a time."""
     waiting = list(reversed(todo))
@@ -171,14 +201,18 @@ def run_all(
         while waiting and len(running) < children:
             slot = min(set(range(children)) - {slot for slot, _, _ in running.values()})
             mutant = waiting.pop()
-            pid = start(module, path, mutant.source, tests, slot)
+            lines = range(mutant.line, mutant.last_line + 1)
+            tests = list(dict.fromkeys(t for line in lines for t in reached.get(line, [])))
+            pid = start(module, path, mutant.source, tests or reached[0], slot)
             running[pid] = slot, mutant, time.monotonic()
         _, mutant, fate = wait_for(running)
         yield mutant, fate
 
 
-def start(module: str, path: Path, source: str, tests: list[str], slot: int) -> int:
-    """Fork a process that runs the tests with another source of the module."""
+def start(
+    module: str, path: Path, source: str, tests: list[str], slot: int, lines: Path | None = None
+) -> int:
+    """Fork a process that runs the tests with another source; `lines` takes what they reach."""
     sys.stdout.flush()
     pid = os.fork()
     if pid:
@@ -195,7 +229,15 @@ def start(module: str, path: Path, source: str, tests: list[str], slot: int) -> 
 
         options = ['-x', '-q', '-p', 'pytest_timeout', '-p', 'no:cacheprovider']
         # A test that waits in vain for a message does so for seconds, not for a minute.
+        counter = None
+        if lines is not None:
+            counter = Coverage(data_file=str(lines), include=[str(path)])
+            counter.set_option('run:dynamic_context', 'test_function')
+            counter.start()
         status = int(pytest.main([*options, '--timeout=30', *tests]))
+        if counter is not None:
+            counter.stop()
+            counter.save()
     os._exit(status)
 
 

@@ -47,14 +47,15 @@ class Mutant:
     ----------
     name
         Where (function) and what: the text before and after; unique in its file.
-    line
-        Line in the original.
+    line, last_line
+        Lines in the original.
     source
         The whole changed text.
     """
 
     name: str
     line: int
+    last_line: int
     source: str
 
 
@@ -69,7 +70,9 @@ def mutants_of(text: str) -> Iterator[Mutant]:
             seen[name] = seen.get(name, 0) + 1
             if seen[name] > 1:
                 name += f' ({seen[name]})'
-            yield Mutant(name, getattr(node, 'lineno', 0), _replaced(tree, path, changed))
+            first = getattr(node, 'lineno', 0)
+            last = getattr(node, 'end_lineno', first)
+            yield Mutant(name, first, last, _replaced(tree, path, changed))
 
 
 Path = tuple[tuple[str, int | None], ...]

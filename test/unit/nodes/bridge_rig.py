@@ -60,7 +60,12 @@ class CountedBridge(robot_bridge.RobotBridge):
         self.taken = dict.fromkeys(('states', 'summaries', 'events', 'solutions', 'ways'), 0)
         self.published = self.sent = 0
         self.logged = []
-        super().__init__()
+        try:
+            super().__init__()
+        except BaseException:
+            # A process would end now, and its lock with it.
+            self.destroy_node()
+            raise
 
     def get_logger(self):
         return LogBook(super().get_logger(), self.logged)
@@ -177,6 +182,8 @@ class Rig:
             self.bridge = CountedBridge()
         except BaseException:
             rclpy.try_shutdown()
+            self.bridge = None
+            self.close()
             raise
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.bridge)
@@ -361,6 +368,13 @@ class Rig:
     def moves(self):
         """The commands of more than the micrometre of the probe."""
         return [c for c in self.commands if np.max(np.abs(c.q - c.start_q)) > 1e-4]
+
+    def logged(self):
+        """What it wrote, without the pairs of bodies that are never looked at."""
+        return [line for line in self.bridge.logged if not line[1].startswith('collisions: ')]
+
+    def reason(self, name):
+        return self.bridge.supervisor._interlocks.reason(name)
 
     def halted(self):
         return self.bridge.supervisor.halted

@@ -83,7 +83,7 @@ def test_a_second_publisher_halts_a_collection(rig, intruder, topic, kind, first
     # It follows its path: it is stopped there.
     r.wait(lambda: len(r.commands) == sent + 1, 'the stop')
     assert np.all(r.commands[-1].v[-1] == 0.0)
-    assert r.bridge.supervisor._reasons['rivals'] == r.halted()
+    assert r.reason('rivals') == r.halted()
 
 
 def test_another_bridge_with_a_lease_halts_a_collection(rig, intruder):
@@ -123,7 +123,7 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 def show(r, publisher, state):
     publisher.publish(Bool(data=state))
     wanted = 'the robot reports an emergency stop' if state else ''
-    r.wait(lambda: r.bridge.supervisor._reasons.get('safety') == wanted, 'the emergency stop')
+    r.wait(lambda: r.reason('safety') == wanted, 'the emergency stop')
 
 
 def test_an_emergency_stop_halts_and_is_cleared_only_after_its_end(rig):
@@ -132,7 +132,7 @@ def test_an_emergency_stop_halts_and_is_cleared_only_after_its_end(rig):
     publisher = r.peer.create_publisher(Bool, EMERGENCY, LATCHED)
     r.alone()
     silent = f'/{EMERGENCY} (emergency_stop_topic) is silent: nothing moves without it'
-    assert r.bridge.supervisor._reasons['safety_link'] == silent
+    assert r.reason('safety_link') == silent
     show(r, publisher, False)
     r.ready()
     r.go(AWAY, speed=0.2)
@@ -211,7 +211,7 @@ def test_a_bridge_that_is_started_again_is_still_halted(rig, tmp_path):
     r.close()
     again = rig(ready=False)
     assert again.halted().startswith('joint_states are not finite (halted ')
-    assert again.bridge.logged == [('error', f'halted: {again.halted()}')]
+    assert again.logged() == [('error', f'halted: {again.halted()}')]
     again.alone()
     again.plan(HOME + 0.1)
     again.run(1.0)
@@ -292,7 +292,7 @@ def test_every_rule_is_asked_at_the_time_it_is(rig):
     r.bridge.supervisor = Watched(r.bridge.supervisor)
     r.wall += 0.125
     r.say('recorder', waiting_for='x')
-    r.say('pose_planner', state='running')
+    r.say('pose_planner', state='running', run='its')
     r.report()
     r.report(name=[])
     r.plan(HOME + 0.05)
@@ -302,7 +302,7 @@ def test_every_rule_is_asked_at_the_time_it_is(rig):
     r.call_clear()
     wanted = {
         'recorder_waits': ('x', r.wall),
-        'planner_is': ('running', r.wall),
+        'planner_is': ('running', r.wall, 'its'),
         'emergency': (False, r.wall),
         'answered': (3, r.wall),
         'clear_halt': (r.wall,),

@@ -8,11 +8,13 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 from bridge_rig import CHAIN, HOME, PATIENCE_S, Rig, stamp
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from simple_cells import write_cell
 from trajectory_msgs.msg import JointTrajectory
 
+from remaster_ros.core.errors import InputError
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.nodes import robot_bridge
@@ -51,7 +53,7 @@ def rig(monkeypatch, tmp_path):
 def test_parameters_reach_the_limits_and_the_rules(rig, tmp_path):
     acceleration = [2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0]
     cell = write_cell(tmp_path / 'cell.yaml', acceleration_limit_rad_s2=acceleration)
-    bridge = rig(
+    r = rig(
         ready=False,
         cell=cell,
         speed_share=0.4,
@@ -59,7 +61,8 @@ def test_parameters_reach_the_limits_and_the_rules(rig, tmp_path):
         limit_margin_deg=2.0,
         settle_s=0.7,
         heartbeat_s=4.0,
-    ).bridge
+    )
+    bridge = r.bridge
     limits = bridge.supervisor.gate.limits
     wanted = MotionLimits.of(
         CHAIN, 0.4, None, np.array(acceleration), 0.15, float(np.deg2rad(2.0))
@@ -71,19 +74,55 @@ def test_parameters_reach_the_limits_and_the_rules(rig, tmp_path):
     assert bridge.supervisor.rules.settle.settle_s == 0.7
     assert bridge._emergency._silence_s == 4.0
     assert bridge._emergency.topic == ''
-    assert not bridge.logged
+    assert not r.logged()
 
 
 def test_without_a_cartesian_limit_it_says_so(rig):
-    bridge = rig(ready=False, cartesian_speed_limit_m_s=0.0).bridge
-    assert bridge.supervisor.gate.limits.tool_speed == np.inf
-    assert bridge.logged == [
+    r = rig(ready=False, cartesian_speed_limit_m_s=0.0)
+    assert r.bridge.supervisor.gate.limits.tool_speed == np.inf
+    assert r.logged() == [
         (
             'warning',
             'no Cartesian speed limit (cartesian_speed_limit_m_s is 0): the joints alone '
             'limit the speed of the arm',
         )
     ]
+
+
+def test_without_a_cell_file_it_does_not_start(rig):
+    with pytest.raises(InputError) as error:
+        rig(ready=False, cell='')
+    assert str(error.value) == (
+        'robot_bridge: parameter cell is empty; give the cell file of this arm (demo, the '
+        'shipped one, is for the fakes)'
+    )
+
+
+def test_bodies_that_are_never_looked_at_are_named(rig):
+    bridge = rig(ready=False).bridge
+    left_out = bridge._search._model.left_out
+    assert left_out
+    assert bridge.logged == [('info', f'collisions: {pair}') for pair in left_out]
+
+
+def test_other_speeds_are_taken_while_it_runs(rig):
+    r = rig()
+    r.go(AWAY, speed=0.2)
+    values = {'speed_share': 0.25, 'cartesian_speed_limit_m_s': 0.125}
+    answers = r.bridge.set_parameters([Parameter(name, value=v) for name, v in values.items()])
+    assert all(answer.successful for answer in answers)
+    r.flush()
+    limits = r.bridge.supervisor.gate.limits
+    np.testing.assert_allclose(limits.velocity, 0.25 * CHAIN.velocity_limits)
+    assert limits.tool_speed == 0.125
+    assert (r.bridge.p.speed_share, r.bridge.p.cartesian_speed_limit_m_s) == (0.25, 0.125)
+    stops = [event[2] for event in r.events if event[0] == 'stopped']
+    assert stops == ['other limits']
+    text = 'speed_share is 0.25, cartesian_speed_limit_m_s 0.125'
+    assert ('info', text) in r.logged()
+    r.run(30.0, lambda: r.settled)
+    _, v, _ = r.commands[-1].spline().sample()
+    assert np.all(np.abs(v) <= 0.25 * CHAIN.velocity_limits * 1.001)
 
 
 def test_the_fastest_point_keeps_the_cartesian_limit(rig):
@@ -326,7 +365,7 @@ def test_solutions_that_cannot_be_read_are_dropped(rig, spoil, reason):
     message.points = [robot_bridge.JointTrajectoryPoint(positions=HOME.tolist()) for _ in 'ab']
     spoil(message)
     r.taken(r.solutions, message, 'solutions')
-    assert r.bridge.logged == [('error', f'joint_solutions dropped: {reason}')]
+    assert r.logged() == [('error', f'joint_solutions dropped: {reason}')]
     r.run(0.5)
     assert not r.commands
     assert r.summary()[2]['pose'] == ''
@@ -360,7 +399,7 @@ def test_waypoints_of_another_pose_or_solution_are_not(rig, options):
 def test_waypoints_that_cannot_be_read_drop_the_pose(rig):
     r = rig()
     r.plan(TARGET, ways=[(0, [WAY[:6]])])
-    ((level, text),) = r.bridge.logged
+    ((level, text),) = r.logged()
     assert level == 'error'
     assert text.startswith('joint_solutions dropped: joint_waypoints: a point ')
     r.run(1.0)
@@ -453,6 +492,7 @@ def test_the_summary(rig):
         'moves_refused': '0',
         'pose': named,
         'run': 'token',
+        'qos_trouble': '',
     }
     r.report(position=[float('nan')] * 7)
     assert r.summary()[2]['joints_refused_not_finite'] == '1'
@@ -534,8 +574,9 @@ def test_the_halt_is_shown_at_once_and_with_its_level(rig):
     count = len(r.summaries)
     r.alter = lambda m: setattr(m, 'position', [float('nan')] * 7) or m
     r.run(1.0, r.halted)
-    r.wait(lambda: len(r.summaries) > count, 'a summary of the halt')
-    level, text, values = r.summaries[-1]
+    shown = lambda: [s for s in r.summaries[count:] if s[2]['halted']]  # noqa: E731
+    r.wait(shown, 'a summary of the halt')
+    level, text, values = shown()[0]
     assert (level, text) == ('error', 'joint_states are not finite')
     assert values['halted'] == values['joints_trouble'] == text
     for _ in range(3):
@@ -564,12 +605,13 @@ def test_without_the_simulated_clock_nothing_is_believed(rig):
     wanted = 'the simulated clock has not been heard: who publishes /clock?'
     assert r.bridge.clock_trouble == wanted
     r.report()
-    assert r.bridge.supervisor._reasons['clock'] == wanted
+    assert r.reason('clock') == wanted
     assert r.bridge.supervisor.report_age_s(r.wall) == np.inf
-    assert r.bridge.supervisor._reasons.get('robot') is None
+    assert r.reason('robot') == ''
     # It is looked at without a report, too, on a clock that always runs.
-    r.bridge.supervisor._reasons.clear()
-    r.wait(lambda: r.bridge.supervisor._reasons.get('clock') == wanted, 'the watch')
+    r.bridge.supervisor.observe('clock', '', r.wall)
+    assert r.reason('clock') == ''
+    r.wait(lambda: r.reason('clock') == wanted, 'the watch')
 
 
 # The controller
@@ -578,9 +620,7 @@ def test_without_the_simulated_clock_nothing_is_believed(rig):
 def test_nothing_is_commanded_before_a_controller_listens(rig):
     r = rig(ready=False, controller=False)
     r.bridge._watch()
-    assert r.bridge.supervisor._reasons['controller'] == (
-        'looking for another robot_bridge of this name'
-    )
+    assert r.reason('controller') == ('looking for another robot_bridge of this name')
     assert r.bridge._controller is None
     r.alone()
     r.plan(TARGET)
@@ -595,7 +635,7 @@ def test_nothing_is_commanded_before_a_controller_listens(rig):
     r.run(0.45)
     assert r.summary()[1] == wanted, 'the controller may not be matched yet'
     r.run(10.0, lambda: r.commands)
-    assert r.commands[0].arrival_s - matched >= robot_bridge.MATCHED_WALL_S
+    assert 0.5 <= r.commands[0].arrival_s - matched < 1.2
     r.run(10.0, lambda: r.settled)
 
 

@@ -13,7 +13,7 @@ from remaster_ros.nodes.bridge_parameters import Parameters
 pytestmark = pytest.mark.ros
 
 RANGES = {
-    'cell': ('demo', None, None),
+    'cell': ('', None, None),
     'speed_share': (0.3, 0.01, 1.0),
     'cartesian_speed_limit_m_s': (0.25, 0.0, 10.0),
     'limit_margin_deg': (0.5, 0.0, 45.0),
@@ -38,6 +38,8 @@ def test_defaults_and_ranges():
         for field in dataclasses.fields(Parameters)
     }
     assert found == RANGES
+    live = [f.name for f in dataclasses.fields(Parameters) if f.metadata['live']]
+    assert live == ['speed_share', 'cartesian_speed_limit_m_s']
 
 
 def test_every_rule_comes_from_its_own_parameter():
