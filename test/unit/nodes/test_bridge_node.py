@@ -306,6 +306,8 @@ def test_only_the_recorders_answer_for_this_pose_and_solution_counts(rig, answer
     r = rig()
     named = r.settle(TARGET, HOME)
     r.answer(**{'stamp_key': named, **answer})
+    r.say('recorder: configuration', stamp=named)
+    r.say('recorder: configuration', solution=0)
     r.run(1.0, dt=0.1)
     assert len(r.moves()) == 1, 'it went on'
     r.answer(named, 0)
