@@ -606,13 +606,20 @@ def test_without_the_simulated_clock_nothing_is_believed(rig):
     r = rig(ready=False, use_sim_time=True)
     wanted = 'the simulated clock has not been heard: who publishes /clock?'
     assert r.bridge.clock_trouble == wanted
+    seen, observe = [], r.bridge.supervisor.observe
+    r.quiet()
+    r.bridge.supervisor.observe = lambda *args: seen.append(args) or observe(*args)
     r.report()
+    assert seen == [('clock', wanted, r.wall)]
+    r.bridge.supervisor.observe = observe
     assert r.reason('clock') == wanted
     assert r.bridge.supervisor.report_age_s(r.wall) == np.inf
     assert r.reason('robot') == ''
     # It is looked at without a report, too, on a clock that always runs.
     r.bridge.supervisor.observe('clock', '', r.wall)
     assert r.reason('clock') == ''
+    for timer in r.bridge.timers:
+        timer.reset()
     r.wait(lambda: r.reason('clock') == wanted, 'the watch')
 
 
