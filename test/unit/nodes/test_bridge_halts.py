@@ -293,6 +293,8 @@ def test_every_rule_is_asked_at_the_time_it_is(rig):
     r.wall += 0.125
     r.say('recorder', waiting_for='x')
     r.say('pose_planner', state='running', run='its')
+    r.say('pose_planner')
+    r.say('recorder')
     r.report()
     r.report(name=[])
     r.plan(HOME + 0.05)
@@ -309,6 +311,9 @@ def test_every_rule_is_asked_at_the_time_it_is(rig):
     }
     for name, args in wanted.items():
         assert seen[name][0] == args, name
+    # What a summary leaves out.
+    assert seen['planner_is'][1] == ('unknown', r.wall, '')
+    assert seen['recorder_waits'][1] == ('', r.wall)
     assert [args[0] for args in seen['observe'][:4]] == [
         'rivals',
         'controller',

@@ -306,6 +306,8 @@ def test_only_the_recorders_answer_for_this_pose_and_solution_counts(rig, answer
     r = rig()
     named = r.settle(TARGET, HOME)
     r.answer(**{'stamp_key': named, **answer})
+    r.say('recorder: configuration', stamp=named)
+    r.say('recorder: configuration', solution=0)
     r.run(1.0, dt=0.1)
     assert len(r.moves()) == 1, 'it went on'
     r.answer(named, 0)
@@ -604,13 +606,20 @@ def test_without_the_simulated_clock_nothing_is_believed(rig):
     r = rig(ready=False, use_sim_time=True)
     wanted = 'the simulated clock has not been heard: who publishes /clock?'
     assert r.bridge.clock_trouble == wanted
+    seen, observe = [], r.bridge.supervisor.observe
+    r.quiet()
+    r.bridge.supervisor.observe = lambda *args: seen.append(args) or observe(*args)
     r.report()
+    assert seen == [('clock', wanted, r.wall)]
+    r.bridge.supervisor.observe = observe
     assert r.reason('clock') == wanted
     assert r.bridge.supervisor.report_age_s(r.wall) == np.inf
     assert r.reason('robot') == ''
     # It is looked at without a report, too, on a clock that always runs.
     r.bridge.supervisor.observe('clock', '', r.wall)
     assert r.reason('clock') == ''
+    for timer in r.bridge.timers:
+        timer.reset()
     r.wait(lambda: r.reason('clock') == wanted, 'the watch')
 
 

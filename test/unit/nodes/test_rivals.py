@@ -15,12 +15,13 @@ from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
 from remaster_ros.nodes import rivals
-from remaster_ros.nodes.rivals import COUNT_WALL_S, OnlyPublisher
+from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.status import LEASED
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 
 TOPIC = 'moves'
+COUNT_WALL_S = 3.0
 PLAIN = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 # For the graph as ours; but it lives only as long as it publishes, as a killed process does not.
 MORTAL = QoSProfile(
