@@ -205,11 +205,11 @@ class Search:
             return list(cells)
         data = self.data
         fixed = [cell for cell in given if cell.penalty is None]
-        start = np.concatenate((data.base, data.row_columns(fixed)), axis=2)
+        start = np.concatenate((data.base, data.columns(fixed)), axis=2)
         known, _ = np.linalg.qr(_unit(start.reshape(3 * len(data), -1)))
         kept = []
         for cell in cells:
-            block = _unit(data.row_columns([cell]).reshape(3 * len(data), -1))
+            block = _unit(data.columns([cell]).reshape(3 * len(data), -1))
             left = block - known @ (known.T @ block)
             left -= known @ (known.T @ left)
             if np.linalg.svd(left, compute_uv=False)[-1] < FAMILY_ABSORBED:
