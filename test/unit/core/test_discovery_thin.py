@@ -60,6 +60,19 @@ def test_few_poses_with_many_rows_are_all_kept():
     assert set(groups[1].tolist()) == {100}
 
 
+def test_of_many_poses_with_many_rows_some_rows_of_some_poses_are_drawn():
+    """However the rows lie, about as many are drawn as were asked for."""
+    for rows in (11, 20, 100):
+        m = measurements(100_000 // rows, rows)
+        drawn = draw_rows(m, np.arange(len(m.pose)), rng(), most=5000)
+        poses, count = np.unique(m.pose[drawn], return_counts=True)
+        assert len(poses) == FEWEST_POSES
+        assert (np.diff(poses) > 0).all()
+        assert poses[-1] - poses[0] > 0.99 * (100_000 // rows)
+        assert count.min() >= 2
+        assert 4500 <= len(drawn) <= 5500
+
+
 def test_a_sensor_that_is_rarely_there_keeps_its_poses():
     m = measurements(20_000, 5, rare=400)
     drawn = draw_rows(m, np.arange(len(m.pose)), rng(), most=10_000)
