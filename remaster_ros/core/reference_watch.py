@@ -2,8 +2,8 @@
 
 The references are measured twice at the beginning: how far the two rounds lie apart is what arm
 and sensor together repeat to, the noise that every later difference is held against. Each later
-round is held against them by F tests; the probabilities of a false alarm of all rounds of a session,
-however many, add up to what is stated (alpha spending: round r spends 6 / (π r)² of it).
+round is held against them by F tests; the probabilities of a false alarm of all rounds of a
+session, however many, add up to what is stated (alpha spending: round r spends 6 / (π r)² of it).
 Only a round that differs is then asked for its cause.
 """
 
@@ -19,7 +19,7 @@ from remaster_ros.core import transforms
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.reference_causes import Cause, Place, causes
 from remaster_ros.core.tour import nearest_solution
-from remaster_ros.core.types import FloatArray
+from remaster_ros.core.types import FloatArray, IntArray
 
 FALSE_ALARM = 0.01
 """Probability that a session in which nothing changes has any alarm."""
@@ -285,7 +285,7 @@ class ReferenceWatch:
         return self.change
 
     def _off(self, row: ReferenceReading, T_R_N: FloatArray) -> FloatArray:
-        """Return measured minus nominal marker position in R, m, (3,): the arm's own part is out."""
+        """Return measured minus nominal marker position in R, m, (3,): less the arm's own part."""
         nominal = self._chain.positions(row.q, self._markers[row.marker])
         return np.asarray(transforms.apply(T_R_N, row.position) - nominal)
 
@@ -363,7 +363,8 @@ class ReferenceWatch:
             for row in (self._rounds[number].rows[key] for key in keys)
         ]
         steps = [i for i in rounds if i > self._begin and (i > 1 or self._begin)]
-        patterns: list[tuple[int | None, FloatArray]] = [(i, (at >= i) * 1.0) for i in steps]
+        patterns: list[tuple[int | None, FloatArray]] = []
+        patterns += [(i, (at >= i).astype(float)) for i in steps]
         if len(steps) > 1:
             # One later round cannot tell a drift from a step.
             span = max(float(np.ptp(stamps)), 1e-9)
@@ -417,7 +418,7 @@ class ReferenceWatch:
         )
 
 
-def _centered(values: FloatArray, group: FloatArray) -> FloatArray:
+def _centered(values: FloatArray, group: IntArray) -> FloatArray:
     """Return values (n, ...) less the mean of their group, (n,): where each began is unknown."""
     count = np.bincount(group)
     total = np.zeros((len(count), *values.shape[1:]))

@@ -67,7 +67,8 @@ class Scene:
                 self.readings.append(
                     ReferenceReading(
                         self.configuration, name, marker, stands, position, self.time_s,
-                        np.full(3, 1e-5) if name == 'mocap' else None, 30 if name == 'mocap' else 1,
+                        None if name == 'tracker' else np.full(3, 1e-5),
+                        1 if name == 'tracker' else 30,
                     )
                 )  # fmt: skip
             self.configuration += 1
@@ -90,14 +91,14 @@ def unit(rng):
     return vector / np.linalg.norm(vector)
 
 
-def changed(scene, change):
+def changed(scene, change, *args):
     """Two rounds, a third that is as they were, the change, and a fourth."""
     scene.round()
     scene.round()
     scene.collect()
     scene.round()
     scene.collect()
-    change()
+    change(*args)
     scene.round()
     found = scene.judge()
     assert found, 'nothing was found'
@@ -142,9 +143,7 @@ def test_a_turn_of_a_sensor_about_itself(name):
         turn = np.deg2rad(0.05) * unit(scene.rng)
         about = scene.true[name][:3, 3]
         # A turn about the line of sight is a turn alone.
-        found = changed(
-            scene, lambda: scene.moved.update({name: move(np.eye(4), 0.0, turn, about)})
-        )
+        found = changed(scene, scene.moved.update, {name: move(np.eye(4), 0.0, turn, about)})
         assert (found.kind, found.subject) == ('sensor', f'{name} was moved')
         assert found.turn_rad == pytest.approx(np.deg2rad(0.05), rel=0.35)
 
@@ -155,7 +154,7 @@ def test_a_turn_of_the_base():
         scene = Scene(seed)
         turn = np.deg2rad(0.05) * unit(scene.rng)
         T = move(np.eye(4), 5e-4 * unit(scene.rng), turn, np.zeros(3))
-        found = changed(scene, lambda: scene.moved.update(dict.fromkeys(scene.moved, T)))
+        found = changed(scene, scene.moved.update, dict.fromkeys(scene.moved, T))
         assert found.kind == 'base'
         assert found.turn_rad == pytest.approx(np.deg2rad(0.05), rel=0.15)
 
@@ -167,7 +166,7 @@ def test_a_slipped_marker(name):
         scene = Scene(seed)
         slip = 5e-4 * unit(scene.rng)
         place = scene.markers[name] + slip
-        found = changed(scene, lambda: scene.markers.update({name: place}))
+        found = changed(scene, scene.markers.update, {name: place})
         # A slip across the line between the markers can be a turn of the tool as well.
         assert f'marker {name} slipped on the tool' in (found.subject, *found.look_alikes)
         assert found.kind in ('marker', 'tool')
@@ -178,14 +177,14 @@ def test_a_slipped_marker(name):
 def test_a_slipped_encoder(joint):
     """By 0.03 degrees. That of joint 1 turns the base, that of the last one the tool.
 
-    The axes of the wrist are 0.1 m or less from the markers: 0.03 degrees there are 0.05 mm, within
-    the noise of one reading. Those slip by 0.1 degrees.
+    The axes of the wrist are 0.1 m or less from the markers: 0.03 degrees there are 0.05 mm,
+    within the noise of one reading. Those slip by 0.1 degrees.
     """
     slip = np.deg2rad(0.03 if joint < 4 else 0.1)
     for seed in range(5):
         print(f'seed {seed}')
         scene = Scene(seed)
-        found = changed(scene, lambda: scene.slip.__setitem__(joint, slip))
+        found = changed(scene, scene.slip.__setitem__, joint, slip)
         name = f'the encoder of {CHAIN.joint_names[joint]} slipped'
         assert name == found.subject or name in found.look_alikes
         if found.kind == 'joint':
@@ -197,7 +196,7 @@ def test_one_sensor_alone_cannot_tell_its_move_from_that_of_the_base():
         print(f'seed {seed}')
         scene = Scene(seed, only=('tracker',))
         T = move(np.eye(4), 1e-3 * unit(scene.rng), np.zeros(3), MIDDLE)
-        found = changed(scene, lambda: scene.moved.update(tracker=T))
+        found = changed(scene, scene.moved.update, {'tracker': T})
         assert (found.kind, found.subject) == ('sensor', 'tracker or the base was moved')
 
 
