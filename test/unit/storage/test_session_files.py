@@ -105,7 +105,7 @@ def refused(folder, *parts):
         ('stamp_s', '0.0', 'time runs backwards'),
         ('sensor', 'camera', 'not among the sensors of session.yaml (mocap, tracker)'),
         ('marker', 'ball', 'not among the markers of session.yaml (sir, smr)'),
-        ('split', 'test', 'neither optimization nor validation'),
+        ('split', 'test', 'none of optimization, validation, reference'),
         ('split', 'validation', 'give a pose one split'),
         ('configuration', '0', 'give a configuration one pose'),
     ],
