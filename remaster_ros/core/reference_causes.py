@@ -14,6 +14,9 @@ import numpy as np
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.types import FloatArray
 
+MOST_EXCHANGES = 3
+"""So often at most each reference is exchanged for a better one."""
+
 
 @dataclass(frozen=True)
 class Place:
@@ -135,7 +138,8 @@ def choose_references(
     causes apart: a marker's slip turns with the tool, the slip of a joint is another curve in each
     joint solution. They are chosen one by one, each to add the most to the log determinant of the
     information on all these freedoms together (D-optimal), until the smallest singular value of
-    the rigid moves is `wanted` times the noise for a shift of `shift_m` and a turn of `turn_rad`.
+    the rigid moves is `wanted` times the noise for a shift of `shift_m` and a turn of `turn_rad`;
+    before one more is added, those chosen are exchanged for others that show these moves better.
 
     Parameters
     ----------
@@ -179,10 +183,38 @@ def choose_references(
         gain[chosen] = -np.inf
         chosen.append(int(np.argmax(gain)))
         information = information + stacked[chosen[-1]].T @ stacked[chosen[-1]]
-        smallest = min(_smallest(move[chosen]) for move in moves)
-        if len(chosen) >= fewest and smallest >= wanted:
-            break
+        if len(chosen) >= min(fewest, len(candidates)):
+            chosen, smallest = _exchanged(chosen, moves, wanted)
+            if smallest >= wanted:
+                break
     return Choice(tuple(chosen), smallest)
+
+
+def _exchanged(
+    chosen: Sequence[int], moves: Sequence[FloatArray], wanted: float
+) -> tuple[list[int], float]:
+    """Exchange one reference after the other while that shows rigid moves better.
+
+    Returns
+    -------
+    chosen, smallest
+        What was chosen last, and its smallest singular value; as soon as that is `wanted`, no more
+        is exchanged, since the first choice tells the causes apart best.
+    """
+    best, smallest = list(chosen), min(_smallest(move[list(chosen)]) for move in moves)
+    for _ in range(MOST_EXCHANGES):
+        before = smallest
+        for place in range(len(best)):
+            for other in range(len(moves[0])):
+                if smallest >= wanted:
+                    return best, smallest
+                tried = [*best[:place], other, *best[place + 1 :]]
+                value = min(_smallest(move[tried]) for move in moves)
+                if value > smallest and other not in best:
+                    best, smallest = tried, value
+        if smallest <= before:
+            break
+    return best, smallest
 
 
 def _smallest(signals: FloatArray) -> float:

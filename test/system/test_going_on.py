@@ -26,7 +26,7 @@ SEED = 11
 class Cell:
     """A small collection of real nodes on fake devices, and what they say."""
 
-    def __init__(self, start, client, folder, require, sensors, reference_every=0):
+    def __init__(self, start, client, folder, require, sensors, candidates=2, reference_every=0):
         from remaster_ros.nodes.status import listen
 
         self.client, self.folder, self.session = client, folder, folder / 'session'
@@ -41,7 +41,7 @@ class Cell:
             'fake_robot': {'world': folder / 'world'},
             'pose_planner': {
                 'session': self.session,
-                'optimization_candidates': 2,
+                'optimization_candidates': candidates,
                 'validation_candidates': 1,
                 'registration_candidates': 6,
                 'reference_every': reference_every,

@@ -21,7 +21,8 @@ def rounds(cell):
 
 
 def test_a_bumped_sensor_is_named_and_pauses_the_collection(start, client, tmp_path):
-    cell = Cell(start, client, tmp_path, 'all', ['mocap', 'tracker'], reference_every=4)
+    sensors = ['mocap', 'tracker']
+    cell = Cell(start, client, tmp_path, 'all', sensors, candidates=9, reference_every=6)
     cell.until(lambda: rounds(cell) == 3, 'three rounds of the references', 200)
     reading = lambda: cell.said['pose_planner']  # noqa: E731
     # The third is over when something else is measured.
