@@ -9,7 +9,7 @@ Only a round that differs is then asked for its cause.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -425,33 +425,3 @@ def _centered(values: FloatArray, group: IntArray) -> FloatArray:
     np.add.at(total, group, values)
     mean = total / count.reshape(-1, *(1,) * (values.ndim - 1))
     return np.asarray(values - mean[group])
-
-
-def replay(
-    watch: ReferenceWatch,
-    readings: Sequence[ReferenceReading],
-    others: Sequence[int],
-    T_R_N: Mapping[str, FloatArray],
-) -> list[Change]:
-    """Judge the references of a recorded session; return what was found, round by round.
-
-    Parameters
-    ----------
-    readings
-        In the order measured.
-    others
-        Numbers of the configurations that are no references, in any order.
-    """
-    other = np.sort(np.asarray(others, dtype=int))
-    found: list[Change] = []
-    for i, reading in enumerate(readings):
-        if i:
-            between = (readings[i - 1].configuration, reading.configuration)
-            if np.ptp(np.searchsorted(other, between)) > 0:
-                watch.end_round()
-        if watch.rounds and watch.begins_round(reading):
-            change = watch.judge(T_R_N)
-            found += [change] if change is not None else []
-        watch.add(reading)
-    change = watch.judge(T_R_N)
-    return found + ([change] if change is not None else [])

@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from remaster_ros.core import transforms
 from remaster_ros.core.reference_causes import choose_references
-from remaster_ros.core.reference_watch import ReferenceReading, ReferenceWatch, replay
+from remaster_ros.core.reference_session import replay
+from remaster_ros.core.reference_watch import ReferenceReading, ReferenceWatch
 from remaster_ros.storage.cell import read_cell
 
 CELL = read_cell('demo')
