@@ -101,9 +101,9 @@ class Logbook:
         elif kind == 'configuration':
             self._decide(record['pose'], record['solution'], record['result'])
             readings = [_reading(content) for content in record.get('readings', ())]
-            if record['split'] == REGISTRATION:
+            if record.get('split') == REGISTRATION:
                 self.registration += readings
-            elif record['split'] == REFERENCE and readings:
+            elif record.get('split') == REFERENCE and readings:
                 self.watched.append(('reference', record['number'], readings))
             elif record.get('rows') and self.watched:
                 self.watched.append(('other', 0, []))
