@@ -96,11 +96,13 @@ class Bench:
         Of the recorder.
     candidates
         Candidate poses for optimization.
+    reference_every
+        Of the planner; 0 for a collection without references.
     """
 
     def __init__(
         self, folder: Path, domain: int, *, relays=False, emergency=False, require='all',
-        candidates=32,
+        candidates=32, reference_every=0,
     ) -> None:  # fmt: skip
         self.folder, self.session = folder, folder / 'session'
         self.world = make_world(folder / 'world', read_cell('demo'), SEED, RATE)
@@ -126,6 +128,7 @@ class Bench:
             'pose_planner': {
                 'session': str(self.session), 'optimization_candidates': candidates,
                 'validation_candidates': 1, 'registration_candidates': 6, 'seed': SEED,
+                'reference_every': reference_every,
             },
             'robot_bridge': {
                 'speed_share': SPEED_SHARE, 'settle_s': 0.6, 'answer_timeout_s': 30.0,

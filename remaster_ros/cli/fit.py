@@ -18,6 +18,7 @@ from remaster_ros.core.fit import (
     FitResult,
     fit_session,
 )
+from remaster_ros.core.reference_session import changes
 from remaster_ros.storage.priors import read_priors
 from remaster_ros.storage.results import prepare_folder, save_fit
 from remaster_ros.storage.session import read_session
@@ -117,6 +118,8 @@ def summary(result: FitResult) -> str:
                 f'{check.sensor}: noise ({1e3 * check.noise_error_m:.3f} mm) does not explain the '
                 f'{left}: other errors dominate; run "remaster discover"'
             )
+    _, found = changes(result.session, result.chain, result.T_R_N)
+    lines += [f'changed while it was measured: {change.describe()}' for change in found]
     lines.append(result.sampler.message)
     if result.left_out:
         rows = ', '.join(str(observation) for observation, _ in result.left_out)

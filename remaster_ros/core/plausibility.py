@@ -51,7 +51,9 @@ class Plausibility:
         self._usual: dict[str, list[float]] = {}
         self._last: dict[str, PairedReading] = {}
 
-    def judge(self, reading: PairedReading, T_R_N: FloatArray | None) -> PairedReading | Rejection:
+    def judge(
+        self, reading: PairedReading, T_R_N: FloatArray | None, *, anywhere: bool = False
+    ) -> PairedReading | Rejection:
         """Return the reading, or why it is none.
 
         Parameters
@@ -60,6 +62,8 @@ class Plausibility:
             As paired.
         T_R_N
             The sensor in the robot base, (4, 4); None before it is registered.
+        anywhere
+            Of a reference, whose very deviation tells that something was moved: no place is wrong.
         """
         name = reading.sensor
         marker_R = self._place(reading)
@@ -69,7 +73,7 @@ class Plausibility:
             if moved > MOVED_M:
                 detail = f'the same to the last bit, though the arm moved it {1e3 * moved:.0f} mm'
                 return Rejection(name, 'frozen', detail)
-        if T_R_N is not None:
+        if T_R_N is not None and not anywhere:
             measured_R = transforms.apply(T_R_N, reading.position)
             deviation = float(np.linalg.norm(measured_R - marker_R))
             allowed = self._allowed_m(name)

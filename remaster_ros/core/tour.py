@@ -17,6 +17,9 @@ from remaster_ros.core.planning import Plan, order_solutions
 from remaster_ros.core.types import FloatArray
 
 REGISTRATION = 'registration'
+REFERENCE = 'reference'
+FIRST_ROUNDS = 2
+"""The references are measured so often at the beginning: their difference is the noise."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +31,7 @@ class Stop:
     pose
         Its number in the session; registration poses have numbers of their own, below zero.
     split
-        ``registration``, ``optimization`` or ``validation``.
+        ``registration``, ``reference``, ``optimization`` or ``validation``.
     T_R_T
         The tool's pose in the robot base, (4, 4).
     solutions
@@ -79,6 +82,11 @@ class Tour:
     So what drifts or warms up meanwhile is met by both, and not extrapolated from the one to the
     other; and a collection that ends early has some of both.
 
+    A plan of the split ``reference`` is visited again and again: a round of all its poses, twice
+    at the beginning, then before more than `reference_every` other configurations were visited,
+    and at the end. Its poses come in their order, and each is reached from the one before it, so
+    that backlash is the same each time.
+
     Parameters
     ----------
     chain
@@ -92,6 +100,9 @@ class Tour:
     model
         What the arm must not hit on its way; None where that does not matter (an arm that is
         computed).
+    reference_every
+        How many configurations lie between two rounds of the references at most; a pose with more
+        solutions than that is not interrupted.
     """
 
     def __init__(
@@ -102,15 +113,23 @@ class Tour:
         in_order: bool = False,
         one_solution: bool = False,
         model: CollisionModel | None = None,
+        reference_every: int = 0,
     ) -> None:
         self._chain, self._model = chain, model
+        self.reference_every = reference_every
         self.in_order, self.one_solution = in_order, one_solution
         self.plans = dict(plans)
-        self._left = {split: list(range(len(plan.poses))) for split, plan in plans.items()}
-        self.poses = {split: len(plan.poses) for split, plan in plans.items()}
+        once = {split: plan for split, plan in plans.items() if split != REFERENCE}
+        references = plans.get(REFERENCE)
+        self.references = len(references.poses) if references is not None else 0
+        # Which reference is next, of how many rounds that are due; and what was visited since.
+        self._reference, self._rounds_due = 0, FIRST_ROUNDS if self.references else 0
+        self._since = self.reference_stops = 0
+        self._left = {split: list(range(len(plan.poses))) for split, plan in once.items()}
+        self.poses = {split: len(plan.poses) for split, plan in once.items()}
         self.configurations = {
             split: sum(1 if one_solution else len(pose.solutions) for pose in plan.poses)
-            for split, plan in plans.items()
+            for split, plan in once.items()
         }
         self.dropped: Counter[str] = Counter()
         self.dropped_solutions: Counter[str] = Counter()
@@ -126,16 +145,51 @@ class Tour:
 
     def propose(self, q: FloatArray) -> Stop | None:
         """Return what `next` would, and leave the tour as it is: a thread may do this."""
+        if self._rounds_due:
+            return self._propose_reference(q)
         left = [(split, index) for split, indices in self._left.items() for index in indices]
         if not left:
-            return None
+            return self._propose_reference(q) if self.references and self._since else None
         here = self._chain.forward(q)[:3, 3]
         places = [self.plans[split].poses[index].T_R_T[:3, 3] for split, index in left]
         distances = np.linalg.norm(np.array(places) - here, axis=1)
         split, index = left[0 if self.in_order else int(np.argmin(distances))]
         solutions = self.plans[split].poses[index].solutions
         ids, paths, unreached = self._route(split, index, range(len(solutions)), q)
+        if self.references and self._since and self._since + len(ids) > self.reference_every:
+            return self._propose_reference(q)
         return self._stop(split, index, ids, paths, unreached)
+
+    @property
+    def poses_begun(self) -> int:
+        """How many poses were begun that are no references."""
+        return self.visited - self.reference_stops
+
+    def ask_round(self) -> None:
+        """Begin a round of the references with the next stop."""
+        if self.references:
+            self._reference, self._rounds_due = 0, max(self._rounds_due, 1)
+
+    def _propose_reference(self, q: FloatArray) -> Stop:
+        index = self._reference
+        ids, paths, unreached = self._route(REFERENCE, index, [0], q)
+        return self._stop(REFERENCE, index, ids, paths, unreached)
+
+    def _route_to_reference(self, index: int, q: FloatArray) -> FloatArray | None:
+        """Return what to go through to a reference, by way of the one before it; None for no way.
+
+        rad, (n, k). Where the one before it cannot be reached the way leads there directly.
+        """
+        goals = [pose.solutions[0] for pose in self.plans[REFERENCE].poses]
+        goal, before = goals[index], goals[index - 1]
+        last = free_way(self._model, before, goal, self._chain.velocity_limits, index)
+        if last is not None:
+            if nearest_solution(before[None], q) is not None:
+                return last
+            first = free_way(self._model, q, before, self._chain.velocity_limits, index)
+            if first is not None:
+                return np.concatenate((first, before[None], last))
+        return free_way(self._model, q, goal, self._chain.velocity_limits, index)
 
     def take(self, proposed: Stop) -> Stop:
         """Count a proposed stop visited and return it with its number."""
@@ -163,10 +217,23 @@ class Tour:
 
         This is how a tour that was begun before takes up where it was: the stops so far, in order.
         """
-        self._left[split].remove(index)
         stop = self._stop(split, index, ids, paths, unreached)
+        if split == REFERENCE:
+            self._begin_reference(index)
+        else:
+            self._left[split].remove(index)
+            self._since += len(ids)
         self.visited += 1
         return stop
+
+    def _begin_reference(self, index: int) -> None:
+        """Count a reference visited: the round is over with its last one."""
+        self.reference_stops += 1
+        self._rounds_due = max(self._rounds_due, 1)
+        self._reference = index + 1
+        if self._reference >= self.references:
+            self._reference, self._since = 0, 0
+            self._rounds_due -= 1
 
     def _stop(
         self,
@@ -188,6 +255,9 @@ class Tour:
     ) -> tuple[list[int], list[FloatArray], tuple[int, ...]]:
         """Order these solutions of a pose; see `free_order`."""
         ids = list(ids)
+        if split == REFERENCE:
+            way = self._route_to_reference(index, q) if ids else None
+            return ([], [], tuple(ids)) if way is None else (ids, [way], ())
         solutions = self.plans[split].poses[index].solutions[ids]
         # The same draws whenever this pose is planned: a tour can be told again.
         rng = np.random.default_rng([index, *split.encode()])
@@ -207,7 +277,11 @@ class Tour:
             for split, count in self.poses.items()
         )
         reasons = ', '.join(f'{count} {reason}' for reason, count in self.dropped.most_common())
-        return f'planned {kept}; dropped poses: {reasons or "none"}'
+        watched = (
+            f'; {self.references} reference configurations, measured again every '
+            f'{self.reference_every}'
+        ) * bool(self.references)
+        return f'planned {kept}{watched}; dropped poses: {reasons or "none"}'
 
 
 def free_order(
@@ -271,6 +345,22 @@ def free_order(
         left.remove(found)
         here = solutions[found]
     return order, paths
+
+
+def free_way(
+    model: CollisionModel | None,
+    q: FloatArray,
+    goal: FloatArray,
+    velocity_limits: FloatArray,
+    seed: int,
+) -> FloatArray | None:
+    """Return what to go through from `q` to one configuration, rad, (n, k); None for no way.
+
+    The same way each time, for the same ends and seed.
+    """
+    rng = np.random.default_rng([seed, *REFERENCE.encode()])
+    order, paths = free_order(model, q, goal[None], velocity_limits, rng)
+    return paths[0] if order else None
 
 
 def registration_tour(

@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-Split = Literal['optimization', 'validation']
+Split = Literal['optimization', 'validation', 'reference']
 
 FARTHEST_M = 200.0
 """More than any tracker's range: such a number is in millimetres, or broken."""
@@ -145,6 +145,8 @@ class Measurements:
         Degrees Celsius, (n,); NaN where unknown.
     effort
         Measured joint torques, N m, (n, k), NaN where unknown; None if the file has no column.
+    is_reference
+        True where ``split`` is ``reference``, (n,); None where none is, as in every session.
     """
 
     observation: IntArray
@@ -161,6 +163,7 @@ class Measurements:
     samples: IntArray
     temperature_c: FloatArray
     effort: FloatArray | None = None
+    is_reference: BoolArray | None = None
 
     def __len__(self) -> int:
         """Return the number of observations."""
@@ -208,6 +211,11 @@ class Session:
         How well the nominal marker positions are known, per axis, m.
     sensors
         Sensor name -> the marker it follows while collecting.
+    measurements
+        What is fitted and what is held out: no row of them is a reference.
+    references
+        Rows of configurations that were measured again and again, to watch for changes; neither
+        fitted nor in any metric. None where there are none.
     base_prior
         Sensor name -> registration known beforehand.
     exit_status
@@ -229,6 +237,7 @@ class Session:
     notes: str = ''
     created: str = ''
     extra: Mapping[str, Any] = field(default_factory=dict)
+    references: Measurements | None = None
 
     @property
     def sensor_names(self) -> tuple[str, ...]:

@@ -45,6 +45,7 @@ An OptiTrack server:
 ``duplicate``      sends every frame twice
 ``reordered``      sends every second frame before the first
 ``renumbered``     begins the frame numbers and the time anew, once
+``bumped``         has been moved by so many metres, across its line of sight
 =================  =====================================================
 
 A laser tracker:
@@ -59,6 +60,7 @@ A laser tracker:
 ``intermittent``   loses the beam every other period of so many seconds
 ``search_fails``   finds no reflector
 ``renumbered``     has been switched off and on, once
+``bumped``         has been moved by so many metres, across its line of sight
 =================  =====================================================
 """
 

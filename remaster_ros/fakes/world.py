@@ -357,7 +357,9 @@ class World:
             # The same, without working out what is nothing.
             marker_R = self.chain.positions(q, truth.marker, self.truth.joint_offsets)
             marker_N = transforms.apply(transforms.inverse(truth.T_R_N), marker_R)
-        marker_N[0] += self.faults(sensor).get('swapped', 0.0)
+        faults = self.faults(sensor)
+        marker_N[0] += faults.get('swapped', 0.0)
+        marker_N[1] += faults.get('bumped', 0.0)
         return marker_N
 
     def warming_k(self, t: float) -> float:

@@ -29,6 +29,8 @@ class Announced:
         The plan that both are numbered by.
     stamp
         Names this announcement; the same pose announced again has another one.
+    last
+        Whether it is the last reference of a round.
     """
 
     pose: int
@@ -36,6 +38,7 @@ class Announced:
     ids: tuple[int, ...]
     plan: str
     stamp: str = ''
+    last: bool = False
 
 
 def waypoints_message(stop: Stop, joint_names: Sequence[str], header: Header) -> JointTrajectory:
@@ -124,6 +127,7 @@ class Announcements:
             tuple(map(int, ids.split())),
             values.get('plan', ''),
             values['stamp'],
+            values.get('last') == 'yes',
         )
 
     def hear_solutions(self, message: JointTrajectory) -> None:

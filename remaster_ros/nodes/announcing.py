@@ -103,8 +103,14 @@ class Announcer:
             for node, peer in self._peers.items()
         )
 
-    def announce(self, stop: Stop, plan: str, status: Status) -> None:
-        """Publish a pose with what is left of its solutions."""
+    def announce(self, stop: Stop, plan: str, status: Status, last: bool = False) -> None:
+        """Publish a pose with what is left of its solutions.
+
+        Parameters
+        ----------
+        last
+            Whether it is the last reference of a round.
+        """
         stamp = self._node.get_clock().now().to_msg()
         self.stamp, self._published_wall = stamp_key(stamp), time.monotonic()
         self._ids[self.stamp] = stop.ids
@@ -119,6 +125,7 @@ class Announcer:
             solutions=len(stop.solutions),
             ids=' '.join(map(str, stop.ids)),
             plan=plan,
+            last='yes' if last else 'no',
         )
         pose = PoseStamped()
         pose.header.stamp, pose.header.frame_id = stamp, self._chain.base_link

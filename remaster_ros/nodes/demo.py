@@ -270,6 +270,12 @@ class Demo:
                 if planner.get('state') == 'idle' and planner.get('resuming') == 'no':
                     # It was killed, and could not be certain that its run still lives.
                     self._trigger('remaster/collect', 'pose_planner')
+                recorder = self.node.summaries.get('recorder', {})
+                if planner.get('state') == 'paused' and recorder.get('changed'):
+                    # What a person would look at; in the demo nobody has anything to mend.
+                    self.console.print(f'the references say: {recorder["changed"]}')
+                    self.console.print('going on, as /remaster/collect does')
+                    self._trigger('remaster/collect', 'pose_planner')
                 if planner.get('state') == 'failed':
                     raise DeviceError(f'the planner gave up: {planner["message"]}')
                 closed = self.node.summaries.get('recorder', {}).get('exit_status')

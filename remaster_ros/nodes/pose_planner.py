@@ -29,7 +29,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from remaster_ros.core.errors import InputError, InsufficientDataError, RemasterError
-from remaster_ros.core.tour import REGISTRATION, Stop
+from remaster_ros.core.tour import REFERENCE, REGISTRATION, Stop
 from remaster_ros.core.types import FloatArray
 from remaster_ros.nodes.announcing import PEERS, Announcer
 from remaster_ros.nodes.clearance import Clearance
@@ -61,6 +61,13 @@ class Parameters:
         12, 'candidate poses for the three-point registration', low=3, high=1000
     )
     seed: int = parameter(0, 'seed of the Latin hypercube', low=0)
+    reference_every: int = parameter(
+        25,
+        'how many configurations lie between two visits to the reference configurations, by which '
+        'a moved sensor or base, a slipped marker or encoder and drift are seen; 0 for none',
+        low=0,
+        high=100000,
+    )
     session: str = parameter(
         'session', "folder of the recorder's session, where the plan is kept (plan.jsonl)"
     )
@@ -101,7 +108,9 @@ class PosePlanner(RemasterNode):
             REGISTRATION: self.p.registration_candidates,
         }
         margin = np.deg2rad(self.p.limit_margin_deg)
-        self._tours = TourPlanner(self.cell, self.chain, counts, self.p.seed, margin)
+        self._tours = TourPlanner(
+            self.cell, self.chain, counts, self.p.seed, margin, self.p.reference_every
+        )
         self._background = Background()
         model = self._tours.model
         self.book = PlanBook(Path(self.p.session), self._settings(), self.chain, model)
@@ -131,6 +140,7 @@ class PosePlanner(RemasterNode):
             'validation_candidates': p.validation_candidates,
             'registration_candidates': p.registration_candidates,
             'seed': p.seed,
+            'reference_every': p.reference_every,
             'limit_margin_deg': p.limit_margin_deg,
         }
 
@@ -177,6 +187,8 @@ class PosePlanner(RemasterNode):
                 why = f'{" and ".join(other)} did not take part in its run'
             elif halted := says('robot_bridge', 'halted'):
                 why = f'the arm is halted: {halted}'
+            elif says('recorder', 'changed_run') in (self._left, 'unknown'):
+                why = says('recorder', 'changed')
         with self._lock:
             left, self._left = self._left, ''
             if left and not why:
@@ -189,7 +201,7 @@ class PosePlanner(RemasterNode):
 
     def _progress(self) -> str:
         tour = self.book.tour
-        poses = f'{tour.visited} of {sum(tour.poses.values())}' if tour else 'none'
+        poses = f'{tour.poses_begun} of {sum(tour.poses.values())}' if tour else 'none'
         return (
             f'{poses} {self.phase} poses begun, {self.book.outcomes.total()} configurations done'
         )
@@ -209,6 +221,12 @@ class PosePlanner(RemasterNode):
         if self._announcer.says('recorder', 'exit_status') == 'complete':
             response.message = "the recorder's session is complete; give it a new folder"
             return response
+        if self.state != 'running' and self._announcer.says('recorder', 'changed_run') not in (
+            '',
+            'none',
+        ):
+            # A person has looked: how things are from now on is measured first.
+            self.book.ask_round()
         if self.state != 'running' and self._joint_states is None:
             # The arm may have been stopped, or moved by hand, since it last settled.
             self._joint_states = self._listen_to_the_arm()
@@ -280,6 +298,10 @@ class PosePlanner(RemasterNode):
             # It goes on when somebody has looked at the arm and calls /remaster/collect.
             self._set_state('paused', event.message, only_from='running')
             return
+        if (event.node, event.event) == ('recorder', 'changed'):
+            if event.values.get('stops') == 'yes':
+                self._set_state('paused', event.message, only_from='running')
+            return
         final = (event.node, event.event) in (
             ('recorder', 'configuration'),
             ('robot_bridge', 'failed'),
@@ -303,6 +325,10 @@ class PosePlanner(RemasterNode):
         self._announcer.hear(node, values)
         if node == 'robot_bridge' and values.get('halted'):
             self._set_state('paused', values['halted'], only_from='running')
+        run = self._run
+        if node == 'recorder' and run is not None and values.get('changed_run') == run.token:
+            # Said while this planner was not there; collect begins another run.
+            self._set_state('paused', values.get('changed', ''), only_from='running')
         stop = self.book.stop
         if node != 'recorder' or stop is None or self.state in ('complete', 'failed'):
             return
@@ -472,7 +498,12 @@ class PosePlanner(RemasterNode):
         with self._lock:
             # Paused or stopped while the pose was chosen and written: collect announces it.
             if self.state == 'running':
-                self._announcer.announce(stop, self.book.id, self.status)
+                last = (
+                    tour is not None
+                    and stop.split == REFERENCE
+                    and stop.index == tour.references - 1
+                )
+                self._announcer.announce(stop, self.book.id, self.status, last)
 
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
         tour, outcomes, run = self.book.tour, dict(self.book.outcomes), self._run
@@ -485,10 +516,12 @@ class PosePlanner(RemasterNode):
             'state': 'held' if full and self.state == 'running' else self.state,
             'phase': self.phase,
             'robot': 'silent' if self._q is None else 'heard',
-            'poses_done': tour.visited if tour else 0,
+            'poses_done': tour.poses_begun if tour else 0,
             'poses': sum(tour.poses.values()) if tour else 0,
             'configurations_done': sum(outcomes.values()),
             'configurations': sum(tour.configurations.values()) if tour else 0,
+            'references': tour.references if tour else 0,
+            'references_done': self.book.references.total(),
             'plan': self.book.id,
             'run': '' if run is None else run.token,
             # Whether it may still go on by itself.

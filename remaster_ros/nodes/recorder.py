@@ -29,7 +29,7 @@ from remaster_ros.core.errors import DiskError, InputError
 from remaster_ros.core.pairing import PairedReading, Pairing, Rejection
 from remaster_ros.core.plausibility import Plausibility
 from remaster_ros.core.presence import Presence
-from remaster_ros.core.tour import REGISTRATION
+from remaster_ros.core.tour import REFERENCE, REGISTRATION
 from remaster_ros.core.types import FloatArray, MarkerReading, Measurements, Session
 from remaster_ros.nodes.announcements import Announced, Announcements
 from remaster_ros.nodes.bagging import BEGAN, BagRecorder
@@ -42,6 +42,7 @@ from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.shots import Shots
 from remaster_ros.nodes.status import JOINT_STATES, Event, Status, receiver, run_after
 from remaster_ros.nodes.status import TOPIC as STATUS
+from remaster_ros.nodes.watching import Watching
 from remaster_ros.storage.cell import read_cell
 from remaster_ros.storage.logbook import Logbook
 from remaster_ros.storage.session_writer import ExitStatus
@@ -50,6 +51,8 @@ TEMPERATURE_S = 600.0
 """A temperature older than this says nothing of a reading, s."""
 CHECK_S = 1.0
 """How often it is looked whether the session's files are still the ones that are written, s."""
+PAUSED = 'paused'
+"""In place of a run that was paused, and whose token was lost with the recorder."""
 BY_HAND = -1_000_000
 """The number of poses that a user drove to for a registration: no planner's."""
 
@@ -120,6 +123,7 @@ class Recorder(RemasterNode):
         self.registrar = Registrar(self, self.cell, self.chain, self.p.max_deviation_m / 2)
         markers = {name: np.array(position) for name, position in self.cell.markers.items()}
         self._plausibility = Plausibility(self.chain, markers, self.p.max_deviation_m)
+        self._watching = Watching(self.chain, markers, self.p.reference_stop_m)
         recording = self.p.bag and not self.logbook.closed
         self._bag = BagRecorder(self, folder / 'bag' if recording else None)
         self._subscribe()
@@ -134,6 +138,7 @@ class Recorder(RemasterNode):
         for note in (*self.logbook.notes, *self._bag.notes):
             self.get_logger().warning(note)
         self.registrar.add(self.logbook.registration)
+        self._watching.take_back(self.logbook.watched, self.registrar.T_R_N)
         self.create_timer(0.05, self._look, clock=self.status.steady)
 
     def _subscribe(self) -> None:
@@ -196,6 +201,8 @@ class Recorder(RemasterNode):
     def _on_event(self, event: Event) -> None:
         if (event.node, event.event) == ('pose_planner', 'pose'):
             self._announcements.hear_pose(event.values)
+            if event.values['split'] not in (REFERENCE, REGISTRATION):
+                self._say_change(self._watching.leave(self.registrar.T_R_N))
             if not self._disk.full and not self.logbook.closed:
                 # Before the arm gets there: it is held where there is no room.
                 self._disk.write(partial(self.logbook.follow, event.values.get('plan', '')))
@@ -219,6 +226,7 @@ class Recorder(RemasterNode):
             )
         if node == 'pose_planner':
             self._run = run_after(self._run, values)
+            self._follow_stop(values.get('state', ''))
         if node == 'pose_planner' and not self._busy() and not self._due:
             state = values.get('state')
             if state == 'complete':
@@ -345,7 +353,8 @@ class Recorder(RemasterNode):
             return
         self._taking = None
         taking.pairing.finish()
-        decided = [self._judged(item) for item in taking.pairing.decided.values()]
+        of_reference = taking.pose.split == REFERENCE
+        decided = [self._judged(item, of_reference) for item in taking.pairing.decided.values()]
         waited_s = taking.pairing.waited_s()
         for name, seconds_waited in waited_s.items():
             self._waited_s[name] += seconds_waited
@@ -368,9 +377,13 @@ class Recorder(RemasterNode):
         why = '; '.join(f'{r.sensor}: {r.reason}: {r.detail}' for r in bad)
         missed = [item for item in bad if item.reason not in ('not_waited', 'absent')]
         result = 'rejected' if not good else 'partial' if missed else 'recorded'
-        self._write(good, taking, result, why)
+        number = self._write(good, taking, result, why)
         if taking.pose.split == REGISTRATION:
             self.registrar.add(good)
+        if taking.pose.split == REFERENCE:
+            # Before the planner hears that it may go on.
+            known, ends = self.registrar.T_R_N, taking.pose.last
+            self._say_change(self._watching.read(number, good, known, ends))
         if taking.future is not None:
             taking.future.set_result((good, why))
             return
@@ -386,14 +399,17 @@ class Recorder(RemasterNode):
         )
         self._take_next()
 
-    def _judged(self, item: PairedReading | Rejection) -> PairedReading | Rejection:
+    def _judged(
+        self, item: PairedReading | Rejection, of_reference: bool
+    ) -> PairedReading | Rejection:
         if isinstance(item, Rejection):
             return item
-        return self._plausibility.judge(item, self.registrar.T_R_N.get(item.sensor))
+        T_R_N = self.registrar.T_R_N.get(item.sensor)
+        return self._plausibility.judge(item, T_R_N, anywhere=of_reference)
 
-    def _write(self, good: list[PairedReading], taking: _Taking, result: str, reason: str) -> None:
+    def _write(self, good: list[PairedReading], taking: _Taking, result: str, reason: str) -> int:
         """Write what became of one configuration; on disk when this returns."""
-        self.logbook.write(
+        return self.logbook.write(
             pose=taking.pose.pose,
             solution=taking.pose.ids[taking.solution],
             split=taking.pose.split,
@@ -418,6 +434,51 @@ class Recorder(RemasterNode):
             reason=why,
             **values,
         )
+
+    # The references
+
+    def _say_change(self, new: bool) -> None:
+        """Say what has changed at the references, and have the planner pause where it is large."""
+        watching = self._watching
+        if not new or watching.change is None:
+            return
+        text, stops = watching.describe(), watching.stops
+        if stops:
+            watching.stopped_run = self._run
+        self.get_logger().error(text)
+        self.status.event(
+            'changed',
+            text,
+            level='error' if stops else 'warn',
+            stops='yes' if stops else 'no',
+            cause=watching.change.kind,
+            size_m=f'{watching.change.size_m:.6f}',
+        )
+        self.status.publish()
+
+    def _follow_stop(self, state: str) -> None:
+        """Take it that a person has looked once another run has begun, as /remaster/collect does.
+
+        A recorder that was started again does not know which run was stopped: the one it finds
+        running is, and after a pause none.
+        """
+        watching = self._watching
+        if watching.stopped_run == '':
+            watching.stopped_run = (
+                self._run if state == 'running' else PAUSED * (state == 'paused')
+            )
+        elif (
+            watching.stopped_run not in (None, self._run)
+            and self._run
+            and not self._disk.full
+            and not self.logbook.closed
+        ):
+            self._disk.write(self._accept_change)
+
+    def _accept_change(self) -> None:
+        self.logbook.note_accepted()
+        self._watching.accept()
+        self.status.publish()
 
     # Registration by hand
 
@@ -448,7 +509,8 @@ class Recorder(RemasterNode):
         waiting_for = self._waiting_for(self._absent())
         trouble = self._trouble or (f'waiting for {waiting_for}' if waiting_for else '')
         trouble = trouble or self.logbook.beyond_repair or self._restored
-        pose = self._announcements.now
+        trouble = trouble or self._watching.describe()
+        pose, stopped = self._announcements.now, self._watching.stopped_run
         values = {
             'state': state,
             'exit_status': self.logbook.closed,
@@ -466,6 +528,9 @@ class Recorder(RemasterNode):
             **{f'read_age_s_{n}': f'{self._presence.read_age_s(n, now):.1f}' for n in sensors},
             'bag_dropped': self._bag.dropped,
             'restored': self._restored,
+            'changed': self._watching.describe(),
+            'changed_run': 'none' if stopped is None else stopped or 'unknown',
+            'reference_rounds': self._watching.rounds,
             **dict(sorted(self.counts.items())),
         }
         return ('warn' if trouble else 'ok'), trouble or state, values
@@ -497,6 +562,7 @@ class Recorder(RemasterNode):
 
     def _close(self, exit_status: ExitStatus) -> None:
         if not self.logbook.closed:
+            self._say_change(self._watching.judge(self.registrar.T_R_N))
             self.logbook.close(exit_status)
             self._say_restored()
             if self.logbook.closed != exit_status:

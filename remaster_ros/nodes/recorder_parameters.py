@@ -51,6 +51,14 @@ class Parameters:
         low=1e-3,
         high=5.0,
     )
+    reference_stop_m: float = parameter(
+        0.5e-3,
+        'a change at the reference configurations that is larger than this pauses the collection '
+        'until a person has looked; 0 for never',
+        unit='m',
+        low=0.0,
+        high=1.0,
+    )
 
 
 def sensor_rules(cell: Cell, p: Parameters) -> tuple[SensorRules, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -11,11 +11,20 @@ import numpy as np
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.errors import InsufficientDataError
 from remaster_ros.core.inverse import InverseKinematics
-from remaster_ros.core.planning import Plan, candidate_poses, plan_poses
-from remaster_ros.core.tour import REGISTRATION, Tour, registration_tour
+from remaster_ros.core.planning import (
+    Plan,
+    PlannedPose,
+    candidate_poses,
+    order_solutions,
+    plan_poses,
+)
+from remaster_ros.core.reference_causes import choose_references
+from remaster_ros.core.tour import REFERENCE, REGISTRATION, Tour, free_way, registration_tour
 from remaster_ros.core.types import FloatArray
 from remaster_ros.storage.cell import Cell
 
+MOST_TRIES = 5
+"""So often references are chosen anew where one has no free way to it."""
 MOVED_RAD = 0.005
 """An arm this far from where a way begins, in any joint, gets another one."""
 
@@ -35,6 +44,8 @@ class TourPlanner:
         Of the Latin hypercube.
     limit_margin
         Distance kept from the joint limits, rad.
+    reference_every
+        How many configurations lie between two rounds of the references; 0 for no references.
 
     Attributes
     ----------
@@ -54,7 +65,9 @@ class TourPlanner:
         counts: Mapping[str, int],
         seed: int,
         limit_margin: float,
+        reference_every: int = 0,
     ) -> None:
+        self._every = reference_every
         self._cell, self._chain = cell, chain
         self._counts, self._seed, self._margin = counts, seed, limit_margin
         self._inverse = InverseKinematics(chain, cell.held(chain))
@@ -85,10 +98,53 @@ class TourPlanner:
             for split, count in self._counts.items()
             if count and split != REGISTRATION
         }
-        tour = Tour(self._chain, plans, model=self.model)
+        if self._every and plans['optimization'].poses:
+            plans[REFERENCE] = self._references(plans)
+        tour = Tour(self._chain, plans, model=self.model, reference_every=self._every)
         if not plans['optimization'].poses:
             raise InsufficientDataError(f'{tour.describe()}: no pose is left to fit on')
         return tour
+
+    def _references(self, plans: Mapping[str, Plan]) -> Plan:
+        """Choose references among the planned configurations, each with a way from the last."""
+        poses = [
+            PlannedPose(pose.T_R_T, q[None])
+            for plan in plans.values()
+            for pose in plan.poses
+            for q in pose.solutions
+        ]
+        seen = {
+            name: (sensor.marker, np.array(self._cell.markers[sensor.marker]))
+            for name, sensor in self._cell.sensors.items()
+        }
+        chosen: list[PlannedPose] = []
+        for _ in range(MOST_TRIES):
+            q = np.array([pose.solutions[0] for pose in poses])
+            picked = choose_references(self._chain, q, seen).indices
+            chosen = [poses[i] for i in self._in_turn(q, list(picked))]
+            lost = self._without_way(chosen)
+            if not lost:
+                break
+            poses = [pose for pose in poses if all(pose is not other for other in lost)]
+        return Plan(tuple(chosen))
+
+    def _in_turn(self, q: FloatArray, left: list[int]) -> list[int]:
+        """Order the indices so that each is the nearest of those left to the one before."""
+        order = left[:1]
+        while rest := [i for i in left if i not in order]:
+            limits = self._chain.velocity_limits
+            order.append(rest[int(order_solutions(q[rest], q[order[-1]], limits)[0])])
+        return order
+
+    def _without_way(self, poses: Sequence[PlannedPose]) -> list[PlannedPose]:
+        """Return the references that no free way leads to from the one before."""
+        limits = self._chain.velocity_limits
+        return [
+            pose
+            for i, pose in enumerate(poses)
+            if free_way(self.model, poses[i - 1].solutions[0], pose.solutions[0], limits, i)
+            is None
+        ]
 
     def _plan(self, split: str, aim: FloatArray, sensors_R: dict[str, FloatArray]) -> Plan:
         """Plan poses that face `aim` and that every sensor sees; positions in R, m, (3,)."""

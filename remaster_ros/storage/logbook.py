@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.core.pairing import PairedReading
-from remaster_ros.core.tour import REGISTRATION
-from remaster_ros.core.types import FloatArray, Observation, Session
+from remaster_ros.core.tour import REFERENCE, REGISTRATION
+from remaster_ros.core.types import FloatArray, Observation, Session, Split
 from remaster_ros.storage.files import read_limited
 from remaster_ros.storage.journal import Record
 from remaster_ros.storage.session import HEADER, OBSERVATIONS_LIMIT, ROWS
@@ -49,6 +49,10 @@ class Logbook:
         What a user should know of how the session was found, a line each.
     registration
         The readings that the sensors were registered by in the runs before.
+    watched
+        What the references told in the runs before, in order: ``reference`` with the number of the
+        configuration and its readings, ``other`` for any other configuration, ``accepted`` where
+        a person had seen to a change.
 
     Raises
     ------
@@ -63,6 +67,7 @@ class Logbook:
         self.observations = 0
         self.notes: list[str] = []
         self.registration: list[PairedReading] = []
+        self.watched: list[tuple[str, int, list[PairedReading]]] = []
         self._results: dict[tuple[int, int], str] = {}
         self._last_pose: int | None = None
         self._shift_s = 0.0
@@ -84,7 +89,7 @@ class Logbook:
             self.notes.append(f'{self.folder}: going on after {self.observations} observations')
         if self._writer.lost:
             self.notes.append(self._writer.lost)
-        self.registration, self._results = [], {}
+        self.registration, self._results, self.watched = [], {}, []
         for record in self._writer.records:
             self._replay(record)
 
@@ -95,7 +100,15 @@ class Logbook:
             self._results = {}
         elif kind == 'configuration':
             self._decide(record['pose'], record['solution'], record['result'])
-            self.registration += map(_reading, record.get('readings', ()))
+            readings = [_reading(content) for content in record.get('readings', ())]
+            if record.get('split') == REGISTRATION:
+                self.registration += readings
+            elif record.get('split') == REFERENCE and readings:
+                self.watched.append(('reference', record['number'], readings))
+            elif record.get('rows') and self.watched:
+                self.watched.append(('other', 0, []))
+        elif kind == 'accepted':
+            self.watched.append(('accepted', 0, []))
         elif kind == 'shift':
             self._shift_s = record['shift_s']
 
@@ -144,7 +157,7 @@ class Logbook:
         readings: Sequence[PairedReading],
         from_q: FloatArray | None,
         temperatures_c: Sequence[float | None],
-    ) -> None:
+    ) -> int:
         """Write what became of a configuration; durable on return.
 
         Parameters
@@ -152,13 +165,18 @@ class Logbook:
         pose, solution
             As the planner numbers them.
         split
-            ``registration``, ``optimization`` or ``validation``.
+            ``registration``, ``reference``, ``optimization`` or ``validation``.
         result, reason
             ``recorded``, ``partial`` or ``rejected``, and why.
         readings, temperatures_c
             What was accepted, and the temperature with each, degrees Celsius, None if unknown.
         from_q
             Where the arm came from, rad, (k,); None if unknown.
+
+        Returns
+        -------
+        int
+            The number that the configuration has in the session, where it has readings.
 
         Raises
         ------
@@ -173,12 +191,21 @@ class Logbook:
             'result': result,
             'reason': reason,
         }
+        number = 0 if self._writer is None else self._writer.configurations
         if split == REGISTRATION:
             self._append({**record, 'readings': [_content(reading) for reading in readings]})
         else:
+            if split == REFERENCE:
+                record['number'] = number
+                record['readings'] = [_content(reading) for reading in readings]
             self._append(record, self._rows(pose, split, readings, from_q, temperatures_c))
             self.observations += len(readings)
         self._decide(pose, solution, result)
+        return number
+
+    def note_accepted(self) -> None:
+        """Write that a person has seen to what had changed at the references."""
+        self._append({'kind': 'accepted'})
 
     def _rows(
         self,
@@ -198,7 +225,7 @@ class Logbook:
                 observation=writer.observations + number,
                 pose=pose,
                 configuration=writer.configurations,
-                split='validation' if split == 'validation' else 'optimization',
+                split=_split(split),
                 stamp_s=reading.stamp_s + self._shift_s,
                 sensor=reading.sensor,
                 marker=reading.marker,
@@ -259,6 +286,13 @@ def is_complete(folder: Path) -> bool:
     return header.exit_status == 'complete'
 
 
+def _split(name: str) -> Split:
+    """Return the split of a row; what a planner of another version names otherwise is fitted."""
+    if name == 'validation':
+        return 'validation'
+    return 'reference' if name == REFERENCE else 'optimization'
+
+
 def _content(reading: PairedReading) -> dict[str, Any]:
     return {
         'sensor': reading.sensor,
@@ -267,6 +301,7 @@ def _content(reading: PairedReading) -> dict[str, Any]:
         'q': reading.q.tolist(),
         'position': reading.position.tolist(),
         'samples': reading.samples,
+        **({} if reading.std is None else {'std': reading.std.tolist()}),
     }
 
 
@@ -277,6 +312,6 @@ def _reading(content: dict[str, Any]) -> PairedReading:
         stamp_s=content['stamp_s'],
         q=np.array(content['q']),
         position=np.array(content['position']),
-        std=None,
+        std=np.array(content['std']) if 'std' in content else None,
         samples=content['samples'],
     )

@@ -22,6 +22,7 @@ from remaster_ros.storage.sequence_rules import (
     SequenceRules,
     keeps_the_rules,
     row_keys,
+    split_indices,
 )
 
 log = logging.getLogger('remaster_ros')
@@ -199,7 +200,7 @@ def format_measurements(m: Measurements, sensors: Sequence[str], markers: Sequen
 
     cells = [
         *(list(map(str, ids.tolist())) for ids in (m.observation, m.pose, m.configuration)),
-        [SPLITS[split] for split in m.is_validation.tolist()],
+        [SPLITS[split] for split in split_indices(m).tolist()],
         *numbers(m.stamp_s[:, None]),
         [sensors[sensor] for sensor in m.sensor.tolist()],
         [markers[marker] for marker in m.marker.tolist()],
@@ -253,12 +254,13 @@ def _columns(
     with_effort: bool,
 ) -> Measurements:
     """Convert and check every column by itself."""
-    split = table.choices('split', SPLITS, f'is neither {SPLITS[0]} nor {SPLITS[1]}; correct it')
+    split = table.choices('split', SPLITS, f'is none of {", ".join(SPLITS)}; correct it')
+    is_reference = split == SPLITS.index('reference')
     measurements = Measurements(
         observation=table.integers('observation'),
         pose=table.integers('pose'),
         configuration=table.integers('configuration'),
-        is_validation=split.astype(bool),
+        is_validation=split == SPLITS.index('validation'),
         stamp_s=table.numbers(['stamp_s'])[:, 0],
         sensor=table.choices('sensor', sensors, _not_among('sensors', sensors)),
         marker=table.choices('marker', markers, _not_among('markers', markers)),
@@ -269,6 +271,7 @@ def _columns(
         samples=table.integers('samples', optional=True),
         temperature_c=table.numbers(['temperature_c'], optional=True)[:, 0],
         effort=table.numbers(columns.effort, optional=True) if with_effort else None,
+        is_reference=is_reference if is_reference.any() else None,
     )
     too_few = np.flatnonzero(
         (measurements.samples < 1)

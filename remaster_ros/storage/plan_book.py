@@ -20,7 +20,7 @@ from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.collision import CollisionModel
 from remaster_ros.core.errors import DiskError, InputError
 from remaster_ros.core.planning import Plan, PlannedPose
-from remaster_ros.core.tour import REGISTRATION, Stop, Tour
+from remaster_ros.core.tour import REFERENCE, REGISTRATION, Stop, Tour
 from remaster_ros.core.types import FloatArray
 from remaster_ros.storage.files import make_folder
 from remaster_ros.storage.journal import Journal, Record
@@ -55,7 +55,9 @@ class PlanBook:
     stop
         The last stop with the solutions that still have no outcome; None before the first.
     outcomes
-        How many configurations of the collection came to which end.
+        How many configurations of the collection came to which end, references not counted.
+    references
+        The same for visits to the references.
     state
         What the planner last said it does, '' before.
     run
@@ -87,6 +89,7 @@ class PlanBook:
         self.tour: Tour | None = None
         self.stop: Stop | None = None
         self.outcomes: Counter[str] = Counter()
+        self.references: Counter[str] = Counter()
         if self.path.exists():
             self._open()
 
@@ -114,7 +117,9 @@ class PlanBook:
     def _check(self, record: Record) -> None:
         self.id = record['id']
         made = record['settings']
-        other = [name for name, value in self._settings.items() if made.get(name) != value]
+        # Plans of older versions have no references, and go on without them.
+        here = {k: v for k, v in self._settings.items() if k != 'reference_every' or k in made}
+        other = [name for name, value in here.items() if made.get(name) != value]
         if other:
             name = other[0]
             was = '' if name == 'cell' else f' ({made.get(name)}, now {self._settings[name]})'
@@ -133,6 +138,7 @@ class PlanBook:
                 in_order=record['in_order'],
                 one_solution=record['one_solution'],
                 model=self._model,
+                reference_every=record.get('reference_every', 0),
             )
             self.stop = None
         elif kind == 'stop' and self.tour is not None:
@@ -145,6 +151,8 @@ class PlanBook:
             self._take(
                 replace(self.stop, solutions=solutions, ids=ids, paths=paths, unreached=unreached)
             )
+        elif kind == 'round' and self.tour is not None:
+            self.tour.ask_round()
         elif kind == 'outcome':
             self._close_solution(record['id'], record['result'])
         elif kind == 'state':
@@ -152,16 +160,19 @@ class PlanBook:
 
     def _take(self, stop: Stop) -> None:
         """Go to a stop; the solutions that nothing leads to have their outcome with it."""
-        if stop.split != REGISTRATION and stop.unreached:
-            self.outcomes[NO_FREE_PATH] += len(stop.unreached)
+        if stop.unreached:
+            self._count(stop.split, NO_FREE_PATH, len(stop.unreached))
         # Counted once.
         self.stop = replace(stop, unreached=())
 
     def _close_solution(self, solution: int, result: str) -> None:
         assert self.stop is not None
-        if self.stop.split != REGISTRATION:
-            self.outcomes[result] += 1
+        self._count(self.stop.split, result, 1)
         self.stop = self.stop.only([number for number in self.stop.ids if number != solution])
+
+    def _count(self, split: str, result: str, times: int) -> None:
+        if split != REGISTRATION:
+            (self.references if split == REFERENCE else self.outcomes)[result] += times
 
     def _append(self, record: Record) -> None:
         if self._journal is None:
@@ -188,11 +199,18 @@ class PlanBook:
                 'plans': {split: _content(plan) for split, plan in tour.plans.items()},
                 'in_order': tour.in_order,
                 'one_solution': tour.one_solution,
+                'reference_every': tour.reference_every,
             }
         )
         # Said before there was a file to keep it in.
         self._append({'kind': 'state', 'state': self.state, 'run': self.run})
         self.tour, self.stop = tour, None
+
+    def ask_round(self) -> None:
+        """Visit the references next, and remember that: something was seen to by a person."""
+        if self.tour is not None and self.tour.references:
+            self._append({'kind': 'round'})
+            self.tour.ask_round()
 
     def open_stop(self, stop: Stop) -> None:
         """Remember the next stop, before the arm is sent there."""

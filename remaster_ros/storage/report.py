@@ -15,6 +15,7 @@ import numpy as np
 from markupsafe import Markup
 
 from remaster_ros.core.noise_check import NoiseCheck
+from remaster_ros.core.reference_session import changes
 from remaster_ros.storage.figures import draw_figures
 from remaster_ros.storage.files import make_folder, write_atomically
 from remaster_ros.storage.pages import inlined, page
@@ -84,12 +85,19 @@ def report_html(result: FitResult, drawings: dict[str, str]) -> str:
         verdict=verdict(result),
         accuracy=_accuracy_rows(result),
         markers=_marker_rows(result),
+        references=_references(result),
         notes=result.session.notes,
         drawings={name: inlined(name, text) for name, text in drawings.items()},
         scene=scene,
         scene_json=_json({'data': scene.data, 'layout': scene.layout}) if scene else '',
         plotly=_plotly() if scene else '',
     )
+
+
+def _references(result: FitResult) -> tuple[int, list[str]]:
+    """Return the rounds of the references, and what changed in the session, a sentence each."""
+    rounds, found = changes(result.session, result.chain, result.T_R_N)
+    return rounds, [f'While it was measured, {change.describe()}.' for change in found]
 
 
 def verdict(result: FitResult) -> Verdict:
@@ -126,6 +134,9 @@ def verdict(result: FitResult) -> Verdict:
         headline = f'The offsets make it worse: the mean position error goes from {change}.'
 
     points = [_compared(check) for check in unexplained]
+    points += _references(result)[1]
+    if _references(result)[1] and mood == 'good':
+        mood = 'caution'
     if result.implausible:
         mood = 'bad'
         headline += ' Do not apply the offsets yet: they are larger than a mastering is off by.'

@@ -10,7 +10,7 @@ import numpy as np
 
 from remaster_ros.core.types import BoolArray, IntArray, Measurements
 
-SPLITS = ('optimization', 'validation')
+SPLITS = ('optimization', 'validation', 'reference')
 
 
 class RowKeys(NamedTuple):
@@ -20,7 +20,7 @@ class RowKeys(NamedTuple):
     observation: int
     pose: int
     configuration: int
-    is_validation: bool
+    split: int
     stamp_s: float
 
 
@@ -66,10 +66,10 @@ class SequenceRules:
                 'time runs backwards; give the rows in the order measured'
             )
         same = self._of_pose.get(row.pose)
-        if same is not None and same.is_validation != row.is_validation:
+        if same is not None and same.split != row.split:
             return (
-                f'column split: pose {row.pose} is {SPLITS[same.is_validation]} on line '
-                f'{same.line} and {SPLITS[row.is_validation]} here; give a pose one split'
+                f'column split: pose {row.pose} is {SPLITS[same.split]} on line '
+                f'{same.line} and {SPLITS[row.split]} here; give a pose one split'
             )
         same = self._of_configuration.get(row.configuration)
         if same is not None and same.pose != row.pose:
@@ -97,14 +97,22 @@ def keeps_the_rules(m: Measurements) -> bool:
     return bool(
         (np.diff(m.observation) > 0).all()
         and (np.diff(m.stamp_s) >= 0).all()
-        and belongs(m.pose, m.is_validation)
+        and belongs(m.pose, split_indices(m))
         and belongs(m.configuration, m.pose)
     )
+
+
+def split_indices(m: Measurements) -> IntArray:
+    """Return the index into `SPLITS` of every row, (n,)."""
+    index = m.is_validation.astype(np.int64)
+    if m.is_reference is not None:
+        index[m.is_reference] = SPLITS.index('reference')
+    return index
 
 
 def row_keys(m: Measurements, first_line: int) -> Iterator[RowKeys]:
     """Yield the keys of every row, the first being on `first_line` of its file."""
     lines = range(first_line, first_line + len(m))
-    columns = (m.observation, m.pose, m.configuration, m.is_validation, m.stamp_s)
+    columns = (m.observation, m.pose, m.configuration, split_indices(m), m.stamp_s)
     # Plain Python numbers: dictionaries of NumPy scalars are slow.
     return map(RowKeys, lines, *(column.tolist() for column in columns))

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from remaster_ros.core.chain import SerialChain
 from remaster_ros.core.errors import InputError
-from remaster_ros.core.types import Session
+from remaster_ros.core.types import Measurements, Session
 from remaster_ros.storage.files import (
     decode_text,
     make_new_folder,
@@ -84,6 +86,16 @@ def _read(folder: Path, sums: dict[str, str]) -> Session:
         tuple(header.sensors),
         tuple(header.markers),
     )
+    references = None
+    if measurements.is_reference is not None:
+        of_references = measurements.is_reference
+        measurements = replace(measurements, is_reference=None)
+        references = measurements.select(of_references)
+        measurements = measurements.select(~of_references)
+        if not len(measurements):
+            raise InputError(
+                f'{rows_path}: holds rows of split reference alone; measure before fitting'
+            )
 
     return Session(
         urdf=urdf,
@@ -99,6 +111,7 @@ def _read(folder: Path, sums: dict[str, str]) -> Session:
         notes=header.notes,
         created=header.created,
         extra=header.extra,
+        references=references,
     )
 
 
@@ -114,13 +127,30 @@ def write_session(folder: str | os.PathLike[str], session: Session) -> None:
     chain = read_chain(session.urdf, folder / URDF, session.base_link, session.tip_link)
     header = write_header(session, URDF, session.exit_status)
     rows = format_measurements(
-        session.measurements, session.sensor_names, session.marker_names
+        all_rows(session), session.sensor_names, session.marker_names
     ).encode()
     parse_observations(rows, folder / ROWS, chain, session.sensor_names, session.marker_names)
     make_new_folder(folder)
     write_atomically(folder / URDF, session.urdf)
     write_atomically(folder / ROWS, rows)
     write_atomically(folder / HEADER, header)
+
+
+def all_rows(session: Session) -> Measurements:
+    """Return every row of a session in the order measured, those of the references among them."""
+    m, references = session.measurements, session.references
+    if references is None:
+        return m
+    of_references = np.repeat([False, True], [len(m), len(references)])
+    columns: dict[str, Any] = {
+        name: None
+        if value is None or getattr(references, name) is None
+        else np.concatenate((value, getattr(references, name)))
+        for name, value in vars(m).items()
+    }
+    columns['is_reference'] = of_references
+    merged = Measurements(**columns)
+    return merged.select(np.argsort(merged.observation, kind='stable'))
 
 
 def read_chain(urdf: str, path: Path, base_link: str, tip_link: str) -> SerialChain:

@@ -26,13 +26,13 @@ SEED = 11
 class Cell:
     """A small collection of real nodes on fake devices, and what they say."""
 
-    def __init__(self, start, client, folder, require, sensors):
+    def __init__(self, start, client, folder, require, sensors, candidates=2, reference_every=0):
         from remaster_ros.nodes.status import listen
 
         self.client, self.folder, self.session = client, folder, folder / 'session'
         print('seed', SEED)
         self.world = make_world(folder / 'world', read_cell('demo'), SEED, 10.0)
-        self.said, self.messages, self.results = {}, {}, []
+        self.said, self.messages, self.results, self.events = {}, {}, [], []
         listen(client, self._event, self._summary)
         command, data, tracker = free_ports(
             socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM
@@ -41,9 +41,10 @@ class Cell:
             'fake_robot': {'world': folder / 'world'},
             'pose_planner': {
                 'session': self.session,
-                'optimization_candidates': 2,
+                'optimization_candidates': candidates,
                 'validation_candidates': 1,
                 'registration_candidates': 6,
+                'reference_every': reference_every,
             },
             'robot_bridge': {},
             'recorder': {'session': self.session, 'require': require},
@@ -77,6 +78,7 @@ class Cell:
         self.said[node], self.messages[node] = values, message
 
     def _event(self, event):
+        self.events.append(event)
         if (event.node, event.event) == ('recorder', 'configuration'):
             self.results.append(event.values['result'])
 

@@ -113,6 +113,7 @@ def relay(start, client, ros_environment, tmp_path):
             'optimization_candidates': 2,
             'validation_candidates': 1,
             'registration_candidates': 6,
+            'reference_every': 0,
         },
         'robot_bridge': {'settle_s': 0.5, 'heartbeat_s': 1.0, 'cartesian_speed_limit_m_s': 0.25},
         'recorder': {'session': tmp_path / 'session', 'require': 'mocap', 'settle_s': 0.5},

@@ -49,6 +49,7 @@ class OneCell:
                 'optimization_candidates': 2,
                 'validation_candidates': 0,
                 'registration_candidates': 6,
+                'reference_every': 0,
             },
             'robot_bridge': {},
             'recorder': {'session': self.session, 'require': 'mocap'},

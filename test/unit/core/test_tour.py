@@ -234,3 +234,57 @@ def test_low_poses_are_not_reached_through_the_floor(held):
     seeing = troubles(Tour(chain, {'optimization': plan}, model=model))
     assert len(seeing) > 0.9 * len(blind)
     assert set(seeing) == {''}
+
+
+def references_of(joints):
+    """A plan of single configurations."""
+    return Plan(tuple(PlannedPose(CHAIN.forward(q), np.array([q])) for q in joints))
+
+
+def test_references_twice_at_first_then_every_so_many_and_at_the_end():
+    goals = random_joints(21, 4)
+    plans = {
+        'optimization': plan_of(random_joints(22, 9)),
+        'validation': plan_of(random_joints(23, 8)),
+        'reference': references_of(goals),
+    }
+    tour = Tour(CHAIN, plans, reference_every=7)
+    assert sum(tour.configurations.values()) == 34
+    stops = walk(tour, np.zeros(7))
+    splits = ''.join('r' if stop.split == 'reference' else '.' for stop in stops)
+    # Two solutions each: three poses, of six configurations, lie between.
+    assert splits == 'rrrrrrrr' + '...rrrr' * 5 + '..rrrr'
+    assert [stop.pose for stop in stops] == list(range(len(stops)))
+    assert tour.poses_begun == 17
+    visited = [stop.solutions[0] for stop in stops if stop.split == 'reference']
+    np.testing.assert_array_equal(visited, np.tile(goals, (8, 1)))
+    assert '4 reference configurations, measured again every 7' in tour.describe()
+
+
+def test_a_reference_is_reached_from_the_one_before_it():
+    """So that backlash is the same each time, wherever the arm comes from."""
+    goals = random_joints(24, 3)
+    plans = {'optimization': plan_of(random_joints(25, 3)), 'reference': references_of(goals)}
+    tour = Tour(CHAIN, plans, reference_every=2)
+    q, before = np.full(7, 0.5), {}
+    while (stop := tour.next(q)) is not None:
+        if stop.split == 'reference':
+            came_from = stop.paths[0][-1] if len(stop.paths[0]) else q
+            assert np.array_equal(came_from, goals[stop.index - 1])
+            before.setdefault(stop.index, []).append(came_from)
+        q = stop.solutions[-1]
+    assert {index: len(ways) for index, ways in before.items()} == {0: 5, 1: 5, 2: 5}
+
+
+def test_a_round_can_be_asked_for():
+    plans = {
+        'optimization': plan_of(random_joints(26, 3)),
+        'reference': references_of(random_joints(27, 2)),
+    }
+    tour = Tour(CHAIN, plans, reference_every=100)
+    q = np.zeros(7)
+    for _ in range(5):
+        stop = tour.next(q)
+    assert stop.split == 'optimization'
+    tour.ask_round()
+    assert [tour.next(q).split for _ in range(3)] == ['reference', 'reference', 'optimization']

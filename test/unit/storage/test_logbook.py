@@ -96,3 +96,30 @@ def test_a_folder_of_something_else_is_refused(session, tmp_path):
     (tmp_path / 'observations.csv').write_text('mine\n')
     with pytest.raises(InputError, match='already holds files'):
         Logbook(tmp_path, session)
+
+
+def test_references_are_rows_of_their_own_and_are_remembered(session, tmp_path):
+    book = Logbook(tmp_path, session)
+    book.follow('a')
+    places = [[reading('mocap', 1.0), reading('tracker', 1.5)], [reading('mocap', 2.0)]]
+    write(book, 0, 0, places[0], split='reference')
+    write(book, 1, 0, [reading('mocap', 3.0)], split='validation')
+    book.note_accepted()
+    write(book, 2, 0, places[1], split='reference')
+    book._writer.release()  # killed
+    book = Logbook(tmp_path, session)
+    assert [kind for kind, _, _ in book.watched] == ['reference', 'other', 'accepted', 'reference']
+    assert [number for kind, number, _ in book.watched if kind == 'reference'] == [0, 2]
+    for readings, (_, _, found) in zip(places, (book.watched[0], book.watched[3])):
+        for one, other in zip(readings, found, strict=True):
+            assert (one.sensor, one.stamp_s) == (other.sensor, other.stamp_s)
+            np.testing.assert_array_equal(one.position, other.position)
+            assert (one.std is None) == (other.std is None)
+    assert not book.registration
+    write(book, 3, 0, [reading('mocap', 4.0)])
+    book.close('complete')
+    found = read_session(tmp_path)
+    assert found.measurements.observation.tolist() == [2, 4]
+    assert found.measurements.is_validation.tolist() == [True, False]
+    assert found.references.observation.tolist() == [0, 1, 3]
+    assert found.references.configuration.tolist() == [0, 0, 2]

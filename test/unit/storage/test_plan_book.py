@@ -199,3 +199,48 @@ def test_the_counts_of_dropped_solutions_survive_a_restart(chain, tmp_path):
     book.close()
     book = PlanBook(tmp_path / 'session', SETTINGS, chain)
     assert book.tour.dropped_solutions == {'self-collision': 3}
+
+
+def test_references_are_visited_as_in_one_run_whatever_is_killed(chain, tmp_path):
+    """Also a round that was asked for, and an old plan goes on without references."""
+    seed = 29
+    print('seed', seed)
+    rng = np.random.default_rng(seed)
+    plans = {
+        'optimization': plan_of(chain, 5, 6, 3),
+        'reference': plan_of(chain, 6, 3, 1),
+    }
+    settings = {**SETTINGS, 'reference_every': 7}
+    one_run = Tour(chain, plans, reference_every=7)
+    book = PlanBook(tmp_path / 'session', settings, chain)
+    book.begin(Tour(chain, plans, reference_every=7))
+    q, number = np.zeros(len(chain)), 0
+    while (wanted := one_run.next(q)) is not None:
+        stop = visit(book.tour, book, q, rng, {})
+        assert (stop.pose, stop.split, stop.ids) == (wanted.pose, wanted.split, wanted.ids)
+        number += 1
+        if number in (7, 10):
+            # In the middle of a round, and between two.
+            book.ask_round()
+            one_run.ask_round()
+        for solution in book.stop.ids:
+            book.outcome(solution, 'recorded')
+        book.close()
+        book = PlanBook(tmp_path / 'session', settings, chain)
+        q = rng.uniform(-1, 1, len(chain))
+    assert book.tour.next(q) is None
+    assert book.outcomes.total() == sum(book.tour.configurations.values()) == 18
+    assert book.references.total() == book.tour.reference_stops == number - 6
+    book.close()
+    with pytest.raises(InputError, match='another reference_every'):
+        PlanBook(tmp_path / 'session', {**settings, 'reference_every': 8}, chain)
+
+
+def test_a_plan_of_a_version_without_references_goes_on_without(chain, tmp_path):
+    book = PlanBook(tmp_path, SETTINGS, chain)
+    book.begin(Tour(chain, {'optimization': plan_of(chain, 7, 2, 2)}))
+    book.close()
+    again = PlanBook(tmp_path, {**SETTINGS, 'reference_every': 25}, chain)
+    again.ask_round()
+    assert again.tour.next(np.zeros(len(chain))).split == 'optimization'
+    again.close()

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from remaster_ros.core import transforms
 from remaster_ros.core.noise_check import NoiseCheck
 from remaster_ros.core.result import NoiseEstimate
 from remaster_ros.core.transforms import apply
@@ -288,3 +289,42 @@ def test_error_vectors_lead_from_the_measured_to_the_modelled_marker(fit_result)
 )
 def test_magnifications_are_round(factor, rounded):
     assert _round_factor(factor) == rounded
+
+
+def with_references(fit_result, shift_m):
+    """The session with four rounds of five references, the sensor moved before the last one."""
+    session, chain = fit_result.session, fit_result.chain
+    m = session.measurements
+    rng = np.random.default_rng(12)
+    print('seed 12')
+    pick = np.flatnonzero(m.sensor == 0)[np.linspace(0, 40, 5).astype(int)]
+    rows = m.select(np.tile(pick, 4))
+    name = session.sensor_names[0]
+    seen = chain.positions(rows.q, session.markers[session.sensors[name]])
+    seen[-5:] += [0.0, shift_m, 0.0]
+    T = fit_result.T_R_N[name]
+    number = np.arange(len(rows)) + 10_000
+    references = replace(
+        rows,
+        observation=number,
+        configuration=number,
+        position=transforms.apply(transforms.inverse(T), seen) + rng.normal(0, 2e-5, seen.shape),
+        std=np.full((len(rows), 3), np.nan),
+        stamp_s=number * 5.0,
+    )
+    return replace(fit_result, session=replace(session, references=references)), name
+
+
+def test_what_changed_in_the_session_is_said_first(fit_result):
+    assert 'id="references"' not in report_html(fit_result, {})
+    result, _ = with_references(fit_result, 0.0)
+    html = report_html(result, {})
+    assert '4 rounds of the same few configurations' in html
+    assert 'Nothing did' in html
+    result, name = with_references(fit_result, 3e-3)
+    judged = verdict(result)
+    assert any(f'{name} or the base was moved between' in point for point in judged.points)
+    assert judged.mood != 'good'
+    html = report_html(result, {})
+    assert html.count('was moved between configurations') == 2
+    assert 'off by up to 3.0' in html

@@ -105,7 +105,7 @@ def refused(folder, *parts):
         ('stamp_s', '0.0', 'time runs backwards'),
         ('sensor', 'camera', 'not among the sensors of session.yaml (mocap, tracker)'),
         ('marker', 'ball', 'not among the markers of session.yaml (sir, smr)'),
-        ('split', 'test', 'neither optimization nor validation'),
+        ('split', 'test', 'none of optimization, validation, reference'),
         ('split', 'validation', 'give a pose one split'),
         ('configuration', '0', 'give a configuration one pose'),
     ],
@@ -353,3 +353,48 @@ def test_nothing_but_the_one_error_comes_out_of_damaged_files(folder):
             assert '\n' not in str(error)  # noqa: PT017
         path.write_bytes(whole)
     assert refused_count > 100
+
+
+def test_references_stay_apart_from_what_is_fitted(session, tmp_path):
+    """And survive the round trip, in the order measured."""
+    m = session.measurements
+    of_references = m.pose == 2
+    apart = replace(
+        session,
+        measurements=m.select(~of_references),
+        references=m.select(of_references),
+    )
+    write_session(tmp_path / 'session', apart)
+    text = (tmp_path / 'session' / 'observations.csv').read_text()
+    assert text.count(',reference,') == 4
+    found = read_session(tmp_path / 'session')
+    for rows, wanted in (
+        (found.measurements, apart.measurements),
+        (found.references, apart.references),
+    ):
+        np.testing.assert_array_equal(rows.observation, wanted.observation)
+        np.testing.assert_array_equal(rows.position, wanted.position)
+        assert rows.is_reference is None or rows.is_reference.all()
+    assert not set(found.measurements.pose) & set(found.references.pose)
+    write_session(tmp_path / 'again', found)
+    assert (tmp_path / 'again' / 'observations.csv').read_text() == text
+    assert read_session(tmp_path / 'again').select(np.array([0])).references is not None
+
+
+def test_a_session_of_references_alone_has_nothing_to_fit(session, tmp_path):
+    m = session.measurements
+    write_session(tmp_path / 'session', session)
+    path = tmp_path / 'session' / 'observations.csv'
+    for split in ('optimization', 'validation'):
+        path.write_text(path.read_text().replace(f',{split},', ',reference,'))
+    with pytest.raises(InputError, match='reference alone; measure before fitting'):
+        read_session(tmp_path / 'session')
+    assert len(m) == 20
+
+
+def test_a_pose_is_not_reference_and_fitted(session, tmp_path):
+    write_session(tmp_path / 'session', session)
+    path = tmp_path / 'session' / 'observations.csv'
+    path.write_text(path.read_text().replace(',optimization,', ',reference,', 1))
+    with pytest.raises(InputError, match='column split: pose 0 is reference on line 2 and optim'):
+        read_session(tmp_path / 'session')

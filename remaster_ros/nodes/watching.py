@@ -1,0 +1,136 @@
+"""What the recorder makes of the references: what has changed, said once, and whether to stop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.pairing import PairedReading
+from remaster_ros.core.reference_watch import Change, ReferenceReading, ReferenceWatch
+from remaster_ros.core.types import FloatArray
+
+GROWN = 1.5
+"""A change that was said is said again where it has grown so many times."""
+
+
+class Watching:
+    """Follow the references of a session, and remember what a person has not seen to yet.
+
+    Parameters
+    ----------
+    chain, markers
+        As for `ReferenceWatch`.
+    stop_m
+        A change larger than this stops the collection, m; 0 for none.
+
+    Attributes
+    ----------
+    change
+        What has changed since the beginning, or since a person has seen to the last change.
+    stopped_run
+        The planner's run that a change has stopped, and that no person has seen to yet; '' for
+        one that is not known, None where nothing has stopped.
+    """
+
+    def __init__(
+        self, chain: SerialChain, markers: Mapping[str, FloatArray], stop_m: float
+    ) -> None:
+        self._stop_m = stop_m
+        self._watch = ReferenceWatch(chain, markers, **({'stop_m': stop_m} if stop_m else {}))
+        self._said: Change | None = None
+        self.change: Change | None = None
+        self.stopped_run: str | None = None
+
+    @property
+    def rounds(self) -> int:
+        """How many rounds have begun."""
+        return self._watch.rounds
+
+    @property
+    def stops(self) -> bool:
+        """Whether the change is large enough to stop for."""
+        change = self.change
+        return change is not None and bool(self._stop_m) and change.size_m > self._stop_m
+
+    def describe(self) -> str:
+        """Return what has changed and what to do, in a line; '' where nothing has."""
+        if self.change is None:
+            return ''
+        text = self.change.describe()
+        if not self.stops:
+            return text
+        return (
+            f'{text}. That is more than {1e3 * self._stop_m:g} mm: what was measured before and '
+            'after does not fit together. Look at it; then begin a new session (best), or go on '
+            'with /remaster/collect'
+        )
+
+    def take_back(
+        self,
+        log: Iterable[tuple[str, int, Sequence[PairedReading]]],
+        T_R_N: Mapping[str, FloatArray],
+    ) -> None:
+        """Take up what a recorder before this one has logged (`Logbook.watched`)."""
+        for kind, configuration, readings in log:
+            if kind == 'reference':
+                self.read(configuration, readings, T_R_N)
+            elif kind == 'accepted':
+                self.accept()
+            else:
+                self.leave(T_R_N)
+        self.judge(T_R_N)
+        if self.stops:
+            self.stopped_run = ''
+
+    def read(
+        self,
+        configuration: int,
+        readings: Sequence[PairedReading],
+        T_R_N: Mapping[str, FloatArray],
+        last: bool = False,
+    ) -> bool:
+        """Take the readings at a reference; return whether something new is to be said.
+
+        Parameters
+        ----------
+        last
+            Whether it is the last one of its round.
+        """
+        new = False
+        for reading in readings:
+            row = ReferenceReading(
+                configuration,
+                reading.sensor,
+                reading.marker,
+                reading.q,
+                reading.position,
+                reading.stamp_s,
+                reading.std,
+                reading.samples,
+            )
+            if self._watch.rounds and self._watch.begins_round(row):
+                new |= self.judge(T_R_N)
+            self._watch.add(row)
+        return self.judge(T_R_N) or new if last else new
+
+    def leave(self, T_R_N: Mapping[str, FloatArray]) -> bool:
+        """Take it that the arm goes elsewhere; return as `read`."""
+        new = self.judge(T_R_N)
+        self._watch.end_round()
+        return new
+
+    def judge(self, T_R_N: Mapping[str, FloatArray]) -> bool:
+        """Judge the round so far, once; return as `read`."""
+        self.change = self._watch.judge(T_R_N)
+        if self.change is None or self.change is self._said:
+            return False
+        said, now = self._said, self.change
+        new = said is None or now.size_m > GROWN * said.size_m or now.subject != said.subject
+        if new or self.stops:
+            self._said = now
+        return new or self.stops
+
+    def accept(self) -> None:
+        """Take it that a person has seen to the change: the next round is a new beginning."""
+        self._watch.accept()
+        self.change = self._said = self.stopped_run = None

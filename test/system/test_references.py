@@ -1,0 +1,71 @@
+"""A sensor is bumped in mid-run: the references tell it, by name and size, and the arm stands."""
+
+import csv
+
+import numpy as np
+import pytest
+from conftest import call
+from test_going_on import Cell
+
+from remaster_ros.fakes.faults import inject
+from remaster_ros.storage.journal import read_journal
+from remaster_ros.storage.session import read_session
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(400)]
+
+BUMP_M = 2e-3
+
+
+def rounds(cell):
+    return int(cell.recorder('reference_rounds') or 0)
+
+
+def test_a_bumped_sensor_is_named_and_pauses_the_collection(start, client, tmp_path):
+    sensors = ['mocap', 'tracker']
+    cell = Cell(start, client, tmp_path, 'all', sensors, candidates=9, reference_every=6)
+    cell.until(lambda: rounds(cell) == 3, 'three rounds of the references', 200)
+    reading = lambda: cell.said['pose_planner']  # noqa: E731
+    # The third is over when something else is measured.
+    done = int(reading()['configurations_done'])
+    cell.until(lambda: int(reading()['configurations_done']) > done, 'another configuration')
+    assert cell.recorder('changed') == ''
+    inject(cell.world.folder, {'tracker': {'bumped': BUMP_M}})
+    found = lambda: [e for e in cell.events if e.event == 'changed']  # noqa: E731
+    cell.until(found, 'the change', 200)
+    event = found()[0]
+    print(event.message)
+    assert event.values['stops'] == 'yes'
+    assert event.values['cause'] == 'sensor'
+    assert event.message.startswith('tracker was moved between configurations')
+    assert float(event.values['size_m']) == pytest.approx(BUMP_M, rel=0.25)
+    cell.until(lambda: reading()['state'] == 'paused', 'the pause', 10)
+    assert cell.messages['pose_planner'] == event.message
+    assert event.message in cell.recorder('changed')
+
+    # Nobody has looked: it stays so, also with another recorder.
+    recorded = cell.recorder('observations')
+    cell.kill_and_start('recorder')
+    cell.said.pop('recorder')
+    cell.until(lambda: cell.recorder('changed'), 'the recorder that was started again')
+    assert cell.recorder('changed') == event.message
+    assert (reading()['state'], cell.recorder('observations')) == ('paused', recorded)
+
+    before = rounds(cell)
+    assert call(client, '/remaster/collect').success
+    cell.until(lambda: cell.recorder('changed') == '', 'that a person has looked', 20)
+    cell.until(lambda: rounds(cell) == before + 1, 'a new beginning')
+    cell.until(lambda: cell.recorder('exit_status') == 'complete', 'the end', 200)
+    session = read_session(cell.session)
+    assert len(found()) == 1, 'what was seen to is not said again'
+
+    with (cell.session / 'observations.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    of_references = [row for row in rows if row['split'] == 'reference']
+    assert len(session.references) == len(of_references) > 0
+    assert len(session.measurements) == len(rows) - len(of_references)
+    assert not set(session.measurements.configuration) & set(session.references.configuration)
+    planned = int(reading()['configurations'])
+    assert int(reading()['configurations_done']) == planned
+    assert len(np.unique(session.measurements.configuration)) == planned
+    kinds = [record['kind'] for record in read_journal(cell.session / 'journal.jsonl').records]
+    assert kinds.count('accepted') == 1
