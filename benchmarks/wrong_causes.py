@@ -117,7 +117,7 @@ def _flat(data: Residuals) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _columns(data: Residuals, cell: Cell, base: np.ndarray) -> np.ndarray:
-    columns = data.columns([cell])[data.rows.source].reshape(3 * len(data), -1)
+    columns = data.columns([cell]).reshape(3 * len(data), -1)
     left = columns - base @ (base.T @ columns)
     norm, before = np.linalg.norm(left, axis=0), np.linalg.norm(columns, axis=0)
     # What is absorbed is rounding: it explains nothing.

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from remaster_ros.core.chain import SerialChain
+from remaster_ros.core.extension import Extension, Term
 from remaster_ros.core.inverse import InverseKinematics
 from remaster_ros.core.simulation import SimulatedSensor, Truth, simulate_session
 from remaster_ros.core.transforms import rotation_vector_to_matrix, transform
@@ -78,3 +79,19 @@ def scene(
         markers=MARKERS,
         **options,  # type: ignore[arg-type]
     )
+
+
+def extension(
+    names: tuple[str, ...],
+    units: tuple[str, ...],
+    joint: np.ndarray,
+    displacement: np.ndarray,
+    displacement0: np.ndarray,
+    theta0: np.ndarray,
+    prior_precision: np.ndarray,
+) -> Extension:
+    """Return an extension of dense arrays: (n, k, m) at all joints, (n, 3, m) beside them."""
+    every = slice(0, len(names))
+    turning = [Term(every, at, joint[:, at]) for at in range(joint.shape[1])]
+    terms = (*turning, Term(every, None, displacement))
+    return Extension(names, units, terms, displacement0, theta0, prior_precision)

@@ -22,8 +22,12 @@ TOUCHED_RAD = 1e-4
 """The probe before the first move goes a micrometre; no other command does."""
 SPEED_TOLERANCE = 1.02
 """The servo of the fake arm overshoots a little: it is not quite as fast as its reference."""
-SAME_RAD = 1e-3
-"""So near are a command and what the fake arm makes of it."""
+SAME_RAD = 0.03
+"""So near are a command and what the fake arm makes of it, also where it goes elsewhere, rad."""
+SAME_WALL_S = 3.0
+"""A command comes to the bench so much earlier or later at most than to the fake arm, s."""
+UNNAMED = '_NODE_NAMESPACE_UNKNOWN_/_NODE_NAME_UNKNOWN_'
+"""Of a participant that has just been found the graph has no name yet."""
 CONSEQUENCES = ('planner is ', 'the halt was cleared', 'looking for another', 'no controller')
 """What a bridge tells that follows from the operator or from a restart, and not from the fault."""
 STARTING_S = 4.0
@@ -127,24 +131,30 @@ class Observer:
             self._commands.append(self._command(*self._messages[len(self._commands)]))
         return self._commands
 
-    def _start(self, wall_s: float, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _start(self, wall_s: float, points: int, end: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return where the arm was, and how fast, when a command to `end` began."""
         lines = (self.world.folder / 'motion.jsonl').read_text().splitlines()
-        motion = Motion(START_S, self.world.start_q)
-        begun = None
+        motion, came_s = Motion(START_S, self.world.start_q), self._world_time(wall_s)
+        nearest_s, begun = SAME_WALL_S * self.world.rate, None
         for line in map(json.loads, lines):
-            if np.max(np.abs(np.array(line['points'][-1][1]) - end)) < SAME_RAD:
-                begun = motion.at(line['start_s'])
+            since_s = abs(line['start_s'] - came_s)
+            off = np.max(np.abs(np.array(line['points'][-1][1]) - end))
+            if len(line['points']) == points and off < SAME_RAD and since_s < nearest_s:
+                nearest_s, begun = since_s, motion.at(line['start_s'])
             motion.follow(
                 line['start_s'],
                 [Waypoint(t, np.array(q), v and np.array(v)) for t, q, v in line['points']],
             )
         # One that the arm has dropped began when it came.
-        return begun or motion.at(self.world.now() - self.world.rate * (time.monotonic() - wall_s))
+        return begun or motion.at(came_s)
+
+    def _world_time(self, wall_s: float) -> float:
+        return self.world.now() - self.world.rate * (time.monotonic() - wall_s)
 
     def _command(self, wall_s: float, message) -> Command:
         columns = [list(message.joint_names).index(name) for name in self.chain.joint_names]
-        q, velocity = self._start(wall_s, np.array(message.points[-1].positions)[columns])
+        end = np.array(message.points[-1].positions)[columns]
+        q, velocity = self._start(wall_s, len(message.points), end)
         times, places, speeds = [0.0], [q], [velocity]
         for point in message.points:
             times.append(point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec)
@@ -207,6 +217,11 @@ class Observer:
             idle = message in ('moving or measuring', 'waiting for a pose')
             if not idle and up_s > STARTING_S:
                 found.setdefault(message, 0)
+        for text in [text for text in found if UNNAMED in text]:
+            named = text.split(': ')[0]
+            if any(other.startswith(named) and UNNAMED not in other for other in found):
+                # It has been told again, with the name.
+                del found[text]
         wanted = {plain(text): rank for text, rank in found.items() if not _follows(text)}
         return sorted(wanted, key=lambda text: (wanted[text], text))
 
@@ -220,7 +235,7 @@ def plain(text: str) -> str:
     """Return a reason without what depends on the moment."""
     text = re.sub(r' \((halted|process) [^)]*\)', '', text).replace('|', '/')
     text = re.sub(r'joint(s?)[ _]\d', r'joint\1 …', text)
-    # Of a participant that has just been found the graph has no name yet.
-    text = text.replace('_NODE_NAMESPACE_UNKNOWN_/_NODE_NAME_UNKNOWN_', '/stranger')
+    text = re.sub(r'((?:other_)?joint …)(, \1)+', r'\1', text)
+    text = text.replace(UNNAMED, '…')
     text = re.sub(r'-?\d+\.\d+|\b(inf|nan)\b|\d+(?= mm| usable| readings| s old)', '…', text)
     return re.sub(r'solutions? \d+', 'a solution', text)

@@ -46,5 +46,30 @@ def same(first: tuple[str, ...], second: tuple[str, ...]) -> bool:
     return [_masked(cell) for cell in first] == [_masked(cell) for cell in second]
 
 
+def allows(page: list[tuple[str, ...]], seen: tuple[str, ...], said: int) -> bool:
+    """Whether the page's lines of a fault have what was seen of it.
+
+    What is commanded and how it goes on must be as in one of them. Of several reasons not each is
+    told every time, as the first one may be over when a node looks again: none may be new.
+
+    Parameters
+    ----------
+    page
+        The lines of this fault.
+    seen
+        As a line.
+    said
+        The column of reasons.
+    """
+    rest = {tuple(_masked(c) for i, c in enumerate(row) if i != said) for row in page}
+    known = {part for row in page for part in _parts(row[said])}
+    mine = tuple(_masked(c) for i, c in enumerate(seen) if i != said)
+    return mine in rest and _parts(seen[said]) <= known
+
+
+def _parts(said: str) -> set[str]:
+    return {part.lower() for part in _masked(said).split('; ')}
+
+
 def _masked(cell: str) -> str:
     return re.sub(r'\d+(\.\d+)?', '…', cell)

@@ -6,7 +6,7 @@ number of leading dimensions in ``q``, ``points`` and ``joint_offsets``, and bro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -128,6 +128,22 @@ class SerialChain:
     def __len__(self) -> int:
         """Return the number of joints k."""
         return len(self.joint_names)
+
+    def with_offsets(self, joint_offsets: FloatArray) -> SerialChain:
+        """Return the arm with zero-offsets (rad, (k,)) built in: it takes reported angles.
+
+        Where ``frames`` of reported angles q are is where the arm is, and its limits are those of
+        the reported angles at its stops.
+        """
+        T_fixed = self.T_fixed.copy()
+        turns = rotation_vector_to_matrix(self.axes * np.asarray(joint_offsets)[:, None])
+        T_fixed[:-1, :3, :3] = T_fixed[:-1, :3, :3] @ turns
+        return replace(
+            self,
+            T_fixed=T_fixed,
+            lower=self.lower - joint_offsets,
+            upper=self.upper - joint_offsets,
+        )
 
     def within_limits(self, q: ArrayLike, tolerance: float = 0.0) -> BoolArray:
         """Tell whether all joints of q (..., k) are within limits (+ tolerance, rad), (...)."""

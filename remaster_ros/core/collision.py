@@ -390,7 +390,8 @@ class CollisionModel:
         high = np.where(np.isfinite(self.chain.upper), self.chain.upper, np.pi)
         q = low + np.random.default_rng(0).random((_SAMPLES, len(self.chain))) * (high - low)
         touching, near = np.zeros(len(self._inner)), np.zeros(len(self._inner))
-        for short in self.shortfalls(q):
+        # With the planner's reserve: it must not drop all that the construction brings so near.
+        for short in self.shortfalls(q, RESERVE_M):
             near[short.pair] += 1
             touching[short.pair] += short.distance < 0.0
         is_self = np.array([self._category(pair) == SELF_COLLISION for pair in range(len(near))])

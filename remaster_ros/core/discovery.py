@@ -230,7 +230,7 @@ def _judged(
     """Return the residuals of the rows of the pool that the extended model does not call gross."""
     problem = found.problem
     every = residuals.only(pool, found.model.reference)
-    left = residuals.unexplained(solution)[every.rows.source]
+    left = every.left(solution)
 
     def refit(keep: BoolArray) -> FloatArray:
         return left

@@ -237,11 +237,10 @@ def _same(data: Residuals, solution: Solution, cell: Cell, other: Cell) -> bool:
     """Do two cells displace the marker alike, whatever the data's noise?"""
     if cell.size != other.size or cell.driver != other.driver:
         return False
-    source = data.rows.source
     base = data.base.reshape(3 * len(data), -1)
     spaces = []
     for columns in (data.columns([cell]), data.columns([other])):
-        flat = columns[source].reshape(3 * len(data), -1)
+        flat = columns.reshape(3 * len(data), -1)
         flat = flat / np.linalg.norm(flat, axis=0)
         spaces.append(np.linalg.qr(flat - base @ (base.T @ flat))[0])
     cosines = np.linalg.svd(spaces[0].T @ spaces[1], compute_uv=False)
@@ -257,7 +256,7 @@ def _size(
     wheres = dict(zip(solution.cells, solution.slices(), strict=True))
     shift = np.zeros((len(data), 3))
     for cell in group:
-        shift += data.row_columns([cell]) @ solution.parameters[wheres[cell]]
+        shift += data.columns([cell]) @ solution.parameters[wheres[cell]]
     flat, base = shift.ravel(), data.base.reshape(3 * len(data), -1)
     left = flat - base @ (base.T @ flat)
     return float(np.sqrt(np.sum(left**2) / len(data)))

@@ -146,7 +146,7 @@ def _left(
     values = dict(zip(discovery.fit.theta_names, discovery.fit.theta, strict=True))
     cells = [cell for group in groups for cell in group]
     theta = np.array([values[name] for cell in cells for name in cell.parameters])
-    left = data.full_errors - data.columns(cells) @ theta
+    left = data.full_errors - data.displaced(cells, theta)
     # What is not held again: a small step, so linear.
     columns = data.full_jacobian[:, :, joints:]
     white = data.whitened(columns[data.rows.source], data.noise).reshape(3 * len(data), -1)

@@ -159,7 +159,7 @@ def solve(
         Log prior probability of the set; by default that of its cells one by one.
     """
     cells = tuple(cells)
-    columns = data.row_columns(cells)
+    columns = data.columns(cells)
     scale = np.sqrt(np.einsum('nim,nim->m', columns, columns))
     free = np.array([cell.penalty is None for cell in cells for _ in cell.parameters], dtype=bool)
     if np.any(scale[free] == 0.0):

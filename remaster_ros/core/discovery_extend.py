@@ -6,29 +6,34 @@ import numpy as np
 
 from remaster_ros.core.discovery_evidence import Solution
 from remaster_ros.core.discovery_noise import Residuals
-from remaster_ros.core.extension import Extension
+from remaster_ros.core.effects.cell import Cell
+from remaster_ros.core.effects.scene import Scene
+from remaster_ros.core.extension import Extension, Term
+from remaster_ros.core.types import FloatArray
 
 
 def extension_of(residuals: Residuals, solution: Solution) -> Extension:
     """Return the cells of a solution as further parameters, linearised where it has them."""
-    scene = residuals.scene
-    m = len(solution.parameters)
-    joint = np.zeros((len(scene), scene.joints, m))
-    displacement = np.zeros((len(scene), 3, m))
+    terms = []
+    displacement0 = np.zeros((len(residuals.scene), 3))
     for cell, where in zip(solution.cells, solution.slices(), strict=True):
-        columns = cell.columns(scene)
-        if columns.at is None:
-            displacement[:, :, where] = columns.values
-        else:
-            joint[:, columns.at, where] = columns.values
+        term = Term(where, *_columns(cell, residuals.scene))
+        if term.at is None:
+            displacement0 += term.values @ solution.parameters[where]
+        terms.append(term)
     names = tuple(name for cell in solution.cells for name in cell.parameters)
     units = tuple(cell.unit for cell in solution.cells for _ in cell.parameters)
     return Extension(
         names,
         units,
-        joint,
-        displacement,
-        displacement @ solution.parameters,
+        tuple(terms),
+        displacement0,
         solution.parameters,
         solution.prior_precision(),
     )
+
+
+def _columns(cell: Cell, scene: Scene) -> tuple[int | None, FloatArray]:
+    """Return joint and values of a cell's columns in every row of a session."""
+    blocks = [cell.columns(block) for _, block in scene.blocks()]
+    return blocks[0].at, np.concatenate([block.values for block in blocks])

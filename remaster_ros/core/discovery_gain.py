@@ -107,10 +107,10 @@ def noise_by_range(data: Residuals, solution: Solution) -> dict[str, dict[str, f
         error.
     """
     rows = data.rows
-    length = np.linalg.norm(data.unexplained(solution)[rows.source], axis=1)
+    length = np.linalg.norm(data.left(solution), axis=1)
     found = {}
     for sensor, span in rows.spans:
-        distance = data.scene.range_m[rows.source[span]]
+        distance = data.part.range_m[span]
         low, high = np.quantile(distance, (0.25, 0.75))
         near, far = length[span][distance <= low], length[span][distance >= high]
         p_value = 1.0 if np.ptp(distance) == 0.0 else spearmanr(distance, length[span])[1]

@@ -35,7 +35,7 @@ def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple
     model, problem = found.model, found.problem
     x = model.natural(found.mode.z)
     jacobian = model.natural_jacobian(x, data.rows)
-    columns = data.row_columns(solution.cells)
+    columns = data.columns(solution.cells)
     joined = np.concatenate((jacobian, columns), axis=2)
     white = data.whitened(joined, solution.noise).reshape(3 * len(data), -1)
     error = data.whitened(data.errors, solution.noise).ravel()

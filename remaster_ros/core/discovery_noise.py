@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from remaster_ros.core.effects.cell import Cell
-from remaster_ros.core.effects.scene import Scene
+from remaster_ros.core.effects.scene import BLOCK_ROWS, Scene
 from remaster_ros.core.estimate import Estimate
 from remaster_ros.core.laplace import Mode
 from remaster_ros.core.outliers import robust_noise
@@ -27,8 +27,6 @@ from remaster_ros.core.types import BoolArray, FloatArray, IntArray
 ROUNDING = 1e-8
 # Bytes of displacements that are kept for the next fit; only those of large sessions are more.
 KEPT_BYTES = 1 << 28
-# Rows of the session for each row worked on, from where that is a part.
-PART = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +108,11 @@ class Residuals:
         count = len(scene)
         every = Rows.of(problem.measurements, np.arange(count), model.reference)
         full_errors = np.empty((count, 3))
-        full_errors[every.source] = every.target - model.predict(mode.z, every)
         full_jacobian = np.empty((count, 3, model.size))
-        full_jacobian[every.source] = model.natural_jacobian(x, every)
+        for first, last in every.blocks(BLOCK_ROWS):
+            block = every.of_groups(first, last)
+            full_errors[block.source] = block.target - model.predict(mode.z, block)
+            full_jacobian[block.source] = model.natural_jacobian(x, block)
 
         rows = Rows.of(problem.measurements, found.kept, model.reference)
         flat = full_jacobian[rows.source].reshape(-1, model.size)
@@ -150,6 +150,14 @@ class Residuals:
         return len(self.scene.sensor_names)
 
     @cached_property
+    def part(self) -> Scene:
+        """The scene of the rows worked on, in their order.
+
+        What the search needs of hundreds of causes is computed on these rows alone.
+        """
+        return self.scene.at(self.rows.source)
+
+    @cached_property
     def _displacements(self) -> dict[Cell, FloatArray]:
         """What `columns` has computed so far: a search fits the same few cells again and again."""
         return {}
@@ -172,54 +180,37 @@ class Residuals:
         return int(self.pose_of_row.max()) + 1
 
     def columns(self, cells: Sequence[Cell]) -> FloatArray:
-        """Return what a unit of each parameter displaces in every row of the session."""
-        parts = [self._displacement(cell) for cell in cells]
-        return np.concatenate([np.zeros((len(self.scene), 3, 0)), *parts], axis=2)
-
-    def row_columns(self, cells: Sequence[Cell]) -> FloatArray:
-        """Return the same as `columns` in the rows worked on, (n, 3, c)."""
-        if not self.is_part:
-            return self.columns(cells)[self.rows.source]
-        kept = self._row_displacements
+        """Return what a unit of each parameter displaces in the rows worked on, (n, 3, c)."""
+        kept = self._displacements
         for cell in cells:
             if cell not in kept:
-                kept[cell] = self._computed(cell)[self.rows.source]
+                kept[cell] = cell.columns(self.part).displacement(self.part)
         parts = [kept[cell] for cell in cells]
         joined = np.concatenate([np.zeros((len(self), 3, 0)), *parts], axis=2)
-        _forget(kept)
+        while len(kept) > 1 and sum(values.nbytes for values in kept.values()) > KEPT_BYTES:
+            del kept[next(iter(kept))]
         return joined
 
-    @property
-    def is_part(self) -> bool:
-        """Whether the rows are few of the session's: columns of all of them are not kept then."""
-        return len(self.scene) > PART * len(self)
-
-    @cached_property
-    def _row_displacements(self) -> dict[Cell, FloatArray]:
-        return {}
-
-    def _displacement(self, cell: Cell) -> FloatArray:
-        if self.is_part:
-            return self._computed(cell)
-        kept = self._displacements
-        if cell not in kept:
-            kept[cell] = self._computed(cell)
-            _forget(kept)
-        return kept[cell]
-
-    def _computed(self, cell: Cell) -> FloatArray:
-        return cell.columns(self.scene).displacement(self.scene)
+    def displaced(self, cells: Sequence[Cell], parameters: FloatArray) -> FloatArray:
+        """Return what cells with these parameters displace in every row, m, (all rows, 3)."""
+        shift = np.zeros((len(self.scene), 3))
+        for where, scene in self.scene.blocks():
+            start = 0
+            for cell in cells:
+                columns = cell.columns(scene).displacement(scene)
+                shift[where] += columns @ parameters[start : start + cell.size]
+                start += cell.size
+        return shift
 
     def unexplained(self, fit: Fit) -> FloatArray:
         """Return what a fit leaves of the errors in every row of the session, m, (all rows, 3)."""
         left: FloatArray = self.full_errors - self.full_base @ fit.base
-        if not self.is_part:
-            return left - self.columns(fit.cells) @ fit.parameters
-        start = 0
-        for cell in fit.cells:
-            left -= self._computed(cell) @ fit.parameters[start : start + cell.size]
-            start += cell.size
-        return left
+        return left - self.displaced(fit.cells, fit.parameters)
+
+    def left(self, fit: Fit) -> FloatArray:
+        """Return the same in the rows worked on, m, (n, 3)."""
+        explained: FloatArray = self.base @ fit.base + self.columns(fit.cells) @ fit.parameters
+        return self.errors - explained
 
     def whitened(self, values: NDArray[Any], noise: Noise) -> NDArray[Any]:
         """Return values (n, ...) in units of the noise: independent of variance 1 in all rows."""
@@ -234,9 +225,3 @@ class Residuals:
         scale = 1.0 / noise.sigma[sensor][rows.group_of_row]
         white = flat * scale[:, None].astype(flat.dtype) - common[rows.group_of_row]
         return white.reshape(values.shape)
-
-
-def _forget(kept: dict[Cell, FloatArray]) -> None:
-    """Drop the oldest of what is kept until it fits; the last one stays."""
-    while len(kept) > 1 and sum(values.nbytes for values in kept.values()) > KEPT_BYTES:
-        del kept[next(iter(kept))]

@@ -69,11 +69,11 @@ class Catalogue:
     @classmethod
     def of(cls, data: Residuals, cells: Sequence[Cell]) -> Catalogue:
         """Compute all columns on the rows of the residuals, in single precision."""
-        source = data.rows.source
+        scene = data.part
         at, features, shifts = [], [], []
         for cell in cells:
-            columns = cell.columns(data.scene)
-            values = columns.values[source].astype(np.float32)
+            columns = cell.columns(scene)
+            values = columns.values.astype(np.float32)
             if columns.at is None:
                 at += [-1] * cell.size
                 shifts.append(values)
@@ -90,7 +90,7 @@ class Catalogue:
             np.concatenate([np.zeros((n, 0), np.float32), *features], axis=1),
             np.concatenate([np.zeros((n, 3, 0), np.float32), *shifts], axis=2),
             position,
-            data.scene.jacobian[source].astype(np.float32),
+            scene.jacobian.astype(np.float32),
         )
 
     def block(self, columns: IntArray) -> NDArray[np.float32]:
@@ -189,7 +189,7 @@ class _Projection:
     """Takes out what base and given cells explain, in units of the noise."""
 
     def __init__(self, data: Residuals, given: Solution) -> None:
-        columns = data.row_columns(given.cells)
+        columns = data.columns(given.cells)
         joined = np.concatenate((data.base, columns), axis=2)
         white = data.whitened(joined, given.noise).reshape(3 * len(data), -1)
         # Penalties are rows of their own, in which the candidates are zero.

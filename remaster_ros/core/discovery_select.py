@@ -132,7 +132,7 @@ class Search:
             share = self.held_out_share(solution, candidate)
             new = tuple(cell for cell in candidate.cells if cell not in solution.cells)
             step = Step(new, p_value, share, candidate.log_evidence - solution.log_evidence)
-            if p_value > SIGNIFICANCE or share < LEAST_GAIN:
+            if p_value > SIGNIFICANCE or share < _least_share(solution, candidate):
                 rejected = step
                 break
             steps.append(step)
@@ -205,11 +205,11 @@ class Search:
             return list(cells)
         data = self.data
         fixed = [cell for cell in given if cell.penalty is None]
-        start = np.concatenate((data.base, data.row_columns(fixed)), axis=2)
+        start = np.concatenate((data.base, data.columns(fixed)), axis=2)
         known, _ = np.linalg.qr(_unit(start.reshape(3 * len(data), -1)))
         kept = []
         for cell in cells:
-            block = _unit(data.row_columns([cell]).reshape(3 * len(data), -1))
+            block = _unit(data.columns([cell]).reshape(3 * len(data), -1))
             left = block - known @ (known.T @ block)
             left -= known @ (known.T @ left)
             if np.linalg.svd(left, compute_uv=False)[-1] < FAMILY_ABSORBED:
@@ -345,6 +345,15 @@ class Search:
             self._last_held_out = larger, float(after.sum())
         before = held_out_error(self.data, smaller, larger.noise, self._fold_of_pose)
         return float(1.0 - self._last_held_out[1] / before.sum())
+
+
+def _least_share(solution: Solution, candidate: Solution) -> float:
+    """Return the share of the held-out error that a candidate has to save.
+
+    What needs no more parameters than the set it replaces has only to do no worse: a family of
+    curves that stood in for a weaker cause gives way to it.
+    """
+    return LEAST_GAIN if len(candidate.parameters) > len(solution.parameters) else 0.0
 
 
 # A member of a family that the others explain to this share of its size is another name for them.

@@ -55,7 +55,7 @@ def draw_rows(
     """Return about `most` of the given rows, drawn evenly over time; all where they are fewer.
 
     Whole poses are drawn, one of every few consecutive ones that the same sensors saw. Where that
-    would leave few poses, all are kept with fewer rows of each.
+    would leave few poses, `FEWEST_POSES` are, with fewer rows of each.
 
     Parameters
     ----------
@@ -83,13 +83,14 @@ def draw_rows(
     for kind in range(int(kinds.max()) + 1):
         poses = np.flatnonzero(kinds == kind)
         poses = poses[np.argsort(first[poses])]
+        wanted = share * len(poses)
         drawn = poses
-        if share * len(poses) >= FEWEST_POSES:
-            drawn = poses[_one_of_each(len(poses), round(share * len(poses)), rng)]
+        if len(poses) > FEWEST_POSES:
+            drawn = poses[_one_of_each(len(poses), max(FEWEST_POSES, round(wanted)), rng)]
         mine = np.flatnonzero(np.isin(pose, drawn))
-        if share * len(poses) < FEWEST_POSES:
+        if wanted < FEWEST_POSES:
             group = pose[mine] * seen.shape[1] + measurements.sensor[rows[mine]]
-            mine = mine[_some_of_each_group(group, share, rng)]
+            mine = mine[_some_of_each_group(group, wanted / len(drawn), rng)]
         kept.append(rows[mine])
     return np.sort(np.concatenate(kept))
 

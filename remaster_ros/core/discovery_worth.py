@@ -35,7 +35,7 @@ def held_out_error(
     fold_of_pose
         Poses with the same number are left out together, (poses,).
     """
-    columns = data.row_columns(solution.cells)
+    columns = data.columns(solution.cells)
     joined = np.concatenate((data.base, columns, data.errors[:, :, None]), axis=2)
     white = data.whitened(joined, noise).reshape(3 * len(data), -1)
     scale = np.linalg.norm(white, axis=0)

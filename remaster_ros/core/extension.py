@@ -8,7 +8,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from remaster_ros.core.types import FloatArray
+import numpy as np
+
+from remaster_ros.core.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """What some of the parameters do, in one place.
+
+    Attributes
+    ----------
+    where
+        Which parameters, in order.
+    at
+        Index of the joint whose angle they add to; None where they displace the marker.
+    values
+        Added joint angle, rad per unit, (n, c), or displacement in base coordinates R, m per unit,
+        (n, 3, c): of all that does not enter through a joint angle (links, base, marker, sensor
+        frame), the derivative at ``theta0``.
+    """
+
+    where: slice
+    at: int | None
+    values: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,8 +40,8 @@ class Extension:
 
     The marker of row n is predicted at::
 
-        chain.positions(q + offsets + joint @ theta)
-        + displacement0 + displacement @ (theta - theta0)
+        chain.positions(q + offsets + Σ turning terms: values @ theta)
+        + displacement0 + Σ displacing terms: values @ (theta - theta0)
 
     in base coordinates R, then registered as without an extension. Rows are those of the
     `Measurements` (``Rows.source``).
@@ -29,13 +52,10 @@ class Extension:
         'compliance_2', …, m names.
     units
         'rad/(N m)', …, m units.
-    joint
-        Added to the reported joint angles, rad per unit of theta, (n, k, m).
-    displacement
-        All that does not enter through a joint angle (links, base, marker, sensor frame): its
-        derivative by theta at ``theta0`` in base coordinates, m per unit, (n, 3, m).
+    terms
+        What they do. A curve of a joint has a hundred parameters, which concern this joint alone.
     displacement0
-        Its exact value at ``theta0``, m, (n, 3).
+        Exact value at ``theta0`` of what the displacing terms are derivatives of, m, (n, 3).
     theta0
         Where it was linearised, (m,).
     prior_precision
@@ -44,8 +64,53 @@ class Extension:
 
     names: tuple[str, ...]
     units: tuple[str, ...]
-    joint: FloatArray
-    displacement: FloatArray
+    terms: tuple[Term, ...]
     displacement0: FloatArray
     theta0: FloatArray
     prior_precision: FloatArray
+
+    def turns(self, theta: FloatArray, rows: IntArray, joints: int) -> FloatArray:
+        """Return the joint angles that theta (..., m) adds to n rows, rad, (..., n, joints)."""
+        added = np.zeros((*theta.shape[:-1], len(rows), joints))
+        for term in self.terms:
+            if term.at is not None:
+                added[..., term.at] += _product(term.values[rows], theta[..., term.where])
+        return added
+
+    def shifts(self, theta: FloatArray, rows: IntArray) -> FloatArray:
+        """Return the displacements of n rows by theta (..., m), in R, m, (..., n, 3)."""
+        step = theta - self.theta0
+        shift = np.zeros((*theta.shape[:-1], len(rows), 3))
+        for term in self.terms:
+            if term.at is None:
+                shift += _product(term.values[rows], step[..., term.where])
+        shift += self.displacement0[rows]
+        return shift
+
+    def derivative(self, by_joints: FloatArray, base: FloatArray, rows: IntArray) -> FloatArray:
+        """Return the derivative of n points by theta, m per unit, (n, 3, m).
+
+        Parameters
+        ----------
+        by_joints
+            Derivative of the points by the joint angles, m/rad, (n, 3, k).
+        base
+            Rotation that displacements are turned by, (3, 3).
+        rows
+            Their indices in the measurements, (n,).
+        """
+        result = np.zeros((len(rows), 3, len(self.theta0)))
+        for term in self.terms:
+            values = term.values[rows]
+            if term.at is None:
+                result[:, :, term.where] += base @ values
+            else:
+                result[:, :, term.where] += by_joints[:, :, term.at, None] * values[:, None, :]
+        return result
+
+
+def _product(values: FloatArray, theta: FloatArray) -> FloatArray:
+    """Return values (n, ..., c) times theta (draws..., c): (draws..., n, ...), one product."""
+    c = values.shape[-1]
+    product = theta.reshape(-1, c) @ values.reshape(-1, c).T
+    return product.reshape(*theta.shape[:-1], *values.shape[:-1])

@@ -32,6 +32,8 @@ WEAK_FACTOR = 5.0
 WEAK_SHARE = 0.1
 # Entries of a direction below this share of its largest are rounding errors.
 NEGLIGIBLE = 1e-5
+# Rows whose derivatives are at hand at a time.
+BLOCK_ROWS = 5_000
 
 
 @dataclass(frozen=True)
@@ -146,19 +148,15 @@ def _null_space(
 
     Last come the joints that are hardly seen: direction, index and standard deviation, rad.
     """
-    derivative = model.natural_jacobian(x, rows)
-    errors = rows.target - model.predict(model.pinned(x), rows)
-    for spread, (_, span) in zip(robust_spread(errors, rows), rows.spans, strict=True):
-        derivative[span] /= spread
-    flat = derivative.reshape(-1, model.size)
-    scale = np.linalg.norm(flat, axis=0)
+    triangle = _triangle(model, x, rows)
+    scale = np.linalg.norm(triangle, axis=0)
     # What the data do not see at all is measured by its prior, else by what they see best.
     unseen = np.full(model.size, scale.max())
     if model.extension is not None:
         known = np.sqrt(np.diag(model.extension.prior_precision))
         unseen[model.core :] = np.where(known > 0.0, known, scale.max())
     scale = np.where(scale > ROUNDING * scale.max(), scale, unseen)
-    triangle: FloatArray = np.asarray(np.linalg.qr(flat / scale, mode='r'))
+    triangle = triangle / scale
     _, singular, vectors = np.linalg.svd(triangle, full_matrices=True)
     singular = np.append(singular, np.zeros(len(vectors) - len(singular)))
     null = singular < ROUNDING * singular[0]
@@ -175,6 +173,25 @@ def _null_space(
     joints = np.arange(model.size) < model.joints
     weak = _nearly_null(triangle, scale, pivots, joints, WEAK_ANGLE, WEAK_FACTOR)
     return scale, basis, pivots, weak
+
+
+def _triangle(model: Model, x: FloatArray, rows: Rows) -> FloatArray:
+    """Return R of the data's Jacobian J = Q R in units of their spread, (size, size) at most.
+
+    From blocks of rows, so that memory does not grow with their number.
+    """
+    errors = rows.target - model.predict(model.pinned(x), rows)
+    spread = np.ones(len(model.sensor_names))
+    spread[[sensor for sensor, _ in rows.spans]] = robust_spread(errors, rows)
+    triangle = np.zeros((0, model.size))
+    for first, last in rows.blocks(BLOCK_ROWS):
+        block = rows.of_groups(first, last)
+        derivative = model.natural_jacobian(x, block)
+        for sensor, span in block.spans:
+            derivative[span] /= spread[sensor]
+        stacked = np.concatenate((triangle, derivative.reshape(-1, model.size)))
+        triangle = np.asarray(np.linalg.qr(stacked, mode='r'))
+    return triangle
 
 
 def _nearly_null(

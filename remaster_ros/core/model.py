@@ -292,9 +292,7 @@ class Model:
         if self.extension is None:
             return np.zeros(self.joints), np.zeros(3)
         given, theta = self.extension, self.theta(x)
-        turns = _along_last(given.joint, theta)
-        shifts = given.displacement0 + _along_last(given.displacement, theta - given.theta0)
-        return turns[..., rows.source, :], shifts[..., rows.source, :]
+        return given.turns(theta, rows.source, self.joints), given.shifts(theta, rows.source)
 
     def _derivative(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> FloatArray:
         derivative = np.zeros((len(rows.q), 3, self.size))
@@ -305,8 +303,7 @@ class Model:
             # The joints themselves turn under the displacements.
             turned = by_joints.copy()
             turned[..., 0] -= np.cross(self.base_axis[1], self._extended(x, rows)[1] @ base.T)
-            by_theta = turned @ self.extension.joint[rows.source]
-            by_theta += base @ self.extension.displacement[rows.source]
+            by_theta = self.extension.derivative(turned, base, rows.source)
         correction = self.corrections(x)
         for sensor, span in rows.spans:
             turn = correction[sensor, :3, :3]
@@ -347,13 +344,6 @@ class Pose(NamedTuple):
     points: FloatArray
     axes: FloatArray
     by_joints: FloatArray
-
-
-def _along_last(tensor: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Return tensor (n, a, m) times vectors (..., m), (..., n, a): one product, nothing copied."""
-    n, a, m = tensor.shape
-    product = vectors.reshape(-1, m) @ tensor.reshape(-1, m).T
-    return product.reshape(*vectors.shape[:-1], n, a)
 
 
 def _rotation_about(point: FloatArray, axis: FloatArray, angle: FloatArray) -> FloatArray:

@@ -14,7 +14,6 @@ commanded then would begin where the arm is not.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,12 +29,8 @@ from remaster_ros.motion.actions import (
     Stop,
     SupervisorRules,
 )
-from remaster_ros.motion.following import (
-    STOPPED_ON_ITS_WAY,
-    Following,
-    Seen,
-    allowed_lag_s,
-)
+from remaster_ros.motion.following import Following, Seen, allowed_lag_s
+from remaster_ros.motion.interlocks import Interlocks
 from remaster_ros.motion.joint_reports import JointReport, JointReports
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import (
@@ -46,7 +41,7 @@ from remaster_ros.motion.motion_gate import (
 )
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.settling import SettleDetector
-from remaster_ros.motion.trajectory import Trajectory
+from remaster_ros.motion.visit import Braking, Visit
 
 PROBE = -1
 """The number of the move before the first one."""
@@ -56,49 +51,10 @@ STANDING = -3
 """The number of a question about where the arm stands, before it is moved at all."""
 PROBE_RAD = 1e-6
 """How far the probe goes, rad: less than the arm repeats, more than the last bit."""
-PROBE_WAIT_S = 0.5
-"""After its end a robot that copies commands has copied this one, s."""
 DOUBT_S = 0.5
 """Reports that are not believed for so long (wall time) halt the arm, s."""
-MOVED_RAD = 0.02
-"""An arm that was moved by so much while nothing was commanded was moved by another, rad."""
-ELSEWHERE_RAD = 0.05
-"""An arm that stands so far from its target does not follow, rad; nearer it is inaccurate."""
 STOPPED_S = 1.0
 """After the end of a stop the arm stands within so much time, s; the lag comes on top."""
-OWN_PAUSE_S = 0.5
-"""Between two looks at the clock passes less, s of wall time, or this process was paused."""
-
-
-@dataclass
-class _Visit:
-    """The configuration under way: when it was sent (stamp) and must have arrived (robot time)."""
-
-    solution: int
-    following: Following
-    detector: SettleDetector
-    sent_stamp: float
-    deadline: float
-    settled: bool = False
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """Where it was sent."""
-        return self.following.trajectory
-
-
-@dataclass(frozen=True)
-class _Braking:
-    """A stop under way: where it ends (rad, (k,)), and when the arm must stand (robot time)."""
-
-    end: FloatArray
-    deadline: float
-
-
-NAMES = ('planner', 'recorder', 'robot')
-"""Who must be alive; their reasons not to move count in this order."""
-OBSERVED = ('safety_link', 'controller', 'clock', 'rivals')
-"""What else must be right."""
 NO_WAYPOINTS: Mapping[int, FloatArray] = {}
 
 
@@ -129,33 +85,39 @@ class ArmSupervisor:
     ) -> None:
         self.gate, self.reports, self.rules = gate, reports, rules
         self.halted = halted
-        self._heard: dict[str, float] = {}
-        # Why the arm must not move, by each reason's origin; '' if it may.
-        self._reasons: dict[str, str] = {}
+        # Before a collection is begun (again) by a person nothing moves.
+        self._interlocks = Interlocks(rules.heartbeat_s, must_collect=bool(halted))
         self._failures = 0
         self._must_probe = self._must_look = True
-        # Before a collection is begun (again) by a person nothing moves.
-        self._must_collect = bool(halted)
         self._seen: Seen | None = None
         self._doubted_wall: float | None = None
-        self._ticked_wall: float | None = None
-        self._braking: _Braking | None = None
+        self._braking: Braking | None = None
         self._offered: FreePath | None = None
         self._way_out: FreePath | None = None
         self._requests = 0
         # The number of the path that is asked for, and of the solution that it leads to.
         self._pending: tuple[int, int] | None = None
-        self._visit: _Visit | None = None
+        self._visit: Visit | None = None
         self._begin(())
 
     # What comes in
 
-    def planner_is(self, state: str, wall_s: float) -> list[Action]:
-        """Take the planner's state; anything but ``running`` stops the arm."""
+    def planner_is(self, state: str, wall_s: float, run: str = '') -> list[Action]:
+        """Take the planner's state; anything but ``running`` stops the arm.
+
+        Parameters
+        ----------
+        state
+            As in its summary.
+        wall_s
+            Now, s.
+        run
+            Names the run of a collection: by another one a person's /remaster/collect is known.
+        """
         reason = '' if state == 'running' else f'planner is {state}'
-        if reason and not self.halted:
-            self._must_collect, self._failures = False, 0
-        return self._hear('planner', reason, wall_s)
+        if self._interlocks.planner(reason, run, wall_s, halted=bool(self.halted)):
+            self._failures = 0
+        return self.tick(wall_s)
 
     def recorder_waits(self, waiting_for: str, wall_s: float) -> list[Action]:
         """Take the recorder's sign of life, and which required sensor it misses ('' for none)."""
@@ -195,7 +157,8 @@ class ArmSupervisor:
 
     def emergency(self, stopped: bool, wall_s: float) -> list[Action]:
         """Take the state of the robot's own safety circuit."""
-        self._reasons['safety'] = 'the robot reports an emergency stop' if stopped else ''
+        reason = 'the robot reports an emergency stop' if stopped else ''
+        self._interlocks.set('safety', reason)
         return self.tick(wall_s)
 
     def observe(self, name: str, trouble: str, wall_s: float) -> list[Action]:
@@ -204,17 +167,18 @@ class ArmSupervisor:
         Parameters
         ----------
         name
-            One of `OBSERVED`: the link to the safety circuit, the controller, the node's clock,
-            who else publishes what moves the arm. The last always halts a collection; the others
-            where they were right before, and else only hold it: they take a while at the start.
+            One of `interlocks.OBSERVED`: the link to the safety circuit, the controller, the
+            node's clock, who else publishes what moves the arm. The last always halts a
+            collection; the others where they were right before, and else only hold it: they take
+            a while at the start.
         trouble
             What is wrong; '' for nothing.
         wall_s
             Now, s.
         """
-        before = self._reasons.get(name)
-        self._reasons[name] = trouble
-        if trouble and self._engaged and not self.halted and (name == 'rivals' or before == ''):
+        halts = name == 'rivals' or self._interlocks.was_right(name)
+        self._interlocks.set(name, trouble)
+        if trouble and halts and self._engaged and not self.halted:
             return self._halt(trouble, wall_s, stop=True)
         return self.tick(wall_s)
 
@@ -222,7 +186,7 @@ class ArmSupervisor:
         """Take a report of the joints."""
         wall_s = report.wall_s
         if not self.reports.believes(report):
-            return self._doubt(self.reports.trouble, wall_s)
+            return self._doubt(self.reports.trouble, wall_s, self.reports.kind)
         self._doubted_wall = None
         gap = self._gap(report)
         self._excuse_gap(report)
@@ -232,9 +196,11 @@ class ArmSupervisor:
         if gap:
             actions = self._halt(gap, wall_s)
         elif visit is not None and visit.settled:
-            actions = self._watch_settled(visit, seen)
+            waits = bool(self._interlocks.reason('recorder'))
+            outcome = visit.judge_settled(seen, recorder_waits=waits)
+            actions = self._conclude(visit, *outcome, seen)
         elif visit is not None:
-            actions = self._judge(visit, seen)
+            actions = self._conclude(visit, *visit.judge(seen, self._rate), seen)
         elif self._braking is not None:
             actions = self._watch_braking(self._braking, seen)
         return actions + self._hear('robot', '', wall_s)
@@ -263,18 +229,21 @@ class ArmSupervisor:
         What stands in the way of a motion still does; nothing moves before the collection is
         begun again.
         """
-        if self._reasons.get('safety'):
-            return self._reasons['safety']
+        if self._interlocks.reason('safety'):
+            return self._interlocks.reason('safety')
         if not self.halted:
             return 'the arm is not halted'
         self.halted, self._failures = '', 0
-        self._must_collect = self._must_probe = self._must_look = True
+        # A planner that does not run begins only by a person's word; one that runs has to be heard
+        # of otherwise first.
+        self._interlocks.must_collect = not self._interlocks.reason('planner')
+        self._must_probe = self._must_look = True
         self._way_out, self._offered = self._offered, None
         # What was not believed may be the truth now: a robot that was mastered, a clock that was
         # set. It is learned anew while the arm stands.
         self.reports.forget()
         self._seen, self._doubted_wall, self._braking = None, None, None
-        self._reasons['robot'] = ''
+        self._interlocks.set('robot', '')
         return ''
 
     def use_limits(self, limits: MotionLimits, wall_s: float) -> list[Action]:
@@ -285,15 +254,15 @@ class ArmSupervisor:
 
     def tick(self, wall_s: float) -> list[Action]:
         """Look at the time: stop or halt on silence, go on when nothing is in the way."""
-        self._excuse_own_pause(wall_s)
+        self._interlocks.look(wall_s)
         if self.halted:
             return []
-        emergency = self._reasons.get('safety')
+        emergency = self._interlocks.reason('safety')
         if emergency:
             return self._halt(emergency, wall_s)
-        silent = self._silence_s('robot', wall_s) > self.rules.heartbeat_s
-        if silent and 'robot' in self._heard and self._engaged:
-            return self._halt(f'no sign of robot for {self.rules.heartbeat_s:g} s', wall_s)
+        silent = self._interlocks.fell_silent('robot', wall_s)
+        if silent and self._engaged:
+            return self._halt(silent, wall_s)
         blocked = self.blocked(wall_s)
         return self._stop(blocked, wall_s) if blocked else self._go_on(wall_s)
 
@@ -312,24 +281,15 @@ class ArmSupervisor:
     @property
     def trouble(self) -> str:
         """What is wrong with the reports of the joints; ''."""
-        return self._reasons.get('robot', '')
+        return self._interlocks.reason('robot')
 
     def report_age_s(self, wall_s: float) -> float:
         """Time since a report was believed, s; infinite if none was."""
-        return self._silence_s('robot', wall_s)
+        return self._interlocks.silence_s('robot', wall_s)
 
     def blocked(self, wall_s: float) -> str:
         """Why the arm must not move; '' if it may."""
-        limit = self.rules.heartbeat_s
-        if self.halted:
-            return self.halted
-        silent = [name for name in NAMES if self._silence_s(name, wall_s) > limit]
-        if silent:
-            return f'no sign of {", ".join(silent)} for {limit:g} s'
-        reasons = (self._reasons.get(name, '') for name in (*NAMES, *OBSERVED))
-        if self._must_collect and not self._reasons.get('planner'):
-            return 'the halt was cleared: /remaster/collect goes on'
-        return next(filter(None, reasons), '')
+        return self.halted or self._interlocks.blocked(wall_s)
 
     # Inside: reasons not to move
 
@@ -341,21 +301,20 @@ class ArmSupervisor:
     @property
     def _engaged(self) -> bool:
         """Whether a collection is running: what is wrong with the robot then halts it."""
-        running = 'planner' in self._heard and not self._reasons.get('planner')
-        return (running and not self._must_collect) or self._visit is not None
+        return self._interlocks.collecting or self._visit is not None
 
     def _hear(self, name: str, reason: str, wall_s: float) -> list[Action]:
-        self._heard[name], self._reasons[name] = wall_s, reason
+        self._interlocks.hear(name, reason, wall_s)
         return self.tick(wall_s)
 
-    def _doubt(self, why: str, wall_s: float) -> list[Action]:
+    def _doubt(self, why: str, wall_s: float, kind: str = '') -> list[Action]:
         """Take a report that is not believed; where that goes on it halts a collection."""
         if self._doubted_wall is None:
             self._doubted_wall = wall_s
         if wall_s - self._doubted_wall <= DOUBT_S:
             return self.tick(wall_s)
-        self._reasons['robot'] = why
-        jumped = self._seen is not None and self.reports.kind in ('too_fast', 'outside_limits')
+        self._interlocks.set('robot', why)
+        jumped = self._seen is not None and kind in ('too_fast', 'outside_limits')
         if (self._engaged or jumped) and not self.halted:
             return self._halt(why, wall_s)
         # Nothing moves, so that what is usual can be learned anew: a driver that was restarted, a
@@ -364,18 +323,6 @@ class ArmSupervisor:
         self._seen = None
         return self.tick(wall_s)
 
-    def _excuse_own_pause(self, wall_s: float) -> None:
-        """Shift what was last heard where this process was paused: nobody else was silent."""
-        last, self._ticked_wall = self._ticked_wall, wall_s
-        if last is None or wall_s - last <= OWN_PAUSE_S:
-            return
-        pause = wall_s - last
-        # Who was heard since is no exception, and nobody was heard in the future.
-        self._heard = {name: min(heard + pause, wall_s) for name, heard in self._heard.items()}
-
-    def _silence_s(self, name: str, wall_s: float) -> float:
-        return wall_s - self._heard[name] if name in self._heard else np.inf
-
     def _gap(self, report: JointReport) -> str:
         """Return in words that the arm was not observed for long while it was to be; ''."""
         if self._seen is None or not self._engaged or self.halted:
@@ -383,8 +330,6 @@ class ArmSupervisor:
         gap = (report.stamp_s - self._seen.stamp) / self._rate
         too_long = gap > self.rules.heartbeat_s
         return f'the robot was not observed for {gap:.1f} s' if too_long else ''
-
-    # Inside: the arm
 
     def _excuse_gap(self, report: JointReport) -> None:
         """Give an arm that was not seen for a while as much longer to arrive."""
@@ -454,7 +399,7 @@ class ArmSupervisor:
         deadline = time + trajectory.duration_s + rules.settle.settle_s + rules.arrive_timeout_s
         detector = SettleDetector(trajectory.end, rules.settle)
         following = Following(trajectory, time, wall_s, rules)
-        self._visit = _Visit(solution, following, detector, seen.stamp, deadline)
+        self._visit = Visit(solution, following, detector, rules, seen.stamp, deadline)
         return [Drive(solution, admitted)]
 
     def _give_up(self, solution: int, reason: str, wall_s: float) -> list[Action]:
@@ -480,76 +425,39 @@ class ArmSupervisor:
             f'(at most {WAY_OUT_TOOL_SPEED:g} m/s): {joints}'
         )
 
-    def _leave(self, visit: _Visit) -> None:
+    def _leave(self, visit: Visit) -> None:
         """Be done with a configuration: the next one follows."""
         self._visit, self._next = None, visit.solution + 1
 
     # Inside: the configuration under way
 
-    def _judge(self, visit: _Visit, seen: Seen) -> list[Action]:
-        """Say what becomes of the configuration that the arm is on its way to."""
-        detector, rules, wall_s = visit.detector, self.rules, seen.wall
-        trajectory, elapsed = visit.trajectory, visit.following.elapsed_s(seen.time)
-        settled = detector.update(seen.stamp, seen.q) == 'settled'
-        arrived = elapsed > trajectory.duration_s + PROBE_WAIT_S
-        if (arrived or settled) and np.array_equal(seen.q, trajectory.end):
-            why = 'joint_states repeat what was commanded to the last bit: no measurement'
-            return self._halt(f'{why}; switch the driver to measured positions', wall_s)
-        astray = visit.following.update(seen, self._rate)
-        if astray:
-            return self._halt(astray, wall_s)
-        if visit.solution < 0:
-            if arrived:
-                self._visit, self._must_probe = None, visit.solution != PROBE
-            return []
-        if settled:
+    def _conclude(self, visit: Visit, outcome: str, why: str, seen: Seen) -> list[Action]:
+        """Do what follows from what became of the configuration."""
+        if outcome == 'halted':
+            return self._halt(why, seen.wall)
+        if outcome == 'over':
+            self._visit, self._must_probe = None, visit.solution != PROBE
+        if outcome == 'settled':
+            self._failures, detector = 0, visit.detector
             assert detector.still_since is not None
-            visit.settled, self._failures = True, 0
-            visit.deadline = seen.time + rules.answer_timeout_s
             motion_s = detector.still_since - visit.sent_stamp
             settle_s = seen.stamp - detector.still_since
             return [Settled(visit.solution, seen.stamp, detector.mean, motion_s, settle_s)]
-        if not visit.following.reacted:
-            # On a simulated clock that runs fast its time is over before a command is seen.
-            return []
-        distance = float(np.max(np.abs(seen.q - trajectory.end)))
-        if distance > ELSEWHERE_RAD and arrived and seen.stands(wall_s):
-            return self._halt(STOPPED_ON_ITS_WAY, wall_s)
-        stood_s = min(seen.time - seen.stands_since, elapsed - trajectory.duration_s)
-        if distance > rules.settle.arrive_tolerance and stood_s >= rules.stall_s:
-            return self._fail(visit, f'arrived elsewhere: {distance:.4f} rad off', wall_s)
-        if seen.time > visit.deadline:
-            return self._fail(visit, 'did not come to rest at its target in time', wall_s)
-        return []
-
-    def _watch_settled(self, visit: _Visit, seen: Seen) -> list[Action]:
-        """Wait for the recorder's answer; the arm must stand meanwhile."""
-        moved = float(np.max(np.abs(seen.q - visit.trajectory.end)))
-        if moved > MOVED_RAD:
-            why = f'the arm was moved by {np.rad2deg(moved):.1f} deg, and not by a command'
-            return self._halt(why, seen.wall)
-        if self._reasons.get('recorder'):
-            visit.deadline = seen.time + self.rules.answer_timeout_s
-        elif seen.time > visit.deadline:
+        if outcome == 'failed' and visit.settled:
             self._leave(visit)
-            return [Failed(visit.solution, 'the recorder did not say what became of it')]
-        return []
+            return [Failed(visit.solution, why)]
+        return self._fail(visit, why, seen.wall) if outcome == 'failed' else []
 
-    def _watch_braking(self, braking: _Braking, seen: Seen) -> list[Action]:
+    def _watch_braking(self, braking: Braking, seen: Seen) -> list[Action]:
         """See that a stop is a stop."""
-        if seen.stands(seen.wall):
+        outcome, why = braking.judge(seen)
+        if outcome:
             self._braking = None
-            if np.max(np.abs(seen.q - braking.end)) <= ELSEWHERE_RAD:
-                return []
-            return self._halt('the arm stands, but not where its stop led', seen.wall)
-        if seen.time > braking.deadline:
-            self._braking = None
-            return self._halt('the arm goes on after a stop', seen.wall)
-        return []
+        return self._halt(why, seen.wall) if outcome == 'halted' else []
 
     # Inside: ends of a motion
 
-    def _fail(self, visit: _Visit, reason: str, wall_s: float) -> list[Action]:
+    def _fail(self, visit: Visit, reason: str, wall_s: float) -> list[Action]:
         """Give a configuration up; halt where that happens too often in a row."""
         self._failures += 1
         if self._failures >= self.rules.failures_in_a_row:
@@ -583,7 +491,7 @@ class ArmSupervisor:
             return self._halt(f'{reason}; {lost}: nothing is commanded', wall_s)
         return self._brake(visit, seen, reason, wall_s)
 
-    def _brake(self, visit: _Visit, seen: Seen, reason: str, wall_s: float) -> list[Action]:
+    def _brake(self, visit: Visit, seen: Seen, reason: str, wall_s: float) -> list[Action]:
         """Leave the rest of the line along the line."""
         self._visit, self._pending = None, None
         if visit.following.has_ended(seen, wall_s, self._rate):
@@ -596,5 +504,5 @@ class ArmSupervisor:
             + allowed_lag_s(self.rules, self._rate)
             + STOPPED_S
         )
-        self._braking = _Braking(stop.q, deadline)
+        self._braking = Braking(stop.q, deadline)
         return [Stop(admitted, reason)]

@@ -50,11 +50,11 @@ class Seen:
     time: float
     stands_at: FloatArray
     stands_since: float
-    late_s: float = 0.0
+    late_s: float
 
     @classmethod
     def after(
-        cls, last: Seen | None, report: JointReport, rules: SupervisorRules, late_s: float = 0.0
+        cls, last: Seen | None, report: JointReport, rules: SupervisorRules, late_s: float
     ) -> Seen:
         """Follow robot time and standstill; a gap begins the standstill anew."""
         q, stamp, wall = report.q, report.stamp_s, report.wall_s

@@ -28,7 +28,7 @@ LATE_S = 0.15
 """A report may come so much later than the others, s of the node's time."""
 LATE_WALL_S = 0.1
 """And so much, s of wall time: a busy machine delays by wall time, however fast a clock runs."""
-DRIFT = 2e-3
+DRIFT = 2e-4
 """Two clocks may run apart by so many seconds a second."""
 LEARN, LEARN_WALL_S = 5, 1.0
 """By so many reports at least, over so much wall time (s), is learned how long one takes.

@@ -89,8 +89,6 @@ class _Stretch:
         """Return time and end of a stop in the time that the slowest has left on the line."""
         time = max(self._left_s, 1.5 * (1.0 - self._x[0]) / self._rate, END_OF_STOP_S)
         low, high = -1.0, 1.0
-        if self._farthest(time, high) <= 1.0:
-            return time, high
         for _ in range(ROUNDS):
             end = 0.5 * (low + high)
             low, high = (low, end) if self._farthest(time, end) > 1.0 else (end, high)

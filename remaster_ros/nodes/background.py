@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import deque
 from collections.abc import Callable
 from queue import SimpleQueue
 from typing import Any
 
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 
 Work = Callable[[], Any]
@@ -50,7 +52,9 @@ class Background:
             except Exception as error:  # Whatever it is, the node must go on.
                 result = error
             self._results.append((then, result))
-            self._guard.trigger()
+            # A node that has ended meanwhile takes no result, and has no guard any more.
+            with contextlib.suppress(InvalidHandle):
+                self._guard.trigger()
 
     def _deliver(self) -> None:
         while self._results:

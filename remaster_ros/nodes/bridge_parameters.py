@@ -13,7 +13,7 @@ from remaster_ros.nodes.parameters import parameter
 class Parameters:
     """Parameters of the bridge."""
 
-    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
+    cell: str = parameter('', 'cell file: a path, or the name of a shipped one; must be given')
     speed_share: float = parameter(
         0.3,
         'share of each joint velocity limit that is used; while the arm moves, it is stopped and '

@@ -38,26 +38,38 @@ class OnlyPublisher:
         self._node, self._type = node, message_type
         self._topic = node.resolve_topic_name(topic)
         self._counter: Subscription | None = None
-        self._counted_wall, self._alive = 0.0, 0
+        # Since when several are listed, all of them with a lease; wall time, s.
+        self._several_wall: float | None = None
+        self._alive = 0
 
     def trouble(self) -> str:
         """Return who publishes there, if they are more than one; ''."""
         if self._node.count_publishers(self._topic) <= 1:
-            self._count(False)
+            self._several_wall = None
             return ''
         listed = self._node.get_publishers_info_by_topic(self._topic)
         leased = [info for info in listed if _has_lease(info)]
         if len(leased) < len(listed):
             # One without a lease beside another one.
             return self._words(listed) if len(listed) > 1 else ''
-        self._count(len(leased) > 1)
-        known = time.monotonic() - self._counted_wall > COUNT_WALL_S
-        return self._words(listed) if known and self._alive > 1 else ''
+        self._count()
+        now = time.monotonic()
+        if self._several_wall is None:
+            self._several_wall = now
+        known = now - self._several_wall > COUNT_WALL_S
+        return self._words(listed) if known and self._alive + self._own() > 1 else ''
 
-    def _count(self, wanted: bool) -> None:
-        """Begin or end to count those that are alive."""
-        if wanted and self._counter is None:
-            self._counted_wall, self._alive = time.monotonic(), 0
+    def _own(self) -> int:
+        """Return how many publishers are this node's own: Fast DDS counts no lease of theirs."""
+        return sum(publisher.topic_name == self._topic for publisher in self._node.publishers)
+
+    def _count(self) -> None:
+        """Begin to count those that are alive.
+
+        It is never ended: Fast DDS tells a subscription that is made again nothing of publishers
+        whose lease it has seen before.
+        """
+        if self._counter is None:
             self._counter = self._node.create_subscription(
                 self._type,
                 self._topic,
@@ -67,9 +79,6 @@ class OnlyPublisher:
                     liveliness=self._on_liveliness, use_default_callbacks=False
                 ),
             )
-        elif not wanted and self._counter is not None:
-            self._node.destroy_subscription(self._counter)
-            self._counter = None
 
     def _on_liveliness(self, change: QoSLivelinessChangedInfo) -> None:
         self._alive = change.alive_count

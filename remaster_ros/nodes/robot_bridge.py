@@ -58,8 +58,12 @@ MATCHED_WALL_S = 0.5
 """So much later than ours the controller's side of a DDS match may come."""
 WATCH_WALL_S = 0.05
 """How often silence and the graph are looked at."""
-KNOWN_OFFSET_RAD = np.deg2rad(0.1)
+KNOWN_OFFSET_RAD = float(np.deg2rad(0.1))
 """What may still be wrong with a joint whose offset is in use, for the clearance of paths."""
+OFFSET_STDS = 3.0
+"""Or so many standard deviations of the offset that is known least."""
+LISTENERS = ('robot_bridge', 'recorder', 'laser_tracker_markers')
+"""Nodes of ours that listen to what a controller is told."""
 
 
 class RobotBridge(RemasterNode):
@@ -68,12 +72,19 @@ class RobotBridge(RemasterNode):
     def __init__(self) -> None:
         super().__init__('robot_bridge')
         self.p = declare(self, Parameters, self._on_parameters)
+        if not self.p.cell:
+            raise InputError(
+                'robot_bridge: parameter cell is empty; give the cell file of this arm (demo, the '
+                'shipped one, is for the fakes)'
+            )
         cell = read_cell(self.p.cell)
         self.chain = cell.chain()
         self._order = JointOrder(self.chain.joint_names)
-        offsets = self._offsets(self.chain)
-        model = cell.collision_model(self.chain, None if offsets is None else KNOWN_OFFSET_RAD)
-        speeds = PointSpeeds(self.chain, model.extent_points)
+        offsets, unknown_rad = self._offsets(self.chain)
+        # Paths are checked where the arm is, not where its encoders put it.
+        true_arm = self.chain if offsets is None else self.chain.with_offsets(offsets)
+        model = cell.collision_model(true_arm, unknown_rad)
+        speeds = PointSpeeds(true_arm, model.extent_points)
         self._acceleration = cell.acceleration_limits(self.chain)
         self._limits = partial(self._make_limits, offsets)
         self._halt_file = HaltFile(self.get_fully_qualified_name())
@@ -115,18 +126,26 @@ class RobotBridge(RemasterNode):
         self.create_timer(WATCH_WALL_S, self._watch, clock=self.status.steady)
         if self.supervisor.halted:
             self.get_logger().error(f'halted: {self.supervisor.halted}')
+        for pair in model.left_out:
+            self.get_logger().info(f'collisions: {pair}')
         if not self.p.cartesian_speed_limit_m_s:
             self.get_logger().warning(
                 'no Cartesian speed limit (cartesian_speed_limit_m_s is 0): the joints alone '
                 'limit the speed of the arm'
             )
 
-    def _offsets(self, chain: SerialChain) -> FloatArray | None:
-        """Return the offsets in use, rad, (k,); what a fit could not tell counts as none."""
+    def _offsets(self, chain: SerialChain) -> tuple[FloatArray | None, float | None]:
+        """Return the offsets in use, rad, (k,), and what a joint's may still be off by, rad.
+
+        What a fit could not tell counts as no offset, and as little is known of it as before: the
+        clearance of the cell file remains then (None).
+        """
         if not self.p.offsets:
-            return None
+            return None, None
         offsets, std = joint_offsets_rad(read_fit(self.p.offsets), chain.joint_names)
-        return np.where(std > 0.0, offsets, 0.0)
+        told = std > 0.0
+        unknown = max(KNOWN_OFFSET_RAD, OFFSET_STDS * float(np.max(std))) if told.all() else None
+        return np.where(told, offsets, 0.0), unknown
 
     def _make_limits(self, offsets: FloatArray | None, p: Parameters) -> MotionLimits:
         return MotionLimits.of(
@@ -156,7 +175,7 @@ class RobotBridge(RemasterNode):
             if state == 'running':
                 # By it a planner that is started again sees that this bridge was there all along.
                 self._run = values.get('run', '')
-            self._do(self.supervisor.planner_is(state, now))
+            self._do(self.supervisor.planner_is(state, now, values.get('run', '')))
         elif node == 'recorder':
             self._do(self.supervisor.recorder_waits(values.get('waiting_for', ''), now))
 
@@ -171,21 +190,29 @@ class RobotBridge(RemasterNode):
         self._waypoints = message
 
     def _on_solutions(self, message: JointTrajectory) -> None:
-        names = self.chain.joint_names
         try:
-            columns = [list(message.joint_names).index(name) for name in names]
-            solutions = [[point.positions[c] for c in columns] for point in message.points]
+            targets = self._targets(message)
             belongs = self._waypoints.header.stamp == message.header.stamp
+            names = self.chain.joint_names
             waypoints = waypoints_by_solution(self._waypoints, names) if belongs else {}
-        except (ValueError, IndexError, InputError):
-            self.get_logger().error(
-                f'joint_solutions dropped: they are for {", ".join(message.joint_names)}, '
-                f'the cell has {", ".join(names)}'
-            )
+        except InputError as error:
+            self.get_logger().error(f'joint_solutions dropped: {error}')
             return
         self._pose_stamp = stamp_key(message.header.stamp)
-        targets = np.reshape(np.array(solutions, float), (-1, len(self.chain)))
         self._do(self.supervisor.plan(targets, time.monotonic(), waypoints))
+
+    def _targets(self, message: JointTrajectory) -> FloatArray:
+        """Return the solutions by the names of the cell's joints, rad, (m, k)."""
+        names, given = self.chain.joint_names, list(message.joint_names)
+        if not message.points:
+            # A stop, whatever joints it names.
+            return np.empty((0, len(names)))
+        if not set(names) <= set(given):
+            raise InputError(f'they are for {", ".join(given)}, the cell has {", ".join(names)}')
+        if any(len(point.positions) != len(given) for point in message.points):
+            raise InputError(f'a point has not as many positions as joints, {len(given)}')
+        columns = [given.index(name) for name in names]
+        return np.array([point.positions for point in message.points])[:, columns]
 
     def _on_joint_state(self, message: JointState) -> None:
         now = time.monotonic()
@@ -230,13 +257,18 @@ class RobotBridge(RemasterNode):
             if not self.status.alone(now):
                 return 'looking for another robot_bridge of this name'
             self._controller = self.create_publisher(JointTrajectory, COMMANDS, LEASED)
-        if not self._controller.get_subscription_count():
+        if not (self._controller.get_subscription_count() and self._controller_is_listed()):
             self._listened_wall = None
         elif self._listened_wall is None:
             self._listened_wall = now
         if self._listened_wall is None or now - self._listened_wall < MATCHED_WALL_S:
             return f'no controller listens to {self.resolve_topic_name(COMMANDS)}'
         return ''
+
+    def _controller_is_listed(self) -> bool:
+        """Whether somebody else than nodes of ours listens to the commands."""
+        found = self.get_subscriptions_info_by_topic(self.resolve_topic_name(COMMANDS))
+        return any(info.node_name not in LISTENERS for info in found)
 
     # What goes out
 

@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 
 from remaster_ros.core.discovery import Discovery
 from remaster_ros.core.effects.cell import Cell
+from remaster_ros.core.effects.scene import Scene
 from remaster_ros.core.types import FloatArray
 from remaster_ros.storage.figures import AFTER, BEFORE, INK, STYLE, WIDTH_IN, log_axis
 
@@ -24,6 +25,8 @@ ARC_MINUTE = np.radians(1.0 / 60.0)
 BINS = 12
 SCATTER_POINTS = 800
 MOST_CAUSES = 8
+# Of a larger session the curves are drawn at the rows that were searched.
+MOST_DRAWN = 20_000
 
 
 def draw_discovery(discovery: Discovery) -> dict[str, str]:
@@ -99,13 +102,13 @@ def gain(discovery: Discovery) -> Figure:
 def drivers(discovery: Discovery) -> Figure:
     """Draw, joint by joint, the errors along the joint's motion against every driver."""
     data, selection = discovery.residuals, discovery.selection
-    scene, rows = data.scene, data.rows.source
+    scene = data.part
     by_joint: list[tuple[str, Callable[[int], FloatArray] | None]] = [
-        ('own angle (°)', lambda j: np.degrees(scene.measurements.q[rows, j])),
-        ('gravity torque (N m)', lambda j: scene.gravity_torque[rows, j]),
-        ('last move (°)', lambda j: np.degrees(scene.last_move[rows, j])),
-        ('time (h)', lambda j: scene.elapsed_s[rows] / 3600.0),
-        ('temperature (K)', lambda j: scene.warming[rows]),
+        ('own angle (°)', lambda j: np.degrees(scene.measurements.q[:, j])),
+        ('gravity torque (N m)', lambda j: scene.gravity_torque[:, j]),
+        ('last move (°)', lambda j: np.degrees(scene.last_move[:, j])),
+        ('time (h)', lambda j: scene.elapsed_s / 3600.0),
+        ('temperature (K)', lambda j: scene.warming),
     ]
     shown = [True, scene.has_gravity, scene.has_approach, scene.has_time, scene.has_temperature]
     kept = [pair for pair, show in zip(by_joint, shown, strict=True) if show]
@@ -122,13 +125,13 @@ def drivers(discovery: Discovery) -> Figure:
         hspace=0.7,
         wspace=0.1,
     )
-    motion = scene.jacobian[rows]
+    motion = scene.jacobian
     length = np.maximum(np.linalg.norm(motion, axis=1), 1e-6)
     fits = [(selection.empty, BEFORE, 'before')]
     if discovery.groups:
         fits.append((selection.solution, AFTER, 'after'))
     for fit, color, _ in fits:
-        left = data.unexplained(fit)[rows]
+        left = data.left(fit)
         along = 1e3 * np.einsum('nij,ni->nj', motion, left) / length
         for row, (_, value) in enumerate(kept):
             for joint in range(joints):
@@ -168,7 +171,7 @@ def _binned(ax: Axes, x: FloatArray, y: FloatArray, color: str) -> None:
 
 def causes(discovery: Discovery) -> Figure:
     """Draw each cause: what is left without it against what drives it, and the fit with band."""
-    panels = [cell for group in discovery.groups for cell in group if _driver(discovery, cell)]
+    panels = [cell for group in discovery.groups for cell in group if cell.place == 'joint_angle']
     constant = [
         (effect, group)
         for effect, group in zip(discovery.effects, discovery.groups, strict=False)
@@ -192,11 +195,8 @@ def causes(discovery: Discovery) -> Figure:
     return figure
 
 
-def _driver(discovery: Discovery, cell: Cell) -> tuple[str, FloatArray] | None:
-    """Return label and value of what drives a joint's cause, (n,); None for other places."""
-    if cell.place != 'joint_angle':
-        return None
-    scene = discovery.residuals.scene
+def _driver(scene: Scene, cell: Cell) -> tuple[str, FloatArray]:
+    """Return label and value of what drives a cause at a joint's angle, (n,)."""
     joint = cell.joints[-1] - 1
     if cell.driver == 'own_angle' or cell.driver.startswith('angle_of'):
         return f'angle of joint {joint + 1} (°)', np.degrees(scene.measurements.q[:, joint])
@@ -214,11 +214,15 @@ def _driver(discovery: Discovery, cell: Cell) -> tuple[str, FloatArray] | None:
 def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     """Draw one cause at a joint's angle, in arc minutes."""
     data, solution = discovery.residuals, discovery.selection.solution
-    driver = _driver(discovery, cell)
-    assert driver is not None
-    label, x = driver
+    whole = len(data.scene) <= MOST_DRAWN
+    scene = data.scene if whole else data.part
+    left = data.unexplained(solution) if whole else data.left(solution)
+    fitted = np.ones(len(scene), dtype=bool)
+    if whole:
+        fitted = np.isin(np.arange(len(scene)), data.rows.source)
+    label, x = _driver(scene, cell)
     where = dict(zip(solution.cells, solution.slices(), strict=True))[cell]
-    columns = cell.columns(data.scene)
+    columns = cell.columns(scene)
     assert columns.at is not None
     index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
     chosen = [index[name] for name in cell.parameters]
@@ -227,14 +231,13 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     values = columns.values
     if cell.form in ('free', 'sin/cos'):
         # A curve's mean is a zero-offset.
-        values = values - values[data.rows.source].mean(axis=0)
+        values = values - values[fitted].mean(axis=0)
     effect = values @ solution.parameters[where] / ARC_MINUTE
     spread = (values @ draws.T / ARC_MINUTE).std(axis=1)
-    motion = data.scene.jacobian[:, :, columns.at]
-    left = data.unexplained(solution)
+    motion = scene.jacobian[:, :, columns.at]
     # What is left, as an angle of this joint: only where the marker is far from its axis.
     square = np.sum(motion**2, axis=1)
-    far = np.isin(np.arange(len(x)), data.rows.source) & (square > 0.1 * np.median(square))
+    far = fitted & (square > 0.1 * np.median(square))
     angle = np.sum(motion * left, axis=1)[far] / square[far] / ARC_MINUTE
     shown = slice(None, None, max(1, int(far.sum()) // SCATTER_POINTS))
     points = (effect[far] + angle)[shown]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -41,18 +40,20 @@ class HaltFile:
 
     def __init__(self, node: str, environment: Mapping[str, str] = os.environ) -> None:
         home = Path(environment.get('ROS_HOME') or Path.home() / '.ros')
-        name = re.sub(r'[^A-Za-z0-9]+', '_', node.strip('/'))
+        # No name of a node has a point: /a/b and /a_b have a file each.
+        name = node.strip('/').replace('/', '.')
         domain = environment.get('ROS_DOMAIN_ID') or '0'
         self.path = home / 'remaster_ros' / f'halt_{domain}_{name}.json'
 
     def read(self) -> str:
         """Return why the arm is halted, '' if it is not; a damaged file is a halt, too."""
-        if not self.path.exists():
-            return ''
         try:
+            if not self.path.exists():
+                return ''
             data = read_limited(self.path, LIMIT, 'it holds a halt')
             halt = msgspec.json.decode(data, type=_Halt)
-        except (InputError, msgspec.DecodeError) as error:
+        except (OSError, InputError, msgspec.DecodeError) as error:
+            # What the disk does not answer may be a halt.
             return f'{self.path}: a halt that cannot be read ({error})'
         return f'{halt.halted} (halted {halt.since}, before this bridge was started)'
 

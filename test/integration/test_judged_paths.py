@@ -7,7 +7,8 @@ half of that. In the small; benchmarks/bench_paths.py does twelve cells.
 import numpy as np
 import pytest
 
-pytest.importorskip('fcl')
+pytest.importorskip('fcl', reason='needs the judge: pip install python-fcl')
+pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
 from bench_paths import tours
 from path_cells import SPECS, make_cell

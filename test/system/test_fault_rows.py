@@ -20,8 +20,9 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 
 ALL = bool(fault_page.MODE)
 TRIED = [row for row in fault_rows.ROWS if ALL or row.quick]
-TRIED.sort(key=lambda row: row.bench)
-ENOUGH = 6
+TRIED.sort(key=lambda row: (list(fault_rows.BENCHES).index(row.bench), not row.quick))
+TRIES = 3
+ENOUGH = 12
 """So many configurations must be left for another row."""
 FIVE_HEADING = 'situation', 'commanded before', 'commanded now', 'what is said', 'how it goes on'
 BAD_FITS = {'no gauge': '{"format": "remaster-fit/1", "joint_offsets": []}', 'garbage': '\0{"f'}
@@ -48,7 +49,7 @@ class Benches:
             from fault_bench import Bench
 
             folder = self._folders.mktemp(f'faults_{next(self._numbers)}')
-            self._kind, self.broken = kind, False
+            self._kind, self.broken = kind, True
             self._bench = Bench(folder, next(_domains), **fault_rows.BENCHES[kind])
             self._bench.begin()
         return self._bench
@@ -76,7 +77,8 @@ def write(section, seen):
     rows = fault_page.rows(section)
     if fault_page.MODE == 'write':
         rows = [row for row in rows if row[:keys] != seen[:keys]]
-    if not any(fault_page.same(seen, other) for other in rows):
+    known = [row for row in rows if row[:keys] == seen[:keys]]
+    if not any(fault_page.same(seen, other) for other in known):
         rows.append(seen)
     order += OTHERS
     rows = [row for row in rows if row[:keys] in order]
@@ -85,16 +87,21 @@ def write(section, seen):
     fault_page.replace(section, fault_page.table(heading, rows))
 
 
+def is_on_page(section, row):
+    """Return whether the page has this row, and the lines that it has of this fault."""
+    keys = 1 if section == 'five' else 2
+    page = [other for other in fault_page.rows(section) if other[:keys] == row[:keys]]
+    heading = FIVE_HEADING if section == 'five' else fault_rows.COLUMNS
+    return fault_page.allows(page, row, heading.index('what is said')), page
+
+
 def compare(section, row):
     """See that the page has this row, or write it there."""
     if fault_page.MODE:
         write(section, row)
         return
-    keys = 1 if section == 'five' else 2
-    page = [other for other in fault_page.rows(section) if other[:keys] == row[:keys]]
-    assert any(fault_page.same(row, other) for other in page), (
-        f'docs/faults.md is not what was observed (make faults writes it):\n{row}\n{page}'
-    )
+    known, page = is_on_page(section, row)
+    assert known, f'docs/faults.md is not what was observed (make faults):\n{row}\n{page}'
 
 
 def cells(row, seen):
@@ -110,12 +117,23 @@ def cells(row, seen):
 
 @pytest.mark.parametrize('row', TRIED, ids=lambda row: f'{row.who}: {row.fault}')
 def test_row(benches, row):
-    bench = benches.of(row.bench)
-    benches.broken = True
-    seen = fault_rows.observe(bench, row)
-    benches.broken = False
-    section, line = cells(row, seen)
-    print(line)
+    """What is commanded must be right every time; what is told, in one of some tries.
+
+    Which of several reasons comes first depends on the moment and on how busy the machine is.
+    """
+    for tried in range(1, TRIES + 1):
+        bench = benches.of(row.bench)
+        benches.broken = True
+        try:
+            seen = fault_rows.observe(bench, row)
+        except fault_rows.TooBusyError as busy:
+            benches.broken = False
+            pytest.skip(str(busy))
+        benches.broken = False
+        section, line = cells(row, seen)
+        print(line)
+        if fault_page.MODE or tried == TRIES or is_on_page(section, line)[0]:
+            break
     compare(section, line)
 
 
@@ -157,7 +175,7 @@ def test_offsets_that_are_none(fault, tmp_path):
     path = tmp_path / 'fit.json'
     path.write_text(BAD_FITS[fault])
     done = subprocess.run(
-        [*command, '-p', f'offsets:={path}'],
+        [*command, '-p', 'cell:=demo', '-p', f'offsets:={path}'],
         env=environment, capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 2, done.stderr

@@ -180,7 +180,14 @@ def test_a_collection_goes_on_where_the_tracker_does_not_see_its_marker(start, c
     cell.until(lambda: cell.results.count('recorded') == 1, 'the first registration pose')
     inject(tmp_path / 'world', {'tracker': {'search_fails': 1}})
     cell.kill_and_start('recorder')
+    cell.said.pop('pose_planner', None)
     cell.kill_and_start('pose_planner')
+    # With both gone nobody is left who took part in the run: a person has to begin it again.
+    cell.until(
+        lambda: cell.said.get('pose_planner', {}).get('resuming') == 'no', 'the decision to wait'
+    )
+    assert cell.said['pose_planner']['state'] == 'idle'
+    assert call(client, '/remaster/collect').success
     cell.until(lambda: 'partial' in cell.results, 'the next pose')
     inject(tmp_path / 'world', {})
     cell.check(cell.complete())

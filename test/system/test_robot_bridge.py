@@ -9,7 +9,9 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 pytest.importorskip('pinocchio', reason='the judge needs pinocchio (pip install .[test])')
 
-from hostile_bench import EMERGENCY, Bench, environment
+from hostile_bench import Bench
+from hostile_lines import EMERGENCY
+from hostile_process import environment
 from hostile_scene import HOME
 from simple_cells import write_cell
 

@@ -21,7 +21,7 @@ def cells(scene: Scene) -> Iterator[Cell]:
         def motion(scene: Scene, index: int = index) -> Columns:
             mine = scene.seen_by(index)
             amount = (scene.elapsed_s * mine)[:, None]
-            arms = scene.points - scene.points[mine].mean(axis=0)
+            arms = scene.points - scene.centers[index]
             axes = [scene.sensor_turn[:, :, axis] for axis in range(3)]
             shifts = [amount * axis for axis in axes]
             # A turn seen at one metre, which has the unit of the shifts.

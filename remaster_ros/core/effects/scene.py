@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,6 +21,8 @@ LEAST_TURN_RAD = 1e-2
 KNOWN_SHARE = 0.8
 # Temperatures that vary less than this drive nothing that could be seen.
 LEAST_WARMING_K = 0.2
+# Rows of a block: frames and Jacobians of so many take some ten megabytes.
+BLOCK_ROWS = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,9 +186,49 @@ class Scene:
         return np.einsum('nji,nj->ni', self.sensor_turn, shift)
 
     @cached_property
+    def centers(self) -> FloatArray:
+        """Mean of the modelled markers that each sensor saw, in R, m, (sensors, 3)."""
+        points = self.chain.positions(
+            self.measurements.q, self.markers[self.marker], self.joint_offsets
+        )
+        # A sensor without rows has no cell that asks for its centre.
+        seen = [points[self.seen_by(sensor)] for sensor in range(len(self.sensor_names))]
+        return np.array([rows.mean(axis=0) if len(rows) else np.zeros(3) for rows in seen])
+
+    @cached_property
     def range_m(self) -> FloatArray:
         """Distance from the row's sensor, m, (n,)."""
         return np.linalg.norm(self.in_sensor, axis=1)
+
+    def at(self, rows: IntArray) -> Scene:
+        """Return the scene of some rows, by their indices in this one and in that order.
+
+        Every value is that which the row has here, also where it depends on other rows: time
+        since the first row, the move before, a sensor's centre.
+        """
+        return PartOfScene(
+            self.chain,
+            self.measurements.select(rows),
+            self.sensor_names,
+            self.marker_names,
+            self.joint_offsets,
+            self.markers,
+            self.T_R_N,
+            self,
+            rows,
+        )
+
+    def blocks(self, rows: int = BLOCK_ROWS) -> Iterator[tuple[slice, Scene]]:
+        """Give the scene in runs of so many rows, each with its place; a small one as it is.
+
+        What a block computes goes with it, so memory does not grow with the rows.
+        """
+        if len(self) <= rows:
+            yield slice(0, len(self)), self
+            return
+        for start in range(0, len(self), rows):
+            where = slice(start, min(start + rows, len(self)))
+            yield where, self.at(np.arange(where.start, where.stop))
 
     def seen_by(self, sensor: int) -> BoolArray:
         """Return which rows a sensor measured, (n,)."""
@@ -212,3 +254,57 @@ class Scene:
     def link_rotation(self, joint: int) -> FloatArray:
         """Return the rotation of the link moved by a joint (1-based) in R, (n, 3, 3)."""
         return self.frames[:, joint - 1, :3, :3]
+
+
+@dataclass(frozen=True, eq=False)
+class PartOfScene(Scene):
+    """Some rows of a scene; what depends on more than a row itself is that of the whole.
+
+    Attributes
+    ----------
+    whole, rows
+        The scene, and which of its rows these are, (n,).
+    """
+
+    whole: Scene
+    rows: IntArray
+
+    @cached_property
+    def approach(self) -> FloatArray:
+        """As of the whole, (n, k)."""
+        return self.whole.approach[self.rows]
+
+    @cached_property
+    def has_approach(self) -> bool:
+        """As of the whole."""
+        return self.whole.has_approach
+
+    @cached_property
+    def elapsed_s(self) -> FloatArray:
+        """Time since the first row of the whole, s, (n,)."""
+        return self.whole.elapsed_s[self.rows]
+
+    @cached_property
+    def has_time(self) -> bool:
+        """As of the whole."""
+        return self.whole.has_time
+
+    @cached_property
+    def warming(self) -> FloatArray:
+        """Temperature above that of the whole's first row that knows one, K, (n,)."""
+        return self.whole.warming[self.rows]
+
+    @cached_property
+    def has_temperature(self) -> bool:
+        """As of the whole."""
+        return self.whole.has_temperature
+
+    @cached_property
+    def centers(self) -> FloatArray:
+        """As of the whole, (sensors, 3)."""
+        return self.whole.centers
+
+    @cached_property
+    def moving(self) -> tuple[int, ...]:
+        """As of the whole."""
+        return self.whole.moving

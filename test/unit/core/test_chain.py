@@ -276,3 +276,15 @@ def test_bad_urdf_is_refused_with_one_line_that_names_the_culprit(case):
 def test_links_that_make_no_chain_are_refused(base, tip, message):
     with pytest.raises(InputError, match=message):
         SerialChain.from_urdf(arm(), base, tip)
+
+
+def test_offsets_built_in_are_offsets_added():
+    """Frames of reported angles where the true ones are; limits where the true stops are."""
+    rng, _, chain = random_chain(5)
+    q, offsets = rng.uniform(-3, 3, (4, len(chain))), rng.normal(0, 0.3, len(chain))
+    arm = chain.with_offsets(offsets)
+    np.testing.assert_allclose(arm.frames(q), chain.frames(q, offsets), atol=1e-12)
+    np.testing.assert_allclose(arm.forward(q), chain.forward(q, offsets), atol=1e-12)
+    np.testing.assert_allclose(arm.lower + offsets, chain.lower)
+    np.testing.assert_allclose(arm.upper + offsets, chain.upper)
+    assert arm.joint_names == chain.joint_names

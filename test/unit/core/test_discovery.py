@@ -205,7 +205,7 @@ def test_whitening_makes_noise_of_the_model_white():
 def test_restricted_likelihood_has_the_gradient_it_says(name):
     data = residuals()
     cells = tuple(cells_named(name)[1:3])
-    columns = data.columns(cells)[data.rows.source]
+    columns = data.columns(cells)
     scale = np.sqrt(np.sum(columns**2, axis=(0, 1)))
     scale[scale == 0.0] = scale.max()
     strata = Strata.of(data, np.concatenate((data.base, columns / scale), axis=2))
@@ -237,7 +237,7 @@ def test_screening_scores_agree_with_a_least_squares_fit_of_each_cell():
         return float(np.sum((errors - columns @ solution) ** 2))
 
     for cell, score in zip(cells, scores, strict=True):
-        white = data.whitened(data.columns([cell])[data.rows.source], empty.noise)
+        white = data.whitened(data.columns([cell]), empty.noise)
         white = white.reshape(3 * len(data), -1)
         white /= np.maximum(np.linalg.norm(white, axis=0), 1e-30)
         left = white - base @ np.linalg.lstsq(base, white, rcond=None)[0]
@@ -283,9 +283,7 @@ def test_held_out_error_is_that_of_fits_without_the_pose():
     folds = np.arange(data.poses)
     by_pose = held_out_error(data, fit, fit.noise, folds)
     pose = 4
-    columns = np.concatenate(
-        (data.base, data.columns([cell])[data.rows.source], data.errors[:, :, None]), axis=2
-    )
+    columns = np.concatenate((data.base, data.columns([cell]), data.errors[:, :, None]), axis=2)
     white = data.whitened(columns, fit.noise)
     out = data.pose_of_row == pose
     kept = white[~out].reshape(-1, white.shape[2])

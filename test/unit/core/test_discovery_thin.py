@@ -60,6 +60,19 @@ def test_few_poses_with_many_rows_are_all_kept():
     assert set(groups[1].tolist()) == {100}
 
 
+def test_of_many_poses_with_many_rows_some_rows_of_some_poses_are_drawn():
+    """However the rows lie, about as many are drawn as were asked for."""
+    for rows in (11, 20, 100):
+        m = measurements(100_000 // rows, rows)
+        drawn = draw_rows(m, np.arange(len(m.pose)), rng(), most=5000)
+        poses, count = np.unique(m.pose[drawn], return_counts=True)
+        assert len(poses) == FEWEST_POSES
+        assert (np.diff(poses) > 0).all()
+        assert poses[-1] - poses[0] > 0.99 * (100_000 // rows)
+        assert count.min() >= 2
+        assert 4500 <= len(drawn) <= 5500
+
+
 def test_a_sensor_that_is_rarely_there_keeps_its_poses():
     m = measurements(20_000, 5, rare=400)
     drawn = draw_rows(m, np.arange(len(m.pose)), rng(), most=10_000)
@@ -119,16 +132,24 @@ def test_forgotten_displacements_are_computed_again(monkeypatch):
     assert forgotten.selection.solution.log_evidence == kept.selection.solution.log_evidence
 
 
-def test_columns_of_a_part_are_those_of_the_whole(monkeypatch):
-    """Of a part only its rows are kept; a whole is worked on as it is."""
+def test_columns_and_errors_of_a_part_are_those_of_the_whole():
+    """In the rows worked on everything is what it is among all rows."""
     found = findings(session_with(21, sagging))
     data, solution = found.residuals, found.selection.solution
-    assert not data.is_part
-    wanted = data.columns(solution.cells)[data.rows.source]
-    left = data.unexplained(solution)
-    monkeypatch.setattr(discovery_noise, 'PART', 0)
-    part = data.only(data.rows.source, np.array([np.eye(4)] * data.sensors))
-    assert part.is_part
-    np.testing.assert_array_equal(part.row_columns(solution.cells), wanted)
-    np.testing.assert_allclose(part.unexplained(solution), left, atol=1e-15)
-    assert not part._displacements
+    rows = data.rows.source
+    wanted = [cell.columns(data.scene).displacement(data.scene)[rows] for cell in solution.cells]
+    np.testing.assert_allclose(
+        data.columns(solution.cells), np.concatenate(wanted, axis=2), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        data.left(solution), data.unexplained(solution)[rows], rtol=0.0, atol=1e-12
+    )
+
+
+def test_what_a_fit_leaves_does_not_depend_on_blocks(monkeypatch):
+    found = findings(session_with(21, sagging))
+    data, solution = found.residuals, found.selection.solution
+    whole = data.unexplained(solution)
+    blocks = type(data.scene).blocks
+    monkeypatch.setattr(type(data.scene), 'blocks', lambda scene: blocks(scene, 7))
+    np.testing.assert_allclose(data.unexplained(solution), whole, rtol=0.0, atol=1e-12)

@@ -59,6 +59,22 @@ def test_every_cell_has_columns_of_its_size_and_a_place_of_the_table(name):
 
 
 @pytest.mark.parametrize('name', EFFECTS)
+def test_columns_of_some_rows_are_those_they_have_among_all(name):
+    """The search of a large session works on parts of it; no column may depend on which."""
+    scene = scene_of()
+    rows = np.random.default_rng(5).permutation(len(scene))[: len(scene) // 3]
+    part = scene.at(rows)
+    for cell in cells_of(name):
+        if cell.name == 'gear_periodic' and cell.label != '7':
+            continue
+        whole, some = cell.columns(scene), cell.columns(part)
+        assert whole.at == some.at
+        np.testing.assert_allclose(
+            some.displacement(part), whole.displacement(scene)[rows], rtol=1e-9, atol=1e-12
+        )
+
+
+@pytest.mark.parametrize('name', EFFECTS)
 def test_every_effect_says_what_a_technician_and_a_scientist_need(name):
     effect = EFFECTS[name]
     assert effect.name == name

@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN, scene
+from calibration_scenes import CHAIN, extension, scene
 
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.estimate import Problem, estimate
-from remaster_ros.core.extension import Extension
 from remaster_ros.core.fit import fit_session
 
 COMPLIANCE = np.array([2e-5, 4e-5])  # rad/(N m), of joints 2 and 4
@@ -19,7 +18,7 @@ GROWTH = 1e-3  # of all measured positions, per m of the point's place in R
 
 @pytest.fixture(scope='module')
 def sagging():
-    """A session whose arm sags at joints 2 and 4 and grows: what is added, and the extension."""
+    """A session whose arm sags at joints 2 and 4 and grows: the arrays of what is added."""
     session, truth = scene(31, poses=20)
     measured = session.measurements
     torque = CHAIN.gravity_torque(measured.q)
@@ -37,22 +36,23 @@ def sagging():
     session = replace(
         session, measurements=replace(measured, position=measured.position + moved @ to_sensor)
     )
-    return session, Extension(
-        ('compliance_2', 'compliance_4', 'growth'),
-        ('rad/(N m)', 'rad/(N m)', '1'),
-        joint,
-        displacement,
-        np.zeros((n, 3)),
-        np.zeros(3),
-        np.diag([1e4**2, 1e4**2, 0.0]),
-    )
+    return session, {
+        'names': ('compliance_2', 'compliance_4', 'growth'),
+        'units': ('rad/(N m)', 'rad/(N m)', '1'),
+        'joint': joint,
+        'displacement': displacement,
+        'displacement0': np.zeros((n, 3)),
+        'theta0': np.zeros(3),
+        'prior_precision': np.diag([1e4**2, 1e4**2, 0.0]),
+    }
 
 
 def test_effects_come_back_with_their_uncertainty(sagging) -> None:
     """Within 4.5 standard deviations: wrong in 1 of 50,000 seeds."""
-    session, extension = sagging
-    result = fit_session(session, rng=np.random.default_rng(1), draws=400, extension=extension)
-    assert result.theta_names == extension.names
+    session, arrays = sagging
+    given = extension(**arrays)
+    result = fit_session(session, rng=np.random.default_rng(1), draws=400, extension=given)
+    assert result.theta_names == given.names
     assert result.theta_draws.shape == (*result.draws.shape[:2], 3)
     assert 'effect.growth' in result.parameter_names
     truth = np.array([*COMPLIANCE, GROWTH])
@@ -68,8 +68,8 @@ def test_effects_come_back_with_their_uncertainty(sagging) -> None:
 
 
 def test_a_prior_on_effects_pulls_them_to_zero(sagging) -> None:
-    session, extension = sagging
-    tight = replace(extension, prior_precision=np.diag([1e8**2, 1e8**2, 1e6**2]))
+    session, arrays = sagging
+    tight = replace(extension(**arrays), prior_precision=np.diag([1e8**2, 1e8**2, 1e6**2]))
     found = estimate(Problem.of(session), tight)
     theta = found.model.theta(found.mode.z)
     assert np.all(np.abs(theta) < [1e-7, 1e-7, 1e-5])
@@ -77,15 +77,16 @@ def test_a_prior_on_effects_pulls_them_to_zero(sagging) -> None:
 
 def test_what_only_its_prior_knows_is_as_wide_as_the_prior(sagging) -> None:
     """A spline beyond the data, beside an effect whose unit is six decades smaller."""
-    session, extension = sagging
-    nothing = np.zeros_like(extension.joint[:, :, :1])
-    drift = 1e6 * extension.displacement[:, :, 2:] * session.measurements.q[:, None, 1:2]
-    beyond = replace(
-        extension,
-        names=(*extension.names, 'edge', 'drift'),
-        units=(*extension.units, 'rad', 'm/s'),
-        joint=np.concatenate((extension.joint, nothing, nothing), axis=2),
-        displacement=np.concatenate((extension.displacement, 0.0 * drift, drift), axis=2),
+    session, arrays = sagging
+    nothing = np.zeros_like(arrays['joint'][:, :, :1])
+    displacement = arrays['displacement']
+    drift = 1e6 * displacement[:, :, 2:] * session.measurements.q[:, None, 1:2]
+    beyond = extension(
+        names=(*arrays['names'], 'edge', 'drift'),
+        units=(*arrays['units'], 'rad', 'm/s'),
+        joint=np.concatenate((arrays['joint'], nothing, nothing), axis=2),
+        displacement=np.concatenate((displacement, 0.0 * drift, drift), axis=2),
+        displacement0=arrays['displacement0'],
         theta0=np.zeros(5),
         prior_precision=np.diag([1e4**2, 1e4**2, 0.0, 3e-4**-2, 1e-9**-2]),
     )
@@ -96,10 +97,10 @@ def test_what_only_its_prior_knows_is_as_wide_as_the_prior(sagging) -> None:
 
 
 def test_an_effect_that_is_a_zero_offset_in_disguise_is_held_and_named(sagging) -> None:
-    session, extension = sagging
-    joint = extension.joint.copy()
+    session, arrays = sagging
+    joint = arrays['joint'].copy()
     joint[:, 2, 0], joint[:, 1, 0] = 1.0, 0.0
-    twin = replace(extension, joint=joint, prior_precision=np.zeros((3, 3)))
+    twin = extension(**{**arrays, 'joint': joint, 'prior_precision': np.zeros((3, 3))})
     gauge = estimate(Problem.of(session), twin).gauge
     direction = next(d for d in gauge.directions if 'effect.compliance_2' in d.combination)
     assert direction.combination['joint_3'] == pytest.approx(-1.0, abs=1e-6)
@@ -114,6 +115,8 @@ def test_an_effect_that_is_a_zero_offset_in_disguise_is_held_and_named(sagging) 
 
 
 def test_the_paper_s_model_takes_no_effects(sagging) -> None:
-    session, extension = sagging
+    session, arrays = sagging
     with pytest.raises(InputError, match='fast sampler'):
-        fit_session(session, rng=np.random.default_rng(1), sampler='paper', extension=extension)
+        fit_session(
+            session, rng=np.random.default_rng(1), sampler='paper', extension=extension(**arrays)
+        )

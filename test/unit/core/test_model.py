@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN, scene
+from calibration_scenes import CHAIN, extension, scene
 
-from remaster_ros.core.extension import Extension
 from remaster_ros.core.model import Model, predict_in_sensor
 from remaster_ros.core.rows import Rows
 from remaster_ros.core.transforms import apply, rotation_vector_to_matrix, transform
@@ -107,34 +107,39 @@ def test_the_derivative_is_that_of_the_prediction(model: Model, measured, x, kin
 
 
 @pytest.fixture
-def extended(model: Model, measured) -> Model:
-    """The same with three effects of no particular meaning, about as large as real ones."""
+def arrays(measured) -> dict[str, Any]:
+    """Three effects of no particular meaning, about as large as real ones."""
     rng = np.random.default_rng(4)
     n = len(measured)
-    extension = Extension(
-        ('a', 'b', 'c'),
-        ('rad', 'm', '1'),
-        0.01 * rng.standard_normal((n, 7, 3)),
-        0.01 * rng.standard_normal((n, 3, 3)),
-        0.001 * rng.standard_normal((n, 3)),
-        rng.standard_normal(3),
-        np.diag([1.0, 4.0, 0.0]),
-    )
-    return replace(model, extension=extension)
+    return {
+        'names': ('a', 'b', 'c'),
+        'units': ('rad', 'm', '1'),
+        'joint': 0.01 * rng.standard_normal((n, 7, 3)),
+        'displacement': 0.01 * rng.standard_normal((n, 3, 3)),
+        'displacement0': 0.001 * rng.standard_normal((n, 3)),
+        'theta0': rng.standard_normal(3),
+        'prior_precision': np.diag([1.0, 4.0, 0.0]),
+    }
 
 
-def test_effects_turn_joints_and_displace_markers(extended: Model, measured, x) -> None:
+@pytest.fixture
+def extended(model: Model, arrays) -> Model:
+    """The same model with these effects."""
+    return replace(model, extension=extension(**arrays))
+
+
+def test_effects_turn_joints_and_displace_markers(extended: Model, arrays, measured, x) -> None:
     """Row by row as the extension's documentation has it, joint 1 held as in most fits."""
     theta = np.array([1.0, -2.0, 0.5])
-    given = extended.extension
     x = np.concatenate((x, theta))
     x[[0, 6]] = 0.0
     rows = rows_of(measured, extended)
     assert extended.names[-3:] == ('effect.a', 'effect.b', 'effect.c')
     for place, row in enumerate(rows.source[:5]):
-        q = measured.q[row] + given.joint[row] @ theta
+        q = measured.q[row] + arrays['joint'][row] @ theta
         point = CHAIN.positions(q, extended.markers(x)[measured.marker[row]], extended.offsets(x))
-        point += given.displacement0[row] + given.displacement[row] @ (theta - given.theta0)
+        step = theta - arrays['theta0']
+        point += arrays['displacement0'][row] + arrays['displacement'][row] @ step
         expected = apply(extended.corrections(x)[measured.sensor[row]], point)
         for z in (x, np.stack((x, x))):
             predicted = extended.predict(z, rows)[..., place, :]

@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN, scene
+from calibration_scenes import CHAIN, extension, scene
 
 from remaster_ros.core import theoretical
-from remaster_ros.core.extension import Extension
 from remaster_ros.core.model import Model
 from remaster_ros.core.theoretical import (
     Predictive,
@@ -131,7 +130,7 @@ def test_random_configurations_fill_the_joint_limits(seen: Measurements) -> None
 def test_further_effects_stay_out_of_random_configurations(seen: Measurements) -> None:
     bare = predictive({'joint_4': 1e-3})
     n = len(seen)
-    extension = Extension(
+    shifting = extension(
         ('shift',),
         ('m',),
         np.zeros((n, 7, 1)),
@@ -142,7 +141,7 @@ def test_further_effects_stay_out_of_random_configurations(seen: Measurements) -
     )
     given = replace(
         bare,
-        model=replace(bare.model, extension=extension),
+        model=replace(bare.model, extension=shifting),
         before=np.append(bare.before, 0.0),
         after=np.append(bare.after, 0.0),
         draws=np.column_stack((bare.draws, np.full(DRAWS, 1e-3))),

@@ -22,7 +22,7 @@ from remaster_ros.motion.trajectory import REST_S, Line, Trajectory
 
 RULES = SupervisorRules(settle=SettleRules(settle_s=1.0, still_tolerance=2.0**-12))
 AT = np.array([0.25, 0.5])
-LINE = Line(np.array([0.0, 0.0]), np.array([1.0, 0.0]), 0.5)
+LINE = Line(np.array([0.25, -0.5]), np.array([1.25, -0.5]), 0.5)
 """2.5 s, of which 1.5 s at half a radian a second."""
 
 
@@ -145,15 +145,58 @@ def test_an_arm_that_lags_follows_and_its_lag_is_known(lag):
             assert low == pytest.approx(elapsed - lag - JITTER_S, abs=1e-9)
 
 
-def test_the_window_goes_on_with_the_time_and_with_a_late_report():
+def test_the_window_grows_with_the_time_and_with_a_late_report():
+    """The reference goes on; the arm may have been stopped since the last report."""
     arm = Arm()
     arm.run(1.0, arm.lagging(0.1))
     low, high = arm.window
     later = arm.following.window(arm.seen, arm.seen.wall + 0.125, 1.0)
-    assert later == (pytest.approx(low + 0.125), pytest.approx(high + 0.125))
+    assert later == (low, pytest.approx(high + 0.125))
     report = JointReport(arm.seen.stamp, arm.seen.q, 0.0, arm.seen.wall)
     late = Seen.after(None, report, RULES, 0.2)
     assert arm.following.window(late, late.wall, 1.0) == (low, pytest.approx(high + 0.2))
+
+
+@pytest.mark.parametrize('q', [AT, np.add(AT, 0.1)])
+def test_how_late_a_report_came_is_kept(q):
+    """In the first one, standing or moved."""
+    seen = see(8.0, AT, late=0.125)
+    assert seen.late_s == 0.125
+    assert see(8.125, q, last=seen, late=0.0625).late_s == 0.0625
+
+
+def test_before_the_first_report_nothing_is_lost():
+    """A stop that comes at once after a move was sent is made from its start."""
+    following = Following(Trajectory((LINE,)), 64.0, 512.0, RULES)
+    assert following.reacted is False
+    seen = see(64.0, LINE.start, 512.0)
+    assert following.lost(seen, 512.0) == ''
+    assert following.window(seen, 512.0, 1.0) == (-JITTER_S, JITTER_S)
+
+
+def test_on_a_fast_clock_an_arm_may_be_on_the_line_before():
+    """It may lag by more than it rests; a second ago it was on the first line."""
+    arm = Arm(Trajectory((*CORNERS.lines, Line(CORNERS.end, np.zeros(2), 0.5))), rate=10.0)
+    for until in np.arange(0.1, CORNERS.duration_s + 3.0, 0.1):
+        assert arm.run(until, arm.lagging(0.9)) is None, arm.said
+        if until > 1.5:
+            assert arm.lost == '', until
+
+
+def test_exactly_at_the_tolerances():
+    """Numbers that binary fractions have: on the edge it still follows."""
+    assert see(8.0, AT, wall=0.0).is_fresh(FRESH_S)
+    rules = SupervisorRules(
+        settle=SettleRules(arrive_tolerance=2.0**-8), reaction_s=0.25, lag_s=0.25
+    )
+    following = Following(Trajectory((LINE,)), 64.0, 512.0, rules)
+    at_edge = see(64.25, np.add(LINE.start, [0.0, 2.0**-8]), 512.25)
+    assert following.update(at_edge, 1.0) == ''
+    assert following.lost(at_edge, 512.25) == ''
+    assert not following.reacted
+    just_left = see(64.25, np.add(LINE.start, [0.0, 2.0**-7]), 512.25)
+    following.update(just_left, 1.0)
+    assert following.reacted
 
 
 def test_at_a_fast_clock_the_window_is_wider():
@@ -235,7 +278,7 @@ def test_at_the_ends_a_small_distance_is_no_lag():
     arm = Arm()
 
     def short(t):
-        return np.minimum(LINE.start + LINE.share(t - 0.1)[0] * LINE.way, [0.985, 0.0])
+        return np.minimum(LINE.start + LINE.share(t - 0.1)[0] * LINE.way, [1.235, 0.0])
 
     assert arm.run(6.0, short) is None
     assert arm.lost == ''
@@ -275,7 +318,7 @@ def test_the_reaction_is_wall_time():
 def test_an_arm_that_has_moved_once_has_taken_the_command():
     """Back at its start it has not followed; it is not said to have taken no command."""
     arm = Arm()
-    arm.run(0.4, lambda t: [0.003, 0.0])
+    arm.run(0.4, lambda t: np.add(LINE.start, [0.003, 0.0]))
     assert arm.run(3.0, lambda t: LINE.start) is not None
     assert arm.said == STOPPED_ON_ITS_WAY
 
@@ -297,7 +340,7 @@ def test_an_old_report_tells_nothing():
 
 # Several lines
 
-CORNERS = Trajectory((LINE, Line(LINE.end, np.array([1.0, 1.0]), 0.5)))
+CORNERS = Trajectory((LINE, Line(LINE.end, np.array([1.25, 0.5]), 0.5)))
 
 
 @pytest.mark.parametrize('lag', [0.0, 0.1, 0.3, 0.36])

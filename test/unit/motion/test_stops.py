@@ -12,7 +12,7 @@ from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import MotionGate
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.stopping import END_OF_STOP_S, STOP_S, stop_on_line
-from remaster_ros.motion.trajectory import RAMP_S, Line
+from remaster_ros.motion.trajectory import HEADROOM, RAMP_S, Line
 
 LIMITS = MotionLimits(
     ('a', 'b', 'c'),
@@ -48,7 +48,7 @@ def judge(line, stop, time_s, high_s, limits=LIMITS):
     np.testing.assert_allclose(curve(t), line.start + along[:, None] * way, atol=1e-9)
     assert along.min() >= -1e-9
     assert along.max() <= length + 1e-6
-    assert np.max(np.abs(curve(t, 2)) / limits.acceleration) <= 1.0
+    assert np.max(np.abs(curve(t, 2)) / limits.acceleration) <= HEADROOM + 0.01
 
 
 angles = st.integers(-3_000_000, 3_000_000).map(lambda n: n * 1e-6)

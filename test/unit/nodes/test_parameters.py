@@ -16,8 +16,9 @@ pytestmark = pytest.mark.ros
 
 CONFIG = Path(__file__).parents[3] / 'config'
 # A node has its parameters in its own file, or in one beside it.
+BESIDE = {'bridge_parameters': 'robot_bridge', 'recorder_parameters': 'recorder'}
 NODES = sorted(
-    path.stem.removesuffix('_parameters')
+    BESIDE.get(path.stem, path.stem)
     for path in (Path(__file__).parents[3] / 'remaster_ros' / 'nodes').glob('*.py')
     if 'class Parameters' in path.read_text()
 )

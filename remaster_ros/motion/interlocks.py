@@ -1,0 +1,108 @@
+"""What must be right before an arm may move: who is alive, what is observed, a person's word."""
+
+from __future__ import annotations
+
+import numpy as np
+
+NAMES = ('planner', 'recorder', 'robot')
+"""Who must be alive; their reasons not to move count in this order."""
+OBSERVED = ('safety_link', 'controller', 'clock', 'rivals')
+"""What else must be right."""
+OWN_PAUSE_S = 0.5
+"""Between two looks at the clock passes less, s of wall time, or this process was paused."""
+
+
+class Interlocks:
+    """Reasons not to move, each by its origin, and when everybody was last heard.
+
+    Parameters
+    ----------
+    heartbeat_s
+        Longest silence of those in `NAMES`, s of wall time.
+    must_collect
+        See the attribute.
+
+    Attributes
+    ----------
+    must_collect
+        Nothing moves before a collection is begun (again) by a person.
+    """
+
+    def __init__(self, heartbeat_s: float, *, must_collect: bool) -> None:
+        self.must_collect = must_collect
+        self._run = ''
+        self._heartbeat_s = heartbeat_s
+        self._heard: dict[str, float] = {}
+        self._reasons: dict[str, str] = {}
+        self._looked_wall: float | None = None
+
+    def hear(self, name: str, reason: str, wall_s: float) -> None:
+        """Take a sign of life, and why the arm must not move; '' if it may."""
+        self._heard[name], self._reasons[name] = wall_s, reason
+
+    def planner(self, reason: str, run: str, wall_s: float, *, halted: bool) -> bool:
+        """Take the planner's state; return whether a collection was begun, or is not running.
+
+        Parameters
+        ----------
+        reason
+            Why the arm must not move; '' while a collection runs.
+        run
+            Names the run; another one than before was begun by a person since.
+        wall_s
+            Now, s.
+        halted
+            A halt is not cleared yet: what is begun before it is does not count.
+        """
+        begun = bool(reason) or (run != self._run and bool(self._run))
+        self._run = run if run and not reason else self._run
+        if begun and not halted:
+            self.must_collect = False
+        self.hear('planner', reason, wall_s)
+        return begun
+
+    def set(self, name: str, reason: str) -> None:
+        """Take why the arm must not move; '' if it may."""
+        self._reasons[name] = reason
+
+    def reason(self, name: str) -> str:
+        """Return what stands against a motion by one origin; ''."""
+        return self._reasons.get(name, '')
+
+    def was_right(self, name: str) -> bool:
+        """Whether an origin was heard of and nothing stood against a motion."""
+        return self._reasons.get(name) == ''
+
+    def look(self, wall_s: float) -> None:
+        """Shift what was last heard where this process was paused: nobody else was silent."""
+        last, self._looked_wall = self._looked_wall, wall_s
+        if last is None or wall_s - last <= OWN_PAUSE_S:
+            return
+        pause = wall_s - last
+        # Who was heard since is no exception, and nobody was heard in the future.
+        self._heard = {name: min(heard + pause, wall_s) for name, heard in self._heard.items()}
+
+    def silence_s(self, name: str, wall_s: float) -> float:
+        """Return how long somebody was not heard, s; infinite if never."""
+        return wall_s - self._heard[name] if name in self._heard else np.inf
+
+    def fell_silent(self, name: str, wall_s: float) -> str:
+        """Return in words that somebody who was heard is silent now; ''."""
+        if name in self._heard and self.silence_s(name, wall_s) > self._heartbeat_s:
+            return f'no sign of {name} for {self._heartbeat_s:g} s'
+        return ''
+
+    @property
+    def collecting(self) -> bool:
+        """Whether the planner runs a collection that a person began."""
+        return 'planner' in self._heard and not self.reason('planner') and not self.must_collect
+
+    def blocked(self, wall_s: float) -> str:
+        """Return why the arm must not move; '' if it may."""
+        limit = self._heartbeat_s
+        silent = [name for name in NAMES if self.silence_s(name, wall_s) > limit]
+        if silent:
+            return f'no sign of {", ".join(silent)} for {limit:g} s'
+        if self.must_collect and not self.reason('planner'):
+            return 'the halt was cleared: /remaster/collect goes on'
+        return next(filter(None, map(self.reason, (*NAMES, *OBSERVED))), '')

@@ -1,0 +1,110 @@
+"""The configuration under way, and a stop under way: what becomes of them, report by report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from remaster_ros.core.types import FloatArray
+from remaster_ros.motion.actions import SupervisorRules
+from remaster_ros.motion.following import Following, Seen
+from remaster_ros.motion.settling import SettleDetector
+from remaster_ros.motion.trajectory import Trajectory
+
+PROBE_WAIT_S = 0.5
+"""After its end a robot that copies commands has copied this one, s."""
+MOVED_RAD = 0.02
+"""An arm that was moved by so much while nothing was commanded was moved by another, rad."""
+ELSEWHERE = 'an emergency stop, or an arm less precise than arrive_tolerance?'
+ELSEWHERE_RAD = 0.05
+"""An arm that stands so far from its target does not follow, rad; nearer it is inaccurate."""
+
+Outcome = tuple[Literal['', 'over', 'settled', 'failed', 'halted'], str]
+"""What became of it, and why in words; '' while it is under way."""
+UNDER_WAY: Outcome = '', ''
+
+
+@dataclass
+class Visit:
+    """The configuration under way: when it was sent (stamp) and must have arrived (robot time).
+
+    Attributes
+    ----------
+    solution
+        Its number; negative where nothing is measured at the end.
+    """
+
+    solution: int
+    following: Following
+    detector: SettleDetector
+    rules: SupervisorRules
+    sent_stamp: float
+    deadline: float
+    settled: bool = False
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Where it was sent."""
+        return self.following.trajectory
+
+    def judge(self, seen: Seen, rate: float) -> Outcome:
+        """Say what becomes of an arm that is on its way, by a report."""
+        detector, rules = self.detector, self.rules
+        trajectory, elapsed = self.trajectory, self.following.elapsed_s(seen.time)
+        settled = detector.update(seen.stamp, seen.q) == 'settled'
+        arrived = elapsed > trajectory.duration_s + PROBE_WAIT_S
+        if (arrived or settled) and np.array_equal(seen.q, trajectory.end):
+            why = 'joint_states repeat what was commanded to the last bit: no measurement'
+            return 'halted', f'{why}; switch the driver to measured positions'
+        astray = self.following.update(seen, rate)
+        if astray:
+            return 'halted', astray
+        if self.solution < 0:
+            return ('over', '') if arrived else UNDER_WAY
+        if settled:
+            self.settled, self.deadline = True, seen.time + rules.answer_timeout_s
+            return 'settled', ''
+        if not self.following.reacted:
+            # On a simulated clock that runs fast its time is over before a command is seen.
+            return UNDER_WAY
+        distance = float(np.max(np.abs(seen.q - trajectory.end)))
+        stood_s = min(seen.time - seen.stands_since, elapsed - trajectory.duration_s)
+        if distance > rules.settle.arrive_tolerance and stood_s >= rules.stall_s:
+            # However near: an emergency stop in the last moment of a move looks like this.
+            return 'halted', f'the robot stands {distance:.4f} rad from its target: {ELSEWHERE}'
+        if seen.time > self.deadline:
+            return 'failed', 'did not come to rest at its target in time'
+        return UNDER_WAY
+
+    def judge_settled(self, seen: Seen, *, recorder_waits: bool) -> Outcome:
+        """Say what becomes of an arm that must stand until the recorder answers."""
+        moved = float(np.max(np.abs(seen.q - self.trajectory.end)))
+        if moved > MOVED_RAD:
+            return 'halted', (
+                f'the arm was moved by {np.rad2deg(moved):.1f} deg, and not by a command'
+            )
+        if recorder_waits:
+            self.deadline = seen.time + self.rules.answer_timeout_s
+        elif seen.time > self.deadline:
+            return 'failed', 'the recorder did not say what became of it'
+        return UNDER_WAY
+
+
+@dataclass(frozen=True)
+class Braking:
+    """A stop under way: where it ends (rad, (k,)), and when the arm must stand (robot time)."""
+
+    end: FloatArray
+    deadline: float
+
+    def judge(self, seen: Seen) -> Outcome:
+        """See that a stop is a stop."""
+        if seen.stands(seen.wall):
+            if np.max(np.abs(seen.q - self.end)) <= ELSEWHERE_RAD:
+                return 'over', ''
+            return 'halted', 'the arm stands, but not where its stop led'
+        if seen.time > self.deadline:
+            return 'halted', 'the arm goes on after a stop'
+        return UNDER_WAY

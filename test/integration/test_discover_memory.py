@@ -1,0 +1,83 @@
+"""What `remaster discover` holds in memory against the number of rows of a session."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from calibration_scenes import CHAIN, MARKERS, URDF, sensors
+from command_line import ROOT
+
+from remaster_ros.core.simulation import simulate_session
+from remaster_ros.storage.discovery_results import read_discovery
+from remaster_ros.storage.session import write_session
+
+# The command with a search of few rows, so that what all rows take is what counts; then the
+# largest resident memory of this process alone, which os.wait4 mixes up with its parent's.
+COMMAND = """
+import re, sys
+from functools import partial
+from pathlib import Path
+from remaster_ros.cli.main import main
+from remaster_ros.core import discovery
+from remaster_ros.core.discovery_thin import draw_rows
+discovery.draw_rows = partial(draw_rows, most=1000)
+status = main(['discover', sys.argv[1], '--out', sys.argv[2], '--quiet', '--seed', '1'])
+print(re.search(r'VmHWM:\\s+(\\d+) kB', Path('/proc/self/status').read_text())[1])
+raise SystemExit(status)
+"""
+FEW, MANY = 4_000, 24_000
+# It takes 2. With the causes' columns of all rows in memory at once it took 14.
+MOST_MB_PER_THOUSAND_ROWS = 8.0
+CURVE_RAD = 8e-4
+
+
+def write(rows: int, folder: Path) -> None:
+    """Write a session whose joint 2 errs along a curve: a cause of some fifty parameters."""
+    rng = np.random.default_rng(rows)
+    middle, half = 0.5 * (CHAIN.lower + CHAIN.upper), 0.35 * (CHAIN.upper - CHAIN.lower)
+    q = middle + half * rng.uniform(-1.0, 1.0, (rows, len(CHAIN)))
+    poses = np.array_split(q, rows // 5)
+    session, _ = simulate_session(
+        CHAIN,
+        URDF,
+        rng,
+        poses=poses[200:],
+        validation_poses=poses[:200],
+        sensors=sensors(rng, sigma_m=0.1e-3, pose_sigma_m=0.2e-3),
+        markers={'sir': MARKERS['sir']},
+    )
+    reported = session.measurements.q.copy()
+    angle = reported[:, 1]
+    reported[:, 1] -= CURVE_RAD * (np.exp(-((angle - 0.3) ** 2) / 0.02) + np.cos(7.3 * angle))
+    write_session(folder, replace(session, measurements=replace(session.measurements, q=reported)))
+
+
+def peak_mb(rows: int, folder: Path) -> float:
+    """Return the largest memory of the command on a session of so many rows, MB."""
+    write(rows, folder / 'session')
+    process = subprocess.run(
+        [sys.executable, '-c', COMMAND, folder / 'session', folder / 'out'],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        env={**os.environ, 'PYTHONPATH': str(ROOT), 'OMP_NUM_THREADS': '1'},
+        check=False,
+    )
+    assert process.returncode == 0, process.stderr
+    found = read_discovery(folder / 'out' / 'discovery.json')
+    assert ('joint_error_curve', [2]) in [(e['name'], e['joints']) for e in found['effects']]
+    assert found['rows_searched']['searched'] <= 1100
+    return float(process.stdout) / 1024
+
+
+def test_memory_hardly_grows_with_the_rows(tmp_path):
+    """100,000 rows fit into 2 GiB: a search of a gigabyte, and what each row adds."""
+    few, many = (peak_mb(rows, tmp_path / str(rows)) for rows in (FEW, MANY))
+    growth = 1e3 * (many - few) / (MANY - FEW)
+    print(f'{few:.0f} MB at {FEW} rows, {many:.0f} at {MANY}: {growth:.1f} MB per 1,000 rows')
+    assert growth < MOST_MB_PER_THOUSAND_ROWS

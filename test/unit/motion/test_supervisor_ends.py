@@ -1,0 +1,117 @@
+"""Ends of motions that are neither arrivals nor plain stops; limits that change on the way."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from supervisor_rig import LIMITS, Rig
+
+from remaster_ros.fakes import motion as servo
+from remaster_ros.motion.actions import Drive, Failed, Halted, Settled, Stop
+
+
+@pytest.fixture
+def rig():
+    return Rig()
+
+
+def freeze(rig):
+    """The safety circuit stops the arm where it is."""
+    rig.arm = servo.Motion(rig.t, rig.arm.at(rig.t)[0])
+
+
+def test_an_emergency_stop_just_before_the_end_halts(rig):
+    """It is behind by less than an arm may lag, and stands 0.07 rad from its target."""
+    target = np.array([0.9, -1.9])
+    rig.plan(target)
+    rig.run(5.0, lambda: np.max(np.abs(rig.arm.at(rig.t)[0] - target)) < 0.07)
+    freeze(rig)
+    rig.run(5.0, lambda: rig.said(Halted))
+    assert rig.last(Halted).reason.startswith('the robot stands 0.06')
+    assert not rig.said(Failed, Stop)
+
+
+def test_an_emergency_stop_in_a_stop_halts(rig):
+    """It stands long before the stop's end."""
+    rig.go([0.9, -1.9], 1.2)
+    rig.state = 'paused'
+    rig.do(rig.supervisor.planner_is('paused', rig.wall))
+    rig.step()
+    freeze(rig)
+    rig.run(2.0, lambda: rig.said(Halted))
+    assert rig.last(Halted).reason == 'the arm stands, but not where its stop led'
+    assert len(rig.said(Stop)) == 1
+
+
+def test_other_limits_stop_the_arm_and_it_goes_on_with_them(rig):
+    rig.go([0.9, -1.9])
+    slow = dataclasses.replace(LIMITS, velocity=LIMITS.velocity / 4)
+    rig.do(rig.supervisor.use_limits(slow, rig.wall))
+    assert rig.last(Stop).reason == 'other limits'
+    assert rig.supervisor.gate.limits is slow
+    rig.run(30.0, lambda: rig.said(Settled))
+    first, second = rig.said(Drive)
+    assert first.solution == second.solution == 0
+    fastest = max(np.max(np.abs(p.velocity) / slow.velocity) for p in second.admitted.waypoints)
+    assert fastest <= 1.0
+    # An arm that stands is not stopped.
+    rig.do(rig.supervisor.use_limits(LIMITS, rig.wall))
+    assert len(rig.said(Stop)) == 1
+
+
+def test_an_arm_that_was_not_seen_for_a_while_has_as_much_longer_to_arrive(rig):
+    """A gap of two seconds in the settling adds two seconds to its deadline."""
+    rig.alter = lambda t, q: np.add(q, [1e-3 * np.arcsin(np.sin(t)), 0.0])
+    rig.plan([0.5, 0.5])
+    rig.run(4.0)
+    deadline = rig.supervisor._visit.deadline
+    rig.alive.discard('robot')
+    rig.run(0.4)
+    rig.alive.add('robot')
+    rig.run(0.2)
+    assert rig.supervisor._visit.deadline == deadline, 'a short one adds nothing'
+    rig.alive.discard('robot')
+    rig.run(2.0)
+    rig.alive.add('robot')
+    rig.run(0.1)
+    assert rig.supervisor._visit.deadline == pytest.approx(deadline + 2.0, abs=0.05)
+
+
+def test_the_reasons_are_given_in_an_order(rig):
+    """Silence first, then the planner, the recorder, the robot, and what is observed."""
+    arm = rig.supervisor
+    rig.do(arm.observe('controller', 'no controller', rig.wall))
+    assert arm.blocked(rig.wall) == 'no controller'
+    rig.do(arm.observe('safety_link', 'no link', rig.wall))
+    assert arm.blocked(rig.wall) == 'no link'
+    rig.do(arm.recorder_waits('mocap', rig.wall))
+    assert arm.blocked(rig.wall) == 'waiting for mocap'
+    rig.do(arm.planner_is('paused', rig.wall))
+    assert arm.blocked(rig.wall) == 'planner is paused'
+    assert arm.blocked(rig.wall + 3.5) == 'no sign of planner, recorder, robot for 3 s'
+
+
+@pytest.mark.parametrize('paused', [True, False])
+def test_a_collection_that_is_begun_at_once_after_the_halt_was_cleared_goes_on(rig, paused):
+    """By a planner that did not run when it was cleared, or by another run."""
+
+    def planner(state, run):
+        rig.do(rig.supervisor.planner_is(state, rig.wall, run))
+
+    rig.alive.discard('planner')
+    planner('running', 'first')
+    rig.plan([0.9, -1.9])
+    rig.run(0.8)
+    freeze(rig)
+    rig.run(2.0, lambda: rig.said(Halted))
+    if paused:
+        planner('paused', 'first')
+    assert rig.supervisor.clear_halt(rig.wall) == ''
+    count = len(rig.said(Drive))
+    if not paused:
+        planner('running', 'first')
+        rig.run(1.0)
+        assert len(rig.said(Drive)) == count, 'the run that was halted goes on'
+    planner('running', 'second')
+    rig.run(1.0)
+    assert len(rig.said(Drive)) > count

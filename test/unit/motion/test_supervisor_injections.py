@@ -1,0 +1,193 @@
+"""Whatever happens: nothing is commanded outside limits, speeds, accelerations; none after a halt.
+
+320 runs of six seconds with one to four injections each, at random moments. Each command is judged
+as two kinds of controller would carry it out: from where the arm really is and moves (closed
+loop), and from the reference of the command before (open loop).
+"""
+
+import copy
+from collections import Counter
+
+import numpy as np
+from supervisor_rig import LIMITS, SPEED, Rig
+
+from remaster_ros.fakes import motion as servo
+from remaster_ros.motion.actions import Drive, Halted, Stop
+from remaster_ros.motion.motion_gate import Cubic
+from remaster_ros.motion.trajectory import Waypoint
+
+RUNS, SECONDS, DT = 320, 6.0, 0.05
+SERVO = 0.02
+"""A servo overshoots: share by which the speed of an arm may exceed what it is told."""
+
+
+class Judged(Rig):
+    """Keeps the reference of an open-loop controller, and judges every command."""
+
+    def __init__(self):
+        self.reference = []
+        self.worst = Counter()
+        super().__init__()
+
+    def _reference_at(self, t):
+        q, velocity = self.arm.at(t) if not self.reference else (None, None)
+        for start, cubic in self.reference:
+            if t >= start or q is None:
+                since = min(max(t - start, 0.0), cubic.duration_s)
+                q, velocity = cubic.at(since), cubic.velocity(since)
+        return q, velocity
+
+    def stands_where_it_is(self):
+        """The safety circuit stops the arm; its controller begins anew there."""
+        self.arm = servo.Motion(self.t, self.arm.at(self.t)[0])
+        self.reference = []
+
+    def _command(self, points):
+        if points:
+            assert not self.supervisor.halted or self.halting, 'commanded while halted'
+            for point in points:
+                assert LIMITS.outside(np.round(point.q, 9)) == ''
+            begins = {'open': self._reference_at(self.t), 'closed': self.arm.at(self.t)}
+            for kind, (q, velocity) in begins.items():
+                before, start, reference = Waypoint(0.0, q, velocity), self.t, []
+                for point in points:
+                    cubic = Cubic.between(before, point)
+                    reference.append((start + before.time_s, cubic))
+                    self._judge(kind, cubic)
+                    before = point
+                if kind == 'open':
+                    self.reference = reference
+        super()._command(points)
+
+    def _judge(self, kind, cubic):
+        low, high = cubic.range()
+        beyond = float(max(np.max(LIMITS.lower - low), np.max(high - LIMITS.upper)))
+        speed = float(np.max(cubic.largest_speed() / SPEED))
+        hard = float(np.max(cubic.largest_acceleration() / LIMITS.acceleration))
+        for name, value in (('beyond', beyond), ('speed', speed), ('hard', hard)):
+            self.worst[f'{name} {kind}'] = max(self.worst.get(f'{name} {kind}', -9.0), value)
+
+    @property
+    def halting(self):
+        """Whether the halt came with the actions that are being carried out."""
+        return not any(isinstance(a, Halted) for _, a in self.actions[self.cleared :])
+
+    cleared, frozen = 0, False
+
+
+def injections(rng):
+    """Return what can happen: name -> what it does to a rig, and how it ends."""
+    joint, size = rng.integers(2), rng.uniform(0.3, 7.0) * rng.choice([-1, 1])
+    shift = np.eye(2)[joint] * size
+
+    def set_to(**values):
+        return lambda rig: [setattr(rig, name, value) for name, value in values.items()]
+
+    def frozen(rig):
+        q, rig.frozen = rig.arm.at(rig.t)[0], True
+        rig.alter = lambda t, _: q
+
+    def without(name):
+        return lambda rig: rig.alive.discard(name)
+
+    def back(rig):
+        rig.alive |= {'planner', 'recorder', 'robot', 'bridge'}
+        rig.alter, rig.obey = (lambda t, q: q), (lambda waypoints: waypoints)
+        rig.state, rig.waiting_for, rig.delay_s, rig.frozen = 'running', '', 0.0, False
+
+    def emergency(rig):
+        rig.do(rig.supervisor.emergency(True, rig.wall))
+        rig.stands_where_it_is()
+        rig.do(rig.supervisor.emergency(False, rig.wall))
+
+    def pause_and_stop(rig):
+        rig.alive.discard('bridge')
+        rig.stands_where_it_is()
+
+    def rival(rig):
+        rig.do(rig.supervisor.observe('rivals', 'another publisher', rig.wall))
+        rig.do(rig.supervisor.observe('rivals', '', rig.wall))
+
+    def another_pose(rig):
+        rig.plan(*rng.uniform(LIMITS.lower, LIMITS.upper, (rng.integers(0, 3), 2)))
+
+    def flip(rig):
+        rig.alter = lambda t, q: np.add(q, shift * (round(t / DT) % 2))
+
+    kinds = {
+        'emergency stop': (Judged.stands_where_it_is, back),
+        'emergency stop, told': (emergency, back),
+        'driver silent': (without('robot'), back),
+        'driver silent, arm stopped': (
+            lambda rig: (rig.stands_where_it_is(), rig.alive.discard('robot')),
+            back,
+        ),
+        'planner silent': (without('planner'), back),
+        'recorder silent': (without('recorder'), back),
+        'process paused': (without('bridge'), back),
+        'process paused, arm stopped': (pause_and_stop, back),
+        'paused': (set_to(state='paused'), back),
+        'sensor gone': (set_to(waiting_for='mocap'), back),
+        'late': (set_to(delay_s=rng.uniform(0.0, 2.0)), back),
+        'wrapped': (set_to(alter=lambda t, q: np.add(q, 2 * np.pi)), back),
+        'foreign': (set_to(alter=lambda t, q: np.add(q, shift)), back),
+        'two publishers': (flip, back),
+        'not finite': (set_to(alter=lambda t, q: q * np.nan), back),
+        'frozen': (frozen, back),
+        'stamps shifted': (set_to(stamp_shift=rng.uniform(-5.0, 5.0)), back),
+        'commands lost': (set_to(obey=lambda waypoints: ()), back),
+        'another pose': (another_pose, back),
+        'rival': (rival, back),
+    }
+    name = rng.choice(list(kinds))
+    return name, *kinds[name]
+
+
+def test_nothing_dangerous_is_commanded_in_random_runs():
+    rng = np.random.default_rng(2026)
+    begun, counts, worst = Judged(), Counter(), Counter()
+    for _ in range(RUNS):
+        rig = copy.deepcopy(begun)
+        rig.rng = np.random.default_rng(rng.integers(2**32))
+        rig.obey, rig.alter = (lambda waypoints: waypoints), (lambda t, q: q)
+        corners = {0: rng.uniform(LIMITS.lower, LIMITS.upper, (rng.integers(0, 3), 2))}
+        rig.plan(*rng.uniform(LIMITS.lower, LIMITS.upper, (2, 2)), waypoints=corners)
+        events = []
+        for _ in range(rng.integers(1, 5)):
+            name, begin, end = injections(rng)
+            at = rig.t + rng.uniform(0.0, SECONDS)
+            events += [(at, name, begin), (at + rng.exponential(1.0), '', end)]
+        events.sort(key=lambda event: event[0])
+        stop_at = rig.t + SECONDS
+        while rig.t < stop_at:
+            while events and events[0][0] <= rig.t:
+                _, name, act = events.pop(0)
+                counts[name] += bool(name)
+                act(rig)
+            rig.step(DT)
+            if rng.random() < 0.02:
+                rig.answer(0)
+            if rig.supervisor.halted and not rig.frozen and rng.random() < 0.02:
+                # A person sees to it and begins the collection again. Reports that are frozen
+                # while the arm stands nobody can tell from an arm that stands: the person must.
+                assert rig.supervisor.clear_halt(rig.wall) == ''
+                rig.cleared = len(rig.actions)
+                rig.do(rig.supervisor.planner_is('paused', rig.wall))
+                counts['cleared'] += 1
+        counts['moves'] += len(rig.said(Drive))
+        counts['stops'] += len(rig.said(Stop))
+        counts['halted'] += bool(rig.said(Halted))
+        for name, value in rig.worst.items():
+            worst[name] = max(worst.get(name, -9.0), value)
+    # Enough happened for this to mean anything.
+    assert counts['moves'] > RUNS
+    assert counts['stops'] > 60
+    assert 100 < counts['halted'] < RUNS - 30
+    assert min(counts[name] for name in counts if name) > 5
+    assert len(counts) > 20
+    assert worst['beyond open'] <= 1e-6
+    assert worst['beyond closed'] <= 2e-3
+    assert worst['speed open'] <= 1.001
+    assert worst['speed closed'] <= 1.0 + SERVO
+    assert worst['hard open'] <= 1.001
+    assert worst['hard closed'] <= 1.0 + SERVO

@@ -1,0 +1,98 @@
+"""Slow work beside a node's callbacks."""
+
+import threading
+import time
+
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+
+import rclpy
+from bridge_rig import DOMAIN, PATIENCE_S
+from rclpy.executors import SingleThreadedExecutor
+
+from remaster_ros.nodes.background import Background
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
+
+
+@pytest.fixture
+def node(monkeypatch):
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    made = rclpy.create_node('worker', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(made)
+
+    def spin(condition):
+        end = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < end, 'waited in vain'
+            executor.spin_once(timeout_sec=0.5)
+
+    made.spin_until = spin
+    yield made
+    executor.shutdown()
+    made.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_work_is_done_elsewhere_and_its_result_taken_here(node):
+    background, here, seen = Background(node), threading.get_ident(), []
+    for number in range(3):
+        background.submit(
+            lambda n=number: (n, threading.get_ident()),
+            lambda result: seen.append((*result, threading.get_ident())),
+        )
+    began = time.monotonic()
+    node.spin_until(lambda: len(seen) == 3)
+    assert time.monotonic() - began < 0.4, 'the node was not woken'
+    assert [n for n, _, _ in seen] == [0, 1, 2]
+    assert all(there != here and taken == here for _, there, taken in seen)
+    assert not background._results
+    background.close()
+    assert not background._thread.is_alive()
+
+
+def test_what_fails_is_a_result_too_and_the_next_is_done(node):
+    background, seen = Background(node), []
+
+    def fails():
+        raise ValueError('boom')
+
+    background.submit(fails, seen.append)
+    background.submit(lambda: 7, seen.append)
+    node.spin_until(lambda: len(seen) == 2)
+    assert isinstance(seen[0], ValueError)
+    assert seen[1] == 7
+    background.close()
+
+
+def test_its_end_waits_for_what_is_left_to_do(node):
+    background, done = Background(node), []
+    for number in range(3):
+        background.submit(lambda n=number: time.sleep(0.05) or done.append(n), print)
+    background.close()
+    assert done == [0, 1, 2]
+
+
+def test_its_end_does_not_wait_for_ever(node):
+    """And what ends later finds no node: no error in the thread, nothing taken."""
+    background, go, seen = Background(node), threading.Event(), []
+    background.submit(lambda: go.wait(PATIENCE_S), seen.append)
+    began = time.monotonic()
+    background.close(0.1)
+    assert 0.05 < time.monotonic() - began < 2.0
+    node.destroy_node()
+    go.set()
+    # pytest turns an exception in a thread into an error of the test.
+    background._thread.join(PATIENCE_S)
+    assert not background._thread.is_alive()
+    assert not seen
+
+
+def test_a_process_need_not_wait_for_it(node):
+    background = Background(node)
+    assert background._thread.daemon
+    background.close()

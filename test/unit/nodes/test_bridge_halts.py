@@ -1,0 +1,329 @@
+"""The robot bridge's shell: who else commands, the emergency stop, and halts that are kept."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+
+import rclpy
+from bridge_rig import DOMAIN, HOME, Rig
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
+from trajectory_msgs.msg import JointTrajectory
+
+from remaster_ros.nodes import robot_bridge
+from remaster_ros.nodes.status import LEASED
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
+
+AWAY = HOME + np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+COMMANDS = 'joint_trajectory_controller/joint_trajectory'
+TOPICS = [
+    ('joint_states', JointState, 'peer'),
+    ('remaster/joint_solutions', JointTrajectory, 'peer'),
+    ('remaster/joint_waypoints', JointTrajectory, 'peer'),
+    (COMMANDS, JointTrajectory, 'robot_bridge'),
+]
+
+
+@pytest.fixture
+def rig(monkeypatch, tmp_path):
+    """Return a function that makes a rig with these parameters."""
+    made = []
+
+    def make(ready=True, **options):
+        made.append(Rig(monkeypatch, tmp_path, **options))
+        return made[-1].ready() if ready else made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+@pytest.fixture
+def intruder(monkeypatch):
+    """Return a node in a process of its own, as far as DDS can tell."""
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    node = rclpy.create_node('intruder', context=context)
+    yield node
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def listed(bridge, topic, count):
+    return lambda: (
+        bridge.count_publishers(topic) == count
+        and 'UNKNOWN' not in str([i.node_name for i in bridge.get_publishers_info_by_topic(topic)])
+    )
+
+
+# Rivals
+
+
+@pytest.mark.parametrize(('topic', 'kind', 'first'), TOPICS)
+def test_a_second_publisher_halts_a_collection(rig, intruder, topic, kind, first):
+    r = rig()
+    r.go(AWAY, speed=0.2)
+    sent = r.bridge.published
+    r.quiet()
+    intruder.create_publisher(kind, topic, 10)
+    r.wait(listed(r.bridge, topic, 2), 'the intruder')
+    r.bridge._watch()
+    both = ', '.join(sorted(['/intruder', f'/{first}']))
+    assert r.halted() == (
+        f'2 publishers on /{topic}, where one may be: {both}; '
+        'end the others (those of a killed process are listed for some 20 s)'
+    )
+    # It follows its path: it is stopped there.
+    r.wait(lambda: len(r.commands) == sent + 1, 'the stop')
+    assert np.all(r.commands[-1].v[-1] == 0.0)
+    assert r.reason('rivals') == r.halted()
+
+
+def test_another_bridge_with_a_lease_halts_a_collection(rig, intruder):
+    """Another one's commands have a lease as ours: it counts as soon as a killed one would not."""
+    r = rig()
+    r.go(AWAY, speed=0.2)
+    intruder.create_publisher(JointTrajectory, COMMANDS, LEASED)
+    r.wait(listed(r.bridge, COMMANDS, 2), 'the intruder')
+    r.bridge._watch()
+    assert not r.halted()
+    only = r.bridge._only[3]
+    r.wait(lambda: only._alive == 1, 'its lease')
+    r.run(3.2, r.halted, dt=0.05)
+    assert r.halted().startswith(f'2 publishers on /{COMMANDS}, where one may be: ')
+
+
+def test_the_graph_and_silence_are_watched_by_themselves(rig):
+    """With a timer on a clock that always runs, 20 times a second."""
+    r = rig()
+    watched = []
+    r.bridge.supervisor.observe = lambda *args: watched.append((time.monotonic(), *args)) or []
+    began = time.monotonic()
+    while time.monotonic() - began < 0.5:
+        r.executor.spin_once(timeout_sec=0.05)
+    names = [name for _, name, _, _ in watched]
+    assert names[:4] == ['rivals', 'controller', 'clock', 'safety_link']
+    assert 4 <= len(names) / 4 <= 11
+    assert {(trouble, wall) for _, _, trouble, wall in watched} == {('', r.wall)}
+
+
+# Emergency stop
+
+EMERGENCY = 'robot/emergency_stop'
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def show(r, publisher, state):
+    publisher.publish(Bool(data=state))
+    wanted = 'the robot reports an emergency stop' if state else ''
+    r.wait(lambda: r.reason('safety') == wanted, 'the emergency stop')
+
+
+def test_an_emergency_stop_halts_and_is_cleared_only_after_its_end(rig):
+    r = rig(ready=False, emergency_stop_topic=EMERGENCY)
+    assert r.bridge._emergency.topic == f'/{EMERGENCY}'
+    publisher = r.peer.create_publisher(Bool, EMERGENCY, LATCHED)
+    r.alone()
+    silent = f'/{EMERGENCY} (emergency_stop_topic) is silent: nothing moves without it'
+    assert r.reason('safety_link') == silent
+    show(r, publisher, False)
+    r.ready()
+    r.go(AWAY, speed=0.2)
+    sent = r.bridge.published
+    show(r, publisher, True)
+    assert r.halted() == 'the robot reports an emergency stop'
+    r.run(0.5)
+    # Nothing is commanded to an arm that its brakes have stopped.
+    assert r.bridge.published == sent
+    answer = r.call_clear()
+    assert (answer.success, answer.message) == (False, 'the robot reports an emergency stop')
+    assert not r.named('halt_cleared')
+    assert r.halted()
+    show(r, publisher, False)
+    assert r.halted(), 'its end alone ends no halt'
+    assert r.call_clear().success
+
+
+# Halts that are kept
+
+
+def halt(r):
+    """Halt by reports that are not believed."""
+    alter, r.alter = r.alter, lambda m: setattr(m, 'position', [float('nan')] * 7) or m
+    r.run(1.0, r.halted)
+    r.alter = alter
+    return r.halted()
+
+
+def files(folder):
+    return sorted((folder / 'remaster_ros').glob('halt*'))
+
+
+def test_a_halt_is_kept_shown_and_cleared_by_a_person(rig, tmp_path):
+    r = rig()
+    named = r.plan()
+    reason = halt(r)
+    assert reason == 'joint_states are not finite'
+    path = tmp_path / 'remaster_ros' / 'halt_0_robot_bridge.json'
+    r.wait(path.exists, 'the file')
+    assert json.loads(path.read_text())['halted'] == reason
+    level, text, values = r.summary()
+    assert (level, text, values['halted']) == ('error', reason, reason)
+    r.quiet()
+    r.spin(20)
+    count = len(r.summaries)
+    answer = r.call_clear()
+    assert (answer.success, answer.message) == (True, 'cleared; /remaster/collect goes on')
+    r.wait(lambda: not path.exists(), 'the end of the file')
+    r.flush()
+    (event,) = [event for event in r.events if event[0] == 'halt_cleared']
+    assert event == (
+        'halt_cleared',
+        'ok',
+        'the halt was cleared by a person',
+        {'stamp': named},
+    )
+    # It is shown at once.
+    r.wait(lambda: any(not s[2]['halted'] for s in r.summaries[count:]), 'a summary')
+    # And nothing moves before the collection goes on.
+    r.run(0.5)
+    level, text, _ = r.summary()
+    assert (level, text) == ('warn', 'the halt was cleared: /remaster/collect goes on')
+    again = r.call_clear()
+    assert (again.success, again.message) == (False, 'the arm is not halted')
+    r.flush()
+    assert len(r.named('halt_cleared')) == 1
+    assert not r.commands
+    assert not any(level == 'error' and 'halt is not' in text for level, text in r.bridge.logged)
+
+
+def test_a_bridge_that_is_started_again_is_still_halted(rig, tmp_path):
+    r = rig()
+    halt(r)
+    r.wait(lambda: files(tmp_path), 'the file')
+    r.close()
+    again = rig(ready=False)
+    assert again.halted().startswith('joint_states are not finite (halted ')
+    assert again.logged() == [('error', f'halted: {again.halted()}')]
+    again.alone()
+    again.plan(HOME + 0.1)
+    again.run(1.0)
+    assert not again.bridge.published
+    assert again.summary()[:2] == ('error', again.halted())
+    assert again.call_clear().success
+    again.wait(lambda: not files(tmp_path), 'the end of the file')
+
+
+def test_a_damaged_halt_file_is_a_halt(rig, tmp_path):
+    path = tmp_path / 'remaster_ros' / 'halt_0_robot_bridge.json'
+    path.parent.mkdir()
+    path.write_text('garbage')
+    r = rig(ready=False)
+    assert r.halted().startswith(f'{path}: a halt that cannot be read (')
+    assert r.call_clear().success
+    r.wait(lambda: not path.exists(), 'the end of the file')
+
+
+def test_a_halt_that_cannot_be_kept_is_said(rig, tmp_path):
+    (tmp_path / 'remaster_ros').write_text('a file where the folder should be')
+    r = rig()
+    halt(r)
+    r.wait(lambda: 'the halt is not kept' in str(r.bridge.logged), 'the error')
+    (text,) = [text for level, text in r.bridge.logged if 'kept' in text and level == 'error']
+    path = tmp_path / 'remaster_ros' / 'halt_0_robot_bridge.json'
+    assert text.startswith(f'{path}: the halt is not kept (')
+    assert text.endswith(')')
+    # It is halted all the same.
+    assert r.halted()
+
+
+def test_the_disk_does_not_keep_a_halt_waiting(rig, monkeypatch):
+    """A file system that hangs: the arm is halted, and the bridge goes on."""
+    r = rig()
+    monkeypatch.setattr(r.bridge._halt_file, 'write', lambda reason: time.sleep(0.5))
+    r.wall += 0.1
+    began = time.monotonic()
+    r.bridge._do([robot_bridge.Halted('why')])
+    assert time.monotonic() - began < 0.3
+    assert r.bridge._paths is not r.bridge._disk
+
+
+def test_a_halt_on_the_way_out_is_kept(rig, tmp_path):
+    """The bridge ends while it does not know where the arm is: the next one must be halted."""
+    r = rig()
+    r.go(AWAY, speed=0.2)
+    r.wall += 0.4
+    r.bridge.close()
+    (path,) = files(tmp_path)
+    halted = json.loads(path.read_text())['halted']
+    assert halted.startswith('planner is gone: the bridge stops; the last report of the joints is')
+
+
+# Time
+
+
+def test_every_rule_is_asked_at_the_time_it_is(rig):
+    """Each call of the supervisor has the wall time at which its message was taken."""
+    r = rig()
+    seen = {}
+
+    class Watched:
+        def __init__(self, inner):
+            self.inner = inner
+
+        def __getattr__(self, name):
+            value = getattr(self.inner, name)
+            if not callable(value) or name.startswith('_'):
+                return value
+
+            def call(*args):
+                seen.setdefault(name, []).append(args)
+                return value(*args)
+
+            return call
+
+    r.bridge.supervisor = Watched(r.bridge.supervisor)
+    r.wall += 0.125
+    r.say('recorder', waiting_for='x')
+    r.say('pose_planner', state='running', run='its')
+    r.say('pose_planner')
+    r.say('recorder')
+    r.report()
+    r.report(name=[])
+    r.plan(HOME + 0.05)
+    r.bridge._watch()
+    r.answer('1.000000000', 3)
+    r.bridge._on_emergency_stop(False)
+    r.call_clear()
+    wanted = {
+        'recorder_waits': ('x', r.wall),
+        'planner_is': ('running', r.wall, 'its'),
+        'emergency': (False, r.wall),
+        'answered': (3, r.wall),
+        'clear_halt': (r.wall,),
+    }
+    for name, args in wanted.items():
+        assert seen[name][0] == args, name
+    # What a summary leaves out.
+    assert seen['planner_is'][1] == ('unknown', r.wall, '')
+    assert seen['recorder_waits'][1] == ('', r.wall)
+    assert [args[0] for args in seen['observe'][:4]] == [
+        'rivals',
+        'controller',
+        'clock',
+        'safety_link',
+    ]
+    assert {args[2] for args in seen['observe']} == {r.wall}
+    assert seen['plan'][0][1:] == (r.wall, {})
+    assert seen['unreadable'][0][1] == r.wall
+    (report,) = seen['report'][0]
+    assert report.wall_s == r.wall
+    assert report.clock_s == r.wall + 0.25
+    assert report.stamp_s == pytest.approx(r.wall)

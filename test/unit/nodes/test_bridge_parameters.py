@@ -1,0 +1,64 @@
+"""Parameters of the bridge: their ranges, and what the supervisor keeps of them."""
+
+import dataclasses
+
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+
+from remaster_ros.motion.actions import SupervisorRules
+from remaster_ros.motion.settling import SettleRules
+from remaster_ros.nodes.bridge_parameters import Parameters
+
+pytestmark = pytest.mark.ros
+
+RANGES = {
+    'cell': ('', None, None),
+    'speed_share': (0.3, 0.01, 1.0),
+    'cartesian_speed_limit_m_s': (0.25, 0.0, 10.0),
+    'limit_margin_deg': (0.5, 0.0, 45.0),
+    'offsets': ('', None, None),
+    'settle_s': (3.0, 0.1, 60.0),
+    'arrive_tolerance': (2e-3, 1e-6, 0.1),
+    'still_tolerance': (2e-4, 1e-7, 0.01),
+    'arrive_timeout_s': (10.0, 1.0, 600.0),
+    'answer_timeout_s': (180.0, 1.0, 3600.0),
+    'heartbeat_s': (3.0, 0.5, 60.0),
+    'stall_s': (1.0, 0.2, 60.0),
+    'reaction_s': (2.0, 0.1, 60.0),
+    'lag_s': (0.35, 0.05, 2.0),
+    'emergency_stop_topic': ('', None, None),
+}
+"""What an arm is left to: whoever changes one of them has to change it here as well."""
+
+
+def test_defaults_and_ranges():
+    found = {
+        field.name: (field.default, field.metadata['low'], field.metadata['high'])
+        for field in dataclasses.fields(Parameters)
+    }
+    assert found == RANGES
+    live = [f.name for f in dataclasses.fields(Parameters) if f.metadata['live']]
+    assert live == ['speed_share', 'cartesian_speed_limit_m_s']
+
+
+def test_every_rule_comes_from_its_own_parameter():
+    parameters = Parameters(
+        settle_s=1.5,
+        arrive_tolerance=0.01,
+        still_tolerance=0.001,
+        arrive_timeout_s=11.0,
+        answer_timeout_s=12.0,
+        heartbeat_s=13.0,
+        stall_s=14.0,
+        reaction_s=15.0,
+        lag_s=1.25,
+    )
+    assert parameters.rules() == SupervisorRules(
+        SettleRules(1.5, 0.01, 0.001), 11.0, 12.0, 13.0, 14.0, 15.0, 1.25
+    )
+
+
+def test_parameters_do_not_change_by_themselves():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Parameters().speed_share = 1.0

@@ -1,0 +1,190 @@
+"""Who else publishes: told at once, or by their leases where a killed one may still be listed."""
+
+import time
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+
+import rclpy
+from bridge_rig import DOMAIN, PATIENCE_S
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Bool
+
+from remaster_ros.nodes import rivals
+from remaster_ros.nodes.rivals import OnlyPublisher
+from remaster_ros.nodes.status import LEASED
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
+
+TOPIC = 'moves'
+COUNT_WALL_S = 3.0
+PLAIN = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+# For the graph as ours; but it lives only as long as it publishes, as a killed process does not.
+MORTAL = QoSProfile(
+    depth=10,
+    reliability=ReliabilityPolicy.RELIABLE,
+    liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
+    liveliness_lease_duration=Duration(seconds=0.2),
+)
+
+
+class Bench:
+    """A node that depends on a topic and others that publish there, on a clock of the test."""
+
+    def __init__(self, monkeypatch):
+        monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        self.now = 500.0
+        monkeypatch.setattr(rivals, 'time', SimpleNamespace(monotonic=lambda: self.now))
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=DOMAIN)
+        self.node = rclpy.create_node('bridge', context=self.context, namespace='/left')
+        self.others = []
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.only = OnlyPublisher(self.node, TOPIC, Bool)
+
+    def other(self, name, qos=PLAIN, namespace='/left'):
+        # In a context of its own, as a process has one: a DDS participant.
+        context = rclpy.Context()
+        rclpy.init(context=context, domain_id=DOMAIN)
+        node = rclpy.create_node(name, context=context, namespace=namespace)
+        self.others.append(node)
+        count = self.node.count_publishers(f'/left/{TOPIC}')
+        publisher = node.create_publisher(Bool, f'/left/{TOPIC}', qos)
+        self.spin(lambda: self.node.count_publishers(f'/left/{TOPIC}') == count + 1)
+        # The name of its node may come a little later.
+        self.spin(
+            lambda: all(
+                'UNKNOWN' not in info.node_name
+                for info in self.node.get_publishers_info_by_topic(f'/left/{TOPIC}')
+            )
+        )
+        return publisher
+
+    def spin(self, condition=None, seconds=PATIENCE_S):
+        end = time.monotonic() + seconds
+        while condition is None or not condition():
+            if time.monotonic() > end:
+                assert condition is None, 'waited in vain'
+                return
+            self.executor.spin_once(timeout_sec=0.01)
+
+    def close(self):
+        self.executor.shutdown()
+        for node in (*self.others, self.node):
+            node.destroy_node()
+            rclpy.shutdown(context=node.context)
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    made = Bench(monkeypatch)
+    yield made
+    made.close()
+
+
+def words(*names):
+    return (
+        f'{len(names)} publishers on /left/moves, where one may be: {", ".join(names)}; '
+        'end the others (those of a killed process are listed for some 20 s)'
+    )
+
+
+@pytest.mark.parametrize('qos', [PLAIN, LEASED])
+def test_nobody_and_one_are_no_trouble(bench, qos):
+    assert bench.only.trouble() == ''
+    bench.other('planner', qos)
+    bench.now += 100.0
+    assert bench.only.trouble() == ''
+    assert not list(bench.node.subscriptions)
+
+
+def test_one_without_a_lease_beside_another_is_told_at_once(bench):
+    bench.other('robot')
+    bench.other('intruder', namespace='/')
+    assert bench.only.trouble() == words('/intruder', '/left/robot')
+    assert not list(bench.node.subscriptions), 'there is nothing to count'
+
+
+def test_one_with_and_one_without_a_lease_are_told_at_once(bench):
+    bench.other('planner', LEASED)
+    bench.other('intruder')
+    assert bench.only.trouble() == words('/left/intruder', '/left/planner')
+
+
+def test_two_that_live_are_told_when_a_killed_one_would_be_dead(bench):
+    bench.other('planner', LEASED)
+    last = bench.other('second', LEASED)
+    assert bench.only.trouble() == ''
+    bench.spin(lambda: bench.only._alive == 2)
+    bench.now += COUNT_WALL_S
+    assert bench.only.trouble() == ''
+    bench.now += 0.01
+    assert bench.only.trouble() == words('/left/planner', '/left/second')
+    # It goes: no trouble.
+    last.destroy()
+    bench.spin(lambda: bench.node.count_publishers('/left/moves') == 1)
+    assert bench.only.trouble() == ''
+    bench.spin(lambda: bench.only._alive == 1)
+    # And another one comes: the time begins anew.
+    bench.other('third', LEASED)
+    assert bench.only.trouble() == ''
+    bench.spin(lambda: bench.only._alive == 2)
+    assert bench.only.trouble() == ''
+    bench.now += COUNT_WALL_S + 0.01
+    assert bench.only.trouble() == words('/left/planner', '/left/third')
+
+
+@pytest.mark.parametrize('qos', [LEASED, MORTAL])
+def test_the_nodes_own_publisher_counts_as_one(bench, qos):
+    """The bridge publishes commands itself: one more that lives is one too many."""
+    bench.node.create_publisher(Bool, TOPIC, LEASED)
+    bench.node.create_publisher(Bool, 'another', LEASED)
+    other = bench.other('second', qos)
+    assert bench.only.trouble() == ''
+    bench.spin(lambda: other.publish(Bool()) or bench.only._alive == 1)
+    bench.now += COUNT_WALL_S + 0.01
+    assert bench.only.trouble() == words('/left/bridge', '/left/second')
+    if qos is MORTAL:
+        bench.spin(lambda: bench.only._alive == 0)
+        assert bench.only.trouble() == ''
+
+
+def test_one_that_was_killed_does_not_count(bench):
+    bench.other('planner', LEASED)
+    dead = bench.other('killed', MORTAL)
+    assert bench.only.trouble() == ''
+    bench.spin(lambda: dead.publish(Bool()) or bench.only._alive == 2)
+    bench.spin(lambda: bench.only._alive == 1)
+    bench.now += 10.0
+    assert bench.only.trouble() == ''
+    assert bench.node.count_publishers('/left/moves') == 2
+    # One more that lives does.
+    bench.other('second', LEASED)
+    bench.spin(lambda: bench.only._alive == 2)
+    assert bench.only.trouble() == words('/left/killed', '/left/planner', '/left/second')
+
+
+def test_what_they_publish_is_taken_and_left(bench):
+    """The subscription that counts takes the messages of both and does nothing with them."""
+    first, _ = bench.other('planner', LEASED), bench.other('second', LEASED)
+    bench.only.trouble()
+    bench.spin(lambda: bench.only._alive == 2)
+    first.publish(Bool(data=True))
+    bench.spin(seconds=0.1)
+
+
+def test_a_lease_of_an_hour_is_none(bench):
+    """A driver with so long a lease would count as alive for an hour after its end."""
+    for name, seconds in (('long', 3600), ('longer', 7200)):
+        qos = QoSProfile(
+            depth=1,
+            liveliness=LivelinessPolicy.AUTOMATIC,
+            liveliness_lease_duration=Duration(seconds=seconds),
+        )
+        bench.other(name, qos)
+    assert bench.only.trouble() == words('/left/long', '/left/longer')
