@@ -63,7 +63,8 @@ class Plausibility:
         T_R_N
             The sensor in the robot base, (4, 4); None before it is registered.
         anywhere
-            Of a reference, whose very deviation tells that something was moved: no place is wrong.
+            Of a reference, whose very deviation tells that something was moved: anything up to
+            `max_deviation_m`.
         """
         name = reading.sensor
         marker_R = self._place(reading)
@@ -73,17 +74,18 @@ class Plausibility:
             if moved > MOVED_M:
                 detail = f'the same to the last bit, though the arm moved it {1e3 * moved:.0f} mm'
                 return Rejection(name, 'frozen', detail)
-        if T_R_N is not None and not anywhere:
+        if T_R_N is not None:
             measured_R = transforms.apply(T_R_N, reading.position)
             deviation = float(np.linalg.norm(measured_R - marker_R))
-            allowed = self._allowed_m(name)
+            allowed = self._max_deviation_m if anywhere else self._allowed_m(name)
             if not deviation <= allowed:
                 detail = (
                     f'{1e3 * deviation:.0f} mm from where the robot has the marker (allowed '
                     f'{1e3 * allowed:.0f} mm): another marker, or the sensor was moved?'
                 )
                 return Rejection(name, 'swapped', detail)
-            self._usual.setdefault(name, []).append(deviation)
+            if not anywhere:
+                self._usual.setdefault(name, []).append(deviation)
         self._last[name] = reading
         return reading
 

@@ -108,3 +108,23 @@ def test_not_a_number_is_not_the_marker():
     plausibility = Plausibility(CHAIN, {'sir': MARKER})
     verdict = plausibility.judge(reading(np.zeros(7), np.full(3, np.nan)), np.eye(4))
     assert verdict.reason == 'swapped'
+
+
+def test_a_reference_may_be_beside_its_place_but_not_frozen(scene):
+    """Where a sensor was moved by 20 mm it is the references that must tell it."""
+    rng, _, T_R_N, measure = scene
+    plausibility = Plausibility(CHAIN, {'sir': MARKER}, 0.08)
+    for q in poses(rng, 30):
+        plausibility.judge(reading(q, measure(q)), T_R_N)
+    usual = plausibility._allowed_m('mocap')
+    first, second = poses(rng, 2)
+    away = transforms.apply(T_R_N, measure(first)) - CHAIN.positions(first, MARKER)
+    onward = T_R_N[:3, :3].T @ (away / np.linalg.norm(away))
+    moved = reading(first, measure(first) + onward * usual)
+    assert isinstance(plausibility.judge(moved, T_R_N), Rejection)
+    assert plausibility.judge(moved, T_R_N, anywhere=True) is moved
+    stray = reading(first, measure(first) + onward * 0.3)
+    assert isinstance(plausibility.judge(stray, T_R_N, anywhere=True), Rejection)
+    frozen = plausibility.judge(reading(second, moved.position), T_R_N, anywhere=True)
+    assert isinstance(frozen, Rejection)
+    assert frozen.reason == 'frozen'
