@@ -130,7 +130,13 @@ class Demo:
         self.hidden = Path(tempfile.mkdtemp(prefix='remaster_world_'))
         (self.out / 'log').mkdir(exist_ok=True)
         self.processes = NodeProcesses(
-            self.out / 'log', {'PYTHONUNBUFFERED': '1', **_domain_environment()}
+            self.out / 'log',
+            {
+                'PYTHONUNBUFFERED': '1',
+                # A halt of the fake arm is kept with its session, not with those of real arms.
+                'ROS_HOME': str((self.out / 'ros_home').resolve()),
+                **_domain_environment(),
+            },
         )
 
     # Running
