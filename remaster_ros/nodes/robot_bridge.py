@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -45,7 +46,7 @@ from remaster_ros.nodes.messages import JointOrder, duration_of, seconds, stamp_
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import JOINT_STATES, LEASED, RELIABLE, Event, Status, listen
+from remaster_ros.nodes.status import LEASED, RELIABLE, Event, Status, listen
 from remaster_ros.storage.cell import read_cell
 from remaster_ros.storage.halt_file import HaltFile
 from remaster_ros.storage.results import joint_offsets_rad, read_fit
@@ -54,6 +55,8 @@ COMMANDS = 'joint_trajectory_controller/joint_trajectory'
 JOINTS = 'joint_states'
 SOLUTIONS = 'remaster/joint_solutions'
 WAYPOINTS = 'remaster/joint_waypoints'
+NEWEST_STATES = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""A bridge that is kept busy drops what is old: it has to know where the arm is now."""
 MATCHED_WALL_S = 0.5
 """So much later than ours the controller's side of a DDS match may come."""
 WATCH_WALL_S = 0.05
@@ -106,7 +109,7 @@ class RobotBridge(RemasterNode):
         self._listened_wall: float | None = None
         self._settled = self.create_publisher(JointState, 'remaster/settled', RELIABLE)
         self.status = Status(self, self._summary)
-        self.create_subscription(JointState, JOINTS, self._on_joint_state, JOINT_STATES)
+        self.create_subscription(JointState, JOINTS, self._on_joint_state, NEWEST_STATES)
         self.create_subscription(JointTrajectory, WAYPOINTS, self._on_waypoints, RELIABLE)
         self.create_subscription(JointTrajectory, SOLUTIONS, self._on_solutions, RELIABLE)
         self._emergency = EmergencyLink(

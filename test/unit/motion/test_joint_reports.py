@@ -205,10 +205,10 @@ def test_a_long_silence_does_not_excuse_a_late_report():
 
 @pytest.mark.parametrize('rate', [10.0, 20.0])
 def test_a_fast_clock_makes_a_busy_machine_later(rate):
-    """0.1 s of wall time are `rate` times as long on it; the drift is, too."""
+    """Half a second of wall time is `rate` times as long on it; the drift is, too."""
     stream = Stream(rate=rate, count=70 * int(rate))
     assert stream.reports.clock.rate == pytest.approx(rate, rel=1e-6)
-    limit = 0.15 + 0.1 * rate
+    limit = 0.15 + 0.5 * rate
     assert stream.next(late=limit - 0.02)
     assert not stream.next(late=limit + 0.06)
     slow = Stream(rate=0.5, count=200)
