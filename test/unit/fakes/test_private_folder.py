@@ -37,7 +37,7 @@ def test_it_is_for_this_user_alone(folder):
         os.umask(before)
     make_private_folder(folder)
     make_world(folder, read_cell('demo'), 1, 1.0)
-    assert open_world('', 0.0).folder == folder
+    assert open_world('', timeout_s=0.0).folder == folder
 
 
 def test_a_link_is_not_followed(folder, tmp_path):
@@ -48,7 +48,7 @@ def test_a_link_is_not_followed(folder, tmp_path):
         make_private_folder(folder)
     make_world(victim, read_cell('demo'), 1, 1.0)
     with pytest.raises(InputError, match='is a link, which is not followed'):
-        open_world('', 0.0)
+        open_world('', timeout_s=0.0)
 
 
 def test_a_link_to_nowhere_is_not_followed(folder, tmp_path):
@@ -56,7 +56,7 @@ def test_a_link_to_nowhere_is_not_followed(folder, tmp_path):
     with pytest.raises(InputError, match='is a link'):
         make_private_folder(folder)
     with pytest.raises(InputError, match='is a link'):
-        open_world('', 0.0)
+        open_world('', timeout_s=0.0)
     assert not (tmp_path / 'nowhere').exists()
 
 
@@ -73,7 +73,7 @@ def test_a_folder_that_is_open_to_others_is_refused(folder, mode):
     folder.mkdir()
     folder.chmod(mode)
     make_world(folder, read_cell('demo'), 1, 1.0)
-    for use in (lambda: make_private_folder(folder), lambda: open_world('', 0.0)):
+    for use in (lambda: make_private_folder(folder), lambda: open_world('', timeout_s=0.0)):
         with pytest.raises(InputError, match=f'mode {mode:o} instead of 700'):
             use()
 

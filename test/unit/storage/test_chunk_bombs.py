@@ -19,14 +19,16 @@ REALLY = 3 * 1024**3
 """What a bomb unpacks to, bytes."""
 PIECE = bytes(1 << 24)
 READ = """
-import resource, sys
+import re, sys
+from pathlib import Path
 from remaster_ros.core.errors import InputError
 from remaster_ros.storage.bag import BagReader
 try:
     BagReader(sys.argv[1])
 except InputError as error:
     print(error)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+# Not ru_maxrss: a child inherits that of the process which started it.
+print(int(re.search(r'VmHWM:\\s+(\\d+) kB', Path('/proc/self/status').read_text())[1]) // 1024)
 """
 
 
