@@ -124,7 +124,9 @@ def judge(out: Path, seen: set[str], truth: dict[str, Any] | None = None) -> dic
     records = [r for r in read_journal(folder / 'journal.jsonl').records if 'rows' in r]
     decided = Counter((record['pose'], record['solution']) for record in records)
     tours = [r for r in read_journal(folder / 'plan.jsonl').records if r['kind'] == 'tour']
-    planned = sum(len(p['solutions']) for s in tours[-1]['plans'].values() for p in s['poses'])
+    # Visits of the references are rows of their own, and none of the measurements.
+    plans = [plan for split, plan in tours[-1]['plans'].items() if split != 'reference']
+    planned = sum(len(pose['solutions']) for plan in plans for pose in plan['poses'])
     result: dict[str, Any] = {
         'exit_status': session.exit_status,
         'rows': len(m),
