@@ -62,10 +62,11 @@ class Drive:
 
 @dataclass(frozen=True)
 class Stop:
-    """Publish this stop."""
+    """Publish this stop, at once: it is for where the arm is at `wall_s`."""
 
     admitted: Admitted
     reason: str
+    wall_s: float
 
 
 @dataclass(frozen=True)

@@ -252,6 +252,16 @@ class ArmSupervisor:
         self.gate.limits = limits
         return actions + self.tick(wall_s)
 
+    def not_sent(self, stop: Stop, wall_s: float) -> list[Action]:
+        """Take that a stop was not published: this process was paused since it was decided."""
+        self._braking = None
+        late_s = wall_s - stop.wall_s
+        return self._halt(
+            f'{stop.reason}; this process was paused for {late_s:.2f} s just then: nothing is '
+            'commanded',
+            wall_s,
+        )
+
     def tick(self, wall_s: float) -> list[Action]:
         """Look at the time: stop or halt on silence, go on when nothing is in the way."""
         self._interlocks.look(wall_s)
@@ -505,4 +515,4 @@ class ArmSupervisor:
             + STOPPED_S
         )
         self._braking = Braking(stop.q, deadline)
-        return [Stop(admitted, reason)]
+        return [Stop(admitted, reason, wall_s)]

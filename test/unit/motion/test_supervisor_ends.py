@@ -115,3 +115,18 @@ def test_a_collection_that_is_begun_at_once_after_the_halt_was_cleared_goes_on(r
     planner('running', 'second')
     rig.run(1.0)
     assert len(rig.said(Drive)) > count
+
+
+def test_a_stop_that_was_not_sent_halts_and_nothing_follows(rig):
+    """The process was paused between the decision and its publication (1 of 1,000 injections)."""
+    rig.go([0.9, -1.9])
+    rig.obey = lambda waypoints: ()
+    rig.state = 'paused'
+    rig.do(rig.supervisor.planner_is('paused', rig.wall))
+    stop = rig.last(Stop)
+    assert stop.wall_s == rig.wall
+    rig.do(rig.supervisor.not_sent(stop, rig.wall + 1.88))
+    assert 'paused for 1.88 s just then: nothing is commanded' in rig.supervisor.halted
+    count = len(rig.actions)
+    rig.run(3.0)
+    assert len(rig.actions) == count
