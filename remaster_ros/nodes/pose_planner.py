@@ -221,6 +221,9 @@ class PosePlanner(RemasterNode):
         if self._announcer.says('recorder', 'exit_status') == 'complete':
             response.message = "the recorder's session is complete; give it a new folder"
             return response
+        if self._announcer.says('recorder', 'changed_run') == 'unknown':
+            response.message = 'the recorder was started just now; try again in a second'
+            return response
         if self.state != 'running' and self._announcer.says('recorder', 'changed_run') not in (
             '',
             'none',

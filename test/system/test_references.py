@@ -50,7 +50,10 @@ def test_a_bumped_sensor_is_named_and_pauses_the_collection(start, client, tmp_p
     assert cell.recorder('changed') == event.message
     assert (reading()['state'], cell.recorder('observations')) == ('paused', recorded)
 
+    # It must have learned that the planner is paused: what runs after that is a person's word.
+    cell.until(lambda: cell.recorder('changed_run') not in ('', 'unknown'), 'the paused planner')
     before = rounds(cell)
+    cell.until(lambda: cell.said['pose_planner']['state'] == 'paused', 'the planner')
     assert call(client, '/remaster/collect').success
     cell.until(lambda: cell.recorder('changed') == '', 'that a person has looked', 20)
     cell.until(lambda: rounds(cell) == before + 1, 'a new beginning')
