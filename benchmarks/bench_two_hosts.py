@@ -173,7 +173,8 @@ def conduct() -> None:
 
     def summary(name: str, message: str, values: dict[str, str]) -> None:
         said[name] = values
-        print(json.dumps({'node': name, 'message': message, **values}), flush=True)
+        # The values have a 'node' of their own: the name with its namespace.
+        print(json.dumps({**values, 'node': name, 'message': message}), flush=True)
 
     listen(node, lambda event: None, summary)
     client = node.create_client(Trigger, '/remaster/collect')

@@ -26,11 +26,14 @@ def restart(cell, *others):
     for name in (*others, 'pose_planner'):
         cell.nodes[name].kill()
         cell.nodes[name].wait()
-    cell.said.pop('pose_planner')
+        cell.said.pop(name)
     for name in (*others, 'pose_planner'):
         cell.nodes[name] = cell._begin(name)
     cell.until(
-        lambda: planner(cell, 'state') == 'running' or planner(cell, 'resuming') == 'no',
+        lambda: (
+            {*others} <= {*cell.said}
+            and (planner(cell, 'state') == 'running' or planner(cell, 'resuming') == 'no')
+        ),
         'the decision',
     )
 

@@ -117,7 +117,9 @@ def test_the_bar_publishes_nothing_without_it(start, client, said, world):
 def test_a_bag_begins_with_the_clock_and_keeps_what_came_before(start, client, said, tmp_path):
     """At time 0 it would last as long as the simulation has been running."""
     from rosgraph_msgs.msg import Clock
-    from sensor_msgs.msg import JointState
+    from geometry_msgs.msg import PoseStamped
+
+    from remaster_ros.nodes.status import RELIABLE
 
     session = tmp_path / 'session'
     node = start(
@@ -125,12 +127,11 @@ def test_a_bag_begins_with_the_clock_and_keeps_what_came_before(start, client, s
         *node_arguments(use_sim_time=True, cell='demo', session=session, call_measure=False),
     )
     until_it_says(client, said, 'recorder', None, '')
-    joints = client.create_publisher(JointState, '/joint_states', 10)
-    wait_until(lambda: client.spin_some() or joints.get_subscription_count(), 20, 'the recorder')
+    # A topic that the recorder takes reliably: of joint states the first may be lost.
+    poses = client.create_publisher(PoseStamped, '/remaster/target_pose', RELIABLE)
+    wait_until(lambda: client.spin_some() or poses.get_subscription_count(), 20, 'the recorder')
     for _ in range(5):
-        message = JointState(name=[f'joint_{i}' for i in range(1, 8)], position=[0.1] * 7)
-        message.header.stamp.sec = TIME_S
-        joints.publish(message)
+        poses.publish(PoseStamped())
     for _ in range(20):
         client.spin_some()
     clock = client.create_publisher(Clock, '/clock', 10)
@@ -146,7 +147,7 @@ def test_a_bag_begins_with_the_clock_and_keeps_what_came_before(start, client, s
     # The first says that the recorder began, which a replay must know first.
     assert messages[0][0] == '/remaster/status'
     assert b'recorder: began' in messages[0][2]
-    assert sum(topic == '/joint_states' for topic, *_ in messages) == 5
+    assert sum(topic == '/remaster/target_pose' for topic, *_ in messages) == 5
     text = (session / 'bag' / 'metadata.yaml').read_text(encoding='utf-8')
     information = yaml.safe_load(text)['rosbag2_bagfile_information']
     assert information['starting_time']['nanoseconds_since_epoch'] == reader.start_ns
