@@ -116,8 +116,8 @@ def test_the_bar_publishes_nothing_without_it(start, client, said, world):
 
 def test_a_bag_begins_with_the_clock_and_keeps_what_came_before(start, client, said, tmp_path):
     """At time 0 it would last as long as the simulation has been running."""
-    from rosgraph_msgs.msg import Clock
     from geometry_msgs.msg import PoseStamped
+    from rosgraph_msgs.msg import Clock
 
     from remaster_ros.nodes.status import RELIABLE
 
