@@ -54,10 +54,11 @@ class PathAnswer:
 
 @dataclass(frozen=True)
 class Drive:
-    """Publish this move."""
+    """Publish this move, at once: it was decided at `wall_s`."""
 
     solution: int
     admitted: Admitted
+    wall_s: float
 
 
 @dataclass(frozen=True)

@@ -252,12 +252,19 @@ class ArmSupervisor:
         self.gate.limits = limits
         return actions + self.tick(wall_s)
 
-    def not_sent(self, stop: Stop, wall_s: float) -> list[Action]:
-        """Take that a stop was not published: this process was paused since it was decided."""
+    def not_sent(self, command: Drive | Stop, wall_s: float) -> list[Action]:
+        """Take that a command was not published: this process was paused since it was decided.
+
+        A move is asked for again when all that came in meanwhile was taken; an arm that was to be
+        stopped goes on, and where it is now is not known.
+        """
+        if isinstance(command, Drive):
+            self._visit = None
+            return []
         self._braking = None
-        late_s = wall_s - stop.wall_s
+        late_s = wall_s - command.wall_s
         return self._halt(
-            f'{stop.reason}; this process was paused for {late_s:.2f} s just then: nothing is '
+            f'{command.reason}; this process was paused for {late_s:.2f} s just then: nothing is '
             'commanded',
             wall_s,
         )
@@ -410,7 +417,7 @@ class ArmSupervisor:
         detector = SettleDetector(trajectory.end, rules.settle)
         following = Following(trajectory, time, wall_s, rules)
         self._visit = Visit(solution, following, detector, rules, seen.stamp, deadline)
-        return [Drive(solution, admitted)]
+        return [Drive(solution, admitted, wall_s)]
 
     def _give_up(self, solution: int, reason: str, wall_s: float) -> list[Action]:
         """Go on with the next solution where the gate or the path refuses one."""

@@ -24,7 +24,7 @@ lines at once."""
 HEADROOM = 0.97
 """Share of the allowed speeds that is planned with: an arm that stands is reported to move a
 little, and the first cubic begins there."""
-STOPPABLE = 0.45
+STOPPABLE = 0.42
 """Share of the allowed accelerations that a line is planned with: a stop of an arm that lags may
 have to brake harder than the line does."""
 NO_CRUISE = 1.0 - 2.0**-20

@@ -38,7 +38,7 @@ from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.run_token import LivingRun, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, Event, Status, listen
-from remaster_ros.nodes.touring import Background, TourPlanner
+from remaster_ros.nodes.touring import PlanningThread, TourPlanner
 from remaster_ros.storage.cell import read_cell
 from remaster_ros.storage.plan_book import NO_FREE_PATH, PlanBook
 
@@ -111,7 +111,7 @@ class PosePlanner(RemasterNode):
         self._tours = TourPlanner(
             self.cell, self.chain, counts, self.p.seed, margin, self.p.reference_every
         )
-        self._background = Background()
+        self._planning = PlanningThread()
         model = self._tours.model
         self.book = PlanBook(Path(self.p.session), self._settings(), self.chain, model)
         self._tried_wall = 0.0
@@ -382,7 +382,7 @@ class PosePlanner(RemasterNode):
         tour = self.book.tour
         assert tour is not None
         what = (tour, stop.split, stop.pose, stop.ids)
-        found = self._background.ask(what, q, lambda: tour.reroute(stop, q))
+        found = self._planning.ask(what, q, lambda: tour.reroute(stop, q))
         if found is not None:
             self.book.reroute(found[0])
             if found[0].ids and not self.book.trouble:
@@ -400,7 +400,7 @@ class PosePlanner(RemasterNode):
             if self._joint_states is None:
                 self._joint_states = self._listen_to_the_arm()
             return None
-        found = self._background.ask((tour, tour.visited), q, lambda: tour.propose(q))
+        found = self._planning.ask((tour, tour.visited), q, lambda: tour.propose(q))
         if found is None or found[0] is None:
             return found
         return (tour.take(found[0]),)
@@ -460,7 +460,7 @@ class PosePlanner(RemasterNode):
             return self._next_registration(q)
         if self.book.tour is None or REGISTRATION in self.book.tour.plans:
             T_R_N = dict(self.T_R_N)
-            planned = self._background.ask('plan', q, lambda: self._tours.collection(T_R_N))
+            planned = self._planning.ask('plan', q, lambda: self._tours.collection(T_R_N))
             if planned is None:
                 return None
             self.book.begin(planned[0])
@@ -479,7 +479,7 @@ class PosePlanner(RemasterNode):
             # The recorder said so; its transforms are on their way.
             return None
         if self.book.tour is None:
-            planned = self._background.ask('register', q, self._tours.registration)
+            planned = self._planning.ask('register', q, self._tours.registration)
             if planned is None:
                 return None
             self.book.begin(planned[0])

@@ -59,8 +59,8 @@ NEWEST_STATES = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 """A bridge that is kept busy drops what is old: it has to know where the arm is now."""
 MATCHED_WALL_S = 0.5
 """So much later than ours the controller's side of a DDS match may come."""
-STOP_WALL_S = 0.1
-"""A stop that was decided longer ago is not published any more."""
+LATE_WALL_S = 0.1
+"""A command that was decided longer ago is not published any more."""
 WATCH_WALL_S = 0.05
 """How often silence and the graph are looked at."""
 KNOWN_OFFSET_RAD = float(np.deg2rad(0.1))
@@ -284,15 +284,14 @@ class RobotBridge(RemasterNode):
                     self._paths.submit(
                         partial(self._search.find, action), partial(self._on_path, action.number)
                     )
+                case Drive() | Stop() if time.monotonic() - action.wall_s > LATE_WALL_S:
+                    # Paused in between (SIGSTOP, a host that swaps): the arm is elsewhere now, or
+                    # must not move any more.
+                    self._do(self.supervisor.not_sent(action, time.monotonic()))
                 case Drive():
                     self._publish(action.admitted)
                     self._on_commanded(action.solution)
-                case Stop(admitted, reason, decided_wall):
-                    now = time.monotonic()
-                    if now - decided_wall > STOP_WALL_S:
-                        # Paused in between (SIGSTOP, a host that swaps): the arm is elsewhere now.
-                        self._do(self.supervisor.not_sent(action, now))
-                        continue
+                case Stop(admitted, reason):
                     self._publish(admitted)
                     self.counts['stopped'] += 1
                     self._event('stopped', reason, 'warn')

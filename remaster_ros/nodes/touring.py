@@ -156,7 +156,7 @@ class TourPlanner:
         return plan_poses(self._inverse, self.model, candidates, sights, self._margin)
 
 
-class Background:
+class PlanningThread:
     """Does one thing at a time beside the callbacks: a stop must not wait for the planning."""
 
     def __init__(self) -> None:

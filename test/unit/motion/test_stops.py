@@ -23,7 +23,7 @@ LIMITS = MotionLimits(
 )
 
 
-BACK = 0.26
+BACK = 0.28
 """In the last moments of a line a stop may go back so fast, as a share of the cruising speed."""
 LAST_S = 0.85
 """These moments, s."""

@@ -130,3 +130,18 @@ def test_a_stop_that_was_not_sent_halts_and_nothing_follows(rig):
     count = len(rig.actions)
     rig.run(3.0)
     assert len(rig.actions) == count
+
+
+def test_a_move_that_was_not_sent_is_asked_for_again(rig):
+    rig.obey = lambda waypoints: ()
+    rig.plan([0.9, -1.9])
+    rig.run(1.0, lambda: rig.said(Drive))
+    first = rig.last(Drive)
+    assert 0.0 <= rig.wall - first.wall_s <= 0.03
+    count = len(rig.actions)
+    assert rig.supervisor.not_sent(first, rig.wall + 1.88) == []
+    assert not rig.supervisor.busy
+    assert not rig.supervisor.halted
+    rig.run(1.0, lambda: len(rig.actions) > count)
+    assert rig.last(Drive) is not first
+    assert rig.last(Drive).solution == first.solution

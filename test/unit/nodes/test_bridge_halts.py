@@ -151,6 +151,56 @@ def test_an_emergency_stop_halts_and_is_cleared_only_after_its_end(rig):
     assert r.call_clear().success
 
 
+def paused_in(r, monkeypatch, name):
+    """Pause the process (SIGSTOP) while the gate makes its next command."""
+    gate = r.bridge.supervisor.gate
+    make = getattr(gate, name)
+
+    def pause(*args):
+        admitted = make(*args)
+        monkeypatch.setattr(gate, name, make)
+        r.wall += 1.88
+        return admitted
+
+    monkeypatch.setattr(gate, name, pause)
+
+
+def test_a_stop_is_not_published_after_a_pause_of_the_process(rig, monkeypatch):
+    """It is for a place that the arm has left: 5.2 times the speed limit, once in a campaign."""
+    r = rig()
+    r.go(AWAY, speed=0.2)
+    sent = r.bridge.published
+    paused_in(r, monkeypatch, 'stop')
+    r.say_planner('paused')
+    r.flush()
+    assert r.halted() == (
+        'planner is paused; this process was paused for 1.88 s just then: nothing is commanded'
+    )
+    r.run(2.0)
+    assert r.bridge.published == sent
+    assert r.bridge.counts['stopped'] == 0
+
+
+def test_a_move_is_not_published_after_a_pause_of_the_process(rig, monkeypatch):
+    """Whatever came in meanwhile counts first; then it is asked for again."""
+    r = rig()
+    r.go(AWAY, speed=0.2)
+    r.run(20.0, lambda: r.settled)
+    sent, commanded = r.bridge.published, r.bridge.counts['commanded']
+    paused_in(r, monkeypatch, 'admit')
+    r.plan(HOME)
+    assert r.bridge.published == sent
+    assert r.bridge.counts['commanded'] == commanded
+    r.say_planner('paused')
+    r.run(1.0)
+    assert r.bridge.published == sent, 'what came in meanwhile was not looked at'
+    assert not r.halted()
+    r.say_planner('running')
+    r.run(2.0, lambda: r.bridge.published > sent)
+    r.flush()
+    assert np.allclose(r.commands[-1].q[-1], HOME, atol=1e-9)
+
+
 # Halts that are kept
 
 

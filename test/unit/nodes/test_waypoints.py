@@ -12,7 +12,7 @@ from trajectory_msgs.msg import JointTrajectory
 from remaster_ros.core.errors import InputError
 from remaster_ros.core.tour import Stop
 from remaster_ros.nodes.announcements import waypoints_by_solution, waypoints_message
-from remaster_ros.nodes.touring import Background
+from remaster_ros.nodes.touring import PlanningThread
 
 NAMES = ('a', 'b', 'c')
 
@@ -69,7 +69,7 @@ def wait_for(background, what, q, job):
 
 
 def test_background_work_is_for_the_arm_that_asked():
-    background, asked = Background(), []
+    background, asked = PlanningThread(), []
 
     def job(name):
         return lambda: asked.append(name) or name
