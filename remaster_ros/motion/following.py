@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from remaster_ros.core.types import FloatArray
 from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.joint_reports import JointReport
-from remaster_ros.motion.trajectory import Trajectory
+from remaster_ros.motion.trajectory import RAMP_S, Trajectory
 
 STANDING_S = 0.25
 """An arm that has not moved for so long stands; it must before it is sent anywhere, s."""
@@ -25,6 +26,14 @@ EARLY_S = 0.1
 """An arm may be so far ahead of its path, s of robot time; `LATENCY_S` comes on top."""
 ON_PATH_RAD = 0.02
 """An arm is on its path that is no further from it, rad: its servo overshoots."""
+SLOWED_S, SLOWED_LONGEST_S = 0.1, 0.3
+"""Over so much at least, and so much at most, is looked whether an arm loses speed, s."""
+SLOWED_RAD = 5e-3
+"""Only where its path leads on by so much in this time, rad."""
+SLOWED_SHARE = 0.5
+"""An arm that has gone less than this share of it is being stopped."""
+LAG_CHANGES_S = 0.1
+"""By so much the lag of an arm that follows may have changed in this time, s."""
 STOPPED_ON_ITS_WAY = 'the robot stopped on its way: an emergency or protective stop?'
 
 
@@ -104,6 +113,8 @@ class Following:
         self._sent, self._sent_wall = sent, sent_wall
         self.reacted = False
         self._lag_s = 0.0
+        # The last moments: time since it was sent (s), where the arm was (rad), its lag (s).
+        self._trail: deque[tuple[float, FloatArray, float]] = deque()
         self._allowed_s = rules.lag_s
         self._astray = ''
         self._astray_wall: float | None = None
@@ -115,7 +126,11 @@ class Following:
     def update(self, seen: Seen, rate: float) -> str:
         """Take a report; return in words how the arm has been off its path for too long, ''."""
         self._allowed_s = allowed_lag_s(self._rules, rate)
-        self._astray = self._look(seen, self.elapsed_s(seen.time))
+        elapsed = self.elapsed_s(seen.time)
+        self._astray = self._look(seen, elapsed)
+        self._trail.append((elapsed, seen.q, self._lag_s))
+        while len(self._trail) > 1 and elapsed - self._trail[1][0] >= SLOWED_S:
+            self._trail.popleft()
         if not self._astray:
             self._astray_wall = None
         elif self._astray_wall is None:
@@ -129,7 +144,7 @@ class Following:
             return f'the last report of the joints is {wall_s - seen.wall:.1f} s old'
         if self._lag_s > self._allowed_s and not self._astray:
             return 'the arm is not seen to move yet'
-        return self._astray
+        return self._astray or (STOPPED_ON_ITS_WAY if self._is_slowed() else '')
 
     def window(self, seen: Seen, wall_s: float, rate: float) -> tuple[float, float]:
         """Return between which times on the trajectory the arm is now, s.
@@ -173,6 +188,29 @@ class Following:
             f'the robot does not follow its path: {lag:.2f} s behind it; is its speed override '
             'below 100 %, or do joint_states come late?'
         )
+
+    def _is_slowed(self) -> bool:
+        """Whether the arm loses speed where its path goes on, long before its lag tells.
+
+        Its path is the trajectory, delayed by about what it lagged a moment ago.
+        """
+        if not self._trail:
+            return False
+        (before, q_before, lag), (now, q, _) = self._trail[0], self._trail[-1]
+        index, since_s = self.trajectory.line_at(before - lag)
+        line = self.trajectory.lines[index]
+        # In a rest, and where a line begins, it is not known by how much the arm lags.
+        least_s = self._allowed_s if index else 0.5 * RAMP_S
+        passed_s = now - before
+        known = least_s <= since_s <= line.duration_s - passed_s
+        if not (known and SLOWED_S <= passed_s <= SLOWED_LONGEST_S):
+            return False
+        expected = float(np.max(np.abs(line.way))) * min(
+            line.share(since_s + passed_s + change)[0] - line.share(since_s + change)[0]
+            for change in (-LAG_CHANGES_S, 0.0, LAG_CHANGES_S)
+        )
+        moved = float(np.max(np.abs(q - q_before)))
+        return expected > SLOWED_RAD and moved < SLOWED_SHARE * expected
 
     def _is_still_at_start(self, seen: Seen) -> bool:
         """Whether nothing of a move has been seen yet; the probe is too short to be seen."""

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from remaster_ros.fakes import motion as servo
 from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.following import (
     ASTRAY_S,
@@ -380,3 +381,56 @@ def test_an_arm_that_stays_at_the_corner_is_astray():
     assert arm.lost == ''
     assert arm.run(begun + 2.0, stays) is not None
     assert arm.said == STOPPED_ON_ITS_WAY
+
+
+# An arm that is being stopped
+
+
+def braked(trajectory, lag, at_s, brake_s=0.15):
+    """An arm whose own brakes close at a time, as an emergency stop does."""
+
+    def where(t):
+        since = min(max(t - at_s, 0.0), brake_s)
+        time = min(t, at_s) + since - since**2 / (2 * brake_s)
+        return trajectory.at(time - lag)[0]
+
+    return where
+
+
+@pytest.mark.parametrize('lag', [0.0, 0.1, 0.3])
+@pytest.mark.parametrize('at_s', [0.8, 1.2, 1.6])
+def test_an_arm_that_is_being_stopped_is_lost_long_before_its_lag_tells(lag, at_s):
+    arm = Arm()
+    where = braked(arm.trajectory, lag, at_s)
+    arm.run(at_s, where)
+    assert arm.lost == ''
+    assert arm.run(at_s + 0.22, where) is None
+    assert arm.lost == STOPPED_ON_ITS_WAY
+    assert arm.seen.time - arm.seen.stands_since < STANDING_S
+
+
+def test_on_a_later_line_it_is_lost_where_its_lag_is_known():
+    arm = Arm(CORNERS)
+    begun = CORNERS.starts_s[1]
+    where = braked(CORNERS, 0.1, begun + 0.8)
+    assert arm.run(begun + 1.02, where) is None
+    assert arm.lost == STOPPED_ON_ITS_WAY
+
+
+def test_an_arm_that_was_not_seen_for_a_while_is_not_called_slow():
+    """Over a longer time its lag may have changed."""
+    arm = Arm()
+    where = braked(arm.trajectory, 0.0, 1.0)
+    arm.run(1.0, where)
+    arm.seen = see(64.0 + 1.375, where(1.375), 512.0 + 1.375, arm.seen)
+    arm.following.update(arm.seen, 1.0)
+    assert arm.lost == ''
+
+
+@pytest.mark.parametrize('trajectory', [Trajectory((LINE,)), CORNERS])
+def test_a_servo_that_lags_and_overshoots_is_never_called_slow(trajectory):
+    arm, joints = Arm(trajectory), servo.Motion(0.0, trajectory.start)
+    joints.follow(0.0, [servo.Waypoint(p.time_s, p.q, p.velocity) for p in trajectory.waypoints()])
+    for until in np.arange(0.05, trajectory.duration_s + 1.0, 0.05):
+        assert arm.run(until, lambda t: joints.at(t)[0]) is None
+        assert arm.lost == '', until
