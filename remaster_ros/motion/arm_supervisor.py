@@ -179,7 +179,7 @@ class ArmSupervisor:
         halts = name == 'rivals' or self._interlocks.was_right(name)
         self._interlocks.set(name, trouble)
         if trouble and halts and self._engaged and not self.halted:
-            return self._halt(trouble, wall_s, stop=True)
+            return self._halt(trouble, stop_wall_s=wall_s)
         return self.tick(wall_s)
 
     def report(self, report: JointReport) -> list[Action]:
@@ -194,7 +194,7 @@ class ArmSupervisor:
         actions: list[Action] = []
         visit = self._visit
         if gap:
-            actions = self._halt(gap, wall_s)
+            actions = self._halt(gap)
         elif visit is not None and visit.settled:
             waits = bool(self._interlocks.reason('recorder'))
             outcome = visit.judge_settled(seen, recorder_waits=waits)
@@ -215,7 +215,7 @@ class ArmSupervisor:
             return []
         solution = request[1]
         if answer.path is None and answer.at_start:
-            return self._halt(self._offer(answer), wall_s)
+            return self._halt(self._offer(answer))
         if solution == STANDING:
             self._must_look = False
             return self.tick(wall_s)
@@ -223,7 +223,7 @@ class ArmSupervisor:
             return self._give_up(solution, f'no free path: {answer.why}', wall_s)
         return self._drive(solution, answer.path, seen, wall_s)
 
-    def clear_halt(self, wall_s: float) -> str:
+    def clear_halt(self) -> str:
         """Take a person's word that the arm may be moved again; return why not, '' if so.
 
         What stands in the way of a motion still does; nothing moves before the collection is
@@ -265,8 +265,7 @@ class ArmSupervisor:
         late_s = wall_s - command.wall_s
         return self._halt(
             f'{command.reason}; this process was paused for {late_s:.2f} s just then: nothing is '
-            'commanded',
-            wall_s,
+            'commanded'
         )
 
     def tick(self, wall_s: float) -> list[Action]:
@@ -276,10 +275,10 @@ class ArmSupervisor:
             return []
         emergency = self._interlocks.reason('safety')
         if emergency:
-            return self._halt(emergency, wall_s)
+            return self._halt(emergency)
         silent = self._interlocks.fell_silent('robot', wall_s)
         if silent and self._engaged:
-            return self._halt(silent, wall_s)
+            return self._halt(silent)
         blocked = self.blocked(wall_s)
         return self._stop(blocked, wall_s) if blocked else self._go_on(wall_s)
 
@@ -333,7 +332,7 @@ class ArmSupervisor:
         self._interlocks.set('robot', why)
         jumped = self._seen is not None and kind in ('too_fast', 'outside_limits')
         if (self._engaged or jumped) and not self.halted:
-            return self._halt(why, wall_s)
+            return self._halt(why)
         # Nothing moves, so that what is usual can be learned anew: a driver that was restarted, a
         # clock that was set.
         self.reports.forget()
@@ -422,7 +421,7 @@ class ArmSupervisor:
     def _give_up(self, solution: int, reason: str, wall_s: float) -> list[Action]:
         """Go on with the next solution where the gate or the path refuses one."""
         if solution < 0:
-            return self._halt(reason, wall_s)
+            return self._halt(reason)
         self._next = solution + 1
         return [Failed(solution, reason), *self.tick(wall_s)]
 
@@ -451,7 +450,7 @@ class ArmSupervisor:
     def _conclude(self, visit: Visit, outcome: str, why: str, seen: Seen) -> list[Action]:
         """Do what follows from what became of the configuration."""
         if outcome == 'halted':
-            return self._halt(why, seen.wall)
+            return self._halt(why)
         if outcome == 'over':
             self._visit, self._must_probe = None, visit.solution != PROBE
         if outcome == 'settled':
@@ -463,34 +462,41 @@ class ArmSupervisor:
         if outcome == 'failed' and visit.settled:
             self._leave(visit)
             return [Failed(visit.solution, why)]
-        return self._fail(visit, why, seen.wall) if outcome == 'failed' else []
+        return self._fail(visit, why) if outcome == 'failed' else []
 
     def _watch_braking(self, braking: Braking, seen: Seen) -> list[Action]:
         """See that a stop is a stop."""
         outcome, why = braking.judge(seen)
         if outcome:
             self._braking = None
-        return self._halt(why, seen.wall) if outcome == 'halted' else []
+        return self._halt(why) if outcome == 'halted' else []
 
     # Inside: ends of a motion
 
-    def _fail(self, visit: Visit, reason: str, wall_s: float) -> list[Action]:
-        """Give a configuration up; halt where that happens too often in a row."""
+    def _fail(self, visit: Visit, reason: str) -> list[Action]:
+        """Give a configuration up; halt where that happens too often in a row.
+
+        Its trajectory has ended: there is nothing to be stopped.
+        """
         self._failures += 1
         if self._failures >= self.rules.failures_in_a_row:
             why = f'{self._failures} configurations not reached: {reason}'
-            return self._halt(why, wall_s, stop=True)
-        # Its trajectory has ended: there is nothing to be stopped.
+            return self._halt(why)
         self._leave(visit)
         return [Failed(visit.solution, reason)]
 
-    def _halt(self, reason: str, wall_s: float, *, stop: bool = False) -> list[Action]:
-        """Halt; with `stop` the arm is stopped first where it is known to follow its path."""
+    def _halt(self, reason: str, stop_wall_s: float | None = None) -> list[Action]:
+        """Halt; with a time the arm is stopped first, where it is known to follow its path."""
         visit, seen = self._visit, self._seen
         actions: list[Action] = []
-        if stop and visit is not None and seen is not None and not visit.settled:
-            known = not visit.following.lost(seen, wall_s)
-            actions = self._brake(visit, seen, reason, wall_s) if known else []
+        if (
+            stop_wall_s is not None
+            and visit is not None
+            and seen is not None
+            and not visit.settled
+        ):
+            known = not visit.following.lost(seen, stop_wall_s)
+            actions = self._brake(visit, seen, reason, stop_wall_s) if known else []
         self.halted = reason
         self._visit, self._pending = None, None
         return [*actions, Halted(reason)]
@@ -505,7 +511,7 @@ class ArmSupervisor:
             return []
         lost = visit.following.lost(seen, wall_s)
         if lost:
-            return self._halt(f'{reason}; {lost}: nothing is commanded', wall_s)
+            return self._halt(f'{reason}; {lost}: nothing is commanded')
         return self._brake(visit, seen, reason, wall_s)
 
     def _brake(self, visit: Visit, seen: Seen, reason: str, wall_s: float) -> list[Action]:

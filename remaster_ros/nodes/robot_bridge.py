@@ -236,7 +236,7 @@ class RobotBridge(RemasterNode):
         self._do(self.supervisor.emergency(stopped, time.monotonic()))
 
     def _on_clear_halt(self, request: Trigger.Request, response: Trigger.Response) -> Any:
-        refusal = self.supervisor.clear_halt(time.monotonic())
+        refusal = self.supervisor.clear_halt()
         response.success = not refusal
         response.message = refusal or 'cleared; /remaster/collect goes on'
         if not refusal:

@@ -151,7 +151,7 @@ class Rig:
 
     def collect(self):
         """What a person does after a halt."""
-        assert self.supervisor.clear_halt(self.wall) == ''
+        assert self.supervisor.clear_halt() == ''
         self.state = 'paused'
         self.run(1.0)
         self.state = 'running'

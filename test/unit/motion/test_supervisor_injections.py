@@ -170,7 +170,7 @@ def test_nothing_dangerous_is_commanded_in_random_runs():
             if rig.supervisor.halted and not rig.frozen and rng.random() < 0.02:
                 # A person sees to it and begins the collection again. Reports that are frozen
                 # while the arm stands nobody can tell from an arm that stands: the person must.
-                assert rig.supervisor.clear_halt(rig.wall) == ''
+                assert rig.supervisor.clear_halt() == ''
                 rig.cleared = len(rig.actions)
                 rig.do(rig.supervisor.planner_is('paused', rig.wall))
                 counts['cleared'] += 1
