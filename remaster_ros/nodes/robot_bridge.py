@@ -59,8 +59,12 @@ NEWEST_STATES = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 """A bridge that is kept busy drops what is old: it has to know where the arm is now."""
 MATCHED_WALL_S = 0.5
 """So much later than ours the controller's side of a DDS match may come."""
-LATE_WALL_S = 0.1
-"""A command that was decided longer ago is not published any more."""
+LATE_WALL_S = {Stop: 0.1, Drive: 0.5}
+"""A command that was decided longer ago is not published any more, s of wall time.
+
+A stop is for where the arm is on its way. A move begins where it stands: a busy machine may take
+longer with it, a paused process may not.
+"""
 WATCH_WALL_S = 0.05
 """How often silence and the graph are looked at."""
 KNOWN_OFFSET_RAD = float(np.deg2rad(0.1))
@@ -284,7 +288,7 @@ class RobotBridge(RemasterNode):
                     self._paths.submit(
                         partial(self._search.find, action), partial(self._on_path, action.number)
                     )
-                case Drive() | Stop() if time.monotonic() - action.wall_s > LATE_WALL_S:
+                case Drive() | Stop() if _age_s(action) > LATE_WALL_S[type(action)]:
                     # Paused in between (SIGSTOP, a host that swaps): the arm is elsewhere now, or
                     # must not move any more.
                     self._do(self.supervisor.not_sent(action, time.monotonic()))
@@ -384,6 +388,11 @@ class RobotBridge(RemasterNode):
         self._do(self.supervisor.planner_is('gone: the bridge stops', time.monotonic()))
         self._paths.close(0.5)
         self._disk.close()
+
+
+def _age_s(command: Drive | Stop) -> float:
+    """Return how long ago a command was decided, s of wall time."""
+    return time.monotonic() - command.wall_s
 
 
 def main(args: list[str] | None = None) -> int:
