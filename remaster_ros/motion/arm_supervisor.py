@@ -153,7 +153,7 @@ class ArmSupervisor:
 
     def unreadable(self, why: str, wall_s: float) -> list[Action]:
         """Take a report that does not tell where the joints are."""
-        return self._doubt(why, wall_s)
+        return self._doubt(why, wall_s, 'unreadable')
 
     def emergency(self, stopped: bool, wall_s: float) -> list[Action]:
         """Take the state of the robot's own safety circuit."""
@@ -233,7 +233,7 @@ class ArmSupervisor:
             return self._interlocks.reason('safety')
         if not self.halted:
             return 'the arm is not halted'
-        self.halted, self._failures = '', 0
+        self.halted = ''
         # A planner that does not run begins only by a person's word; one that runs has to be heard
         # of otherwise first.
         self._interlocks.must_collect = not self._interlocks.reason('planner')
@@ -323,7 +323,7 @@ class ArmSupervisor:
         self._interlocks.hear(name, reason, wall_s)
         return self.tick(wall_s)
 
-    def _doubt(self, why: str, wall_s: float, kind: str = '') -> list[Action]:
+    def _doubt(self, why: str, wall_s: float, kind: str) -> list[Action]:
         """Take a report that is not believed; where that goes on it halts a collection."""
         if self._doubted_wall is None:
             self._doubted_wall = wall_s

@@ -84,7 +84,7 @@ class MotionLimits:
             np.maximum(chain.lower, chain.lower - shift),
             np.minimum(chain.upper, chain.upper - shift),
             speed_share * velocity,
-            np.broadcast_to(np.asarray(acceleration, dtype=float), velocity.shape),
+            np.broadcast_to(acceleration, velocity.shape),
             tool_speed,
             margin,
         )

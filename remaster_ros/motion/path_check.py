@@ -44,7 +44,7 @@ class PointSpeeds:
     def __init__(self, chain: SerialChain, extents: Sequence[FloatArray]) -> None:
         if len(extents) != len(chain):
             raise ValueError(f'{len(extents)} bodies for {len(chain)} joints')
-        self._chain, self._extents = chain, [np.asarray(e, dtype=float) for e in extents]
+        self._chain, self._extents = chain, extents
 
     def fastest(self, q: FloatArray, velocity: FloatArray) -> FloatArray:
         """Return the speed of the fastest point, m/s, (n,), at q and joint velocities (n, k)."""
@@ -53,14 +53,14 @@ class PointSpeeds:
         turn = np.cumsum(velocity[..., None] * axes, axis=-2)
         # Each link's motion as a turn and the velocity of the point of it at the base's origin.
         shift = np.cumsum(velocity[..., None] * np.cross(origins, axes), axis=-2)
-        fastest = np.zeros(q.shape[:-1])
+        fastest = np.zeros(len(q))
         for joint, points in enumerate(self._extents):
             if not len(points):
                 continue
             places = points @ np.swapaxes(frames[..., joint, :3, :3], -1, -2)
             places += origins[..., joint, None, :]
             speeds = shift[..., joint, None, :] + np.cross(turn[..., joint, None, :], places)
-            squares = np.max(np.sum(speeds**2, axis=-1), axis=-1)
+            squares = np.max(np.sum(speeds**2, axis=2), axis=1)
             fastest = np.maximum(fastest, np.sqrt(squares))
         return fastest
 

@@ -108,9 +108,8 @@ class _Stretch:
     def _farthest(self, time: float, end: float) -> float:
         """Return the largest share that any of the cubics reaches."""
         second, third = self._coefficients(time, end)
-        # Its speed is zero at the end, and at the share v T / (3 third).
-        with np.errstate(divide='ignore', invalid='ignore'):
-            turn = np.nan_to_num(self._v * time / (3 * third), posinf=0.0, neginf=0.0)
-        share = np.clip(turn, 0.0, 1.0)
-        place = self._x + share * (self._v * time + share * (second + share * third))
+        # Its speed is zero at the end, and at the share v T / (3 third). That is the farthest only
+        # where it comes first, with a positive third; else the end is.
+        turn = np.divide(self._v * time, 3 * third, out=np.ones_like(third), where=third > 0.0)
+        place = self._x + turn * (self._v * time + turn * (second + turn * third))
         return float(np.max(place, initial=end))

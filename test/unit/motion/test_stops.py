@@ -11,7 +11,7 @@ from scipy.interpolate import CubicHermiteSpline
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import MotionGate
 from remaster_ros.motion.path_check import FreePath
-from remaster_ros.motion.stopping import END_OF_STOP_S, STOP_S, stop_on_line
+from remaster_ros.motion.stopping import END_OF_STOP_S, STOP_S, _Stretch, stop_on_line
 from remaster_ros.motion.trajectory import HEADROOM, RAMP_S, Line
 
 LIMITS = MotionLimits(
@@ -135,6 +135,36 @@ def test_a_stop_at_the_end_stays_there():
     stop = stop_on_line(line, line.duration_s, line.duration_s, LIMITS)
     np.testing.assert_allclose(stop.q, line.end)
     assert stop.time_s == STOP_S
+
+
+@pytest.mark.parametrize(('low', 'high'), [(1.2, 0.0), (0.3, 0.0), (0.02, 0.0), (0.9, 0.05)])
+def test_a_stretch_up_to_the_end_has_the_time_that_the_slowest_needs(low, high):
+    """Not faster than the line from its first place, no longer than that takes."""
+    line = Line.within(LIMITS, np.zeros(3), np.array([2.0, 1.0, 0.0]))
+    low_s, high_s = line.duration_s - low, line.duration_s - high
+    stop = stop_on_line(line, low_s, high_s, LIMITS)
+    share, _ = line.share(low_s)
+    needed = max(low, 1.5 * (1.0 - share) / line.rate, END_OF_STOP_S)
+    assert stop.time_s == pytest.approx(needed, rel=1e-12)
+    for time_s in np.linspace(low_s, high_s, 7):
+        share, rate = line.share(time_s)
+        curve = CubicHermiteSpline([0.0, stop.time_s], [share, stop.q[0] / 2.0], [rate, 0.0])
+        t = np.linspace(0.0, stop.time_s, 101)
+        assert curve(t, 1).max() <= line.rate * (1 + 1e-9)
+        assert curve(t).max() <= 1.0 + 1e-8
+
+
+def test_how_far_an_arm_goes_in_a_stop_against_dense_samples():
+    rng = np.random.default_rng(5)
+    for _ in range(300):
+        line = Line.within(LIMITS, np.zeros(3), 10.0 ** rng.uniform(-4.0, 0.4, 3))
+        low_s, high_s = np.sort(rng.uniform(0.0, line.duration_s, 2))
+        stretch = _Stretch(line, low_s, high_s, LIMITS)
+        time, end = rng.uniform(0.1, 2.0), rng.uniform(0.0, 1.2)
+        second, third = stretch._coefficients(time, end)
+        s = np.linspace(0.0, 1.0, 400)[:, None]
+        dense = stretch._x + s * (stretch._v * time + s * (second + s * third))
+        assert stretch._farthest(time, end) == pytest.approx(dense.max(), abs=2e-5)
 
 
 # Through the gate: trajectories of several lines

@@ -1,0 +1,96 @@
+"""What becomes of a configuration at the very limits of its times and distances."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from remaster_ros.motion.actions import SupervisorRules
+from remaster_ros.motion.following import Following, Seen
+from remaster_ros.motion.settling import SettleDetector, SettleRules
+from remaster_ros.motion.trajectory import Line, Trajectory
+from remaster_ros.motion.visit import ELSEWHERE_RAD, MOVED_RAD, PROBE_WAIT_S, Braking, Visit
+
+RULES = SupervisorRules(
+    settle=SettleRules(settle_s=1.0, arrive_tolerance=2.0**-8, still_tolerance=2.0**-12),
+    stall_s=1.0,
+    answer_timeout_s=16.0,
+)
+LINE = Line(np.array([-1.0, 0.0]), np.zeros(2), 0.5)
+"""2.5 s to zero."""
+SENT_S = 64.0
+
+
+def at(q, time_s, stood_s=0.0):
+    q = np.asarray(q, float)
+    return Seen(q, time_s, time_s, time_s, q, time_s - stood_s, 0.0)
+
+
+def visit(solution=0, rules=RULES, **changes):
+    following = Following(Trajectory((LINE,)), SENT_S, SENT_S, rules)
+    following.reacted = True
+    detector = SettleDetector(LINE.end, rules.settle)
+    made = Visit(solution, following, detector, rules, SENT_S, SENT_S + 8.0)
+    return dataclasses.replace(made, **changes)
+
+
+@pytest.mark.parametrize(('moved', 'outcome'), [(MOVED_RAD, ''), (MOVED_RAD + 1e-12, 'halted')])
+def test_how_far_an_arm_may_move_while_it_is_measured(moved, outcome):
+    settled = visit(settled=True, deadline=SENT_S + 100.0)
+    for q in ([moved, 0.0], [0.0, -moved]):
+        assert settled.judge_settled(at(q, SENT_S), recorder_waits=False)[0] == outcome
+
+
+@pytest.mark.parametrize(('late', 'outcome'), [(0.0, ''), (2.0**-30, 'failed')])
+def test_how_long_the_recorder_may_take(late, outcome):
+    settled = visit(settled=True, deadline=SENT_S + 16.0)
+    seen = at(LINE.end + 1e-6, SENT_S + 16.0 + late)
+    assert settled.judge_settled(seen, recorder_waits=False)[0] == outcome
+    assert settled.judge_settled(seen, recorder_waits=True)[0] == ''
+    assert settled.deadline == seen.time + 16.0
+
+
+@pytest.mark.parametrize(('late', 'outcome'), [(0.0, ''), (2.0**-30, 'failed')])
+def test_how_long_an_arm_may_take(late, outcome):
+    assert visit().judge(at([1e-3, 0.0], SENT_S + 8.0 + late), 1.0)[0] == outcome
+
+
+@pytest.mark.parametrize(
+    ('off', 'stood_s', 'outcome'),
+    [
+        (2.0**-8, 4.0, ''),
+        (2.0**-8 + 2.0**-20, 1.0, 'halted'),
+        (2.0**-8 + 2.0**-20, 1.0 - 2.0**-20, ''),
+    ],
+)
+def test_how_long_an_arm_may_stand_beside_its_target(off, stood_s, outcome):
+    seen = at([-off, 0.0], SENT_S + 5.0, stood_s)
+    assert visit().judge(seen, 1.0)[0] == outcome
+
+
+@pytest.mark.parametrize(('after_s', 'outcome'), [(1.0, 'halted'), (1.0 - 2.0**-20, '')])
+def test_an_arm_that_stood_before_its_move_ended_is_given_time_from_its_end(after_s, outcome):
+    seen = at([-0.015, 0.0], SENT_S + 2.5 + after_s, 2.0)
+    assert visit().judge(seen, 1.0)[0] == outcome
+
+
+def test_a_probe_is_over_when_it_must_have_arrived():
+    arrived = SENT_S + LINE.duration_s + PROBE_WAIT_S
+    probe = visit(solution=-1)
+    assert probe.judge(at([1e-3, 0.0], arrived), 1.0)[0] == ''
+    assert probe.judge(at([1e-3, 0.0], arrived + 2.0**-20), 1.0)[0] == 'over'
+
+
+@pytest.mark.parametrize(
+    ('off', 'outcome'), [(ELSEWHERE_RAD, 'over'), (ELSEWHERE_RAD + 1e-12, 'halted')]
+)
+def test_how_far_from_its_stop_an_arm_may_stand(off, outcome):
+    stop = Braking(np.zeros(2), SENT_S + 4.0)
+    assert stop.judge(at([off, 0.0], SENT_S, 1.0))[0] == outcome
+    assert stop.judge(at([0.0, -off], SENT_S, 1.0))[0] == outcome
+
+
+@pytest.mark.parametrize(('late', 'outcome'), [(0.0, ''), (2.0**-30, 'halted')])
+def test_how_long_a_stop_may_take(late, outcome):
+    stop = Braking(np.zeros(2), SENT_S + 4.0)
+    assert stop.judge(at([1.0, 0.0], SENT_S + 4.0 + late))[0] == outcome
