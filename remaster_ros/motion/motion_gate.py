@@ -250,12 +250,12 @@ class Cubic:
 
     def at(self, time_s: float | FloatArray) -> FloatArray:
         """Return positions, rad, (k,) or (n, k) for times (n,)."""
-        powers = np.power.outer(np.asarray(time_s, dtype=float), np.arange(4))
+        powers = np.power.outer(time_s, np.arange(4))
         return powers @ self.coefficients
 
     def velocity(self, time_s: float | FloatArray) -> FloatArray:
         """Return velocities, rad/s, (k,) or (n, k)."""
-        powers = np.power.outer(np.asarray(time_s, dtype=float), np.arange(3))
+        powers = np.power.outer(time_s, np.arange(3))
         return powers @ (self.coefficients[1:] * np.array([[1.0], [2.0], [3.0]]))
 
     def range(self) -> tuple[FloatArray, FloatArray]:
