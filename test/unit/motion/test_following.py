@@ -200,6 +200,16 @@ def test_exactly_at_the_tolerances():
     assert following.reacted
 
 
+def test_at_a_fast_clock_a_move_has_ended_later():
+    """By how much commands may differ on their way is wall time."""
+    for rate in (1.0, 10.0):
+        arm = Arm(rate=rate)
+        arm.run(2.5 + JITTER_S * rate - 1 / 32, arm.lagging(0.0))
+        assert not arm.following.has_ended(arm.seen, arm.seen.wall, rate)
+        arm.run(2.5 + JITTER_S * rate + 1 / 64, arm.lagging(0.0))
+        assert arm.following.has_ended(arm.seen, arm.seen.wall, rate)
+
+
 def test_at_a_fast_clock_the_window_is_wider():
     arm = Arm(rate=10.0)
     arm.run(1.0, arm.lagging(0.1))
@@ -398,7 +408,7 @@ def braked(trajectory, lag, at_s, brake_s=0.15):
 
 
 @pytest.mark.parametrize('lag', [0.0, 0.1, 0.3])
-@pytest.mark.parametrize('at_s', [0.8, 1.2, 1.6])
+@pytest.mark.parametrize('at_s', [0.3, 0.8, 1.2, 1.6])
 def test_an_arm_that_is_being_stopped_is_lost_long_before_its_lag_tells(lag, at_s):
     arm = Arm()
     where = braked(arm.trajectory, lag, at_s)
