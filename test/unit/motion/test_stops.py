@@ -210,11 +210,11 @@ def test_a_stop_in_a_rest_stays_at_the_corner():
 
 def test_only_what_is_under_way_can_be_stopped_and_once():
     gate = MotionGate(LIMITS)
-    with pytest.raises(LookupError, match='^no move is under way$'):
+    with pytest.raises(LookupError, match=r'^no move is under way$'):
         gate.stop(0.0, 0.0)
     gate, _ = admitted([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     gate.stop(1.0, 1.0)
-    with pytest.raises(LookupError, match='^no move is under way$'):
+    with pytest.raises(LookupError, match=r'^no move is under way$'):
         gate.stop(1.0, 1.0)
 
 
