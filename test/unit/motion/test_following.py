@@ -429,6 +429,18 @@ def test_on_a_later_line_it_is_lost_where_its_lag_is_known():
     assert arm.lost == STOPPED_ON_ITS_WAY
 
 
+def test_an_arm_that_runs_up_later_than_a_moment_ago_is_not_called_slow():
+    """Where it speeds up, a lag that grows looks like a loss of speed."""
+    arm = Arm()
+
+    def where(t):
+        return arm.trajectory.at(t - 0.55 * np.clip(t - 0.3, 0.0, 0.1))[0]
+
+    for until in np.arange(0.1, 1.0, 1 / 64):
+        assert arm.run(until, where) is None
+        assert arm.lost == '', until
+
+
 def test_an_arm_that_was_not_seen_for_a_while_is_not_called_slow():
     """Over a longer time its lag may have changed."""
     arm = Arm()

@@ -167,6 +167,25 @@ def test_how_far_an_arm_goes_in_a_stop_against_dense_samples():
         assert stretch._farthest(time, end) == pytest.approx(dense.max(), abs=2e-5)
 
 
+def test_how_hard_a_stop_brakes_against_a_spline():
+    rng = np.random.default_rng(6)
+    for _ in range(100):
+        bound = rng.uniform(1.0, 9.0, 3)
+        limits = dataclasses.replace(LIMITS, acceleration=bound)
+        line = Line.within(limits, np.zeros(3), rng.uniform(-2.0, 2.0, 3))
+        low_s, high_s = np.sort(rng.uniform(0.0, line.duration_s, 2))
+        stretch = _Stretch(line, low_s, high_s, limits)
+        time, end = rng.uniform(0.1, 2.0), rng.uniform(0.0, 1.2)
+        curves = CubicHermiteSpline(
+            [0.0, time],
+            [stretch._x, np.full_like(stretch._x, end)],
+            [stretch._v, np.zeros_like(stretch._v)],
+        )
+        largest = np.max(np.abs(curves(np.array([0.0, time]), 2)))
+        expected = largest * np.max(np.abs(line.way) / bound)
+        assert stretch._acceleration(time, end) == pytest.approx(expected)
+
+
 # Through the gate: trajectories of several lines
 
 
