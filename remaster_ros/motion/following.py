@@ -199,11 +199,10 @@ class Following:
         (before, q_before, lag), (now, q, _) = self._trail[0], self._trail[-1]
         index, since_s = self.trajectory.line_at(before - lag)
         line = self.trajectory.lines[index]
-        # In a rest, and where a line begins, it is not known by how much the arm lags.
+        # Where a line begins it is not known by how much the arm lags.
         least_s = self._allowed_s if index else 0.5 * RAMP_S
         passed_s = now - before
-        known = least_s <= since_s <= line.duration_s - passed_s
-        if not (known and SLOWED_S <= passed_s <= SLOWED_LONGEST_S):
+        if since_s < least_s or not SLOWED_S <= passed_s <= SLOWED_LONGEST_S:
             return False
         expected = float(np.max(np.abs(line.way))) * min(
             line.share(since_s + passed_s + change)[0] - line.share(since_s + change)[0]

@@ -194,7 +194,7 @@ def test_how_hard_a_stop_brakes_against_a_spline():
 
 
 def test_stops_are_nearly_as_short_as_they_can_be():
-    """Beside a search over 21 ends at each time; one in twenty-four is 5 % longer, none by a quarter."""
+    """Beside a search over 21 ends at each time: one in 24 is 5 % longer, none by a quarter."""
     rng, ratios = np.random.default_rng(7), []
     for _ in range(200):
         bound = np.full(3, 10.0 ** rng.uniform(-0.5, 1.0))

@@ -567,6 +567,15 @@ def test_three_failures_in_a_row_halt_and_the_third_is_not_lost(rig):
     assert len(rig.said(Halted)) == 1
 
 
+def test_a_recorder_that_does_not_answer_is_no_failure_of_the_robot(rig):
+    """However often: each configuration was reached."""
+    rig.plan(*([0.1 * i, 0.3] for i in range(5)))
+    rig.run(150.0, lambda: len(rig.said(Failed)) == 4)
+    assert {f.reason for f in rig.said(Failed)} == {'the recorder did not say what became of it'}
+    assert [f.solution for f in rig.said(Failed)] == [0, 1, 2, 3]
+    assert not rig.said(Halted)
+
+
 def test_a_configuration_that_is_reached_ends_the_row_of_failures(rig):
     rig.alter = restless(rig, {0, 1, 3, 4})
     rig.plan(*([0.1 * i, 0.3] for i in range(6)))

@@ -52,7 +52,8 @@ def test_how_long_the_recorder_may_take(late, outcome):
 
 @pytest.mark.parametrize(('late', 'outcome'), [(0.0, ''), (2.0**-30, 'failed')])
 def test_how_long_an_arm_may_take(late, outcome):
-    assert visit().judge(at([1e-3, 0.0], SENT_S + 8.0 + late), 1.0)[0] == outcome
+    seen = at([1e-3, 0.0], SENT_S + 8.0 + late)
+    assert visit().judge(seen, 1.0)[0] == outcome
 
 
 @pytest.mark.parametrize(
@@ -77,8 +78,16 @@ def test_an_arm_that_stood_before_its_move_ended_is_given_time_from_its_end(afte
 def test_a_probe_is_over_when_it_must_have_arrived():
     arrived = SENT_S + LINE.duration_s + PROBE_WAIT_S
     probe = visit(solution=-1)
-    assert probe.judge(at([1e-3, 0.0], arrived), 1.0)[0] == ''
-    assert probe.judge(at([1e-3, 0.0], arrived + 2.0**-20), 1.0)[0] == 'over'
+    assert probe.judge(at([1e-3, 0.0], arrived), 1.0) == ('', '')
+    assert probe.judge(at([1e-3, 0.0], arrived + 2.0**-20), 1.0) == ('over', '')
+
+
+def test_an_arm_that_has_stood_for_long_enough_has_settled():
+    made = visit()
+    outcomes = [made.judge(at([1e-5, 0.0], SENT_S + 2.5 + t, t), 1.0) for t in (0.0, 0.5, 1.0)]
+    assert outcomes == [('', ''), ('', ''), ('settled', '')]
+    assert made.settled
+    assert made.deadline == SENT_S + 3.5 + 16.0
 
 
 @pytest.mark.parametrize(
@@ -86,7 +95,9 @@ def test_a_probe_is_over_when_it_must_have_arrived():
 )
 def test_how_far_from_its_stop_an_arm_may_stand(off, outcome):
     stop = Braking(np.zeros(2), SENT_S + 4.0)
-    assert stop.judge(at([off, 0.0], SENT_S, 1.0))[0] == outcome
+    said, why = stop.judge(at([off, 0.0], SENT_S, 1.0))
+    assert said == outcome
+    assert bool(why) == (outcome == 'halted')
     assert stop.judge(at([0.0, -off], SENT_S, 1.0))[0] == outcome
 
 
