@@ -153,7 +153,7 @@ class ArmSupervisor:
 
     def unreadable(self, why: str, wall_s: float) -> list[Action]:
         """Take a report that does not tell where the joints are."""
-        return self._doubt(why, wall_s, 'unreadable')
+        return self._doubt(why, wall_s)
 
     def emergency(self, stopped: bool, wall_s: float) -> list[Action]:
         """Take the state of the robot's own safety circuit."""
@@ -186,7 +186,8 @@ class ArmSupervisor:
         """Take a report of the joints."""
         wall_s = report.wall_s
         if not self.reports.believes(report):
-            return self._doubt(self.reports.trouble, wall_s, self.reports.kind)
+            jumped = self._seen is not None and self.reports.kind in ('too_fast', 'outside_limits')
+            return self._doubt(self.reports.trouble, wall_s, jumped=jumped)
         self._doubted_wall = None
         gap = self._gap(report)
         self._excuse_gap(report)
@@ -323,14 +324,13 @@ class ArmSupervisor:
         self._interlocks.hear(name, reason, wall_s)
         return self.tick(wall_s)
 
-    def _doubt(self, why: str, wall_s: float, kind: str) -> list[Action]:
+    def _doubt(self, why: str, wall_s: float, *, jumped: bool = False) -> list[Action]:
         """Take a report that is not believed; where that goes on it halts a collection."""
         if self._doubted_wall is None:
             self._doubted_wall = wall_s
         if wall_s - self._doubted_wall <= DOUBT_S:
             return self.tick(wall_s)
         self._interlocks.set('robot', why)
-        jumped = self._seen is not None and kind in ('too_fast', 'outside_limits')
         if (self._engaged or jumped) and not self.halted:
             return self._halt(why)
         # Nothing moves, so that what is usual can be learned anew: a driver that was restarted, a
