@@ -50,8 +50,8 @@ def write_discovery_report(
         page(
             'discovery.html.jinja',
             found=content,
-            headline=headline(discovery),
-            mood={'effects': 'good', 'none': 'good', 'undetermined': 'caution'}[discovery.verdict],
+            headline=headline(discovery, confirmation),
+            mood='good' if _is_proven(discovery, confirmation) else 'caution',
             equations={name: effect.equation for name, effect in EFFECTS.items()},
             sources={name: effect.source for name, effect in EFFECTS.items()},
             most_parameters=MOST_PARAMETERS,
@@ -62,8 +62,21 @@ def write_discovery_report(
     return folder / REPORT_FILE
 
 
-def headline(discovery: Discovery) -> str:
-    """Return the result in one sentence."""
+def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
+    """Whether poses that were never fitted, and the other session if there is one, agree."""
+    if discovery.verdict == 'undetermined':
+        return False
+    if confirmation is not None and not confirmation.same_offsets:
+        return False
+    if discovery.verdict == 'none':
+        return True
+    before, after = discovery.gain.held_out_rms_before_m, discovery.gain.held_out_rms_after_m
+    gains = before is not None and after is not None and after < before
+    return gains and (confirmation is None or confirmation.confirmed)
+
+
+def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> str:
+    """Return the result in one or a few sentences."""
     gain = discovery.gain
     change = ''
     if gain.held_out_rms_before_m is not None and gain.held_out_rms_after_m is not None:
@@ -80,5 +93,11 @@ def headline(discovery: Discovery) -> str:
         return (
             f'Something is there, but two explanations fit equally well: see which measurements '
             f'would decide.{change}'
+        )
+    if confirmation is not None and not confirmation.confirmed:
+        change += (
+            f' The other session does not confirm {"it" if count == 1 else "them"}: its error is '
+            f'{1e3 * confirmation.rms_after_m:.3f} mm RMS with and '
+            f'{1e3 * confirmation.rms_before_m:.3f} mm without.'
         )
     return f'Beyond the zero-offsets there {"is" if count == 1 else "are"} {causes}.{change}'

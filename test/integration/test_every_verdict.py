@@ -175,12 +175,30 @@ def test_discover_with_a_session_that_confirms(case: str, tmp_path: Path) -> Non
     assert found['confirmation']['rms_before_m'] > 0.0
 
 
+def test_causes_that_another_session_does_not_have_are_not_green(tmp_path: Path) -> None:
+    session = simulated(tmp_path / 'session', '--seed', 3, *DISCOVER['effects'][0])
+    healthy = simulated(tmp_path / 'healthy', '--seed', 3)
+    out = tmp_path / 'causes'
+    assert remaster('discover', session, '--out', out, '--confirm', healthy).returncode == 0
+    page, _, _ = page_of(out)
+    assert 'class="verdict caution"' in page
+    assert 'The other session does not confirm it: its error is ' in page
+    confirming = tmp_path / 'again'
+    again = simulated(tmp_path / 'second', '--seed', 3, *DISCOVER['effects'][0])
+    assert remaster('discover', session, '--out', confirming, '--confirm', again).returncode == 0
+    page, _, _ = page_of(confirming)
+    assert 'class="verdict good"' in page
+    assert 'does not confirm' not in page
+
+
 def test_discover_without_validation(healthy: Path, tmp_path: Path) -> None:
     session = changed(healthy, tmp_path, only_fitted)
     out = tmp_path / 'causes'
     assert remaster('discover', session, '--out', out).returncode == 0
     page, _, _ = page_of(out)
     assert 'No validation poses: the gain is not proven' in page
+    # There is nothing to be proven in a healthy arm.
+    assert 'class="verdict good"' in page
 
 
 def test_recover_has_nothing_to_do(healthy: Path) -> None:
