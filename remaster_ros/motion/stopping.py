@@ -109,7 +109,7 @@ class _Stretch:
         """Return the largest share that any of the cubics reaches."""
         second, third = self._coefficients(time, end)
         # Its speed is zero at the end, and at the share v T / (3 third). That is the farthest only
-        # where it comes first, with a positive third; else the end is.
-        turn = np.divide(self._v * time, 3 * third, out=np.ones_like(third), where=third > 0.0)
+        # where it comes first, with a positive third; else the end is, or the start.
+        turn = self._v * time / np.where(third > 0.0, 3 * third, np.inf)
         place = self._x + turn * (self._v * time + turn * (second + turn * third))
         return float(np.max(place, initial=end))
