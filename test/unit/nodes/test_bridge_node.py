@@ -1,6 +1,8 @@
 """The robot bridge's shell: what it makes of each message, and each message that it sends."""
 
 import json
+import runpy
+import sys
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from trajectory_msgs.msg import JointTrajectory
 from remaster_ros.core.errors import InputError
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.path_check import PointSpeeds
-from remaster_ros.nodes import robot_bridge
+from remaster_ros.nodes import robot_bridge, running
 from remaster_ros.storage.cell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
@@ -745,3 +747,15 @@ def test_main_runs_the_bridge_with_short_turns_of_the_interpreter(monkeypatch):
     assert robot_bridge.main(['x']) == 7
     assert made == [(robot_bridge.RobotBridge, ['x'])]
     assert turns == [1e-3]
+    # The installed command gives no arguments: those of the process hold.
+    assert robot_bridge.main() == 7
+    assert made[1:] == [(robot_bridge.RobotBridge, None)]
+
+
+def test_the_module_runs_as_a_program_with_its_exit_status(monkeypatch):
+    monkeypatch.setattr(running, 'run', lambda make, args: 7)
+    monkeypatch.setattr(robot_bridge.sys, 'setswitchinterval', lambda seconds: None)
+    monkeypatch.delitem(sys.modules, robot_bridge.__name__)
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module(robot_bridge.__name__, run_name='__main__')
+    assert ended.value.code == 7
