@@ -94,8 +94,8 @@ class CountedBridge(robot_bridge.RobotBridge):
         super()._publish(admitted)
         self.published += 1
 
-    def _event(self, event, message, level='ok', **values):
-        super()._event(event, message, level, **values)
+    def _event(self, *args, **values):
+        super()._event(*args, **values)
         self.sent += 1
 
 

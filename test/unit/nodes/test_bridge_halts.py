@@ -151,7 +151,7 @@ def test_an_emergency_stop_halts_and_is_cleared_only_after_its_end(rig):
     assert r.call_clear().success
 
 
-def paused_in(r, monkeypatch, name):
+def paused_in(r, monkeypatch, name, pause_s=1.88):
     """Pause the process (SIGSTOP) while the gate makes its next command."""
     gate = r.bridge.supervisor.gate
     make = getattr(gate, name)
@@ -159,26 +159,44 @@ def paused_in(r, monkeypatch, name):
     def pause(*args):
         admitted = make(*args)
         monkeypatch.setattr(gate, name, make)
-        r.wall += 1.88
+        r.wall += pause_s
         return admitted
 
     monkeypatch.setattr(gate, name, pause)
 
 
-def test_a_stop_is_not_published_after_a_pause_of_the_process(rig, monkeypatch):
+@pytest.mark.parametrize('pause_s', [1.88, 0.11])
+def test_a_stop_is_not_published_after_a_pause_of_the_process(rig, monkeypatch, pause_s):
     """It is for a place that the arm has left: 5.2 times the speed limit, once in a campaign."""
     r = rig()
     r.go(AWAY, speed=0.2)
     sent = r.bridge.published
-    paused_in(r, monkeypatch, 'stop')
+    paused_in(r, monkeypatch, 'stop', pause_s)
     r.say_planner('paused')
     r.flush()
     assert r.halted() == (
-        'planner is paused; this process was paused for 1.88 s just then: nothing is commanded'
+        f'planner is paused; this process was paused for {pause_s:.2f} s just then: '
+        'nothing is commanded'
     )
     r.run(2.0)
     assert r.bridge.published == sent
     assert r.bridge.counts['stopped'] == 0
+
+
+@pytest.mark.parametrize(('limit_s', 'pause_s'), [(0.1, 0.09), (0.125, 0.125)])
+def test_a_stop_that_is_hardly_late_is_published(rig, monkeypatch, limit_s, pause_s):
+    assert robot_bridge.LATE_WALL_S == 0.1
+    monkeypatch.setattr(robot_bridge, 'LATE_WALL_S', limit_s)
+    r = rig()
+    r.go(AWAY, speed=0.2)
+    # A time to which 0.125 s can be added exactly.
+    r.wall = np.ceil(r.wall * 1024.0) / 1024.0
+    sent = r.bridge.published
+    paused_in(r, monkeypatch, 'stop', pause_s)
+    r.say_planner('paused')
+    r.flush()
+    assert r.bridge.published == sent + 1
+    assert not r.halted()
 
 
 def test_a_move_is_not_published_after_a_pause_of_the_process(rig, monkeypatch):
@@ -357,6 +375,7 @@ def test_every_rule_is_asked_at_the_time_it_is(rig):
         'planner_is': ('running', r.wall, 'its'),
         'emergency': (False, r.wall),
         'answered': (3, r.wall),
+        'clear_halt': (),
     }
     for name, args in wanted.items():
         assert seen[name][0] == args, name

@@ -1,6 +1,8 @@
 """The robot bridge's shell: what it makes of each message, and each message that it sends."""
 
 import json
+import runpy
+import sys
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 from bridge_rig import CHAIN, HOME, PATIENCE_S, Rig, stamp
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from simple_cells import write_cell
 from trajectory_msgs.msg import JointTrajectory
@@ -17,7 +19,7 @@ from trajectory_msgs.msg import JointTrajectory
 from remaster_ros.core.errors import InputError
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.path_check import PointSpeeds
-from remaster_ros.nodes import robot_bridge
+from remaster_ros.nodes import robot_bridge, running
 from remaster_ros.storage.cell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
@@ -588,6 +590,22 @@ def test_the_halt_is_shown_at_once_and_with_its_level(rig):
     )
 
 
+@pytest.mark.parametrize(
+    'reliability', [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT]
+)
+def test_joint_states_of_either_reliability_are_heard(rig, reliability):
+    r = rig(ready=False)
+    first = r.states
+    qos = QoSProfile(depth=200, reliability=reliability)
+    r.states = r.peer.create_publisher(JointState, 'joint_states', qos)
+    r.wait(lambda: r.bridge.count_publishers('joint_states') == 2, 'the second publisher')
+    r.wait(r.states.get_subscription_count, 'the match')
+    r.peer.destroy_publisher(first)
+    r.wait(lambda: r.bridge.count_publishers('joint_states') == 1, 'the end of the first one')
+    r.ready()
+    assert r.summary()[:2] == ('ok', 'waiting for a pose')
+
+
 def test_lateness_is_told_by_the_nodes_clock_and_the_stamps(rig):
     """The clocks of the two hosts are half a minute apart: no matter. A late report does."""
     r = rig(ready=False)
@@ -639,8 +657,12 @@ def test_nothing_is_commanded_before_a_controller_listens(rig):
     assert not r.bridge.published
     r.open_controller()
     r.wait(r.bridge._controller.get_subscription_count, 'the controller')
+    # A time to which half a second can be added exactly.
+    r.wall = np.ceil(r.wall * 1024.0) / 1024.0
     r.bridge._watch()
     matched = r.wall
+    assert r.bridge._controller_trouble(matched + 0.4999) == wanted
+    assert r.bridge._controller_trouble(matched + 0.5) == ''
     r.run(0.45)
     assert r.summary()[1] == wanted, 'the controller may not be matched yet'
     r.run(10.0, lambda: r.commands)
@@ -725,3 +747,15 @@ def test_main_runs_the_bridge_with_short_turns_of_the_interpreter(monkeypatch):
     assert robot_bridge.main(['x']) == 7
     assert made == [(robot_bridge.RobotBridge, ['x'])]
     assert turns == [1e-3]
+    # The installed command gives no arguments: those of the process hold.
+    assert robot_bridge.main() == 7
+    assert made[1:] == [(robot_bridge.RobotBridge, None)]
+
+
+def test_the_module_runs_as_a_program_with_its_exit_status(monkeypatch):
+    monkeypatch.setattr(running, 'run', lambda make, args: 7)
+    monkeypatch.setattr(robot_bridge.sys, 'setswitchinterval', lambda seconds: None)
+    monkeypatch.delitem(sys.modules, robot_bridge.__name__)
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module(robot_bridge.__name__, run_name='__main__')
+    assert ended.value.code == 7

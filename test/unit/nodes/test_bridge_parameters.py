@@ -13,33 +13,39 @@ from remaster_ros.nodes.bridge_parameters import Parameters
 pytestmark = pytest.mark.ros
 
 RANGES = {
-    'cell': ('', None, None),
-    'speed_share': (0.3, 0.01, 1.0),
-    'cartesian_speed_limit_m_s': (0.25, 0.0, 10.0),
-    'limit_margin_deg': (0.5, 0.0, 45.0),
-    'offsets': ('', None, None),
-    'settle_s': (3.0, 0.1, 60.0),
-    'arrive_tolerance': (2e-3, 1e-6, 0.1),
-    'still_tolerance': (2e-4, 1e-7, 0.01),
-    'arrive_timeout_s': (10.0, 1.0, 600.0),
-    'answer_timeout_s': (180.0, 1.0, 3600.0),
-    'heartbeat_s': (3.0, 0.5, 60.0),
-    'stall_s': (1.0, 0.2, 60.0),
-    'reaction_s': (2.0, 0.1, 60.0),
-    'lag_s': (0.35, 0.05, 2.0),
-    'emergency_stop_topic': ('', None, None),
+    'cell': ('', None, None, ''),
+    'speed_share': (0.3, 0.01, 1.0, ''),
+    'cartesian_speed_limit_m_s': (0.25, 0.0, 10.0, 'm/s'),
+    'limit_margin_deg': (0.5, 0.0, 45.0, 'deg'),
+    'offsets': ('', None, None, ''),
+    'settle_s': (3.0, 0.1, 60.0, 's'),
+    'arrive_tolerance': (2e-3, 1e-6, 0.1, 'rad'),
+    'still_tolerance': (2e-4, 1e-7, 0.01, 'rad'),
+    'arrive_timeout_s': (10.0, 1.0, 600.0, 's'),
+    'answer_timeout_s': (180.0, 1.0, 3600.0, 's'),
+    'heartbeat_s': (3.0, 0.5, 60.0, 's'),
+    'stall_s': (1.0, 0.2, 60.0, 's'),
+    'reaction_s': (2.0, 0.1, 60.0, 's'),
+    'lag_s': (0.35, 0.05, 2.0, 's'),
+    'emergency_stop_topic': ('', None, None, ''),
 }
 """What an arm is left to: whoever changes one of them has to change it here as well."""
 
 
-def test_defaults_and_ranges():
+def test_defaults_ranges_and_units():
     found = {
-        field.name: (field.default, field.metadata['low'], field.metadata['high'])
+        field.name: (field.default, *(field.metadata[key] for key in ('low', 'high', 'unit')))
         for field in dataclasses.fields(Parameters)
     }
     assert found == RANGES
     live = [f.name for f in dataclasses.fields(Parameters) if f.metadata['live']]
     assert live == ['speed_share', 'cartesian_speed_limit_m_s']
+
+
+@pytest.mark.parametrize('field', dataclasses.fields(Parameters), ids=lambda field: field.name)
+def test_every_parameter_says_what_it_is(field):
+    """What ros2 param describe shows."""
+    assert len(field.metadata['description'].split()) > 3
 
 
 def test_every_rule_comes_from_its_own_parameter():

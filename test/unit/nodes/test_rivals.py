@@ -11,6 +11,7 @@ import rclpy
 from bridge_rig import DOMAIN, PATIENCE_S
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
@@ -106,7 +107,8 @@ def test_nobody_and_one_are_no_trouble(bench, qos):
 def test_one_without_a_lease_beside_another_is_told_at_once(bench):
     bench.other('robot')
     bench.other('intruder', namespace='/')
-    assert bench.only.trouble() == words('/intruder', '/left/robot')
+    bench.other('driver', namespace='/stage_X')
+    assert bench.only.trouble() == words('/intruder', '/left/robot', '/stage_X/driver')
     assert not list(bench.node.subscriptions), 'there is nothing to count'
 
 
@@ -169,6 +171,23 @@ def test_one_that_was_killed_does_not_count(bench):
     assert bench.only.trouble() == words('/left/killed', '/left/planner', '/left/second')
 
 
+def test_one_that_was_dead_before_it_was_counted_does_not_count(bench):
+    """A bridge that is started again soon after it was killed: only its own commands live."""
+    bench.node.create_publisher(Bool, TOPIC, LEASED)
+    bench.other('killed', MORTAL)
+    assert bench.only.trouble() == ''
+    bench.spin(seconds=0.5)
+    bench.now += COUNT_WALL_S + 0.01
+    assert bench.only.trouble() == ''
+    assert bench.node.count_publishers('/left/moves') == 2
+
+
+def test_one_that_goes_while_they_are_looked_up_is_no_trouble(bench, monkeypatch):
+    bench.other('robot')
+    monkeypatch.setattr(bench.node, 'count_publishers', lambda topic: 2)
+    assert bench.only.trouble() == ''
+
+
 def test_what_they_publish_is_taken_and_left(bench):
     """The subscription that counts takes the messages of both and does nothing with them."""
     first, _ = bench.other('planner', LEASED), bench.other('second', LEASED)
@@ -178,13 +197,25 @@ def test_what_they_publish_is_taken_and_left(bench):
     bench.spin(seconds=0.1)
 
 
+def test_the_count_warns_of_nobody_that_it_cannot_hear(bench, capfd):
+    """One without a lease is told by the bridge itself; its messages were never wanted."""
+    set_logger_level('left.bridge', LoggingSeverity.INFO)
+    bench.other('planner', LEASED)
+    bench.other('second', LEASED)
+    assert bench.only.trouble() == ''
+    bench.spin(lambda: bench.only._alive == 2)
+    bench.other('intruder')
+    bench.spin(seconds=0.2)
+    assert 'incompatible' not in capfd.readouterr().err
+
+
 def test_a_lease_of_an_hour_is_none(bench):
     """A driver with so long a lease would count as alive for an hour after its end."""
-    for name, seconds in (('long', 3600), ('longer', 7200)):
-        qos = QoSProfile(
-            depth=1,
-            liveliness=LivelinessPolicy.AUTOMATIC,
-            liveliness_lease_duration=Duration(seconds=seconds),
-        )
-        bench.other(name, qos)
-    assert bench.only.trouble() == words('/left/long', '/left/longer')
+    qos = QoSProfile(
+        depth=1,
+        liveliness=LivelinessPolicy.AUTOMATIC,
+        liveliness_lease_duration=Duration(seconds=3600),
+    )
+    bench.other('first', qos)
+    bench.other('second', qos)
+    assert bench.only.trouble() == words('/left/first', '/left/second')
