@@ -44,6 +44,9 @@ ADAPTED_FREEDOM = 15.0
 PILOT_CHAINS = 32
 PILOT_STEPS = 1000
 WALK_STEPS_PER_DRAW = 20
+# Shares of a Gaussian's best step that are tried for the walk, for so many steps each.
+STEP_SCALES = (1.0, 0.7, 0.5, 0.35, 0.25)
+SCALE_STEPS = 200
 # The second-order density may differ by this from the exact one on the draws it gave, of which so
 # many are checked (fewer where there are so many observations that it would take seconds).
 DENSITY_ERROR_LIMIT = 0.05
@@ -122,7 +125,7 @@ def sample_posterior(
     mode
         Of the posterior.
     chains
-        Number of chains, from dispersed starts.
+        Number of chains, from dispersed starts; a random walk to a precision has more.
     rng
         Source of all randomness.
     draws
@@ -225,10 +228,14 @@ def _exact(
             '(too few of the Laplace proposals were taken)'
         )
 
+    # All of the pilot's chains go on: a batch of them costs hardly more than a few.
+    start = pilot[:, -1] if length.draws is None else start
+    scale = _step_scale(log_density, factor, start, rng)
+
     def walk(start: FloatArray, count: int, warm_up: int) -> Chains:
         return random_walk_sampler(
             log_density,
-            _gaussian_step(factor, chains),
+            _gaussian_step(scale * factor, len(start)),
             start=start,
             steps=(count + warm_up) * WALK_STEPS_PER_DRAW,
             burn_in=warm_up * WALK_STEPS_PER_DRAW,
@@ -240,6 +247,28 @@ def _exact(
 
     run = _long_enough(walk, start, length, quantities, 0.0)
     return run, 'random-walk Metropolis (too few independent proposals were taken)'
+
+
+def _step_scale(
+    log_density: LogDensity, factor: FloatArray, start: FloatArray, rng: np.random.Generator
+) -> float:
+    """Return the share of a Gaussian's best step that moves a walk farthest (Pasarica 2010).
+
+    The widths of a posterior with long tails are too long a step for its bulk.
+    """
+
+    def squared_jump(scale: float) -> float:
+        run = random_walk_sampler(
+            log_density,
+            _gaussian_step(scale * factor, len(start)),
+            start=start,
+            steps=SCALE_STEPS,
+            burn_in=0,
+            rng=rng,
+        )
+        return scale**2 * run.acceptance_rate
+
+    return max(STEP_SCALES, key=squared_jump)
 
 
 def _long_enough(

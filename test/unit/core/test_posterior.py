@@ -174,6 +174,34 @@ def test_a_random_walk_is_the_last_resort(found, monkeypatch) -> None:
     assert stages == {'sampling', 'adapting the sampler', 'sampling by random walk'}
 
 
+def test_a_random_walk_to_a_precision_is_as_long_as_it_takes(found, monkeypatch) -> None:
+    """Against the independent sampler of the same posterior; more chains than were asked for."""
+    monkeypatch.setattr(sampling, 'POOR_ACCEPTANCE', 1.1)
+    monkeypatch.setattr(sampling, 'FIRST_DRAWS', 40)
+    monkeypatch.setattr(sampling, 'WARM_UP', 10)
+    monkeypatch.setattr(sampling, 'R_HAT_LIMIT', 1.1)
+    ask = {'chains': 4, 'precision': 0.1}
+    run, name = sample_posterior(found.mode, rng=np.random.default_rng(7), **ask)
+    assert name.startswith('random-walk')
+    assert run.draws.shape[0] == sampling.PILOT_CHAINS
+    monkeypatch.undo()
+    right, _ = sample_posterior(found.mode, rng=np.random.default_rng(8), **ask)
+    ours, theirs = (r.draws.reshape(-1, found.posterior.size) for r in (run, right))
+    # Some 100 effective draws at least on either side: five standard errors.
+    shift = np.abs(ours.mean(axis=0) - theirs.mean(axis=0)) / theirs.std(axis=0)
+    assert shift.max() < 5 * np.sqrt(2) * 0.1
+
+
+def test_the_step_of_a_walk_suits_the_bulk_of_what_has_long_tails() -> None:
+    """A Gaussian takes its own best step; a narrow core in a wide shell a shorter one."""
+    rng, d = np.random.default_rng(9), 6
+    start = rng.standard_normal((32, d))
+    gaussian = sampling._step_scale(lambda x: -0.5 * np.sum(x**2, axis=1), np.eye(d), start, rng)
+    assert gaussian >= 0.7
+    core = sampling._step_scale(lambda x: -0.5 * np.sum(x**2, axis=1), 5.0 * np.eye(d), start, rng)
+    assert core == 0.25
+
+
 def test_priors_are_standard_normal_in_their_own_units(found) -> None:
     model = found.model
     x = np.zeros(model.size)

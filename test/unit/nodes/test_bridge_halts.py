@@ -15,6 +15,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory
 
+from remaster_ros.motion.actions import Drive, Stop
 from remaster_ros.nodes import robot_bridge
 from remaster_ros.nodes.status import LEASED
 
@@ -185,8 +186,8 @@ def test_a_stop_is_not_published_after_a_pause_of_the_process(rig, monkeypatch, 
 
 @pytest.mark.parametrize(('limit_s', 'pause_s'), [(0.1, 0.09), (0.125, 0.125)])
 def test_a_stop_that_is_hardly_late_is_published(rig, monkeypatch, limit_s, pause_s):
-    assert robot_bridge.LATE_WALL_S == 0.1
-    monkeypatch.setattr(robot_bridge, 'LATE_WALL_S', limit_s)
+    assert {Stop: 0.1, Drive: 0.5} == robot_bridge.LATE_WALL_S
+    monkeypatch.setitem(robot_bridge.LATE_WALL_S, Stop, limit_s)
     r = rig()
     r.go(AWAY, speed=0.2)
     # A time to which 0.125 s can be added exactly.

@@ -187,9 +187,9 @@ def test_paths_are_checked_where_the_arm_is_with_its_offsets(rig, tmp_path, sign
     assert bool(bridge._search._model.trouble(q)) != free
     # So are the speeds of its points.
     v, offsets = np.ones(7), np.deg2rad([3.0 * sign, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    at = PointSpeeds(CHAIN, nominal.extent_points).fastest(q + offsets, v)
-    np.testing.assert_allclose(bridge._search._speeds.fastest(q, v), at)
-    np.testing.assert_allclose(bridge.supervisor.gate._speeds.fastest(q, v), at)
+    at = PointSpeeds(CHAIN, nominal.extent_points).fastest(q[None] + offsets, v[None])
+    np.testing.assert_allclose(bridge._search._speeds.fastest(q[None], v[None]), at)
+    np.testing.assert_allclose(bridge.supervisor.gate._speeds.fastest(q[None], v[None]), at)
 
 
 @pytest.mark.parametrize(
