@@ -85,8 +85,7 @@ class ArmSupervisor:
     ) -> None:
         self.gate, self.reports, self.rules = gate, reports, rules
         self.halted = halted
-        # Before a collection is begun (again) by a person nothing moves.
-        self._interlocks = Interlocks(rules.heartbeat_s, must_collect=bool(halted))
+        self._interlocks = Interlocks(rules.heartbeat_s)
         self._failures = 0
         self._must_probe = self._must_look = True
         self._seen: Seen | None = None
@@ -98,7 +97,9 @@ class ArmSupervisor:
         # The number of the path that is asked for, and of the solution that it leads to.
         self._pending: tuple[int, int] | None = None
         self._visit: Visit | None = None
-        self._begin(())
+        self._solutions: FloatArray | tuple[()] = ()
+        self._waypoints = NO_WAYPOINTS
+        self._next = 0
 
     # What comes in
 
@@ -115,7 +116,7 @@ class ArmSupervisor:
             Names the run of a collection: by another one a person's /remaster/collect is known.
         """
         reason = '' if state == 'running' else f'planner is {state}'
-        if self._interlocks.planner(reason, run, wall_s, halted=bool(self.halted)):
+        if self._interlocks.planner(reason, run, wall_s):
             self._failures = 0
         return self.tick(wall_s)
 
@@ -357,11 +358,7 @@ class ArmSupervisor:
 
     # Inside: the next configuration
 
-    def _begin(
-        self,
-        solutions: FloatArray | tuple[()],
-        waypoints: Mapping[int, FloatArray] = NO_WAYPOINTS,
-    ) -> None:
+    def _begin(self, solutions: FloatArray, waypoints: Mapping[int, FloatArray]) -> None:
         """Begin another pose."""
         self._solutions, self._waypoints, self._next = solutions, waypoints, 0
         self._visit, self._pending = None, None

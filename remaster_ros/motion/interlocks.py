@@ -19,8 +19,6 @@ class Interlocks:
     ----------
     heartbeat_s
         Longest silence of those in `NAMES`, s of wall time.
-    must_collect
-        See the attribute.
 
     Attributes
     ----------
@@ -28,8 +26,8 @@ class Interlocks:
         Nothing moves before a collection is begun (again) by a person.
     """
 
-    def __init__(self, heartbeat_s: float, *, must_collect: bool) -> None:
-        self.must_collect = must_collect
+    def __init__(self, heartbeat_s: float) -> None:
+        self.must_collect = False
         self._run = ''
         self._heartbeat_s = heartbeat_s
         self._heard: dict[str, float] = {}
@@ -40,7 +38,7 @@ class Interlocks:
         """Take a sign of life, and why the arm must not move; '' if it may."""
         self._heard[name], self._reasons[name] = wall_s, reason
 
-    def planner(self, reason: str, run: str, wall_s: float, *, halted: bool) -> bool:
+    def planner(self, reason: str, run: str, wall_s: float) -> bool:
         """Take the planner's state; return whether a collection was begun, or is not running.
 
         Parameters
@@ -51,12 +49,10 @@ class Interlocks:
             Names the run; another one than before was begun by a person since.
         wall_s
             Now, s.
-        halted
-            A halt is not cleared yet: what is begun before it is does not count.
         """
         begun = bool(reason) or (run != self._run and bool(self._run))
-        self._run = run if run and not reason else self._run
-        if begun and not halted:
+        self._run = run
+        if begun:
             self.must_collect = False
         self.hear('planner', reason, wall_s)
         return begun

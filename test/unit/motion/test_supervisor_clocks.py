@@ -205,6 +205,20 @@ def test_with_a_fast_clock_a_command_has_its_time_to_be_seen():
     assert 'does not take commands' in rig.last(Halted).reason
 
 
+def test_how_long_an_arm_may_be_unobserved_is_wall_time_too():
+    """One second of it, and ten of the clock's: shorter than a heartbeat."""
+    rig = Rig(rate=10.0)
+    rig.plan([0.3, 0.1])
+    rig.run(60.0, lambda: rig.said(Settled))
+    rig.alive.discard('robot')
+    rig.run(10.0)
+    rig.alive.add('robot')
+    rig.under_way.clear()
+    rig.run(5.0)
+    assert not rig.said(Halted)
+    assert rig.supervisor.busy
+
+
 # Pauses of this process
 
 

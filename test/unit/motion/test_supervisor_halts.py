@@ -567,6 +567,15 @@ def test_three_failures_in_a_row_halt_and_the_third_is_not_lost(rig):
     assert len(rig.said(Halted)) == 1
 
 
+def test_the_first_configurations_of_all_may_fail_as_often_as_others():
+    """A bridge that is started while the planner runs has not heard of a beginning."""
+    rig = Rig(begun=False)
+    rig.alter = restless(rig)
+    rig.plan([0.5, 0.5], [0.2, 0.2], [0.4, 0.4], [0.1, 0.1])
+    rig.run(90.0, lambda: rig.said(Halted))
+    assert [f.solution for f in rig.said(Failed)] == [0, 1]
+
+
 def test_a_recorder_that_does_not_answer_is_no_failure_of_the_robot(rig):
     """However often: each configuration was reached."""
     rig.plan(*([0.1 * i, 0.3] for i in range(5)))
