@@ -394,7 +394,12 @@ class Bench:
         recorded = set()
         for _, event in self.observer.find('recorder', 'configuration'):
             pose, ids = poses.get(event.values['stamp'], ('', []))
-            if pose and event.values['result'] == 'recorded':
+            # A stranger's answers, which are among what is injected, are no recording.
+            if (
+                pose
+                and event.values['result'] == 'recorded'
+                and event.values['solution'].isdecimal()
+            ):
                 recorded.add((pose, ids[int(event.values['solution'])]))
         assert len(set(m.configuration.tolist())) >= len(recorded), 'lost'
         for log in (self.folder / 'log').iterdir():

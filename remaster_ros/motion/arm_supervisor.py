@@ -55,6 +55,10 @@ DOUBT_S = 0.5
 """Reports that are not believed for so long (wall time) halt the arm, s."""
 STOPPED_S = 1.0
 """After the end of a stop the arm stands within so much time, s; the lag comes on top."""
+REFUSED_IN_A_ROW = 12
+"""So many configurations that could not be commanded, and none between that was reached, and the
+arm is halted: planner and bridge do not agree on the arm, and a collection would be over in
+seconds."""
 NO_WAYPOINTS: Mapping[int, FloatArray] = {}
 
 
@@ -86,7 +90,7 @@ class ArmSupervisor:
         self.gate, self.reports, self.rules = gate, reports, rules
         self.halted = halted
         self._interlocks = Interlocks(rules.heartbeat_s)
-        self._failures = 0
+        self._failures = self._refusals = 0
         self._must_probe = self._must_look = True
         self._seen: Seen | None = None
         self._doubted_wall: float | None = None
@@ -117,7 +121,7 @@ class ArmSupervisor:
         """
         reason = '' if state == 'running' else f'planner is {state}'
         if self._interlocks.planner(reason, run, wall_s):
-            self._failures = 0
+            self._failures = self._refusals = 0
         return self.tick(wall_s)
 
     def recorder_waits(self, waiting_for: str, wall_s: float) -> list[Action]:
@@ -382,8 +386,9 @@ class ArmSupervisor:
                 return [*actions, self._ask(PROBE, seen.q, self._probe(seen.q))]
             if not outside:
                 return [*actions, self._ask(self._next, seen.q, target)]
-            actions.append(Failed(self._next, outside))
-            self._next += 1
+            actions += self._refuse(self._next, outside)
+            if self.halted:
+                break
         return actions
 
     def _ask(self, solution: int, start: FloatArray, target: FloatArray) -> CheckPath:
@@ -419,8 +424,17 @@ class ArmSupervisor:
         """Go on with the next solution where the gate or the path refuses one."""
         if solution < 0:
             return self._halt(reason)
+        actions = self._refuse(solution, reason)
+        return [*actions, *self.tick(wall_s)]
+
+    def _refuse(self, solution: int, reason: str) -> list[Action]:
+        """Give up a configuration that is not commanded; halt where that goes on."""
         self._next = solution + 1
-        return [Failed(solution, reason), *self.tick(wall_s)]
+        self._refusals += 1
+        failed = Failed(solution, reason)
+        if self._refusals < REFUSED_IN_A_ROW:
+            return [failed]
+        return [failed, *self._halt(f'{self._refusals} configurations refused in a row: {reason}')]
 
     def _offer(self, answer: PathAnswer) -> str:
         """Remember a way out for the person who clears the halt; return what to tell them."""
@@ -451,7 +465,8 @@ class ArmSupervisor:
         if outcome == 'over':
             self._visit, self._must_probe = None, visit.solution != PROBE
         if outcome == 'settled':
-            self._failures, detector = 0, visit.detector
+            self._failures = self._refusals = 0
+            detector = visit.detector
             assert detector.still_since is not None
             motion_s = detector.still_since - visit.sent_stamp
             settle_s = seen.stamp - detector.still_since

@@ -310,9 +310,10 @@ class PosePlanner(RemasterNode):
             ('robot_bridge', 'failed'),
         )
         ids = self._announcer.ids(event.values.get('stamp', '')) if final else None
-        if ids is None or self.book.stop is None:
+        number = event.values.get('solution', '')
+        if ids is None or self.book.stop is None or number not in map(str, range(len(ids))):
             return
-        solution = ids[int(event.values['solution'])]
+        solution = ids[int(number)]
         result = event.values.get('result', 'failed')
         outdated = event.values['stamp'] != self._announcer.stamp
         if outdated and result not in ('recorded', 'partial'):

@@ -567,6 +567,43 @@ def test_three_failures_in_a_row_halt_and_the_third_is_not_lost(rig):
     assert len(rig.said(Halted)) == 1
 
 
+@pytest.mark.parametrize('bad', [[9.0, 9.0], [np.nan, 0.0]])
+def test_a_planner_whose_configurations_are_all_refused_is_not_followed_to_its_end(rig, bad):
+    """A collection of which nothing is commanded would be complete in seconds."""
+    rig.plan(*[bad] * 11, [0.3, 0.1], *[bad] * 13)
+    rig.run(20.0, lambda: rig.said(Settled))
+    assert [f.solution for f in rig.said(Failed)] == list(range(11))
+    rig.answer(11)
+    rig.run(1.0, lambda: rig.said(Halted))
+    assert rig.supervisor.halted.startswith('12 configurations refused in a row: a at ')
+    assert [f.solution for f in rig.said(Failed)][11:] == list(range(12, 24))
+    # The one that is left is not refused before a person has looked.
+    rig.run(1.0)
+    assert len(rig.said(Failed)) == 23
+
+
+def test_ways_that_are_not_free_count_among_the_refused(rig):
+    rig.answer_path = lambda request: PathAnswer(None, 'the table')
+    rig.plan(*([0.01 * i, 0.3] for i in range(20)))
+    rig.run(5.0, lambda: rig.said(Halted))
+    reason = '12 configurations refused in a row: no free path: the table'
+    assert rig.supervisor.halted == reason
+    assert len(rig.said(Failed)) == 12
+
+
+def test_a_collection_that_is_begun_again_counts_refusals_anew(rig):
+    rig.plan(*[[9.0, 9.0]] * 11)
+    rig.run(1.0)
+    assert len(rig.said(Failed)) == 11
+    rig.state = 'paused'
+    rig.run(1.0)
+    rig.state = 'running'
+    rig.plan(*[[9.0, 9.0]] * 11)
+    rig.run(1.0)
+    assert len(rig.said(Failed)) == 22
+    assert not rig.said(Halted)
+
+
 def test_the_first_configurations_of_all_may_fail_as_often_as_others():
     """A bridge that is started while the planner runs has not heard of a beginning."""
     rig = Rig(begun=False)
