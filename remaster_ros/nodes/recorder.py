@@ -51,6 +51,8 @@ TEMPERATURE_S = 600.0
 """A temperature older than this says nothing of a reading, s."""
 CHECK_S = 1.0
 """How often it is looked whether the session's files are still the ones that are written, s."""
+SET_BACK_S = 1.0
+"""Stamps of joint_states that go back by more than this are those of a clock that was set, s."""
 PAUSED = 'paused'
 """In place of a run that was paused, and whose token was lost with the recorder."""
 BY_HAND = -1_000_000
@@ -183,7 +185,12 @@ class Recorder(RemasterNode):
         except InputError as error:
             self._trouble = str(error)
             return
-        self._now, self._trouble = seconds(message.header.stamp), ''
+        now = seconds(message.header.stamp)
+        if now < self._now - SET_BACK_S:
+            # The robot's clock was set back: what is kept lies in the future of all that comes.
+            self._recent_joints.clear()
+            self._recent_readings.clear()
+        self._now, self._trouble = now, ''
         self._recent_joints.append((self._now, self._q))
         if self._taking is not None:
             self._taking.pairing.add_joint_state(self._now, self._q)
