@@ -99,6 +99,6 @@ class Interlocks:
         silent = [name for name in NAMES if self.silence_s(name, wall_s) > limit]
         if silent:
             return f'no sign of {", ".join(silent)} for {limit:g} s'
-        if self.must_collect and not self.reason('planner'):
+        if self.must_collect:
             return 'the halt was cleared: /remaster/collect goes on'
         return next(filter(None, map(self.reason, (*NAMES, *OBSERVED))), '')

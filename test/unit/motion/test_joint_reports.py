@@ -189,6 +189,14 @@ def test_a_drift_of_the_clocks_is_followed_and_a_jump_is_not():
     assert stream.reports.late_s == pytest.approx(0.2 - 100 * 0.02 * DRIFT, abs=2e-3)
 
 
+def test_reports_that_are_early_do_not_make_the_next_ones_late():
+    """A jump back is learned no faster than one forward."""
+    stream = Stream()
+    assert stream.next(late=-0.2)
+    assert stream.next(late=0.2), stream.doubt()
+    assert stream.reports.late_s == pytest.approx(0.2, abs=1e-3)
+
+
 def test_a_long_silence_does_not_excuse_a_late_report():
     """What is usual moves by 2 ms at most after a silence of any length."""
     stream = Stream()
