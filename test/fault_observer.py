@@ -234,6 +234,7 @@ def _follows(text: str) -> bool:
 def plain(text: str) -> str:
     """Return a reason without what depends on the moment."""
     text = re.sub(r' \((halted|process) [^)]*\)', '', text).replace('|', '/')
+    text = re.sub(r'\d+(\.\d+){3}:\d+', 'ADDRESS', text)
     text = re.sub(r'joint(s?)[ _]\d', r'joint\1 …', text)
     text = re.sub(r'((?:other_)?joint …)(, \1)+', r'\1', text)
     text = text.replace(UNNAMED, '…')
