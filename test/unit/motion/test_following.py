@@ -362,6 +362,15 @@ def test_around_a_corner_an_arm_that_lags_follows(lag):
         assert arm.lost == ''
 
 
+def test_near_its_place_on_a_later_line_a_long_lag_is_no_reason():
+    """0.03 rad in 2.5 s: a servo's error is most of a second there."""
+    short = Line(LINE.end, np.add(LINE.end, [0.0, 0.03]), 0.5)
+    arm = Arm(Trajectory((LINE, short)))
+    begun = arm.trajectory.starts_s[1]
+    assert arm.run(begun + 0.9, lambda t: arm.trajectory.at(min(t, begun))[0]) is None
+    assert arm.lost == ''
+
+
 def test_in_a_rest_the_window_reaches_back_to_an_arm_that_lags():
     arm = Arm(CORNERS)
     assert arm.run(2.75, arm.lagging(0.36)) is None
