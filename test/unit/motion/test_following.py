@@ -232,6 +232,10 @@ def test_an_arm_that_runs_ahead_does_not_follow():
     """0.2 s are jitter and a busy machine; more is no arm that obeys."""
     arm = Arm()
     assert arm.run(2.2, arm.lagging(-0.19)) is None
+    # A stop is right from where its reference is as well.
+    low, high = arm.window
+    elapsed = arm.seen.time - 64.0
+    assert (low, high) == pytest.approx((elapsed - JITTER_S, elapsed + JITTER_S))
     arm = Arm()
     astray = arm.run(2.2, arm.lagging(-0.22))
     assert astray is not None
