@@ -83,8 +83,7 @@ class MotionGate:
 
     def __init__(self, limits: MotionLimits, speeds: PointSpeeds | None = None) -> None:
         self.limits, self._speeds = limits, speeds
-        self._under_way: Trajectory | None = None
-        self._under_way_limits = limits
+        self._under_way: tuple[Trajectory, MotionLimits] | None = None
         self.refused = 0
 
     def admit(self, path: FreePath, q: FloatArray) -> Admitted:
@@ -113,7 +112,7 @@ class MotionGate:
         except MotionRefusedError:
             self.refused += 1
             raise
-        self._under_way, self._under_way_limits = trajectory, limits
+        self._under_way = trajectory, limits
         return Admitted(waypoints, trajectory)
 
     def stop(self, low_s: float, high_s: float) -> Admitted:
@@ -129,17 +128,15 @@ class MotionGate:
         LookupError
             No move was admitted: there is nothing that could be stopped.
         """
-        trajectory = self._under_way
-        if trajectory is None:
+        if self._under_way is None:
             raise LookupError('no move is under way')
+        trajectory, limits = self._under_way
         index, since_s = trajectory.line_at(high_s)
         low_since_s = max(low_s - trajectory.starts_s[index], 0.0)
         line = trajectory.lines[index]
         # In the rest after a line both times lie past its end.
         end_s = line.duration_s
-        stop = stop_on_line(
-            line, min(low_since_s, end_s), min(since_s, end_s), self._under_way_limits
-        )
+        stop = stop_on_line(line, min(low_since_s, end_s), min(since_s, end_s), limits)
         self._under_way = None
         return Admitted((stop,))
 

@@ -107,12 +107,24 @@ def test_an_arm_that_stands_outside_may_go_inwards_and_no_further_out(judged):
     assert judged(*out, along=along, start=start).startswith('a would go to 7')
 
 
+def test_beyond_one_limit_from_a_start_at_the_other(judged):
+    beyond = judged(
+        (9.0, [1.5, 0.0], [0.0, 0.0]), along=((-1.0, 0.0), (1.5, 0.0)), start=[-1.0, 0.0]
+    )
+    assert beyond.startswith('a would go to 85.94 deg')
+
+
 def test_a_speed_in_between(judged):
     """Slow at both waypoints, and too fast in the middle of the cubic."""
     fast = ((1.5, [0.8, 0.0], [0.0, 0.0]),)
     assert judged(*fast) == 'a would have a speed of 0.800 rad/s; 0.500 are allowed'
     assert judged((2.41, [0.8, 0.0], [0.0, 0.0])) == ''
     assert judged((2.39, [0.8, 0.0], [0.0, 0.0])).startswith('a would have a speed of 0.502')
+    # Half a thousandth above its limit is noise of the present state.
+    assert judged((1.2 / (0.5 * 1.0005), [0.8, 0.0], [0.0, 0.0])) == ''
+    # Of two joints the one is named that exceeds its own limit most: 160 and 120 %.
+    both = judged((1.5, [0.8, 1.2], [0.0, 0.0]), along=((0.0, 0.0), (0.8, 1.2)))
+    assert both == 'a would have a speed of 0.800 rad/s; 0.500 are allowed'
     # And at a waypoint.
     at = ((2.0, [0.5, 0.0], [0.6, 0.0]), (4.0, [0.8, 0.0], [0.0, 0.0]))
     assert 'a would have a speed of 0.600 rad/s' in judged(*at)
@@ -171,6 +183,25 @@ def test_the_speed_of_the_fastest_point_is_looked_at_densely(judged):
     assert len(q) == 5 + 16
 
 
+def test_places_are_counted_from_where_the_move_starts(judged):
+    limits, speeds = dataclasses.replace(LIMITS, tool_speed=9.0), Fastest()
+    waypoint, along = (4.0, [0.4, 0.0], [0.0, 0.0]), ((-0.4, 0.0), (0.4, 0.0))
+    assert judged(waypoint, along=along, start=[-0.4, 0.0], limits=limits, speeds=speeds) == ''
+    assert len(speeds.asked[0][0]) == 5 + 16
+
+
+def test_the_fastest_point_may_exceed_its_limit_by_noise_and_no_more(judged):
+    class Constant:
+        def fastest(self, q, velocity):
+            return np.full(len(q), self.speed)
+
+    limits, speeds = dataclasses.replace(LIMITS, tool_speed=0.4), Constant()
+    speeds.speed = 0.4 * (1.0 + motion_gate.TOLERANCE)
+    assert judged(*GOOD, limits=limits, speeds=speeds) == ''
+    speeds.speed *= 1.0 + 1e-9
+    assert '0.4 m/s are allowed' in judged(*GOOD, limits=limits, speeds=speeds)
+
+
 def test_nan_of_the_fastest_point_is_no_speed(judged):
     class Unknown:
         def fastest(self, q, velocity):
@@ -185,6 +216,8 @@ def test_a_waypoint_off_the_path_that_was_checked(judged, off):
     waypoints = (GOOD[0], (4.0, [0.8, off], [0.0, 0.0]))
     assert judged(*waypoints) == f'a waypoint lies {off:.6f} rad off the path found free'
     assert judged(GOOD[0], (4.0, [0.8, ON_PATH_RAD / 2], [0.0, 0.0])) == ''
+    just = ((2.0, [0.5, ON_PATH_RAD], [0.25, 0.0]), (4.0, [0.8, ON_PATH_RAD], [0.0, 0.0]))
+    assert judged(*just) == ''
     # Beyond the end of the path is off it.
     assert 'off the path' in judged(*GOOD, along=((0.0, 0.0), (0.8 - off, 0.0)))
 
@@ -195,6 +228,11 @@ def test_a_corner_that_is_cut_between_two_waypoints(judged):
     cut = ((4.0, [0.4, 0.4], [0.0, 0.0]),)
     assert judged(*cut, along=along) == (
         'the move leaves the path found free by 0.200000 rad between two waypoints'
+    )
+    # Only the first piece may be off by what the arm stands off the start.
+    late = ((4.0, [0.399, 0.0], [0.0, 0.0]), (8.0, [0.4, 0.001], [0.0, 0.0]))
+    assert judged(*late, along=((0.0, 0.0), (0.4, 0.0), (0.4, 0.002))) == (
+        'the move leaves the path found free by 0.000500 rad between two waypoints'
     )
     corner = ((4.0, [0.4, 0.0], [0.0, 0.0]), (8.0, [0.4, 0.4], [0.0, 0.0]))
     assert judged(*corner, along=along) == ''
@@ -230,6 +268,9 @@ def test_the_start_is_where_the_arm_stands():
     with pytest.raises(StartMovedError, match='nan'):
         gate.admit(free, np.array([0.0, np.nan]))
     assert gate.refused == 2
+    gate.admit(free, np.array([0.0, START_RAD]))
+    with pytest.raises(StartMovedError, match=r'the arm stands 0\.1000 rad from the start'):
+        gate.admit(path([0.2, 0.1], [0.5, 0.5]), np.array([0.3, 0.1]))
 
 
 def test_a_refused_move_leaves_the_former_to_be_stopped():
