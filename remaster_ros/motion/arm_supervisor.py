@@ -91,6 +91,7 @@ class ArmSupervisor:
         self.halted = halted
         self._interlocks = Interlocks(rules.heartbeat_s)
         self._failures = self._refusals = 0
+        self._paused = False
         self._must_probe = self._must_look = True
         self._seen: Seen | None = None
         self._doubted_wall: float | None = None
@@ -120,6 +121,7 @@ class ArmSupervisor:
             Names the run of a collection: by another one a person's /remaster/collect is known.
         """
         reason = '' if state == 'running' else f'planner is {state}'
+        self._paused = state == 'paused'
         if self._interlocks.planner(reason, run, wall_s):
             self._failures = self._refusals = 0
         return self.tick(wall_s)
@@ -338,6 +340,10 @@ class ArmSupervisor:
         self._interlocks.set('robot', why)
         if (self._engaged or jumped) and not self.halted:
             return self._halt(why)
+        if self._paused:
+            # Amid a collection nothing is learned anew: reports that come late for good would be
+            # the usual ones when it goes on.
+            return self.tick(wall_s)
         # Nothing moves, so that what is usual can be learned anew: a driver that was restarted, a
         # clock that was set.
         self.reports.forget()

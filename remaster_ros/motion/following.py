@@ -14,7 +14,7 @@ from remaster_ros.motion.trajectory import RAMP_S, Trajectory
 
 STANDING_S = 0.25
 """An arm that has not moved for so long stands; it must before it is sent anywhere, s."""
-FRESH_S = 0.3
+FRESH_S = 0.25
 """A report older than this (wall time) no longer tells where the arm is, s."""
 ASTRAY_S = 0.3
 """An arm that is off its path for so long (wall time) is halted, s."""

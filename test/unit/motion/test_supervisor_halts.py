@@ -408,6 +408,32 @@ def test_while_nothing_is_collected_a_clock_may_be_set(rig):
     rig.run(20.0, lambda: rig.said(Settled))
 
 
+def test_reports_that_come_late_in_a_pause_do_not_become_the_usual_ones(rig):
+    rig.go([0.9, -1.9])
+    rig.state = 'paused'
+    rig.run(3.0)
+    (stop,) = rig.said(Stop)
+    assert stop.reason == 'planner is paused'
+    rig.delay_s = 0.44
+    rig.run(5.0)
+    assert rig.supervisor.trouble == 'joint_states come 0.44 s late'
+    assert not rig.said(Halted)
+    # In time again they are believed, and the collection could go on.
+    rig.delay_s = 0.0
+    rig.run(0.6)
+    assert rig.supervisor.trouble == ''
+    rig.delay_s = 0.44
+    rig.run(2.0)
+    before = len(rig.commands)
+    rig.state = 'running'
+    rig.run(3.0, lambda: rig.said(Halted))
+    assert rig.last(Halted).reason == 'joint_states come 0.44 s late'
+    assert len(rig.commands) == before
+    rig.delay_s = 0.0
+    rig.collect()
+    rig.run(30.0, lambda: rig.said(Settled))
+
+
 def test_reports_that_come_much_too_late_from_a_moment_on(rig):
     rig.go([0.9, -1.9])
     rig.delay_s = 1.0
