@@ -264,7 +264,7 @@ class Cubic:
             # The form that does not lose digits where the cubic is nearly a parabola.
             flat = -(second + np.where(second >= 0.0, root, -root))
             times = np.array([flat / (3 * third), velocity / flat])
-        times = np.clip(np.nan_to_num(times, nan=0.0, posinf=0.0, neginf=0.0), 0, self.duration_s)
+        times = np.clip(np.nan_to_num(times), 0.0, self.duration_s)
         ends = np.zeros_like(times)
         ends[1] = self.duration_s
         times = np.concatenate([times, ends])
@@ -275,7 +275,7 @@ class Cubic:
         """Return the largest absolute velocity of each joint, rad/s, (k,)."""
         _, velocity, second, third = self.coefficients
         with np.errstate(divide='ignore', invalid='ignore'):
-            middle = np.nan_to_num(-second / (3 * third), nan=0.0, posinf=0.0, neginf=0.0)
+            middle = np.nan_to_num(-second / (3 * third))
         times = np.array([np.zeros_like(middle), np.clip(middle, 0.0, self.duration_s)])
         times = np.vstack([times, np.full_like(middle, self.duration_s)])
         return np.max(np.abs(velocity + 2 * second * times + 3 * third * times**2), axis=0)

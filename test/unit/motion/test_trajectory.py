@@ -45,6 +45,13 @@ def test_two_waypoints_are_never_at_the_same_time(share, count):
     assert np.all(np.diff([point.time_s for point in points]) > 0.0)
 
 
+def test_without_a_fastest_point_only_the_joints_limit_a_line():
+    slow = dataclasses.replace(LIMITS, tool_speed=0.01)
+    start, end = np.zeros(2), np.array([0.5, 0.5])
+    assert Line.within(slow, start, end).rate == Line.within(LIMITS, start, end).rate
+    assert Line.within(slow, start, end, 1.0).rate == pytest.approx(HEADROOM * 0.01)
+
+
 def test_no_joint_exceeds_its_velocity_and_the_slowest_uses_it():
     rng = np.random.default_rng(3)
     short = 0
