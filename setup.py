@@ -60,7 +60,7 @@ setup(
     package_dir={f'{NAME}.config': 'config'},
     package_data={
         f'{NAME}.config': ['*.yaml', '*.rviz', 'robots/*', 'cells/*', 'sros2/*'],
-        f'{NAME}.storage': ['*.jinja'],
+        f'{NAME}.reports': ['*.jinja'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),

@@ -23,10 +23,10 @@ from multiprocessing.connection import Connection
 
 from bench_decode import scene
 
-from remaster_ros.drivers import natnet_sockets
-from remaster_ros.drivers.natnet import NatNetClient, NatNetSettings
-from remaster_ros.drivers.natnet_gate import MarkerChoice, MarkerSample
-from remaster_ros.protocols import natnet
+from remaster_ros.sensors.optitrack import sockets as natnet_sockets
+from remaster_ros.sensors.optitrack.client import NatNetClient, NatNetSettings
+from remaster_ros.sensors.optitrack.frame_gate import MarkerChoice, MarkerSample
+from remaster_ros.sensors.optitrack.protocol import natnet
 
 VERSION = (3, 1)
 RATE_HZ = 1000

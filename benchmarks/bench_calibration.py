@@ -45,13 +45,13 @@ import numpy as np
 from common import OPTIMIZATION, experiment, in_parallel, machine, progress, table
 from scipy.stats import binom, chi2, kstest
 
-from remaster_ros.core.estimate import Estimate, Problem, estimate
-from remaster_ros.core.model import Model
-from remaster_ros.core.rows import Rows
-from remaster_ros.core.sampling import sample_posterior
-from remaster_ros.core.simulation import Truth
-from remaster_ros.core.transforms import inverse
-from remaster_ros.core.types import FloatArray
+from remaster_ros.calibration.estimate import Estimate, Problem, estimate
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.sampling import sample_posterior
+from remaster_ros.kinematics.transforms import inverse
+from remaster_ros.simulation.session_simulator import Truth
+from remaster_ros.types import FloatArray
 
 SENSORS = (('mocap',), ('tracker',), ('mocap', 'tracker'))
 NOISES = ('independent', 'common', 'prior')

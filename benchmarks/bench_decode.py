@@ -18,8 +18,7 @@ from natnet.data_frame import DataFrame
 from natnet.packet_buffer import PacketBuffer
 from natnet.version import Version as TheirVersion
 
-from remaster_ros.protocols.natnet import Version, decode_message, encode_message, format_version
-from remaster_ros.protocols.natnet_frames import (
+from remaster_ros.sensors.optitrack.protocol.frames import (
     HAS_MODEL,
     MEASURED,
     TRACKING_VALID,
@@ -28,6 +27,12 @@ from remaster_ros.protocols.natnet_frames import (
     LabeledMarker,
     MarkerSet,
     RigidBody,
+)
+from remaster_ros.sensors.optitrack.protocol.natnet import (
+    Version,
+    decode_message,
+    encode_message,
+    format_version,
 )
 
 VERSIONS: tuple[Version, ...] = ((2, 10), (3, 1), (4, 1))

@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 from common import CELL, CHAIN, MARKER_OF, MARKERS, machine, sensor_frames, table
 
-from remaster_ros.core.simulation import SimulatedSensor, simulate_session
-from remaster_ros.storage.session import write_session
+from remaster_ros.session.reader import write_session
+from remaster_ros.simulation.session_simulator import SimulatedSensor, simulate_session
 
 NOISE_M = (0.1e-3, 0.2e-3)
 SOLUTIONS = 5

@@ -38,8 +38,8 @@ from discovery_tables import report  # noqa: E402
 from hidden_judge import judge  # noqa: E402
 from hidden_sessions import NOISES, Recipe, held_out_noise_m, hidden_session  # noqa: E402
 
-from remaster_ros.core.discovery import discover_session  # noqa: E402
-from remaster_ros.fakes.effects import NAMED, UNNAMED  # noqa: E402
+from remaster_ros.discovery.discover import discover_session  # noqa: E402
+from remaster_ros.simulation.hidden_effects import NAMED, UNNAMED  # noqa: E402
 
 ROBOTS = ('iiwa7', 'six')
 SENSORS = (('mocap',), ('mocap', 'tracker'))

@@ -23,9 +23,9 @@ from common import OPTIMIZATION, experiment, machine, progress, table
 from paper_model import DIMENSION, NAMES, PaperModel, product_mode, product_states
 from scipy.special import gammaln
 
-from remaster_ros.core import convergence
-from remaster_ros.core.sampling import sample_posterior
-from remaster_ros.core.types import FloatArray
+from remaster_ros.calibration import convergence
+from remaster_ros.calibration.sampling import sample_posterior
+from remaster_ros.types import FloatArray
 
 SIGMA_M = 0.89e-3
 MEAN_LIMIT, STD_LIMIT = 0.02, 0.01

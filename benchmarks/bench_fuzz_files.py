@@ -28,11 +28,11 @@ sys.path.insert(0, str(ROOT / 'test'))
 from hostile_files import read_urdf, spoil_and_read  # noqa: E402
 
 from remaster_ros.cli.main import main as remaster  # noqa: E402
-from remaster_ros.storage.bag import BagReader  # noqa: E402
-from remaster_ros.storage.bag_writer import BagWriter  # noqa: E402
-from remaster_ros.storage.cell import read_cell  # noqa: E402
-from remaster_ros.storage.results import joint_offsets_rad, read_fit  # noqa: E402
-from remaster_ros.storage.session import read_session  # noqa: E402
+from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit  # noqa: E402
+from remaster_ros.session.bag import BagReader  # noqa: E402
+from remaster_ros.session.bag_writer import BagWriter  # noqa: E402
+from remaster_ros.session.reader import read_session  # noqa: E402
+from remaster_ros.session.workcell import read_cell  # noqa: E402
 
 JOINTS = tuple(f'joint_{number}' for number in range(1, 8))
 KINDS = ('session.yaml', 'observations.csv', 'session.urdf', 'robot.urdf', 'cell', 'fit', 'bag')

@@ -28,11 +28,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from remaster_ros.core import transforms
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.errors import InputError
-from remaster_ros.storage.journal import read_journal
-from remaster_ros.storage.session import read_session
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics import transforms
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.journal import read_journal
+from remaster_ros.session.reader import read_session
 
 NODES = (
     'pose_planner',

@@ -22,10 +22,10 @@ from common import in_parallel, machine, table
 from path_cells import SPECS, CellSpec, make_cell
 from path_judges import collides
 
-from remaster_ros.core.collision import FLOOR, OBSTACLE, SELF_COLLISION
-from remaster_ros.core.types import FloatArray
-from remaster_ros.nodes.touring import TourPlanner
-from remaster_ros.storage.cell import Cell
+from remaster_ros.kinematics.collision import FLOOR, OBSTACLE, SELF_COLLISION
+from remaster_ros.nodes.tour_planner import TourPlanner
+from remaster_ros.session.workcell import Cell
+from remaster_ros.types import FloatArray
 
 
 class Tally(NamedTuple):

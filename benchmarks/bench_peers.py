@@ -31,8 +31,8 @@ import numpy as np
 from common import CELL, CHAIN, ROOT, experiment, machine, table
 from paper_model import rigid_fit
 
-from remaster_ros.core.fit import fit_session
-from remaster_ros.core.types import FloatArray, Session
+from remaster_ros.calibration.fit import fit_session
+from remaster_ros.types import FloatArray, Session
 
 # What pip is told, step by step; every version is pinned in a file beside the peer's script.
 PEERS = {

@@ -24,11 +24,11 @@ import numpy as np
 from common import table
 from scipy.stats import chi2, kurtosis
 
-from remaster_ros.core.estimate import Problem, estimate
-from remaster_ros.core.rows import Rows
-from remaster_ros.core.sampling import sample_posterior
-from remaster_ros.core.types import FloatArray
-from remaster_ros.storage.session import read_session
+from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.sampling import sample_posterior
+from remaster_ros.session.reader import read_session
+from remaster_ros.types import FloatArray
 
 # Largest held-out mean that is as good as the independent fit's, mm.
 LIMITS_MM = {'ur10_two_solutions': 1.02, 'irb120_three_points': 0.64}

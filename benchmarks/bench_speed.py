@@ -38,10 +38,10 @@ import numpy as np
 from common import OPTIMIZATION, experiment, machine, progress, table
 from paper_model import DIMENSION, NAMES, PaperModel, product_mode, product_states
 
-from remaster_ros.core import convergence
-from remaster_ros.core.laplace import Mode
-from remaster_ros.core.sampling import sample_posterior
-from remaster_ros.core.types import FloatArray, Session
+from remaster_ros.calibration import convergence
+from remaster_ros.calibration.laplace import Mode
+from remaster_ros.calibration.sampling import sample_posterior
+from remaster_ros.types import FloatArray, Session
 
 SIGMA_M = 0.89e-3
 HALF_WIDTH = 0.0125

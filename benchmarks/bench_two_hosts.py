@@ -29,12 +29,12 @@ from typing import Any
 
 import numpy as np
 
-from remaster_ros.core import transforms
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.fakes.setup import make_world
-from remaster_ros.fakes.world import World
-from remaster_ros.storage.cell import config_path, read_cell
-from remaster_ros.storage.session import read_session
+from remaster_ros.kinematics import transforms
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.reader import read_session
+from remaster_ros.session.workcell import config_path, read_cell
+from remaster_ros.simulation.setup import make_world
+from remaster_ros.simulation.world import World
 
 SENSORS = ('fake_optitrack', 'fake_laser_tracker', 'optitrack_markers', 'laser_tracker_markers')
 REST = ('fake_robot', 'pose_planner', 'robot_bridge', 'recorder')

@@ -41,7 +41,7 @@ from trajectory_msgs.msg import JointTrajectory
 ROOT = Path(__file__).resolve().parents[1]
 NODES = 'test/unit/nodes'
 MODULES = {
-    'remaster_ros.storage.halt_file': ['test/unit/storage/test_halt_file.py'],
+    'remaster_ros.session.halt_file': ['test/unit/session/test_halt_file.py'],
     'remaster_ros.motion.path_search': ['test/unit/motion/test_path_search.py'],
     'remaster_ros.nodes.background': [f'{NODES}/test_background.py'],
     'remaster_ros.nodes.emergency_link': [f'{NODES}/test_emergency_link.py'],
@@ -59,14 +59,14 @@ BEFORE = (
     'pytest',
     'rclpy.executors',
     'rclpy.node',
-    'remaster_ros.core.paths',
+    'remaster_ros.kinematics.free_paths',
     'remaster_ros.motion.arm_supervisor',
-    'remaster_ros.nodes.announcements',
+    'remaster_ros.nodes.pose_tracker',
     'remaster_ros.nodes.parameters',
     'remaster_ros.nodes.running',
     'remaster_ros.nodes.status',
-    'remaster_ros.storage.cell',
-    'remaster_ros.storage.results',
+    'remaster_ros.session.workcell',
+    'remaster_ros.reports.fit_json',
     'simple_cells',
 )
 """Imported before the forks: slow, and nothing of what is changed."""

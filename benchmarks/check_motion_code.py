@@ -28,20 +28,14 @@ EXPLAINED = Path(__file__).with_name('motion_mutants.yaml')
 LEFT_OUT = ('__init__', 'path_search')
 """Path search is a dozen lines around the collision model, and has its tests there."""
 MODULES = [
-    *(
-        f'remaster_ros/motion/{path.name}'
-        for path in sorted((ROOT / 'remaster_ros' / 'motion').glob('*.py'))
-        if path.stem not in LEFT_OUT
-    ),
-    'remaster_ros/core/preflight.py',
+    f'remaster_ros/motion/{path.name}'
+    for path in sorted((ROOT / 'remaster_ros' / 'motion').glob('*.py'))
+    if path.stem not in LEFT_OUT
 ]
 TESTS = [
-    *(
-        str(path.relative_to(ROOT))
-        for path in sorted((ROOT / 'test' / 'unit' / 'motion').glob('test_*.py'))
-        if path.stem.removeprefix('test_') not in LEFT_OUT
-    ),
-    'test/unit/core/test_preflight.py',
+    str(path.relative_to(ROOT))
+    for path in sorted((ROOT / 'test' / 'unit' / 'motion').glob('test_*.py'))
+    if path.stem.removeprefix('test_') not in LEFT_OUT
 ]
 CONFIG = """\
 [mutmut]
@@ -81,7 +75,7 @@ def main() -> int:
 def prepare(folder: Path, modules: list[str], tests: list[str]) -> None:
     """Copy what the tests need."""
     folder.mkdir(exist_ok=True)
-    for name in ('remaster_ros', 'config', 'test/unit/core', 'test/unit/motion'):
+    for name in ('remaster_ros', 'config', 'test/unit/motion'):
         shutil.copytree(
             ROOT / name,
             folder / name,

@@ -14,13 +14,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from remaster_ros.core.inverse import InverseKinematics
-from remaster_ros.core.planning import candidate_poses, plan_poses
-from remaster_ros.core.simulation import SimulatedSensor, Truth, simulate_session
-from remaster_ros.core.transforms import looking_at, transform
-from remaster_ros.core.types import FloatArray, Session
-from remaster_ros.fakes.practice import LIMIT_MARGIN_RAD
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
+from remaster_ros.kinematics.transforms import looking_at, transform
+from remaster_ros.planning.candidates import candidate_poses, plan_poses
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.simulation.offline_tour import LIMIT_MARGIN_RAD
+from remaster_ros.simulation.session_simulator import SimulatedSensor, Truth, simulate_session
+from remaster_ros.types import FloatArray, Session
 
 ROOT = Path(__file__).resolve().parents[1]
 CELL = read_cell('demo')

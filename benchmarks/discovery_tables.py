@@ -11,7 +11,7 @@ import numpy as np
 from hidden_judge import CURVE_SHARE
 from scipy.optimize import minimize
 
-from remaster_ros.fakes.effects import NAMED
+from remaster_ros.simulation.hidden_effects import NAMED
 
 BINS = (0.5, 1.0, 2.0, 4.0, 8.0)
 # Held-out error may lie this far above the noise, in this share of single-effect sessions.

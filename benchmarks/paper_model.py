@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from common import CHAIN
 
-from remaster_ros.core.estimate import Problem, estimate
-from remaster_ros.core.laplace import Mode, find_mode
-from remaster_ros.core.model import Model
-from remaster_ros.core.transforms import inverse
-from remaster_ros.core.types import FloatArray, Session
+from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.laplace import Mode, find_mode
+from remaster_ros.calibration.model import Model
+from remaster_ros.kinematics.transforms import inverse
+from remaster_ros.types import FloatArray, Session
 
 NAMES = ('x', 'y', 'z', 'alpha', 'beta', 'gamma', *CHAIN.joint_names[1:], 'sigma')
 DIMENSION = len(NAMES)

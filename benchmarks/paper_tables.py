@@ -21,13 +21,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from common import experiment, progress, table
 
-from remaster_ros.core.accuracy import solution_pairs
-from remaster_ros.core.estimate import Problem, estimate
-from remaster_ros.core.fit import FitResult, fit_session
-from remaster_ros.core.sampling import sample_posterior
-from remaster_ros.core.simulation import Truth
-from remaster_ros.core.transforms import inverse, rotation_vector_to_matrix, transform
-from remaster_ros.core.types import FloatArray, Session
+from remaster_ros.calibration.accuracy import solution_pairs
+from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.fit import FitResult, fit_session
+from remaster_ros.calibration.sampling import sample_posterior
+from remaster_ros.kinematics.transforms import inverse, rotation_vector_to_matrix, transform
+from remaster_ros.simulation.session_simulator import Truth
+from remaster_ros.types import FloatArray, Session
 
 SENSORS = {'mocap': 'Motion Capture', 'tracker': 'Laser Tracker'}
 NOISES = {'independent': 'independent noise', 'common': 'pose-common noise'}

@@ -14,9 +14,9 @@ import trimesh
 import yaml
 from path_judges import BulletJudge, FclJudge, Judge, Part
 
-from remaster_ros.core.transforms import matrix_from_rpy, transform
-from remaster_ros.core.types import FloatArray
-from remaster_ros.storage.cell import Cell, config_path, read_cell
+from remaster_ros.kinematics.transforms import matrix_from_rpy, transform
+from remaster_ros.session.workcell import Cell, config_path, read_cell
+from remaster_ros.types import FloatArray
 
 # Where each arm's wrist reaches with the tool level.
 RADIUS = {'lwr': [0.2, 0.5], 'iiwa': [0.4, 0.7], 'six': [0.3, 0.65]}

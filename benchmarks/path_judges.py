@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from remaster_ros.core.types import FloatArray, IntArray
+from remaster_ros.types import FloatArray, IntArray
 
 SAMPLE_M = 1e-3
 LOOK_M = 0.15

@@ -24,11 +24,11 @@ sys.path.insert(0, str(ROOT / 'test'))
 from hidden_tours import world  # noqa: E402
 from hidden_world import Noise  # noqa: E402
 
-from remaster_ros.core.discovery import Findings, find_causes  # noqa: E402
-from remaster_ros.core.discovery_noise import Residuals  # noqa: E402
-from remaster_ros.core.effects.cell import Cell  # noqa: E402
-from remaster_ros.core.effects.registry import EFFECTS  # noqa: E402
-from remaster_ros.fakes.effects import HiddenEffect  # noqa: E402
+from remaster_ros.discovery.discover import Findings, find_causes  # noqa: E402
+from remaster_ros.discovery.effects.base import Cell  # noqa: E402
+from remaster_ros.discovery.effects.registry import EFFECTS  # noqa: E402
+from remaster_ros.discovery.residuals import Residuals  # noqa: E402
+from remaster_ros.simulation.hidden_effects import HiddenEffect  # noqa: E402
 
 NOISE = Noise(0.08e-3, 0.1e-3)
 SHARED_NOISE = Noise(0.05e-3, 0.25e-3)

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.extension import Extension, Term
-from remaster_ros.core.inverse import InverseKinematics
-from remaster_ros.core.simulation import SimulatedSensor, Truth, simulate_session
-from remaster_ros.core.transforms import rotation_vector_to_matrix, transform
-from remaster_ros.core.types import Session
+from remaster_ros.calibration.extension import Extension, Term
+from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import rotation_vector_to_matrix, transform
+from remaster_ros.simulation.session_simulator import SimulatedSensor, Truth, simulate_session
+from remaster_ros.types import Session
 
 ROOT = Path(__file__).parent.parent
 URDF = (ROOT / 'config/robots/lwr4plus.urdf').read_text(encoding='utf-8')

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from calibration_scenes import CHAIN, scene
 
-from remaster_ros.core.discovery_noise import Residuals
-from remaster_ros.core.estimate import Problem, estimate
-from remaster_ros.core.transforms import apply, inverse
-from remaster_ros.core.types import FloatArray, Session
+from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.kinematics.transforms import apply, inverse
+from remaster_ros.types import FloatArray, Session
 
 
 def session_with(

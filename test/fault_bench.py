@@ -21,12 +21,12 @@ from pathlib import Path
 import numpy as np
 from fault_observer import Observer
 
-from remaster_ros.core import transforms
-from remaster_ros.fakes.faults import inject
-from remaster_ros.fakes.setup import make_world
+from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.demo import free_ports
-from remaster_ros.storage.cell import config_path, read_cell
-from remaster_ros.storage.session import read_session
+from remaster_ros.session.reader import read_session
+from remaster_ros.session.workcell import config_path, read_cell
+from remaster_ros.simulation.faults import inject
+from remaster_ros.simulation.setup import make_world
 
 ROOT = Path(__file__).parents[1]
 SEED, RATE, SPEED_SHARE = 11, 4.0, 0.2

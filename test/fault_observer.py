@@ -15,8 +15,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from remaster_ros.fakes.motion import Motion, Waypoint, spline
-from remaster_ros.fakes.world import START_S
+from remaster_ros.simulation.arm_motion import Motion, Waypoint, spline
+from remaster_ros.simulation.world import START_S
 
 TOUCHED_RAD = 1e-4
 """The probe before the first move goes a micrometre; no other command does."""

@@ -18,17 +18,16 @@ from pathlib import Path
 
 import numpy as np
 
-from remaster_ros.core.types import FARTHEST_M
-from remaster_ros.drivers import natnet as natnet_driver
-from remaster_ros.drivers.laser_tracker import LaserTrackerClient, LaserTrackerError
-from remaster_ros.drivers.laser_tracker_settings import LaserTrackerSettings
-from remaster_ros.drivers.natnet import NatNetClient
-from remaster_ros.drivers.natnet_diagnosis import NatNetSettings
-from remaster_ros.drivers.natnet_gate import Dropped, MarkerChoice, MarkerSample
-from remaster_ros.protocols import laser_tracker as emscon
-from remaster_ros.protocols import laser_tracker_codes as codes
-from remaster_ros.protocols import natnet
-from remaster_ros.protocols.natnet_frames import (
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient, LaserTrackerError
+from remaster_ros.sensors.laser_tracker.protocol import codes
+from remaster_ros.sensors.laser_tracker.protocol import packets as emscon
+from remaster_ros.sensors.laser_tracker.settings import LaserTrackerSettings
+from remaster_ros.sensors.optitrack import client as natnet_client
+from remaster_ros.sensors.optitrack.client import NatNetClient
+from remaster_ros.sensors.optitrack.diagnosis import NatNetSettings
+from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice, MarkerSample
+from remaster_ros.sensors.optitrack.protocol import natnet
+from remaster_ros.sensors.optitrack.protocol.frames import (
     TRACKING_VALID,
     AnalogDevice,
     Asset,
@@ -39,12 +38,13 @@ from remaster_ros.protocols.natnet_frames import (
     RigidBody,
     Skeleton,
 )
-from remaster_ros.protocols.natnet_models import (
+from remaster_ros.sensors.optitrack.protocol.models import (
     MarkerSetDescription,
     ModelDefinition,
     RigidBodyDescription,
     SkeletonDescription,
 )
+from remaster_ros.types import FARTHEST_M
 
 VERSIONS: tuple[natnet.Version, ...] = (
     (2, 6), (2, 7), (2, 9), (2, 10), (2, 11), (3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (4, 3),
@@ -417,13 +417,13 @@ class NatNetClientTarget:
 
 
 @contextlib.contextmanager
-def silent_natnet_driver() -> Iterable[None]:  # type: ignore[misc]
+def silent_natnet_client() -> Iterable[None]:  # type: ignore[misc]
     """Keep the client from asking the operating system whether a port is closed."""
-    asked, natnet_driver.port_is_closed = natnet_driver.port_is_closed, lambda *_: False
+    asked, natnet_client.port_is_closed = natnet_client.port_is_closed, lambda *_: False
     try:
         yield
     finally:
-        natnet_driver.port_is_closed = asked
+        natnet_client.port_is_closed = asked
 
 
 def read_from_both_sides(rng: random.Random) -> Target:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from remaster_ros.core.types import FloatArray
-from remaster_ros.fakes.stage import ArmState
+from remaster_ros.simulation.world_model import ArmState
+from remaster_ros.types import FloatArray
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 

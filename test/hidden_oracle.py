@@ -12,8 +12,8 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
 
-from remaster_ros.core.types import FloatArray
-from remaster_ros.fakes.effects import HiddenEffect
+from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.types import FloatArray
 
 
 class Oracle:

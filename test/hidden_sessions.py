@@ -10,9 +10,9 @@ from hidden_oracle import Oracle
 from hidden_tours import CANDIDATES, visits, world
 from hidden_world import HiddenTruth, HiddenWorld, Noise
 
-from remaster_ros.core.types import Session
-from remaster_ros.fakes.effects import HiddenEffect
-from remaster_ros.fakes.hiding import draw_effect
+from remaster_ros.simulation.effect_sampling import draw_effect
+from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.types import Session
 
 NOISES = {
     'independent': Noise(0.15e-3),

@@ -13,13 +13,13 @@ import numpy as np
 from hidden_arm import six_joint_arm
 from hidden_world import HiddenWorld, Visits
 
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.collision import CollisionModel, arm_bodies
-from remaster_ros.core.inverse import InverseKinematics
-from remaster_ros.core.planning import LineOfSight, PoseRanges, candidate_poses, plan_poses
-from remaster_ros.core.tour import Tour
-from remaster_ros.core.types import FloatArray
-from remaster_ros.fakes.stage import StagedSensor
+from remaster_ros.kinematics.collision import CollisionModel, arm_bodies
+from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.planning.candidates import LineOfSight, PoseRanges, candidate_poses, plan_poses
+from remaster_ros.planning.tour_order import Tour
+from remaster_ros.simulation.world_model import StagedSensor
+from remaster_ros.types import FloatArray
 
 ROBOTS = Path(__file__).parent.parent / 'config/robots'
 MARKERS = {'sir': np.array([0.1, 0.0, 0.02]), 'smr': np.array([-0.1, 0.0, 0.02])}

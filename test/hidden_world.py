@@ -1,9 +1,9 @@
 """A world that the estimating code cannot see and that shares no physics with it.
 
 Its kinematics and gravity are pinocchio's (`hidden_arm`); the effects and the least squares that
-measure them are those of the fakes (`remaster_ros.fakes.effects`, `.stage`), which share no code
-with what estimates either. Only `hidden_tours`, which chooses the configurations, asks the robot's
-own software, as a real cell does.
+measure them are those of the fakes (`remaster_ros.simulation.hidden_effects`, `.world_model`),
+which share no code with what estimates either. Only `hidden_tours`, which chooses the
+configurations, asks the robot's own software, as a real cell does.
 
 A world predicts what every sensor sees of an arm with any effects. `measure` adds noise and
 returns the session, with no more in it than a recorded one, and the truth, for the judges alone.
@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from hidden_arm import PinocchioArm
 
-from remaster_ros.core.types import BoolArray, FloatArray, IntArray, Measurements, Session
-from remaster_ros.fakes.effects import HiddenEffect
-from remaster_ros.fakes.stage import Round, Stage, StagedSensor
+from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.simulation.world_model import Round, Stage, StagedSensor
+from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements, Session
 
 MARKER_STD_M = 0.5e-3
 

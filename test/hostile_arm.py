@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from remaster_ros.core.types import FloatArray
+from remaster_ros.types import FloatArray
 
 STEP_S = 0.002
 """Step of the servo, s."""

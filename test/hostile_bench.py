@@ -40,7 +40,7 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from remaster_ros.core.types import FloatArray
+from remaster_ros.types import FloatArray
 
 
 class Bench(BridgeProcess):

@@ -14,8 +14,8 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.errors import InputError
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
 
 TIME_LIMIT_S = 3.0
 """Processor time of one read; the valid files take a few milliseconds."""
@@ -148,6 +148,6 @@ def spoil_and_read(
 
 def read_urdf(path: Path) -> SerialChain:
     """Read a URDF file as the session reader does."""
-    from remaster_ros.storage.files import decode_text, read_limited
+    from remaster_ros.session.files import decode_text, read_limited
 
     return SerialChain.from_urdf(decode_text(read_limited(path, 2**24, 'x'), path))

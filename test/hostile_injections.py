@@ -20,7 +20,7 @@ from hostile_scene import ANSWER_S, HOME, SPREAD, Scene
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from remaster_ros.core.types import FloatArray
+from remaster_ros.types import FloatArray
 
 
 def control(s: Scene) -> None:

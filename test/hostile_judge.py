@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 from hostile_arm import Command
 
-from remaster_ros.core.types import FloatArray
+from remaster_ros.types import FloatArray
 
 PROBE_RAD = 1e-4
 """A command that moves no joint so far is a probe, or holds the arm where it is."""

@@ -8,7 +8,7 @@ import numpy as np
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
-from remaster_ros.core.types import FloatArray
+from remaster_ros.types import FloatArray
 
 COMMANDS = '/joint_trajectory_controller/joint_trajectory'
 EMERGENCY = '/robot/emergency_stop'

@@ -12,8 +12,8 @@ from hostile_bench import Bench
 from hostile_judge import Body, Rules
 from hostile_process import environment
 
-from remaster_ros.core.types import FloatArray
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.types import FloatArray
 
 HOME = np.array([0.0, 0.3, 0.0, 1.0, 0.0, 0.5, 0.0])
 SPREAD = np.array([1.2, 0.35, 0.6, 0.5, 1.0, 0.5, 1.2])

@@ -12,14 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from crash_states import Operation, Recorder, crash_state, materialise
 
-from remaster_ros.core.errors import InputError
-from remaster_ros.core.types import Measurements, Observation, Session
-from remaster_ros.storage import session_writer, session_yaml
-from remaster_ros.storage.journal import Journal
-from remaster_ros.storage.recovery import recover_session
-from remaster_ros.storage.safe_yaml import load_yaml
-from remaster_ros.storage.session import read_session
-from remaster_ros.storage.session_writer import PLAN, SessionWriter
+from remaster_ros.errors import InputError
+from remaster_ros.session import session_writer, session_yaml
+from remaster_ros.session.journal import Journal
+from remaster_ros.session.reader import read_session
+from remaster_ros.session.recovery import recover_session
+from remaster_ros.session.safe_yaml import load_yaml
+from remaster_ros.session.session_writer import PLAN, SessionWriter
+from remaster_ros.types import Measurements, Observation, Session
 
 JOINT = """<joint name="joint_{n}" type="revolute">
   <parent link="{parent}"/><child link="{child}"/>

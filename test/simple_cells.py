@@ -4,7 +4,7 @@ from pathlib import Path
 
 import yaml
 
-from remaster_ros.storage.cell import config_path
+from remaster_ros.session.workcell import config_path
 
 
 def write_cell(path: Path, **changes) -> Path:

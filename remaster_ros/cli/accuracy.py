@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from remaster_ros import __version__
+from remaster_ros.calibration.evaluate_offsets import OffsetsJudgement, accuracy_with_offsets
 from remaster_ros.cli.console import progress_bar, say
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.judging import OffsetsJudgement, accuracy_with_offsets
-from remaster_ros.core.types import Session
-from remaster_ros.storage.files import make_folder, write_atomically
-from remaster_ros.storage.results import joint_offsets_rad, read_fit, urdf_sha256
-from remaster_ros.storage.session import read_session
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
+from remaster_ros.session.files import make_folder, write_atomically
+from remaster_ros.session.reader import read_session
+from remaster_ros.types import Session
 
 FORMAT = 'remaster-accuracy/1'
 DESCRIPTION = (
@@ -84,7 +84,7 @@ def warn_of_another_urdf(fit: dict[str, Any], session: Session, path: Path) -> N
     """Warn where the offsets were fitted on another model of the robot."""
     robot = fit.get('robot')
     fitted = robot.get('urdf_sha256') if isinstance(robot, dict) else None
-    if fitted is not None and fitted != urdf_sha256(session):
+    if fitted is not None and fitted != session.urdf_sha256:
         log.warning(
             "%s: fitted with another URDF than this session's; the joints have the same names, "
             'but the geometry may differ',

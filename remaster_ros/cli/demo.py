@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from remaster_ros.cli.options import integer, number
-from remaster_ros.core.errors import InputError
+from remaster_ros.errors import InputError
 
 WITHOUT_ROS = (
     "needs ROS 2 Jazzy: source /opt/ros/jazzy/setup.bash, or pip install '.[jazzy]' for the wheels"

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from remaster_ros.cli.console import progress_bar, say
-from remaster_ros.core.discovery import Discovery, discover_session
-from remaster_ros.core.discovery_confirm import (
+from remaster_ros.discovery.confirmation import (
     Confirmation,
     confirm,
     in_words,
     require_same_cell,
 )
-from remaster_ros.storage.discovery_results import save_discovery
-from remaster_ros.storage.results import prepare_folder
-from remaster_ros.storage.session import read_session
+from remaster_ros.discovery.discover import Discovery, discover_session
+from remaster_ros.reports.discovery_json import save_discovery
+from remaster_ros.reports.fit_json import prepare_folder
+from remaster_ros.session.reader import read_session
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

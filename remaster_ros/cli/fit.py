@@ -9,19 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
-from remaster_ros.cli.console import progress_bar, say
-from remaster_ros.cli.options import integer, number
-from remaster_ros.core.fit import (
+from remaster_ros.calibration.fit import (
     COARSEST_PRECISION,
     FINEST_PRECISION,
     PRECISION,
     FitResult,
     fit_session,
 )
-from remaster_ros.core.reference_session import changes
-from remaster_ros.storage.priors import read_priors
-from remaster_ros.storage.results import prepare_folder, save_fit
-from remaster_ros.storage.session import read_session
+from remaster_ros.cli.console import progress_bar, say
+from remaster_ros.cli.options import integer, number
+from remaster_ros.collection.reference_session import changes
+from remaster_ros.reports.fit_json import prepare_folder, save_fit
+from remaster_ros.session.priors import read_priors
+from remaster_ros.session.reader import read_session
 
 log = logging.getLogger('remaster_ros')
 

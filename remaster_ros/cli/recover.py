@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from remaster_ros.cli.console import say
-from remaster_ros.storage.recovery import recover_session
+from remaster_ros.session.recovery import recover_session
 
 LOST = 3
 """Exit status of a recovery that had to drop something."""

@@ -11,21 +11,21 @@ import numpy as np
 
 from remaster_ros.cli.console import progress_bar, say
 from remaster_ros.cli.options import integer, names, number
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.errors import InputError
-from remaster_ros.core.inverse import FREE_JOINTS
-from remaster_ros.core.simulation import SimulatedSensor, Truth, simulate_session
-from remaster_ros.core.transforms import looking_at, quaternion_xyzw, transform
-from remaster_ros.core.types import FloatArray
-from remaster_ros.fakes.effects import HiddenEffect
-from remaster_ros.fakes.hidden_arm import ChainArm
-from remaster_ros.fakes.hiding import Request, hide
-from remaster_ros.fakes.practice import plan_tour, visit
-from remaster_ros.fakes.stage import Round, Stage, StagedSensor
-from remaster_ros.fakes.wrong_arm import Warming
-from remaster_ros.storage.cell import Cell, CellRobot, config_path, read_cell
-from remaster_ros.storage.files import decode_text, read_limited, write_atomically
-from remaster_ros.storage.session import URDF_LIMIT, write_session
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.inverse_kinematics import FREE_JOINTS
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import looking_at, quaternion_xyzw, transform
+from remaster_ros.session.files import decode_text, read_limited, write_atomically
+from remaster_ros.session.reader import URDF_LIMIT, write_session
+from remaster_ros.session.workcell import Cell, CellRobot, config_path, read_cell
+from remaster_ros.simulation.effect_sampling import Request, hide
+from remaster_ros.simulation.hidden_arm import ChainArm
+from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.simulation.offline_tour import plan_tour, visit
+from remaster_ros.simulation.session_simulator import SimulatedSensor, Truth, simulate_session
+from remaster_ros.simulation.world_model import Round, Stage, StagedSensor
+from remaster_ros.simulation.wrong_arm import Warming
+from remaster_ros.types import FloatArray
 
 TRUTH_FILE = 'truth.json'
 # How far a sensor stands from where the cell has it: roughly known places are good to this.

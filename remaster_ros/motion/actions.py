@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from remaster_ros.core.types import FloatArray
 from remaster_ros.motion.motion_gate import Admitted
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.settling import SettleRules
+from remaster_ros.types import FloatArray
 
 
 @dataclass(frozen=True)

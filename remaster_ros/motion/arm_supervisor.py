@@ -17,7 +17,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from remaster_ros.core.types import FloatArray
 from remaster_ros.motion.actions import (
     Action,
     CheckPath,
@@ -42,6 +41,7 @@ from remaster_ros.motion.motion_gate import (
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.settling import SettleDetector
 from remaster_ros.motion.visit import Braking, Visit
+from remaster_ros.types import FloatArray
 
 PROBE = -1
 """The number of the move before the first one."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from remaster_ros.core.types import FloatArray
 from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.joint_reports import JointReport
 from remaster_ros.motion.trajectory import RAMP_S, Trajectory
+from remaster_ros.types import FloatArray
 
 STANDING_S = 0.25
 """An arm that has not moved for so long stands; it must before it is sent anywhere, s."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from remaster_ros.core.types import FloatArray
+from remaster_ros.types import FloatArray
 
 LIMIT_TOLERANCE_RAD = 0.05
 """A joint may be reported so far outside its limits."""

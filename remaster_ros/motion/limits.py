@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.types import FloatArray
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.types import FloatArray
 
 UNKNOWN_VELOCITY = 1.0
 """Where a robot model has no velocity limit, rad/s: slow for any arm."""

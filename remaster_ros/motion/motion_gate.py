@@ -16,12 +16,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from remaster_ros.core.errors import RemasterError
-from remaster_ros.core.types import FloatArray
+from remaster_ros.errors import RemasterError
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.path_check import FreePath, PointSpeeds
 from remaster_ros.motion.stopping import stop_on_line
 from remaster_ros.motion.trajectory import Trajectory, Waypoint, plan_trajectory
+from remaster_ros.types import FloatArray
 
 START_RAD = 2e-3
 """A move begins so near to where the arm stands, rad: the way between is not checked."""

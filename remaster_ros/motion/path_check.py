@@ -12,15 +12,15 @@ from typing import Protocol
 
 import numpy as np
 
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.types import FloatArray
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.types import FloatArray
 
 PEAK_STEP_RAD = 0.02
 """The peak speed on a line is looked for every so many radians of its fastest joint."""
 
 
 class Surroundings(Protocol):
-    """What tells whether a path is free (`remaster_ros.core.collision.CollisionModel`)."""
+    """What tells whether a path is free (`remaster_ros.kinematics.collision.CollisionModel`)."""
 
     def trouble(self, q: FloatArray) -> str:
         """Return what is wrong with one configuration, rad, (k,); '' if it is free."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from remaster_ros.core.collision import CollisionModel
-from remaster_ros.core.paths import free_path, way_out
+from remaster_ros.kinematics.collision import CollisionModel
+from remaster_ros.kinematics.free_paths import free_path, way_out
 from remaster_ros.motion.actions import CheckPath, PathAnswer
 from remaster_ros.motion.path_check import FreePath, PointSpeeds, peak_speeds
 

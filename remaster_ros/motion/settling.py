@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from remaster_ros.core.types import FloatArray
+from remaster_ros.types import FloatArray
 
 SettleState = Literal['moving', 'elsewhere', 'settling', 'settled']
 

@@ -18,9 +18,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from remaster_ros.core.types import FloatArray
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.trajectory import HEADROOM, Line, Waypoint
+from remaster_ros.types import FloatArray
 
 STOP_S = 0.4
 """A stop takes at least so long, s."""

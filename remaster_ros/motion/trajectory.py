@@ -13,8 +13,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from remaster_ros.core.types import FloatArray
 from remaster_ros.motion.limits import MotionLimits
+from remaster_ros.types import FloatArray
 
 RAMP_S = 0.5
 """How long a line takes to reach its speed, and to lose it, s."""

@@ -7,11 +7,11 @@ from typing import Literal
 
 import numpy as np
 
-from remaster_ros.core.types import FloatArray
 from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.following import Following, Seen
 from remaster_ros.motion.settling import SettleDetector
 from remaster_ros.motion.trajectory import Trajectory
+from remaster_ros.types import FloatArray
 
 PROBE_WAIT_S = 0.5
 """After its end a robot that copies commands has copied this one, s."""

@@ -13,10 +13,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 
-from remaster_ros.core.errors import DiskError, InputError
+from remaster_ros.errors import DiskError, InputError
 from remaster_ros.nodes.status import LATCHED, TOPIC
-from remaster_ros.storage.bag import RECORDED
-from remaster_ros.storage.bag_writer import BagWriter
+from remaster_ros.session.bag import RECORDED
+from remaster_ros.session.bag_writer import BagWriter
 
 DEEP = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 """What a busy recorder has not yet taken is kept for it: seconds of the fastest stream."""
@@ -144,7 +144,7 @@ class BagRecorder:
 def name_in_bag(topic: str) -> str:
     """Return the name in bags of a topic as this package's code names it, relative or not.
 
-    What moves an arm has another one there (`storage.bag.RECORDED`).
+    What moves an arm has another one there (`session.bag.RECORDED`).
     """
     name = f'/{topic.lstrip("/")}'
     return RECORDED.get(name, name)

@@ -28,9 +28,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from std_srvs.srv import Trigger
 
-from remaster_ros.core.errors import DeviceError, InputError, RemasterError
-from remaster_ros.fakes.hiding import Request
-from remaster_ros.fakes.setup import make_world
+from remaster_ros.errors import DeviceError, InputError, RemasterError
 from remaster_ros.nodes.demo_summary import (
     ConfigurationTimes,
     print_hidden,
@@ -41,11 +39,13 @@ from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.processes import NodeProcesses
 from remaster_ros.nodes.running import report
 from remaster_ros.nodes.status import Event, listen
-from remaster_ros.storage.cell import config_path, read_cell
-from remaster_ros.storage.discovery_results import read_discovery
-from remaster_ros.storage.logbook import is_complete
-from remaster_ros.storage.results import read_fit
-from remaster_ros.storage.session_writer import JOURNAL
+from remaster_ros.reports.discovery_json import read_discovery
+from remaster_ros.reports.fit_json import read_fit
+from remaster_ros.session.session_journal import is_complete
+from remaster_ros.session.session_writer import JOURNAL
+from remaster_ros.session.workcell import config_path, read_cell
+from remaster_ros.simulation.effect_sampling import Request
+from remaster_ros.simulation.setup import make_world
 
 FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
 NODES = (

@@ -8,9 +8,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from remaster_ros.fakes.answers import causes, describe, named_cause, true_parameters
-from remaster_ros.fakes.world import Truth
 from remaster_ros.nodes.status import Event
+from remaster_ros.simulation.expected_findings import (
+    causes,
+    describe,
+    named_cause,
+    true_parameters,
+)
+from remaster_ros.simulation.world import Truth
 
 
 class ConfigurationTimes:

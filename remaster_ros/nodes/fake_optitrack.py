@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from remaster_ros.fakes.optitrack import FakeOptiTrackServer
-from remaster_ros.fakes.optitrack_scene import OptiTrackBehaviour
-from remaster_ros.fakes.setup import open_world
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.simulation.optitrack import FakeOptiTrackServer
+from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour
+from remaster_ros.simulation.setup import open_world
 
 
 @dataclass(frozen=True)

@@ -19,17 +19,17 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from remaster_ros.fakes.robot import FakeArm, TrajectoryPoint
-from remaster_ros.fakes.setup import (
+from remaster_ros.nodes.messages import seconds, stamp_of
+from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.simulation.robot import FakeArm, TrajectoryPoint
+from remaster_ros.simulation.setup import (
     default_folder,
     make_private_folder,
     make_world,
     open_world,
 )
-from remaster_ros.nodes.messages import seconds, stamp_of
-from remaster_ros.nodes.parameters import declare, parameter
-from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.storage.cell import read_cell
 
 
 @dataclass(frozen=True)

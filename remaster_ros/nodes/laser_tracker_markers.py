@@ -19,21 +19,21 @@ from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from remaster_ros.core import transforms
-from remaster_ros.core.errors import DeviceError, InputError
-from remaster_ros.core.types import FloatArray
-from remaster_ros.drivers.laser_tracker import (
+from remaster_ros.errors import DeviceError, InputError
+from remaster_ros.kinematics import transforms
+from remaster_ros.nodes.messages import stamp_of, temperature_topic, transform_array
+from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.status import LATCHED, RELIABLE, Status
+from remaster_ros.sensors.laser_tracker.client import (
     LaserTrackerClient,
     LaserTrackerError,
     LaserTrackerSettings,
     TrackerReading,
     TrackerStatus,
 )
-from remaster_ros.nodes.messages import stamp_of, temperature_topic, transform_array
-from remaster_ros.nodes.parameters import declare, parameter
-from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import LATCHED, RELIABLE, Status
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.types import FloatArray
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from remaster_ros.core.errors import InputError
-from remaster_ros.storage.cell import YAML_LIMIT, read_cell
-from remaster_ros.storage.files import decode_text, read_limited
-from remaster_ros.storage.safe_yaml import YamlError, load_yaml
+from remaster_ros.errors import InputError
+from remaster_ros.session.files import decode_text, read_limited
+from remaster_ros.session.safe_yaml import YamlError, load_yaml
+from remaster_ros.session.workcell import YAML_LIMIT, read_cell
 
 CORE = ('pose_planner', 'robot_bridge', 'recorder', 'optimizer')
 SENSORS = ('optitrack_markers', 'laser_tracker_markers')

@@ -14,7 +14,7 @@ import stat
 import time
 from pathlib import Path
 
-from remaster_ros.core.errors import InputError
+from remaster_ros.errors import InputError
 
 PATIENCE_S = 1.0
 """How long a process that is just ending is waited for, s."""

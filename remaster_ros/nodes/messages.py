@@ -9,9 +9,9 @@ from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import JointState
 
-from remaster_ros.core import transforms
-from remaster_ros.core.errors import InputError
-from remaster_ros.core.types import FloatArray
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics import transforms
+from remaster_ros.types import FloatArray
 
 
 def seconds(stamp: Time) -> float:

@@ -19,20 +19,20 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from remaster_ros.core.errors import RemasterError
-from remaster_ros.core.fit import (
+from remaster_ros.calibration.fit import (
     COARSEST_PRECISION,
     FINEST_PRECISION,
     PRECISION,
     fit_session,
 )
-from remaster_ros.core.types import FloatArray
+from remaster_ros.errors import RemasterError
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import LATCHED, Status
-from remaster_ros.storage.priors import read_priors
-from remaster_ros.storage.results import FIT_FILE, prepare_folder, read_fit, save_fit
-from remaster_ros.storage.session import read_session
+from remaster_ros.reports.fit_json import FIT_FILE, prepare_folder, read_fit, save_fit
+from remaster_ros.session.priors import read_priors
+from remaster_ros.session.reader import read_session
+from remaster_ros.types import FloatArray
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,8 @@ class Optimizer(RemasterNode):
 
     def _discover(self) -> tuple[Path, str]:
         # What takes a second to import comes when it is asked for: a node is there at once.
-        from remaster_ros.core.discovery import discover_session
-        from remaster_ros.storage.discovery_results import save_discovery
+        from remaster_ros.discovery.discover import discover_session
+        from remaster_ros.reports.discovery_json import save_discovery
 
         out = Path(self.p.discovery)
         session = read_session(self.p.session)

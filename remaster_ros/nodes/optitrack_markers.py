@@ -12,18 +12,18 @@ from typing import Any
 
 from geometry_msgs.msg import PointStamped
 
-from remaster_ros.core.clock_mapping import ClockMapping
-from remaster_ros.core.errors import DeviceError, InputError
-from remaster_ros.drivers.natnet import NatNetClient
-from remaster_ros.drivers.natnet_diagnosis import NatNetSettings, warning
-from remaster_ros.drivers.natnet_follower import MarkerFollower
-from remaster_ros.drivers.natnet_gate import MarkerChoice, MarkerSample
-from remaster_ros.drivers.natnetclient_backend import NatNetClientBackend
+from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import RELIABLE, Status
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.sensors.clock_offset import ClockMapping
+from remaster_ros.sensors.optitrack.client import NatNetClient
+from remaster_ros.sensors.optitrack.diagnosis import NatNetSettings, warning
+from remaster_ros.sensors.optitrack.frame_gate import MarkerChoice, MarkerSample
+from remaster_ros.sensors.optitrack.marker_follower import MarkerFollower
+from remaster_ros.sensors.optitrack.natnetclient_backend import NatNetClientBackend
+from remaster_ros.session.workcell import read_cell
 
 
 @dataclass(frozen=True)

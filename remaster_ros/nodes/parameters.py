@@ -20,7 +20,7 @@ from rcl_interfaces.msg import (
 )
 from rclpy.node import Node
 
-from remaster_ros.core.errors import InputError
+from remaster_ros.errors import InputError
 
 T = TypeVar('T')
 

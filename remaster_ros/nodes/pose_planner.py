@@ -28,19 +28,19 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from remaster_ros.core.errors import InputError, InsufficientDataError, RemasterError
-from remaster_ros.core.tour import REFERENCE, REGISTRATION, Stop
-from remaster_ros.core.types import FloatArray
-from remaster_ros.nodes.announcing import PEERS, Announcer
-from remaster_ros.nodes.clearance import Clearance
+from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
 from remaster_ros.nodes.messages import JointOrder, transform_array
 from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.pose_publisher import PEERS, Announcer
+from remaster_ros.nodes.preflight_monitor import Clearance
 from remaster_ros.nodes.run_token import LivingRun, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, Event, Status, listen
-from remaster_ros.nodes.touring import PlanningThread, TourPlanner
-from remaster_ros.storage.cell import read_cell
-from remaster_ros.storage.plan_book import NO_FREE_PATH, PlanBook
+from remaster_ros.nodes.tour_planner import PlanningThread, TourPlanner
+from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, Stop
+from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanBook
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.types import FloatArray
 
 RETRY_WALL_S = 1.0
 """How often a full disk is tried again, wall time."""

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from remaster_ros.core.errors import DeviceError
+from remaster_ros.errors import DeviceError
 
 _PR_SET_PDEATHSIG = 1
 

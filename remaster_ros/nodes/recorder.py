@@ -25,27 +25,27 @@ from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from remaster_ros.core.errors import DiskError, InputError
-from remaster_ros.core.pairing import PairedReading, Pairing, Rejection
-from remaster_ros.core.plausibility import Plausibility
-from remaster_ros.core.presence import Presence
-from remaster_ros.core.tour import REFERENCE, REGISTRATION
-from remaster_ros.core.types import FloatArray, MarkerReading, Measurements, Session
-from remaster_ros.nodes.announcements import Announced, Announcements
+from remaster_ros.collection.pairing import PairedReading, Pairing, Rejection
+from remaster_ros.collection.plausibility import Plausibility
+from remaster_ros.errors import DiskError, InputError
+from remaster_ros.motion.liveness import Presence
 from remaster_ros.nodes.bagging import BEGAN, BagRecorder
 from remaster_ros.nodes.messages import JointOrder, seconds, temperature_topic
 from remaster_ros.nodes.parameters import declare
-from remaster_ros.nodes.patience import Patience
+from remaster_ros.nodes.pose_tracker import Announced, Announcements
 from remaster_ros.nodes.recorder_parameters import Parameters, sensor_rules
 from remaster_ros.nodes.registering import Registrar
+from remaster_ros.nodes.retrying_writer import Patience
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.shots import Shots
 from remaster_ros.nodes.status import JOINT_STATES, Event, Status, receiver, run_after
 from remaster_ros.nodes.status import TOPIC as STATUS
+from remaster_ros.nodes.triggered_sensors import Shots
 from remaster_ros.nodes.watching import Watching
-from remaster_ros.storage.cell import read_cell
-from remaster_ros.storage.logbook import Logbook
-from remaster_ros.storage.session_writer import ExitStatus
+from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
+from remaster_ros.session.session_journal import Logbook
+from remaster_ros.session.session_writer import ExitStatus
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.types import FloatArray, MarkerReading, Measurements, Session
 
 TEMPERATURE_S = 600.0
 """A temperature older than this says nothing of a reading, s."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from remaster_ros.core.pairing import SensorRules
+from remaster_ros.collection.pairing import SensorRules
 from remaster_ros.nodes.parameters import parameter
-from remaster_ros.storage.cell import Cell
+from remaster_ros.session.workcell import Cell
 
 
 @dataclass(frozen=True)

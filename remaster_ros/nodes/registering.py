@@ -6,14 +6,14 @@ import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.errors import InsufficientDataError
-from remaster_ros.core.pairing import PairedReading
-from remaster_ros.core.registration import register_agreeing
-from remaster_ros.core.types import FloatArray
+from remaster_ros.calibration.registration import register_agreeing
+from remaster_ros.collection.pairing import PairedReading
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.messages import transform_message
 from remaster_ros.nodes.status import LATCHED
-from remaster_ros.storage.cell import Cell
+from remaster_ros.session.workcell import Cell
+from remaster_ros.types import FloatArray
 
 POINTS = 3
 

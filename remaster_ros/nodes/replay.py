@@ -18,12 +18,12 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from remaster_ros.core.errors import InputError, RemasterError
+from remaster_ros.errors import InputError, RemasterError
 from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import TOPIC as STATUS
-from remaster_ros.storage.bag import LATCHED_TOPICS, RECORDED, BagReader, live_name
+from remaster_ros.session.bag import LATCHED_TOPICS, RECORDED, BagReader, live_name
 
 CLOCK = '/clock'
 COMMANDS = '/joint_trajectory_controller/joint_trajectory'

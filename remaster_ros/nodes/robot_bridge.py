@@ -19,9 +19,8 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.errors import InputError
-from remaster_ros.core.types import FloatArray
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.actions import (
     Action,
     CheckPath,
@@ -38,18 +37,19 @@ from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import Admitted, MotionGate
 from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.motion.path_search import PathSearch
-from remaster_ros.nodes.announcements import waypoints_by_solution
 from remaster_ros.nodes.background import Background
 from remaster_ros.nodes.bridge_parameters import Parameters
 from remaster_ros.nodes.emergency_link import EmergencyLink
 from remaster_ros.nodes.messages import JointOrder, duration_of, seconds, stamp_key, stamp_of
 from remaster_ros.nodes.parameters import declare
+from remaster_ros.nodes.pose_tracker import waypoints_by_solution
 from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import LEASED, RELIABLE, Event, Status, listen
-from remaster_ros.storage.cell import read_cell
-from remaster_ros.storage.halt_file import HaltFile
-from remaster_ros.storage.results import joint_offsets_rad, read_fit
+from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
+from remaster_ros.session.halt_file import HaltFile
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.types import FloatArray
 
 COMMANDS = 'joint_trajectory_controller/joint_trajectory'
 JOINTS = 'joint_states'

@@ -26,7 +26,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
-from remaster_ros.core.errors import InsufficientDataError, RemasterError
+from remaster_ros.errors import InsufficientDataError, RemasterError
 from remaster_ros.nodes.locking import NameLock
 
 TRACEBACK = 'REMASTER_TRACEBACK'

@@ -21,10 +21,10 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
-from remaster_ros.core.errors import InputError
-from remaster_ros.core.rivalry import Rivalry
+from remaster_ros.errors import InputError
+from remaster_ros.motion.rivalry import Rivalry
 from remaster_ros.nodes.qos_mismatch import mismatches
-from remaster_ros.storage.bag_metadata import LATCHED_DEPTH
+from remaster_ros.session.bag_metadata import LATCHED_DEPTH
 
 TOPIC = 'remaster/status'
 RELIABLE = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)

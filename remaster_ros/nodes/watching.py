@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.pairing import PairedReading
-from remaster_ros.core.reference_watch import Change, ReferenceReading, ReferenceWatch
-from remaster_ros.core.types import FloatArray
+from remaster_ros.collection.pairing import PairedReading
+from remaster_ros.collection.reference_watch import Change, ReferenceReading, ReferenceWatch
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.types import FloatArray
 
 GROWN = 1.5
 """A change that was said is said again where it has grown so many times."""

@@ -12,12 +12,12 @@ import robot_descriptions
 import yaml
 from command_line import remaster
 
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.simulation import SimulatedSensor, simulate_session
-from remaster_ros.core.transforms import rotation_vector_to_matrix, transform
-from remaster_ros.core.types import Session
-from remaster_ros.storage.results import joint_offsets_rad, read_fit
-from remaster_ros.storage.session import write_session
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import rotation_vector_to_matrix, transform
+from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
+from remaster_ros.session.reader import write_session
+from remaster_ros.simulation.session_simulator import SimulatedSensor, simulate_session
+from remaster_ros.types import Session
 
 MARKERS = {'sir': np.array([0.1, 0.0, 0.02]), 'smr': np.array([-0.1, 0.03, 0.02])}
 

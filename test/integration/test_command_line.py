@@ -18,10 +18,15 @@ import numpy as np
 import pytest
 from command_line import ROOT, refusal, remaster
 
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.transforms import apply, inverse, matrix_from_quaternion_xyzw, transform
-from remaster_ros.core.types import Session
-from remaster_ros.storage.session import read_session
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import (
+    apply,
+    inverse,
+    matrix_from_quaternion_xyzw,
+    transform,
+)
+from remaster_ros.session.reader import read_session
+from remaster_ros.types import Session
 
 DATA = ROOT.parent / 'shared/data'
 SIZE = ('--poses', 24, '--validation', 10)

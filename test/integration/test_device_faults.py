@@ -17,17 +17,17 @@ import optitrack_world
 import pytest
 import tracker_world
 
-from remaster_ros.core import transforms
-from remaster_ros.core.errors import DeviceError, InsufficientDataError
-from remaster_ros.core.registration import register_agreeing
-from remaster_ros.drivers.laser_tracker import LaserTrackerClient, LaserTrackerSettings
-from remaster_ros.drivers.natnet import MarkerChoice, NatNetClient, NatNetSettings
-from remaster_ros.drivers.natnet_diagnosis import warning
-from remaster_ros.fakes.laser_tracker import FakeLaserTracker
-from remaster_ros.fakes.laser_tracker_settings import TrackerBehaviour
-from remaster_ros.fakes.optitrack import FakeOptiTrackServer
-from remaster_ros.fakes.setup import make_world
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.calibration.registration import register_agreeing
+from remaster_ros.errors import DeviceError, InsufficientDataError
+from remaster_ros.kinematics import transforms
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient, LaserTrackerSettings
+from remaster_ros.sensors.optitrack.client import MarkerChoice, NatNetClient, NatNetSettings
+from remaster_ros.sensors.optitrack.diagnosis import warning
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.simulation.laser_tracker import FakeLaserTracker
+from remaster_ros.simulation.laser_tracker_settings import TrackerBehaviour
+from remaster_ros.simulation.optitrack import FakeOptiTrackServer
+from remaster_ros.simulation.setup import make_world
 
 KINDS = ('off', 'stuck', 'wrong', 'slow', 'delayed', 'intermittent', 'garbage', 'restarted')
 observed: dict[str, dict[str, str]] = {}

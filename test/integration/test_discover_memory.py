@@ -12,9 +12,9 @@ import numpy as np
 from calibration_scenes import CHAIN, MARKERS, URDF, sensors
 from command_line import ROOT
 
-from remaster_ros.core.simulation import simulate_session
-from remaster_ros.storage.discovery_results import read_discovery
-from remaster_ros.storage.session import write_session
+from remaster_ros.reports.discovery_json import read_discovery
+from remaster_ros.session.reader import write_session
+from remaster_ros.simulation.session_simulator import simulate_session
 
 # The command with a search of few rows, so that what all rows take is what counts; then the
 # largest resident memory of this process alone, which os.wait4 mixes up with its parent's.
@@ -23,9 +23,9 @@ import re, sys
 from functools import partial
 from pathlib import Path
 from remaster_ros.cli.main import main
-from remaster_ros.core import discovery
-from remaster_ros.core.discovery_thin import draw_rows
-discovery.draw_rows = partial(draw_rows, most=1000)
+from remaster_ros.discovery import discover
+from remaster_ros.discovery.thinning import draw_rows
+discover.draw_rows = partial(draw_rows, most=1000)
 status = main(['discover', sys.argv[1], '--out', sys.argv[2], '--quiet', '--seed', '1'])
 print(re.search(r'VmHWM:\\s+(\\d+) kB', Path('/proc/self/status').read_text())[1])
 raise SystemExit(status)

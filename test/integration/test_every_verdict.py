@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from command_line import refusal, remaster
 
-from remaster_ros.core.fit import fit_session
-from remaster_ros.core.types import Session
-from remaster_ros.storage.session import read_session, write_session
+from remaster_ros.calibration.fit import fit_session
+from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.types import Session
 
 SIZE = ('--poses', 16, '--validation', 8, '--sensors', 'mocap', '--quiet')
 

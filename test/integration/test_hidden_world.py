@@ -16,9 +16,15 @@ from hidden_tours import robot, visits, world
 from hidden_world import HiddenWorld, Noise
 from scipy.stats import chi2
 
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.fakes.effects import ARC_MINUTE, NAMED, UNNAMED, Deviation, HiddenEffect
-from remaster_ros.fakes.hiding import DRAWS, draw_effect
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.simulation.effect_sampling import DRAWS, draw_effect
+from remaster_ros.simulation.hidden_effects import (
+    ARC_MINUTE,
+    NAMED,
+    UNNAMED,
+    Deviation,
+    HiddenEffect,
+)
 
 
 @pytest.mark.parametrize('name', ['lwr4plus', 'iiwa7', 'iiwa14', 'six'])

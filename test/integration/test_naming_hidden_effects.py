@@ -15,9 +15,9 @@ pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 from hidden_judge import judge
 from hidden_sessions import NOISES, Recipe, another_session, held_out_noise_m, hidden_session
 
-from remaster_ros.core.discovery import Discovery, discover_session
-from remaster_ros.core.discovery_confirm import confirm
-from remaster_ros.fakes.effects import NAMED
+from remaster_ros.discovery.confirmation import confirm
+from remaster_ros.discovery.discover import Discovery, discover_session
+from remaster_ros.simulation.hidden_effects import NAMED
 
 # Half a minute on a quiet machine.
 pytestmark = pytest.mark.timeout(1200)

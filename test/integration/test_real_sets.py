@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from remaster_ros.core.fit import FitResult, fit_session
-from remaster_ros.storage.session import read_session
+from remaster_ros.calibration.fit import FitResult, fit_session
+from remaster_ros.session.reader import read_session
 
 DATA = Path(__file__).parents[3] / 'shared/data'
 

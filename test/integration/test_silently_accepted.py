@@ -12,9 +12,9 @@ import pytest
 import robot_descriptions
 from command_line import ROOT, refusal, remaster
 
-from remaster_ros.core.simulation import SimulatedSensor, simulate_session
-from remaster_ros.core.transforms import transform
-from remaster_ros.storage.session import read_chain, read_session, write_session
+from remaster_ros.kinematics.transforms import transform
+from remaster_ros.session.reader import read_chain, read_session, write_session
+from remaster_ros.simulation.session_simulator import SimulatedSensor, simulate_session
 
 
 def cell_with(folder: Path, *changes: tuple[str, str]) -> Path:

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from calibration_scenes import CHAIN, scene
 
-from remaster_ros.core.errors import InputError, InsufficientDataError
-from remaster_ros.core.fit import FitResult, fit_session
-from remaster_ros.core.judging import OffsetsJudgement, accuracy_with_offsets
-from remaster_ros.core.model import predict_in_sensor
-from remaster_ros.core.simulation import Truth
-from remaster_ros.core.transforms import quaternion_xyzw
-from remaster_ros.core.types import BasePrior, Session
+from remaster_ros.calibration.evaluate_offsets import OffsetsJudgement, accuracy_with_offsets
+from remaster_ros.calibration.fit import FitResult, fit_session
+from remaster_ros.calibration.model import predict_in_sensor
+from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.kinematics.transforms import quaternion_xyzw
+from remaster_ros.simulation.session_simulator import Truth
+from remaster_ros.types import BasePrior, Session
 
 SEEDS = range(100, 112)
 

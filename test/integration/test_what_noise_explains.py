@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from command_line import remaster
 
-from remaster_ros.core.types import Session
-from remaster_ros.storage.session import read_session, write_session
+from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.types import Session
 
 
 @pytest.fixture(scope='module')

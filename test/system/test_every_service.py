@@ -7,7 +7,7 @@ import pytest
 from command_line import remaster
 from conftest import call, node_arguments, wait_until
 
-from remaster_ros.storage.session import read_session, write_session
+from remaster_ros.session.reader import read_session, write_session
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(420)]
 

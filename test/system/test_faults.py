@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from conftest import call, wait_until
 
-from remaster_ros.core import transforms
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.fakes.faults import inject
-from remaster_ros.fakes.setup import make_world
-from remaster_ros.storage.cell import read_cell
-from remaster_ros.storage.session import read_session
+from remaster_ros.kinematics import transforms
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.reader import read_session
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.simulation.faults import inject
+from remaster_ros.simulation.setup import make_world
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from conftest import ROOT, call, node_arguments, wait_until
 
-from remaster_ros.core import transforms
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.fakes.faults import inject
-from remaster_ros.fakes.setup import make_world
+from remaster_ros.kinematics import transforms
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.demo import free_ports
-from remaster_ros.storage.bag import BagReader
-from remaster_ros.storage.cell import read_cell
-from remaster_ros.storage.journal import read_journal
-from remaster_ros.storage.session import read_session
+from remaster_ros.session.bag import BagReader
+from remaster_ros.session.journal import read_journal
+from remaster_ros.session.reader import read_session
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.simulation.faults import inject
+from remaster_ros.simulation.setup import make_world
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 

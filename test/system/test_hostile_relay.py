@@ -19,9 +19,9 @@ from hostile_judge import GRACE_S, Judge, Rules, after
 from hostile_lines import RELIABLE
 from hostile_scene import demo_body
 
-from remaster_ros.fakes.setup import make_world
 from remaster_ros.nodes.demo import free_ports
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.simulation.setup import make_world
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 

@@ -13,8 +13,8 @@ import pytest
 import yaml
 from conftest import ROOT, wait_until
 
-from remaster_ros.fakes.setup import make_world
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.simulation.setup import make_world
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(400)]
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from tracker_world import MARKER, ReflectorWorld, across_and_along
 
-from remaster_ros.fakes.laser_tracker import FakeLaserTracker
-from remaster_ros.fakes.laser_tracker_settings import TrackerBehaviour
-from remaster_ros.protocols.laser_tracker import (
+from remaster_ros.sensors.laser_tracker.protocol.codes import Command, Status
+from remaster_ros.sensors.laser_tracker.protocol.packets import (
     ErrorReport,
     Measurement,
     PacketReader,
@@ -19,7 +18,8 @@ from remaster_ros.protocols.laser_tracker import (
     StatusChange,
     encode,
 )
-from remaster_ros.protocols.laser_tracker_codes import Command, Status
+from remaster_ros.simulation.laser_tracker import FakeLaserTracker
+from remaster_ros.simulation.laser_tracker_settings import TrackerBehaviour
 
 packet = pytest.importorskip('CESAPI.packet', reason='the judge, PyPI CESAPI, is not installed')
 from CESAPI.command import CommandSync  # noqa: E402

@@ -19,15 +19,15 @@ import numpy as np
 import pytest
 from optitrack_world import SENSOR, MarkerWorld, eventually, free_port, open_descriptors
 
-from remaster_ros.core.errors import DeviceError, InputError
-from remaster_ros.drivers import natnetclient_backend
-from remaster_ros.drivers.natnet import NatNetSettings
-from remaster_ros.drivers.natnet_gate import Dropped, MarkerChoice
-from remaster_ros.drivers.natnetclient_backend import NatNetClientBackend
-from remaster_ros.fakes.optitrack import FakeOptiTrackServer
-from remaster_ros.fakes.optitrack_scene import OptiTrackBehaviour
-from remaster_ros.protocols import natnet as our_natnet
-from remaster_ros.protocols.natnet_frames import LabeledMarker
+from remaster_ros.errors import DeviceError, InputError
+from remaster_ros.sensors.optitrack import natnetclient_backend
+from remaster_ros.sensors.optitrack.client import NatNetSettings
+from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
+from remaster_ros.sensors.optitrack.natnetclient_backend import NatNetClientBackend
+from remaster_ros.sensors.optitrack.protocol import natnet as our_natnet
+from remaster_ros.sensors.optitrack.protocol.frames import LabeledMarker
+from remaster_ros.simulation.optitrack import FakeOptiTrackServer
+from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour
 
 MARKER = np.array([0.3, -0.1, 2.0])
 TOOL = OptiTrackBehaviour()

@@ -78,8 +78,8 @@ def test_a_laser_tracker_that_is_not_there(start):
 
 @pytest.mark.parametrize('fake', ['fake_optitrack', 'fake_laser_tracker'])
 def test_a_port_in_use(start, tmp_path, fake):
-    from remaster_ros.fakes.setup import make_world
-    from remaster_ros.storage.cell import read_cell
+    from remaster_ros.session.workcell import read_cell
+    from remaster_ros.simulation.setup import make_world
 
     make_world(tmp_path / 'world', read_cell('demo'), seed=1, rate=1.0).close()
     kind = socket.SOCK_DGRAM if fake == 'fake_optitrack' else socket.SOCK_STREAM

@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 NODE = """
 import sys
 from dataclasses import dataclass
-from remaster_ros.core.errors import InputError
+from remaster_ros.errors import InputError
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 

@@ -3,7 +3,7 @@
 import pytest
 from conftest import node_arguments, wait_until
 
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.session.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from conftest import ROOT, node_arguments, wait_until
 
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.core.transforms import (
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import (
     apply,
     inverse,
     rotation_vector_to_matrix,
     transform,
 )
-from remaster_ros.storage.session import read_session
+from remaster_ros.session.reader import read_session
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
 

@@ -7,9 +7,9 @@ import pytest
 from conftest import call
 from test_going_on import Cell
 
-from remaster_ros.fakes.faults import inject
-from remaster_ros.storage.journal import read_journal
-from remaster_ros.storage.session import read_session
+from remaster_ros.session.journal import read_journal
+from remaster_ros.session.reader import read_session
+from remaster_ros.simulation.faults import inject
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(400)]
 

@@ -3,9 +3,9 @@
 import pytest
 from conftest import node_arguments, wait_until
 
-from remaster_ros.storage.bag import BagReader
-from remaster_ros.storage.bag_writer import BagWriter
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.session.bag import BagReader
+from remaster_ros.session.bag_writer import BagWriter
+from remaster_ros.session.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
 

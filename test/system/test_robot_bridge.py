@@ -15,7 +15,7 @@ from hostile_process import environment
 from hostile_scene import HOME
 from simple_cells import write_cell
 
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.session.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(150)]
 

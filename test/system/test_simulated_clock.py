@@ -11,10 +11,10 @@ import pytest
 import yaml
 from conftest import call, node_arguments, wait_until
 
-from remaster_ros.fakes.setup import make_world
 from remaster_ros.nodes.demo import free_ports
-from remaster_ros.storage.bag import BagReader
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.session.bag import BagReader
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.simulation.setup import make_world
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 

@@ -6,7 +6,7 @@ import time
 import pytest
 from conftest import node_arguments
 
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.session.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(200)]
 
@@ -15,7 +15,7 @@ SLOW = """
 import os, sys, time
 seconds, sys.argv = float(sys.argv[1]), sys.argv[1:]
 from remaster_ros.nodes import pose_planner
-from remaster_ros.storage import journal
+from remaster_ros.session import journal
 append = journal.Journal.append
 def slow_append(self, record):
     print('writing', flush=True)

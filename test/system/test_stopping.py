@@ -9,7 +9,7 @@ import pytest
 import yaml
 from conftest import wait_until
 
-from remaster_ros.storage.session import read_session
+from remaster_ros.session.reader import read_session
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(180)]
 

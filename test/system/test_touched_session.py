@@ -7,7 +7,7 @@ import time
 import pytest
 from test_going_on import Cell
 
-from remaster_ros.storage.session import read_session
+from remaster_ros.session.reader import read_session
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 

@@ -7,12 +7,12 @@ import pytest
 import yaml
 from conftest import ROOT, call, wait_until
 
-from remaster_ros.core import transforms
-from remaster_ros.core.chain import SerialChain
-from remaster_ros.fakes.world import World
+from remaster_ros.kinematics import transforms
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.demo import free_ports
-from remaster_ros.storage.bag import BagReader
-from remaster_ros.storage.session import read_session
+from remaster_ros.session.bag import BagReader
+from remaster_ros.session.reader import read_session
+from remaster_ros.simulation.world import World
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(400)]
 

@@ -20,7 +20,7 @@ def rng():
 @pytest.mark.parametrize('version', [(2, 6), (2, 11), (3, 1), (4, 3)])
 def test_no_datagram_harms_the_optitrack_client(rng, version):
     client = fuzzing.NatNetClientTarget(rng, version)
-    with fuzzing.silent_natnet_driver():
+    with fuzzing.silent_natnet_client():
         fuzzing.run(
             fuzzing.natnet_mutator(rng, version),
             [fuzzing.decode_as_any_version(rng), client],

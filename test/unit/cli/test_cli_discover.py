@@ -3,10 +3,10 @@
 import types
 
 from remaster_ros.cli.discover import summary
-from remaster_ros.core.discovery_causes import FoundEffect, LookAlike
-from remaster_ros.core.discovery_confirm import Confirmation
-from remaster_ros.core.discovery_gain import Gain
-from remaster_ros.core.discovery_thin import Thinning
+from remaster_ros.discovery.confirmation import Confirmation
+from remaster_ros.discovery.explain import FoundEffect, LookAlike
+from remaster_ros.discovery.gain import Gain
+from remaster_ros.discovery.thinning import Thinning
 
 EFFECT = FoundEffect(
     name='joint_compliance',

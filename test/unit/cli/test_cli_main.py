@@ -7,7 +7,7 @@ import types
 import pytest
 
 from remaster_ros.cli import main as cli
-from remaster_ros.core.errors import DeviceError, InputError, InsufficientDataError
+from remaster_ros.errors import DeviceError, InputError, InsufficientDataError
 
 
 @pytest.fixture

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from remaster_ros.cli import simulate
-from remaster_ros.core.errors import InputError
-from remaster_ros.core.planning import order_solutions
-from remaster_ros.core.simulation import SimulatedSensor
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.errors import InputError
+from remaster_ros.planning.candidates import order_solutions
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.simulation.session_simulator import SimulatedSensor
 
 ROOT = Path(__file__).parents[3]
 

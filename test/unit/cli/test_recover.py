@@ -8,8 +8,8 @@ import pytest
 from session_crashes import live, make_observations, session_header
 
 from remaster_ros.cli.main import main
-from remaster_ros.storage.session import read_session
-from remaster_ros.storage.session_writer import SessionWriter
+from remaster_ros.session.reader import read_session
+from remaster_ros.session.session_writer import SessionWriter
 
 
 @pytest.fixture

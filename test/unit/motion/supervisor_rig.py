@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from remaster_ros.fakes import motion as servo
 from remaster_ros.motion.actions import (
     CheckPath,
     Drive,
@@ -18,6 +17,7 @@ from remaster_ros.motion.motion_gate import Cubic, MotionGate
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.motion.trajectory import Waypoint
+from remaster_ros.simulation import arm_motion as servo
 
 SPEED = np.array([0.5, 1.0])
 LIMITS = MotionLimits(

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from remaster_ros.fakes import motion as servo
 from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.following import (
     ASTRAY_S,
@@ -20,6 +19,7 @@ from remaster_ros.motion.following import (
 from remaster_ros.motion.joint_reports import JointReport
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.motion.trajectory import REST_S, Line, Trajectory
+from remaster_ros.simulation import arm_motion as servo
 
 RULES = SupervisorRules(settle=SettleRules(settle_s=1.0, still_tolerance=2.0**-12))
 AT = np.array([0.25, 0.5])

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from remaster_ros.core.chain import SerialChain
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.path_check import (
     PEAK_STEP_RAD,
     FreePath,

@@ -9,7 +9,7 @@ from simple_cells import write_cell
 from remaster_ros.motion.actions import CheckPath
 from remaster_ros.motion.path_check import PointSpeeds, peak_speeds
 from remaster_ros.motion.path_search import PathSearch
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.session.workcell import read_cell
 
 CHAIN = read_cell('demo').chain()
 ARM = np.array([0.0, 0.9, 0.0, 1.2, 0.0, 0.3, 0.0])

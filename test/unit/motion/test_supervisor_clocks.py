@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from supervisor_rig import LIMITS, RULES, SPEED, Rig
 
-from remaster_ros.fakes import motion as servo
 from remaster_ros.motion.actions import Drive, Failed, Halted, Settled, Stop, SupervisorRules
 from remaster_ros.motion.following import STANDING_S
 from remaster_ros.motion.joint_reports import JointReport
+from remaster_ros.simulation import arm_motion as servo
 
 
 @pytest.fixture

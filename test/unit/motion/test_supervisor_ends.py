@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from supervisor_rig import LIMITS, Rig
 
-from remaster_ros.fakes import motion as servo
 from remaster_ros.motion.actions import Drive, Failed, Halted, Settled, Stop
+from remaster_ros.simulation import arm_motion as servo
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from supervisor_rig import HOME, LIMITS, RULES, Rig
 
-from remaster_ros.fakes import motion as servo
 from remaster_ros.motion.actions import (
     CheckPath,
     Drive,
@@ -20,6 +19,7 @@ from remaster_ros.motion.actions import (
 from remaster_ros.motion.arm_supervisor import PROBE, WAY_OUT
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.trajectory import Line
+from remaster_ros.simulation import arm_motion as servo
 
 STOPPED = 'the robot stopped on its way: an emergency or protective stop?'
 NOT_TAKEN = 'the robot does not take commands: see its controller, and its driver'

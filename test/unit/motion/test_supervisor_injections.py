@@ -11,10 +11,10 @@ from collections import Counter
 import numpy as np
 from supervisor_rig import LIMITS, SPEED, Rig
 
-from remaster_ros.fakes import motion as servo
 from remaster_ros.motion.actions import Drive, Halted, Stop
 from remaster_ros.motion.motion_gate import Cubic
 from remaster_ros.motion.trajectory import Waypoint
+from remaster_ros.simulation import arm_motion as servo
 
 RUNS, SECONDS, DT = 320, 6.0, 0.05
 SERVO = 0.02

@@ -22,7 +22,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.nodes import emergency_link, rivals, robot_bridge, status
 from remaster_ros.nodes.messages import seconds
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.session.workcell import read_cell
 
 CHAIN = read_cell('demo').chain()
 HOME = np.array([0.0, 0.3, 0.0, 1.0, 0.0, 0.5, 0.0])

@@ -16,11 +16,11 @@ from sensor_msgs.msg import JointState
 from simple_cells import write_cell
 from trajectory_msgs.msg import JointTrajectory
 
-from remaster_ros.core.errors import InputError
+from remaster_ros.errors import InputError
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.nodes import robot_bridge, running
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.session.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from remaster_ros.core.errors import InputError
+from remaster_ros.errors import InputError
 from remaster_ros.nodes.launching import (
     COMMANDS,
     CORE,

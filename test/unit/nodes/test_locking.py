@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from remaster_ros.core.errors import InputError
+from remaster_ros.errors import InputError
 from remaster_ros.nodes import locking
 from remaster_ros.nodes.locking import NameLock
 

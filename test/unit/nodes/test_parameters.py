@@ -9,7 +9,7 @@ import yaml
 
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
-from remaster_ros.core.errors import InputError
+from remaster_ros.errors import InputError
 from remaster_ros.nodes.parameters import check
 
 pytestmark = pytest.mark.ros

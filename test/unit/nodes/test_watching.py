@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from remaster_ros.core import transforms
-from remaster_ros.core.pairing import PairedReading
+from remaster_ros.collection.pairing import PairedReading
+from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.watching import Watching
-from remaster_ros.storage.cell import read_cell
+from remaster_ros.session.workcell import read_cell
 
 CELL = read_cell('demo')
 CHAIN = CELL.chain()

@@ -9,10 +9,10 @@ from builtin_interfaces.msg import Time
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
-from remaster_ros.core.errors import InputError
-from remaster_ros.core.tour import Stop
-from remaster_ros.nodes.announcements import waypoints_by_solution, waypoints_message
-from remaster_ros.nodes.touring import PlanningThread
+from remaster_ros.errors import InputError
+from remaster_ros.nodes.pose_tracker import waypoints_by_solution, waypoints_message
+from remaster_ros.nodes.tour_planner import PlanningThread
+from remaster_ros.planning.tour_order import Stop
 
 NAMES = ('a', 'b', 'c')
 

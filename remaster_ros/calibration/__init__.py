@@ -1,0 +1,1 @@
+"""From observations to joint offsets with their uncertainty."""

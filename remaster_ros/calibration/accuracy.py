@@ -1,0 +1,168 @@
+"""The paper's three measures of accuracy, section V of Van Wyk et al.
+
+The first two are free of the gauge: the relative error compares distances; the absolute one
+compares points in the sensor's frame, where a turn of joint 1 and of the registration cancel. Of
+the third there are two versions, see `theoretical`. Means and the 2.5 and 97.5 % quantiles are
+over configurations (and draws), in mm, as in Tables III to VIII.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.calibration.predictive_accuracy import (
+    RANDOM_CONFIGURATIONS,
+    Distances,
+    Predictive,
+    random_configurations,
+    theoretical_distances,
+)
+from remaster_ros.types import FloatArray, IntArray, Measurements
+
+# Of more pairs of solutions (100,000 rows at three dozen poses have 1e8) this many are drawn.
+MOST_PAIRS = 200_000
+THEORETICAL = ('theoretical', 'paper_theoretical')
+
+
+def summary(errors: FloatArray) -> dict[str, Any]:
+    """Return mean and 95 % interval of errors in m as ``mean_mm`` and ``interval95_mm``."""
+    low, high = np.quantile(errors, (0.025, 0.975)) * 1e3
+    return {'mean_mm': float(np.mean(errors) * 1e3), 'interval95_mm': [float(low), float(high)]}
+
+
+def unavailable(names: Sequence[str], why: str) -> dict[str, Any]:
+    """Return a metric that the session does not allow, with the reason."""
+    return {**dict.fromkeys(names), 'why': why}
+
+
+def solution_pairs(measurements: Measurements, rng: np.random.Generator) -> IntArray:
+    """Return the rows i < j seen by the same sensor on the same marker at the same pose, (m, 2).
+
+    The sums of eq. 17 of Van Wyk et al.; rows of one configuration are the same solution and make
+    no pair. Of more than 200,000 pairs as many are drawn at random.
+    """
+    key = (measurements.pose, measurements.marker, measurements.sensor)
+    order = np.lexsort((np.arange(len(measurements)), *key))
+    changes = np.any([np.diff(column[order]) != 0 for column in key], axis=0)
+    start = np.concatenate(([0], np.flatnonzero(changes) + 1))
+    size = np.diff(np.append(start, len(measurements)))
+    count = size * (size - 1) // 2
+    total = int(count.sum())
+    number = np.arange(total) if total <= MOST_PAIRS else rng.integers(total, size=MOST_PAIRS)
+    # The number of a pair: its cluster, and its place in the list (0,1) (0,2) (1,2) (0,3) ….
+    cluster = np.searchsorted(np.cumsum(count), number, side='right')
+    place = number - (np.cumsum(count) - count)[cluster]
+    second = ((1.0 + np.sqrt(1.0 + 8.0 * place)) / 2.0).astype(np.int64)
+    first = place - second * (second - 1) // 2
+    pairs = order[start[cluster, None] + np.stack((first, second), axis=1)]
+    configuration = measurements.configuration
+    return pairs[configuration[pairs[:, 0]] != configuration[pairs[:, 1]]]
+
+
+def relative_errors(
+    measurements: Measurements, predicted: FloatArray, pairs: IntArray
+) -> FloatArray:
+    """Return the difference of measured and modelled distances between solutions (eq. 17).
+
+    Parameters
+    ----------
+    measurements
+        n observations.
+    predicted
+        Where the model has the markers, in any one frame per sensor, m, (n, 3).
+    pairs
+        Of `solution_pairs`, (m, 2).
+
+    Returns
+    -------
+    ndarray
+        m, (m,).
+    """
+    first, second = pairs.T
+    measured = np.linalg.norm(measurements.position[first] - measurements.position[second], axis=1)
+    modelled = np.linalg.norm(predicted[first] - predicted[second], axis=1)
+    return np.abs(measured - modelled)
+
+
+def accuracy_of(
+    measurements: Measurements,
+    splits: Mapping[str, IntArray],
+    predicted_before: FloatArray,
+    predicted_after: FloatArray,
+    predictive: Predictive | None,
+    rng: np.random.Generator,
+) -> dict[str, Any]:
+    """Return the three metrics before and after, as fit.json has them.
+
+    Parameters
+    ----------
+    measurements
+        n observations.
+    splits
+        Name -> indices of its rows; a split without rows gives None.
+    predicted_before, predicted_after
+        Modelled markers in the sensors' frames with offsets at zero and as estimated, m, (n, 3).
+    predictive
+        For the theoretical metric; None where no posterior is at hand.
+    rng
+        For the theoretical metric.
+    """
+    at_random: dict[str, Any] = {}
+    if predictive is not None:
+        bare = predictive.without_extension()
+        rows = random_configurations(bare.model, measurements, RANDOM_CONFIGURATIONS, rng)
+        everywhere = np.arange(RANDOM_CONFIGURATIONS)
+        both = theoretical_distances(bare, rows, everywhere, rng)
+        at_random = _theoretical(both, suffix='_random')
+    result: dict[str, Any] = {}
+    for name, chosen in splits.items():
+        if len(chosen) == 0:
+            result[name] = None
+            continue
+        result[name] = _measured(
+            measurements.select(chosen), predicted_before[chosen], predicted_after[chosen], rng
+        )
+        if predictive is None:
+            missing = unavailable(Distances._fields, 'it needs draws of the posterior')
+            result[name] |= {key + s: missing for s in ('', '_random') for key in THEORETICAL}
+        else:
+            both = theoretical_distances(predictive, measurements, chosen, rng)
+            result[name] |= _theoretical(both) | at_random
+    return result
+
+
+def _measured(
+    measurements: Measurements,
+    predicted_before: FloatArray,
+    predicted_after: FloatArray,
+    rng: np.random.Generator,
+) -> dict[str, Any]:
+    """Return the two metrics that need no posterior."""
+    predicted = {'before': predicted_before, 'after': predicted_after}
+    pairs = solution_pairs(measurements, rng)
+    if len(pairs) > 0:
+        relative = {
+            side: summary(relative_errors(measurements, points, pairs))
+            for side, points in predicted.items()
+        }
+    else:
+        relative = unavailable(
+            ('before', 'after'),
+            'no pose has two joint solutions seen by the same sensor on the same marker',
+        )
+    absolute = {
+        side: summary(np.linalg.norm(measurements.position - points, axis=1))
+        for side, points in predicted.items()
+    }
+    return {'relative': relative, 'post_registration': absolute}
+
+
+def _theoretical(both: Sequence[Distances], suffix: str = '') -> dict[str, Any]:
+    """Return the summaries of the invariant and of the paper's version."""
+    return {
+        name + suffix: {side: summary(values) for side, values in distances._asdict().items()}
+        for name, distances in zip(THEORETICAL, both, strict=True)
+    }

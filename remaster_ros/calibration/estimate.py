@@ -1,0 +1,330 @@
+"""From a session to the posterior's mode: gauge fixed, gross errors named, no sampling yet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from remaster_ros.calibration.extension import Extension
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.identifiability import Gauge, find_gauge
+from remaster_ros.calibration.initial_guess import robust_start
+from remaster_ros.calibration.laplace import Mode, find_mode
+from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.outliers import Judgement, find_outliers
+from remaster_ros.calibration.posterior import Posterior
+from remaster_ros.calibration.priors import Prior, base_prior, marker_prior, offset_prior
+from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.types import (
+    BasePrior,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Measurements,
+    Priors,
+    Session,
+)
+
+# Fewer rows of a sensor leave nothing to estimate its noise from.
+FEWEST_ROWS = 4
+FEWEST_POSES = 3
+# Limits of chi-squared with 1 and 2 degrees of freedom at an error rate of 1 in 1,000: so often a
+# sensor without a difference along its line of sight is given one.
+DIRECTION_LIMITS = {1: 10.828, 2: 13.816}
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What a session gives to fit, reduced to the sensors and markers that occur in it.
+
+    Attributes
+    ----------
+    session
+        As it was given.
+    chain
+        The nominal robot.
+    sensor_names, marker_names
+        Those with at least one row.
+    measurements
+        All rows in file order, ``sensor`` and ``marker`` being indices into these names.
+    markers, marker_std_m
+        Nominal positions and how well they are known, m, (markers, 3) and (markers,).
+    fitted
+        Indices of the optimization rows.
+    known_offsets
+        (joint index, mean, standard deviation), rad, of the offsets known beforehand.
+    known_base
+        Sensor name -> registration known beforehand.
+    """
+
+    session: Session
+    chain: SerialChain
+    sensor_names: tuple[str, ...]
+    marker_names: tuple[str, ...]
+    measurements: Measurements
+    markers: FloatArray
+    marker_std_m: FloatArray
+    fitted: IntArray
+    known_offsets: tuple[tuple[int, float, float], ...]
+    known_base: Mapping[str, BasePrior]
+
+    @classmethod
+    def of(cls, session: Session, priors: Priors | None = None) -> Problem:
+        """Reduce and check a session; priors replace what it says of the same markers and sensors.
+
+        Raises
+        ------
+        InputError
+            A robot that does not fit the session, or priors on what the session has not.
+        InsufficientDataError
+            Too few observations, of one sensor or of all.
+        """
+        chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+        given = session.measurements
+        if given.q.shape[1:] != (len(chain),):
+            raise InputError(
+                f'the session has {given.q.shape[-1]} joints, '
+                f'the URDF from {session.base_link} to {session.tip_link} has {len(chain)}'
+            )
+        if len(chain) < 2:
+            raise InsufficientDataError(
+                'the robot has one joint: its zero-offset cannot be told from the registration'
+            )
+        fitted = np.flatnonzero(~given.is_validation)
+        if len(fitted) == 0:
+            raise InsufficientDataError(
+                'the session has no optimization rows; record poses to fit, not only to validate'
+            )
+        sensors, sensor = np.unique(given.sensor, return_inverse=True)
+        markers, marker = np.unique(given.marker, return_inverse=True)
+        sensor_names = tuple(session.sensor_names[index] for index in sensors)
+        marker_names = tuple(session.marker_names[index] for index in markers)
+        for index, name in enumerate(sensor_names):
+            count = int(np.sum(sensor[fitted] == index))
+            poses = len(np.unique(given.pose[fitted][sensor[fitted] == index]))
+            if poses < FEWEST_POSES:
+                raise InsufficientDataError(
+                    f"sensor '{name}' saw {poses} poses to fit; at least {FEWEST_POSES} are "
+                    'needed to register it, and some thirty for good zero-offsets'
+                )
+            if count < FEWEST_ROWS:
+                raise InsufficientDataError(
+                    f"sensor '{name}' has {count} optimization rows; at least {FEWEST_ROWS} are "
+                    'needed to register it and to know its noise'
+                )
+        priors = Priors() if priors is None else priors
+        _require_known('joint', priors.joint_offsets, chain.joint_names)
+        _require_known('marker', priors.markers, session.marker_names)
+        _require_known('sensor', priors.base, session.sensor_names)
+        places = [
+            priors.markers.get(name, (session.markers[name], session.marker_std_m))
+            for name in marker_names
+        ]
+        return cls(
+            session,
+            chain,
+            sensor_names,
+            marker_names,
+            replace(given, sensor=sensor.astype(np.int64), marker=marker.astype(np.int64)),
+            np.array([place for place, _ in places], dtype=float),
+            np.array([std for _, std in places], dtype=float),
+            fitted,
+            tuple(
+                (chain.joint_names.index(name), mean, std)
+                for name, (mean, std) in priors.joint_offsets.items()
+            ),
+            {**session.base_prior, **priors.base},
+        )
+
+    def marker_priors(self, model: Model) -> tuple[Prior, ...]:
+        """Return the priors on the markers."""
+        return tuple(
+            marker_prior(model, index, nominal, float(std))
+            for index, (nominal, std) in enumerate(
+                zip(self.markers, self.marker_std_m, strict=True)
+            )
+        )
+
+    def other_priors(self, model: Model) -> tuple[Prior, ...]:
+        """Return the priors on registrations and offsets that are known beforehand."""
+        base = tuple(
+            base_prior(model, index, self.known_base[name])
+            for index, name in enumerate(self.sensor_names)
+            if name in self.known_base
+        )
+        return base + tuple(offset_prior(model, *known) for known in self.known_offsets)
+
+    def empty_model(self, extension: Extension | None = None) -> Model:
+        """Return a model with registrations still unknown."""
+        count = len(self.sensor_names)
+        return Model(
+            self.chain,
+            self.sensor_names,
+            self.marker_names,
+            np.tile(np.eye(4), (count, 1, 1)),
+            np.zeros((count, 3)),
+            extension,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The mode with offsets and, for comparison, with offsets held at zero.
+
+    Attributes
+    ----------
+    problem, model
+        What was fitted.
+    gauge
+        What the data cannot see.
+    mode, before
+        With offsets, and with all of them at zero (registrations and markers fitted).
+    left_out
+        (row of the measurements, reason) of the gross errors.
+    kept
+        Indices of the optimization rows that were fitted.
+    """
+
+    problem: Problem
+    model: Model
+    gauge: Gauge
+    mode: Mode
+    before: Mode
+    left_out: tuple[tuple[int, str], ...]
+    kept: IntArray
+
+    @property
+    def posterior(self) -> Posterior:
+        """The posterior that `mode` is the mode of."""
+        return self.mode.linearisation.posterior
+
+
+def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
+    """Find the mode, with the parameters of an extension where one is given.
+
+    Raises
+    ------
+    InsufficientDataError
+        Where the data do not determine the parameters, or disagree with the model altogether.
+    """
+    measurements = problem.measurements
+    empty = problem.empty_model(extension)
+    model, z = robust_start(
+        empty,
+        measurements,
+        problem.fitted,
+        problem.markers,
+        float(np.max(problem.marker_std_m)),
+        problem.marker_priors(empty),
+    )
+    priors = problem.marker_priors(model) + problem.other_priors(model)
+    rows = Rows.of(measurements, problem.fitted, model.reference)
+    gauge = find_gauge(model, model.natural(z), rows, priors)
+    free = np.setdiff1d(np.arange(model.size), gauge.held)
+    z[gauge.held[gauge.held < model.joints]] = 0.0
+
+    def kept_rows(keep: BoolArray) -> Rows:
+        return Rows.of(measurements, np.sort(rows.source[keep]), model.reference)
+
+    def refit(keep: BoolArray) -> FloatArray:
+        mode = find_mode(Posterior.of(model, kept_rows(keep), priors, free, z))
+        return rows.target - model.predict(mode.z, rows)
+
+    errors = rows.target - model.predict(z, rows)
+    judgement = find_outliers(rows, refit, errors, model.sensor_names)
+    kept = kept_rows(~judgement.gross)
+    _require_information(kept, free, model)
+    mode = with_directions(find_mode(Posterior.of(model, kept, priors, free, z)))
+    return Estimate(
+        problem,
+        model,
+        gauge,
+        mode,
+        hold_offsets(mode, np.zeros(model.joints)),
+        _left_out(rows, judgement),
+        np.sort(kept.source),
+    )
+
+
+def with_directions(mode: Mode) -> Mode:
+    """Return the mode with a noise along the line of sight of every sensor that shows one.
+
+    One sensor after the other by a likelihood-ratio test of the noise, the parameters integrated
+    out: where there is no difference it finds one in 1 of 1,000 cases, less often where a
+    pose_sigma is zero.
+    """
+    posterior = mode.linearisation.posterior
+    split: list[int] = []
+    for sensor in range(len(posterior.model.sensor_names)):
+        tried = replace_channels(posterior, [*split, sensor], mode.z)
+        try:
+            other = find_mode(tried)
+        except InsufficientDataError:
+            continue
+        # Twice the likelihood ratio is chi-squared, with as many degrees of freedom as the noise
+        # has more parameters.
+        more = tried.size - mode.linearisation.posterior.size
+        if 2.0 * (other.log_evidence - mode.log_evidence) > DIRECTION_LIMITS[more]:
+            mode, split = other, [*split, sensor]
+    return mode
+
+
+def replace_channels(
+    posterior: Posterior, split: Sequence[int], reference: FloatArray
+) -> Posterior:
+    """Return the posterior with a noise along the sight of these sensors, from a reference."""
+    return Posterior.of(
+        posterior.model, posterior.rows, posterior.priors, posterior.free, reference, split
+    )
+
+
+def hold_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
+    """Return the mode of the same posterior with the joint offsets held at given values.
+
+    Parameters
+    ----------
+    mode
+        Of the fit with free offsets.
+    joint_offsets
+        rad, (k,).
+    """
+    posterior = mode.linearisation.posterior
+    joints = posterior.model.joints
+    natural = posterior.model.natural(mode.z)
+    natural[:joints] = joint_offsets
+    held = replace(
+        posterior,
+        free=posterior.free[posterior.free >= joints],
+        reference=posterior.model.pinned(natural),
+    )
+    return find_mode(held)
+
+
+def _require_known(kind: str, given: Mapping[str, object], names: Sequence[str]) -> None:
+    for name in given:
+        if name not in names:
+            raise InputError(
+                f"there is a prior on {kind} '{name}', but the session has {', '.join(names)}; "
+                'correct the name or leave it out'
+            )
+
+
+def _require_information(rows: Rows, free: IntArray, model: Model) -> None:
+    needed = int(np.sum(free < model.joints + 6 * len(model.sensor_names))) + 3
+    if 3 * len(rows) < needed:
+        raise InsufficientDataError(
+            f'{len(rows)} observations of 3 coordinates for {len(free)} unknowns; '
+            f'measure at least {-(-needed // 3)}, better ten times as many'
+        )
+
+
+def _left_out(rows: Rows, judgement: Judgement) -> tuple[tuple[int, str], ...]:
+    found = [
+        (int(source), why)
+        for source, why, gross in zip(rows.source, judgement.why, judgement.gross, strict=True)
+        if gross
+    ]
+    return tuple(sorted(found))

@@ -1,0 +1,135 @@
+"""Judge given zero-offsets on any session of the robot: `remaster accuracy`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.calibration.accuracy import accuracy_of
+from remaster_ros.calibration.estimate import Estimate, Problem, estimate, hold_offsets
+from remaster_ros.calibration.laplace import Mode, linearise
+from remaster_ros.calibration.predictive_accuracy import Predictive
+from remaster_ros.calibration.result import predicted_rows
+from remaster_ros.errors import InputError
+from remaster_ros.types import FloatArray, Session
+
+DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class OffsetsJudgement:
+    """What the offsets do for a session.
+
+    Attributes
+    ----------
+    accuracy
+        The three metrics before and after, as fit.json has them.
+    left_out
+        (observation, reason) of every gross error; neither fitted nor among the metrics of the
+        optimization rows.
+    """
+
+    accuracy: dict[str, Any]
+    left_out: tuple[tuple[int, str], ...]
+
+
+def accuracy_with_offsets(
+    session: Session,
+    joint_offsets: FloatArray,
+    joint_offsets_std: FloatArray | None,
+    rng: np.random.Generator,
+) -> OffsetsJudgement:
+    """Compare a session with the robot without and with given zero-offsets.
+
+    Registrations and markers are fitted to the session's optimization rows (to all rows where it
+    has none), once with the offsets at zero and once with the given ones, and applied to all rows.
+    Offsets that a registration or a marker takes up, as that of joint 1, therefore do not count.
+
+    The theoretical metric (section V-C of Van Wyk et al.) draws the offsets from independent
+    Gaussians about the given ones, the registrations and markers from what the session then says
+    of them. Correlations between the offsets are not in fit.json.
+
+    Parameters
+    ----------
+    session
+        Any session of this robot.
+    joint_offsets
+        rad, (k,).
+    joint_offsets_std
+        rad, (k,); 0 for joints that no data can tell, which are not drawn. Without it there is
+        no theoretical metric.
+    rng
+        Source of all randomness.
+
+    Raises
+    ------
+    InputError
+        Offsets of another robot.
+    InsufficientDataError
+        A session that does not determine registrations and markers.
+    """
+    if not np.any(~session.measurements.is_validation):
+        everything = np.zeros(len(session.measurements), dtype=bool)
+        session = replace(
+            session, measurements=replace(session.measurements, is_validation=everything)
+        )
+    problem = Problem.of(session)
+    for values in (joint_offsets, joint_offsets_std):
+        if values is not None and np.shape(values) != (len(problem.chain),):
+            raise InputError(
+                f'{np.size(values)} zero-offsets for a robot of {len(problem.chain)} joints'
+            )
+    found = estimate(problem)
+    model = found.model
+    given = hold_offsets(found.mode, np.asarray(joint_offsets, dtype=float))
+    predicted_before = predicted_rows(problem, model, found.before.z)
+    predicted_after = predicted_rows(problem, model, given.z)
+    predictive = None
+    if joint_offsets_std is not None:
+        predictive = Predictive(
+            model=model,
+            before=found.before.z,
+            after=given.z,
+            draws=_draws(found, given, joint_offsets_std, rng),
+            sigma=np.tile(found.posterior.total_noise(given.eta), (DRAWS, 1, 1)),
+        )
+    accuracy = accuracy_of(
+        problem.measurements,
+        {
+            'optimization': found.kept,
+            'validation': np.flatnonzero(problem.measurements.is_validation),
+        },
+        predicted_before,
+        predicted_after,
+        predictive,
+        rng,
+    )
+    observation = problem.measurements.observation
+    left_out = tuple((int(observation[row]), why) for row, why in found.left_out)
+    return OffsetsJudgement(accuracy, left_out)
+
+
+def _draws(
+    found: Estimate, given: Mode, joint_offsets_std: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """Draw offsets, and registrations and markers given the offsets, as pinned (draws, size)."""
+    model = found.model
+    joints = np.arange(1, model.joints - 1)
+    # In pinned coordinates the outer two joints move nothing.
+    joints = joints[joint_offsets_std[joints] > 0.0]
+    others = np.arange(model.joints, model.size)
+    everything = replace(found.posterior, free=np.arange(model.size), reference=given.z)
+    information = linearise(everything, given.z).gram(given.eta)[:-1, :-1]
+    scale = 1.0 / np.sqrt(np.diag(information)[others])
+    factor = np.linalg.cholesky(information[np.ix_(others, others)] * np.outer(scale, scale))
+
+    shift = joint_offsets_std[joints] * rng.standard_normal((DRAWS, len(joints)))
+    pull = shift @ (information[np.ix_(joints, others)] * scale)
+    noise = rng.standard_normal((DRAWS, len(others)))
+    answer = np.linalg.solve(factor.T, noise.T - np.linalg.solve(factor, pull.T)).T * scale
+    draws = np.tile(given.z, (DRAWS, 1))
+    draws[:, joints] += shift
+    draws[:, others] += answer
+    return draws

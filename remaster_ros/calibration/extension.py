@@ -1,0 +1,116 @@
+"""Further parameters of the model: what physical effects add, linear in each observation.
+
+An effect is what it does to each row of the measurements: it turns joints, or it displaces the
+marker. Nothing here knows which effect it is; `discovery.effects` does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """What some of the parameters do, in one place.
+
+    Attributes
+    ----------
+    where
+        Which parameters, in order.
+    at
+        Index of the joint whose angle they add to; None where they displace the marker.
+    values
+        Added joint angle, rad per unit, (n, c), or displacement in base coordinates R, m per unit,
+        (n, 3, c): of all that does not enter through a joint angle (links, base, marker, sensor
+        frame), the derivative at ``theta0``.
+    """
+
+    where: slice
+    at: int | None
+    values: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Extension:
+    """Further parameters theta (m,): physical effects, each row deviating linearly in them.
+
+    The marker of row n is predicted at::
+
+        chain.positions(q + offsets + Σ turning terms: values @ theta)
+        + displacement0 + Σ displacing terms: values @ (theta - theta0)
+
+    in base coordinates R, then registered as without an extension. Rows are those of the
+    `Measurements` (``Rows.source``).
+
+    Attributes
+    ----------
+    names
+        'compliance_2', …, m names.
+    units
+        'rad/(N m)', …, m units.
+    terms
+        What they do. A curve of a joint has a hundred parameters, which concern this joint alone.
+    displacement0
+        Exact value at ``theta0`` of what the displacing terms are derivatives of, m, (n, 3).
+    theta0
+        Where it was linearised, (m,).
+    prior_precision
+        Gaussian prior about 0 (plausible size, smoothness); zeros where flat, (m, m).
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    terms: tuple[Term, ...]
+    displacement0: FloatArray
+    theta0: FloatArray
+    prior_precision: FloatArray
+
+    def turns(self, theta: FloatArray, rows: IntArray, joints: int) -> FloatArray:
+        """Return the joint angles that theta (..., m) adds to n rows, rad, (..., n, joints)."""
+        added = np.zeros((*theta.shape[:-1], len(rows), joints))
+        for term in self.terms:
+            if term.at is not None:
+                added[..., term.at] += _product(term.values[rows], theta[..., term.where])
+        return added
+
+    def shifts(self, theta: FloatArray, rows: IntArray) -> FloatArray:
+        """Return the displacements of n rows by theta (..., m), in R, m, (..., n, 3)."""
+        step = theta - self.theta0
+        shift = np.zeros((*theta.shape[:-1], len(rows), 3))
+        for term in self.terms:
+            if term.at is None:
+                shift += _product(term.values[rows], step[..., term.where])
+        shift += self.displacement0[rows]
+        return shift
+
+    def derivative(self, by_joints: FloatArray, base: FloatArray, rows: IntArray) -> FloatArray:
+        """Return the derivative of n points by theta, m per unit, (n, 3, m).
+
+        Parameters
+        ----------
+        by_joints
+            Derivative of the points by the joint angles, m/rad, (n, 3, k).
+        base
+            Rotation that displacements are turned by, (3, 3).
+        rows
+            Their indices in the measurements, (n,).
+        """
+        result = np.zeros((len(rows), 3, len(self.theta0)))
+        for term in self.terms:
+            values = term.values[rows]
+            if term.at is None:
+                result[:, :, term.where] += base @ values
+            else:
+                result[:, :, term.where] += by_joints[:, :, term.at, None] * values[:, None, :]
+        return result
+
+
+def _product(values: FloatArray, theta: FloatArray) -> FloatArray:
+    """Return values (n, ..., c) times theta (draws..., c): (draws..., n, ...), one product."""
+    c = values.shape[-1]
+    product = theta.reshape(-1, c) @ values.reshape(-1, c).T
+    return product.reshape(*theta.shape[:-1], *values.shape[:-1])

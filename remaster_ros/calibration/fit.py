@@ -1,0 +1,173 @@
+"""`fit_session`: zero-offsets, registrations, markers and noise of a session, with uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+
+from remaster_ros.calibration import convergence
+from remaster_ros.calibration.estimate import Estimate, Problem, estimate
+from remaster_ros.calibration.extension import Extension
+from remaster_ros.calibration.paper_sampler import BURN_IN_SHARE, STEPS, fit_paper
+from remaster_ros.calibration.posterior import Posterior
+from remaster_ros.calibration.result import FitResult, Sampled, build_result
+from remaster_ros.calibration.sampling import PRECISION, Length, Progress, sample_posterior, silent
+from remaster_ros.errors import InputError
+from remaster_ros.types import FloatArray, Priors, Session
+
+__all__ = ['PRECISION', 'FitResult', 'fit_session']
+
+Sampler = Literal['fast', 'paper']
+
+# Coarser, and convergence cannot be judged; finer takes more draws than memory holds.
+COARSEST_PRECISION = 0.1
+FINEST_PRECISION = 0.002
+
+
+def fit_session(
+    session: Session,
+    *,
+    rng: np.random.Generator,
+    sampler: Sampler = 'fast',
+    chains: int = 4,
+    draws: int | None = None,
+    precision: float = PRECISION,
+    progress: Progress | None = None,
+    clock: Callable[[], float] | None = None,
+    extension: Extension | None = None,
+    priors: Priors | None = None,
+) -> FitResult:
+    """Fit a session's optimization rows.
+
+    Parameters
+    ----------
+    session
+        As read from its folder.
+    rng
+        Source of all randomness: the same one gives the same result.
+    sampler
+        'fast', or 'paper' for eq. 8 and 12 to 16 of Van Wyk et al. as they stand.
+    chains
+        At least 2, to judge convergence by.
+    draws
+        Per chain; None for as many as the precision takes. In paper mode the steps in all, 200,000
+        by default, of which the last eighth is kept.
+    precision
+        Wanted Monte Carlo error of every mean in standard deviations of that parameter; of no
+        meaning in paper mode.
+    progress
+        Called with the stage and the share of it that is done.
+    clock
+        Returns seconds, to time the sampler; core has no clock of its own.
+    extension
+        Further physical effects to fit; the paper's model has none.
+    priors
+        What is known beforehand, instead of what the session says; the paper's model has none.
+
+    Raises
+    ------
+    InputError
+        A session that does not fit its robot, or arguments out of range.
+    InsufficientDataError
+        Data that do not allow an answer.
+    """
+    if extension is not None and sampler == 'paper':
+        raise InputError("the paper's model has no further effects; use the fast sampler")
+    if priors is not None and sampler == 'paper':
+        raise InputError("the paper's model has no priors on its parameters; use the fast sampler")
+    if chains < 2:
+        raise InputError(f'{chains} chain(s) cannot be judged; use at least 2')
+    if not FINEST_PRECISION <= precision <= COARSEST_PRECISION:
+        raise InputError(
+            f'a precision of {precision:g} is out of range; use {FINEST_PRECISION} to '
+            f'{COARSEST_PRECISION}; 0.02 for an error of 2 % of each standard deviation'
+        )
+    fewest = convergence.MINIMUM_DRAWS / ((1.0 - BURN_IN_SHARE) if sampler == 'paper' else 1.0)
+    if draws is not None and draws < fewest:
+        raise InputError(f'{draws} draws are too few; use at least {fewest:.0f}')
+    report = progress if progress is not None else silent
+    started = clock() if clock is not None else np.nan
+    problem = Problem.of(session, priors)
+    if sampler == 'paper':
+        sampled = fit_paper(
+            problem,
+            chains=chains,
+            steps=STEPS if draws is None else draws,
+            rng=rng,
+            progress=lambda share: report('sampling', share),
+        )
+    else:
+        sampled = _fast(
+            estimate(problem, extension), chains, Length(draws, precision), rng, report
+        )
+    seconds = clock() - started if clock is not None else np.nan
+    return build_result(problem, sampled, seconds, rng)
+
+
+def _fast(
+    found: Estimate, chains: int, length: Length, rng: np.random.Generator, report: Progress
+) -> Sampled:
+    posterior, model = found.posterior, found.model
+
+    def readable(points: FloatArray) -> FloatArray:
+        natural = model.natural(posterior.parameters(points))[..., posterior.free]
+        sigma, pose_sigma = posterior.noise(points[..., len(posterior.free) :])
+        separate = pose_sigma[..., list(posterior.separable)]
+        return np.concatenate((natural, sigma, separate), axis=-1)
+
+    run, name = sample_posterior(
+        found.mode,
+        chains=chains,
+        rng=rng,
+        draws=length.draws,
+        precision=length.precision,
+        quantities=readable,
+        report=report,
+    )
+    names = tuple(model.names[index] for index in posterior.free)
+    noises = tuple(
+        '.'.join(filter(None, ('noise', model.sensor_names[c.sensor], c.direction)))
+        for c in posterior.channels
+    )
+    names += tuple(f'{noise}.sigma' for noise in noises)
+    names += tuple(f'{noises[index]}.pose_sigma' for index in posterior.separable)
+
+    sigma, pose_sigma = posterior.sensor_noise(run.draws[..., len(posterior.free) :])
+    unfixed = np.isin(np.arange(model.joints), found.gauge.held)
+    return Sampled(
+        model=model,
+        z=posterior.parameters(run.draws),
+        z_mean=posterior.parameters(run.draws.reshape(-1, posterior.size).mean(axis=0)),
+        sigma=sigma,
+        pose_sigma=pose_sigma,
+        total_noise=posterior.total_noise(run.draws[..., len(posterior.free) :]),
+        by_direction=_by_direction(posterior, run.draws[..., len(posterior.free) :]),
+        trace=readable(run.trace),
+        draws=readable(run.draws),
+        names=names,
+        separable=tuple({posterior.channels[index].sensor for index in posterior.separable}),
+        name=name,
+        acceptance_rate=run.acceptance_rate,
+        precision=None if length.draws is not None else length.precision,
+        log_density_error=run.log_density_error,
+        checked=run.checked,
+        gauge=found.gauge,
+        unfixed=unfixed,
+        taken_as_known=np.zeros(model.joints),
+        z_before=found.before.z,
+        left_out=found.left_out,
+    )
+
+
+def _by_direction(
+    posterior: Posterior, eta: FloatArray
+) -> dict[tuple[int, str], tuple[FloatArray, FloatArray]]:
+    """Return sigma and pose_sigma, m, (chains, draws) each, along and across lines of sight."""
+    sigma, pose_sigma = posterior.noise(eta)
+    return {
+        (channel.sensor, channel.direction): (sigma[..., index], pose_sigma[..., index])
+        for index, channel in enumerate(posterior.channels)
+        if channel.direction
+    }

@@ -1,0 +1,408 @@
+"""Which combinations of parameters the data cannot see, in words, and what fixes each of them.
+
+The null space of the data's Jacobian (priors left out) over every parameter group, found
+numerically for the data at hand. A direction that a proper prior resolves is left to the prior;
+any other is fixed by holding one joint at zero, and said so. Directions that the data see, but
+hardly, are named as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.initial_guess import robust_spread
+from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.priors import Prior, prior_rows
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.types import BoolArray, FloatArray, IntArray
+
+# Singular values (of unit columns, relative to the largest) that are rounding errors.
+ROUNDING = 1e-9
+# An angle known no better than this counts as unknown: neither the data's nor a prior's linear
+# picture holds over such a range.
+UNKNOWN_ANGLE = np.radians(5.0)
+# An offset that the data tell no better than this, and this many times worse than the median one,
+# is named as hardly seen; of its direction the parts that matter at this share.
+WEAK_ANGLE = np.radians(0.2)
+WEAK_FACTOR = 5.0
+WEAK_SHARE = 0.1
+# Entries of a direction below this share of its largest are rounding errors.
+NEGLIGIBLE = 1e-5
+# Rows whose derivatives are at hand at a time.
+BLOCK_ROWS = 5_000
+
+
+@dataclass(frozen=True)
+class GaugeDirection:
+    """A combination of parameters that can change without any change in the data.
+
+    Attributes
+    ----------
+    combination
+        How far each parameter moves, rad and m, the largest entry 1. Registrations are
+        corrections of the robot's points on their way to the sensor, along the axes of R and
+        about its origin (see `model`).
+    why
+        The same in words.
+    fixed_by
+        What decides where on the direction the result lies.
+    """
+
+    combination: Mapping[str, float]
+    why: str
+    fixed_by: str
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """All of the directions, and what follows for the joints.
+
+    Attributes
+    ----------
+    directions
+        One per dimension of the null space.
+    held
+        Indices of the joints held at zero and of the effects held where they were linearised,
+        (h,).
+    why
+        For each joint what the data cannot tell it from; '' where they can, k strings.
+    """
+
+    directions: tuple[GaugeDirection, ...]
+    held: IntArray
+    why: tuple[str, ...]
+
+
+def find_gauge(
+    model: Model,
+    x: FloatArray,
+    rows: Rows,
+    priors: Sequence[Prior],
+) -> Gauge:
+    """Find the null space at a solution, name it, and fix what no prior does.
+
+    Parameters
+    ----------
+    model, rows, priors
+        What is fitted, to which rows, and what is known beforehand.
+    x
+        Natural parameters, (size,).
+
+    Raises
+    ------
+    InsufficientDataError
+        Where a registration or a marker itself cannot be told: holding a joint does not help.
+    """
+    scale, null, pivots, weak = _null_space(model, x, rows)
+    _, by_x = prior_rows(model, priors, x, natural=True)
+    held = _unresolved(by_x @ null, pivots, model, scale)
+
+    directions, why = [], [''] * model.joints
+    for column, pivot in enumerate(pivots):
+        combination = _about_origin(model, null[:, column], scale)
+        words = _in_words(model, combination)
+        if pivot in held:
+            at = x[pivot] if pivot >= model.core else 0.0
+            fixed_by = f'{model.names[pivot]} = {at:g}'
+        else:
+            fixed_by = _resolving_priors(priors, x, null[:, column], model)
+        directions.append(GaugeDirection(_entries(model, combination), words, fixed_by))
+        for joint in np.flatnonzero(combination[: model.joints]):
+            text = f'the data cannot see it: {words}; fixed by {fixed_by}'
+            why[joint] = f'{why[joint]}; {text}' if why[joint] else text
+    directions += [_hardly_seen(model, *found, scale) for found in weak]
+    return Gauge(tuple(directions), np.array(sorted(held), dtype=np.int64), tuple(why))
+
+
+def _entries(model: Model, combination: FloatArray) -> dict[str, float]:
+    return {
+        name: round(float(value), 9)
+        for name, value in zip(model.names, combination, strict=True)
+        if value != 0.0
+    }
+
+
+def _hardly_seen(
+    model: Model, direction: FloatArray, joint: int, std: float, scale: FloatArray
+) -> GaugeDirection:
+    """Name a direction along which the data tell a joint's offset only to ``std``, rad."""
+    size = np.abs(direction * scale)
+    main = np.where(size > WEAK_SHARE * size.max(), direction, 0.0)
+    combination = _about_origin(model, main, scale)
+    words = (
+        f'{_together(model, combination)} hardly change the observations; poses that are spread '
+        f'further and turn the tool, or a prior on {model.names[joint]}, would tell them apart'
+    )
+    known = f'the data, though {model.names[joint]} only to {np.degrees(std):.2f} deg'
+    return GaugeDirection(_entries(model, combination), words, known)
+
+
+def _null_space(
+    model: Model, x: FloatArray, rows: Rows
+) -> tuple[FloatArray, FloatArray, list[int], list[tuple[FloatArray, int, float]]]:
+    """Return the scale of each parameter, a basis of the null space, (size, d), and its pivots.
+
+    Last come the joints that are hardly seen: direction, index and standard deviation, rad.
+    """
+    triangle = _triangle(model, x, rows)
+    scale = np.linalg.norm(triangle, axis=0)
+    # What the data do not see at all is measured by its prior, else by what they see best.
+    unseen = np.full(model.size, scale.max())
+    if model.extension is not None:
+        known = np.sqrt(np.diag(model.extension.prior_precision))
+        unseen[model.core :] = np.where(known > 0.0, known, scale.max())
+    scale = np.where(scale > ROUNDING * scale.max(), scale, unseen)
+    triangle = triangle / scale
+    _, singular, vectors = np.linalg.svd(triangle, full_matrices=True)
+    singular = np.append(singular, np.zeros(len(vectors) - len(singular)))
+    null = singular < ROUNDING * singular[0]
+
+    basis, pivots = _reduce((vectors[null] / scale).T, scale, _kinds(model))
+    # A prior on effects counts as data for what is nearly unseen: it is what keeps them apart.
+    root = np.zeros((len(model.extension_root), model.size))
+    root[:, model.core :] = model.extension_root
+    triangle = np.asarray(np.linalg.qr(np.concatenate((triangle, root / scale)), 'r'))
+    angles = np.array([_is_angle(model, index) for index in range(model.size)])
+    for direction, pivot, _ in _nearly_null(triangle, scale, pivots, angles, UNKNOWN_ANGLE):
+        basis = np.column_stack((basis, direction))
+        pivots.append(pivot)
+    joints = np.arange(model.size) < model.joints
+    weak = _nearly_null(triangle, scale, pivots, joints, WEAK_ANGLE, WEAK_FACTOR)
+    return scale, basis, pivots, weak
+
+
+def _triangle(model: Model, x: FloatArray, rows: Rows) -> FloatArray:
+    """Return R of the data's Jacobian J = Q R in units of their spread, (size, size) at most.
+
+    From blocks of rows, so that memory does not grow with their number.
+    """
+    errors = rows.target - model.predict(model.pinned(x), rows)
+    spread = np.ones(len(model.sensor_names))
+    spread[[sensor for sensor, _ in rows.spans]] = robust_spread(errors, rows)
+    triangle = np.zeros((0, model.size))
+    for first, last in rows.blocks(BLOCK_ROWS):
+        block = rows.of_groups(first, last)
+        derivative = model.natural_jacobian(x, block)
+        for sensor, span in block.spans:
+            derivative[span] /= spread[sensor]
+        stacked = np.concatenate((triangle, derivative.reshape(-1, model.size)))
+        triangle = np.asarray(np.linalg.qr(stacked, mode='r'))
+    return triangle
+
+
+def _nearly_null(
+    triangle: FloatArray,
+    scale: FloatArray,
+    pivots: list[int],
+    angles: BoolArray,
+    limit: float,
+    factor: float = 0.0,
+) -> list[tuple[FloatArray, int, float]]:
+    """Return the directions along which some of the angles are seen no better than a limit, rad.
+
+    Nor better than a factor times their median. With the pivots of the null space held the rest
+    has a covariance; its column of the worst angle is how everything moves with that angle. Then
+    that one is held too.
+    """
+    found = []
+    active = ~np.isin(np.arange(len(scale)), pivots)
+    while np.any(active & angles):
+        root = np.linalg.inv(np.linalg.qr(triangle[:, active], mode='r'))
+        covariance = (root @ root.T) / np.outer(scale[active], scale[active])
+        std = np.where(angles[active], np.sqrt(np.diag(covariance)), 0.0)
+        worst = int(np.argmax(std))
+        if std[worst] < max(limit, factor * float(np.median(std[angles[active]]))):
+            break
+        direction = np.zeros(len(scale))
+        direction[active] = covariance[worst] / covariance[worst, worst]
+        pivot = int(np.flatnonzero(active)[worst])
+        found.append((direction, pivot, float(std[worst])))
+        active[pivot] = False
+    return found
+
+
+def _is_angle(model: Model, index: int) -> bool:
+    if index >= model.core:
+        return False
+    return index < model.joints or model.names[index].rsplit('.', 1)[-1].startswith('r')
+
+
+def _kinds(model: Model) -> tuple[IntArray, ...]:
+    """Return the indices of effects, joints, markers and registrations: the order of pivots."""
+    end = model.joints + 6 * len(model.sensor_names)
+    return (
+        np.arange(model.core, model.size),
+        np.arange(model.joints),
+        np.arange(end, model.core),
+        np.arange(model.joints, end),
+    )
+
+
+def _reduce(
+    null: FloatArray, scale: FloatArray, kinds: tuple[IntArray, ...]
+) -> tuple[FloatArray, list[int]]:
+    """Bring the basis to reduced echelon form: one pivot each, 1 there and 0 in the others.
+
+    This is what makes directions nameable: any rotation of the basis spans the same space.
+    """
+    work = null * scale[:, None]
+    pivots: list[int] = []
+    for column in range(work.shape[1]):
+        for kind in kinds:
+            part = np.abs(work[kind][:, column:])
+            if part.max(initial=0.0) > NEGLIGIBLE * np.abs(work[:, column:]).max():
+                break
+        row, offset = divmod(int(np.argmax(part)), part.shape[1])
+        pivot = int(kind[row])
+        pivots.append(pivot)
+        work[:, [column, column + offset]] = work[:, [column + offset, column]]
+        work[:, column] /= work[pivot, column]
+        for other in range(work.shape[1]):
+            if other != column:
+                work[:, other] -= work[pivot, other] * work[:, column]
+    null = work / scale[:, None]
+    for column, pivot in enumerate(pivots):
+        null[:, column] /= null[pivot, column]
+    order = np.argsort(pivots)
+    return null[:, order], [pivots[index] for index in order]
+
+
+def _unresolved(
+    by_direction: FloatArray, pivots: list[int], model: Model, scale: FloatArray
+) -> set[int]:
+    """Return the pivots that no prior resolves; all of them must be joints, to be held."""
+    held: set[int] = set()
+    while True:
+        active = [column for column, pivot in enumerate(pivots) if pivot not in held]
+        if not active:
+            return held
+        std = _standard_deviations(by_direction[:, active])
+        loose = [i for i, c in enumerate(active) if std[i] > _limit(model, pivots[c], scale)]
+        if not loose:
+            return held
+        # Effects may have any unit, so all that nothing knows of are held at once.
+        effects = {pivots[active[i]] for i in loose if pivots[active[i]] >= model.core}
+        held |= effects
+        joints = [i for i in loose if pivots[active[i]] < model.joints]
+        if effects:
+            continue
+        if not joints:
+            names = ', '.join(model.names[pivots[active[i]]] for i in loose)
+            raise InsufficientDataError(
+                f'the observations do not determine {names}; '
+                'measure poses that are spread further and turn the tool'
+            )
+        held.add(pivots[active[max(joints, key=lambda i: std[i])]])
+
+
+def _limit(model: Model, index: int, scale: FloatArray) -> float:
+    """Return the prior std from which on a parameter counts as unknown."""
+    if index >= model.core:
+        # Of any unit: a million times what the data would leave it if it were alone.
+        return 1e6 / float(scale[index])
+    return UNKNOWN_ANGLE if _is_angle(model, index) else 1e3
+
+
+def _standard_deviations(by_direction: FloatArray) -> FloatArray:
+    """Return how far priors (m rows) let each direction (d columns) go, (d,); inf without any."""
+    norm = np.linalg.norm(by_direction, axis=0)
+    held = norm > 0.0
+    unit = by_direction[:, held] / norm[held]
+    values, vectors = np.linalg.eigh(unit.T @ unit)
+    # Directions that only one and the same prior holds: apart they are as good as free.
+    variance = (vectors**2) @ (1.0 / np.maximum(values, 1e-14))
+    std = np.full(len(norm), np.inf)
+    std[held] = np.sqrt(variance) / norm[held]
+    return std
+
+
+def _about_origin(model: Model, direction: FloatArray, scale: FloatArray) -> FloatArray:
+    """Turn corrections about the centroids into ones about the origin of R; scale, drop dust."""
+    size = np.abs(direction * scale)
+    moved = np.where(size > NEGLIGIBLE * size.max(), direction, 0.0)
+    for sensor, centroid in enumerate(model.centroid):
+        part = moved[model.registration(sensor)]
+        part[:3] -= np.cross(part[3:], centroid)
+    moved[np.abs(moved) < NEGLIGIBLE * np.abs(moved).max()] = 0.0
+    # The pivot has the value 1 already; it stays positive where it is as large as any other.
+    largest = np.abs(moved).max()
+    if largest > 1.0 + 1e-6:
+        moved /= moved[np.argmax(np.abs(moved))]
+    return moved
+
+
+def _in_words(model: Model, direction: FloatArray) -> str:
+    joints = np.flatnonzero(direction[: model.joints])
+    sensors = [
+        index
+        for index in range(len(model.sensor_names))
+        if np.any(direction[model.registration(index)])
+    ]
+    markers = [
+        index for index in range(len(model.marker_names)) if np.any(direction[model.marker(index)])
+    ]
+    if len(joints) == 1:
+        joint, amount = model.names[joints[0]], direction[joints[0]]
+        if not sensors and not markers:
+            return f'{joint} moves no marker; a marker off its axis would show it'
+        if joints[0] == 0 and not markers:
+            return (
+                f'{joint} offset = a rotation of the '
+                f'{_listed([model.sensor_names[s] for s in sensors])} registration'
+                f'{"s" if len(sensors) > 1 else ""} about the base axis; '
+                'a known base frame (base_prior) would tell them apart'
+            )
+        if joints[0] == model.joints - 1 and not sensors:
+            moved = [
+                f'marker {model.marker_names[m]} moved tangentially, '
+                f'{_per_degree(direction[model.marker(m)] / amount)} mm per degree'
+                for m in markers
+            ]
+            return f'{joint} offset = {_listed(moved)}; a measured marker would tell them apart'
+    return (
+        f'{_together(model, direction)} change no observation; poses that are spread further and '
+        'turn the tool, or a prior on one of them, would tell them apart'
+    )
+
+
+def _together(model: Model, direction: FloatArray) -> str:
+    moved = [
+        f'{name} ({value:+.3g})'
+        for name, value in zip(model.names, direction, strict=True)
+        if value != 0.0
+    ]
+    return f'{_listed(moved)} together'
+
+
+def _per_degree(shift: FloatArray) -> str:
+    return f'{np.radians(1.0) * np.linalg.norm(shift) * 1e3:.3f}'
+
+
+def _listed(parts: Sequence[str]) -> str:
+    if len(parts) < 2:
+        return ''.join(parts)
+    return f'{", ".join(parts[:-1])} and {parts[-1]}'
+
+
+def _resolving_priors(
+    priors: Sequence[Prior], x: FloatArray, direction: FloatArray, model: Model
+) -> str:
+    """Name the priors that hold a direction: those that change along it."""
+    core = replace(model, extension=None)
+    pull = {
+        prior.description: float(
+            np.linalg.norm(
+                prior_rows(core, [prior], x[: model.core], natural=True)[1]
+                @ direction[: model.core]
+            )
+        )
+        for prior in priors
+    }
+    pull['the prior on the effects'] = float(
+        np.linalg.norm(model.extension_root @ model.theta(direction))
+    )
+    return _listed([name for name, p in pull.items() if p > 1e-3 * max(pull.values())])

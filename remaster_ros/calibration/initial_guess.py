@@ -1,0 +1,242 @@
+"""A first solution that a few gross outliers and badly known markers cannot spoil.
+
+Closed-form starts (registration by points; registration and markers together as one linear
+problem), each refined by damped Gauss–Newton steps on a Cauchy cost; the best of them wins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.posterior import RESOLUTION_M
+from remaster_ros.calibration.priors import TIGHTEST_PRIOR, Prior, prior_rows
+from remaster_ros.calibration.registration import register_points
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.kinematics.transforms import apply
+from remaster_ros.types import FloatArray, IntArray, Measurements
+
+# Median length of a standard normal vector in three dimensions.
+MEDIAN_CHI3 = 1.5382
+# Errors beyond this many robust standard deviations lose their weight in the start.
+CAUCHY_WIDTH = 2.5
+# What the linear start expects of a robot out of the box, against which it weighs the nominal
+# marker positions.
+UNCALIBRATED_ERROR_M = 5e-3
+# Rows of a sensor that the start looks at.
+LARGEST_START = 5000
+# A model that leaves more of the points' extent than this describes another robot, or none.
+LARGEST_RELATIVE_ERROR = 0.1
+
+
+def robust_start(
+    model: Model,
+    measurements: Measurements,
+    rows: IntArray,
+    nominal_markers: FloatArray,
+    marker_std_m: float,
+    priors: Sequence[Prior],
+) -> tuple[Model, FloatArray]:
+    """Find a solution near the mode.
+
+    Parameters
+    ----------
+    model
+        Only its chain and names matter here.
+    measurements, rows
+        The observations, and which of them to fit.
+    nominal_markers, marker_std_m
+        Markers in the tool frame, m, (markers, 3), and how well they are known.
+    priors
+        Priors on the markers.
+
+    Returns
+    -------
+    model
+        With its reference registrations at the solution.
+    z
+        Pinned parameters there, the outer joints at 0, (size,).
+
+    Raises
+    ------
+    InsufficientDataError
+        When the points of a sensor do not fix a registration, or are not those of this robot.
+    """
+    chain = model.chain
+    everything, rows = rows, _some_rows(measurements, rows)
+    tool = chain.forward(measurements.q[rows])
+    sensor, marker = measurements.sensor[rows], measurements.marker[rows]
+    measured = measurements.position[rows]
+    candidates = []
+    for markers in (
+        nominal_markers,
+        _linear_markers(tool, sensor, marker, measured, nominal_markers, marker_std_m),
+    ):
+        points = apply(tool, markers[marker])
+        reference = np.array(
+            [
+                register(points[sensor == index], measured[sensor == index], name)
+                for index, name in enumerate(model.sensor_names)
+            ]
+        )
+        start = referenced(model, measurements, rows, reference)
+        sorted_rows = Rows.of(measurements, rows, reference)
+        z = start.vector(np.zeros(len(chain)), markers)
+        z, cost = _refined(start, sorted_rows, priors, z)
+        candidates.append((cost, start, z))
+    _, start, z = min(candidates, key=lambda candidate: candidate[0])
+    sorted_rows = Rows.of(measurements, rows, start.reference)
+    _require_likeness(start, sorted_rows, sorted_rows.target - start.predict(z, sorted_rows))
+    moved = referenced(model, measurements, everything, start.T_R_N(z))
+    return moved, moved.vector(start.offsets(z), start.markers(z))
+
+
+def _some_rows(measurements: Measurements, rows: IntArray) -> IntArray:
+    """Return all rows, or evenly spread ones of a sensor that has more than a start needs."""
+    chosen = []
+    for sensor in np.unique(measurements.sensor[rows]):
+        mine = rows[measurements.sensor[rows] == sensor]
+        count = min(len(mine), LARGEST_START)
+        chosen.append(mine[np.linspace(0, len(mine) - 1, count).astype(np.int64)])
+    return np.sort(np.concatenate(chosen))
+
+
+def register(points_R: FloatArray, points_N: FloatArray, sensor: str) -> FloatArray:
+    """Return T_R_N of one sensor from pairs of points; errors name the sensor."""
+    try:
+        return register_points(points_R, points_N)[0]
+    except InsufficientDataError as error:
+        raise InsufficientDataError(f"sensor '{sensor}': {error}") from error
+
+
+def referenced(
+    model: Model, measurements: Measurements, rows: IntArray, reference: FloatArray
+) -> Model:
+    """Return the model with these registrations as reference, centred on each sensor's data."""
+    centroid = []
+    for index, T_R_N in enumerate(reference):
+        mine = rows[measurements.sensor[rows] == index]
+        centroid.append(apply(T_R_N, np.median(measurements.position[mine], axis=0)))
+    return replace(model, reference=reference, centroid=np.array(centroid))
+
+
+def _require_likeness(model: Model, rows: Rows, errors: FloatArray) -> None:
+    """Refuse data that have nothing to do with the robot: wrong units, joints, markers."""
+    spread = robust_spread(errors, rows)
+    for error, (sensor, span) in zip(spread, rows.spans, strict=True):
+        extent = np.median(np.linalg.norm(rows.target[span] - model.centroid[sensor], axis=1))
+        if error > LARGEST_RELATIVE_ERROR * extent:
+            raise InsufficientDataError(
+                f"sensor '{model.sensor_names[sensor]}': the robot model leaves errors of "
+                f'{error * 1e3:.0f} mm in points {extent * 1e3:.0f} mm apart; check units, joint '
+                'order and signs, the URDF, and which marker was measured'
+            )
+
+
+def _linear_markers(
+    tool: FloatArray,
+    sensor: IntArray,
+    marker: IntArray,
+    measured: FloatArray,
+    nominal: FloatArray,
+    marker_std_m: float,
+) -> FloatArray:
+    """Estimate marker positions without any registration.
+
+    With any 3×3 matrix G in the place of the sensor's rotation, tool · marker = G p + t is linear
+    in marker, G and t together: one least-squares problem, no start needed. Rows that disagree
+    lose their weight in a few repetitions.
+    """
+    sensors, markers = int(sensor.max()) + 1, len(nominal)
+    design = np.zeros((len(measured), 3, 12 * sensors + 3 * markers))
+    rotations = tool[:, :3, :3]
+    for index in range(sensors):
+        mine = sensor == index
+        centred = measured[mine] - measured[mine].mean(axis=0)
+        for axis in range(3):
+            start = 12 * index + 3 * axis
+            design[mine, axis, start : start + 3] = -centred
+            design[mine, axis, 12 * index + 9 + axis] = -1.0
+    for index in range(markers):
+        start = 12 * sensors + 3 * index
+        mine = marker == index
+        design[mine, :, start : start + 3] = rotations[mine]
+    # Unknown marker = nominal + shift, the shift known to be small.
+    target = -apply(tool, nominal[marker])
+    root = np.ones(len(measured))
+    pull = np.zeros((3 * markers, design.shape[2]))
+    pull[:, 12 * sensors :] = np.eye(3 * markers) * (
+        UNCALIBRATED_ERROR_M / max(marker_std_m, TIGHTEST_PRIOR)
+    )
+    for _ in range(6):
+        weighted = (design * root[:, None, None]).reshape(-1, design.shape[2])
+        matrix = np.concatenate((weighted, pull))
+        right = np.concatenate(((target * root[:, None]).ravel(), np.zeros(3 * markers)))
+        solution = np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0], dtype=float)
+        length = np.linalg.norm(design @ solution - target, axis=1)
+        scale = CAUCHY_WIDTH * (np.median(length) / MEDIAN_CHI3 + RESOLUTION_M)
+        root = 1.0 / np.hypot(1.0, length / scale)
+    return nominal + solution[12 * sensors :].reshape(-1, 3)
+
+
+def _refined(
+    model: Model, rows: Rows, priors: Sequence[Prior], z: FloatArray
+) -> tuple[FloatArray, float]:
+    """Minimise the Cauchy cost by damped Gauss–Newton; return the solution and its spread.
+
+    The outer joints stay at 0: in pinned coordinates the data do not depend on them. The
+    extension stays where it was linearised.
+    """
+    free = np.setdiff1d(np.arange(model.core), (0, model.joints - 1))
+    damping = 1e-6
+    errors = rows.target - model.predict(z, rows)
+    spread = robust_spread(errors, rows)
+    for _ in range(60):
+        scale = np.repeat(spread, [span.stop - span.start for _, span in rows.spans])
+        weight = 1.0 / (1.0 + _squares(errors) / (CAUCHY_WIDTH * scale) ** 2) / scale**2
+        derivative = model.jacobian(z, rows)[:, :, free]
+        residual, by_z = prior_rows(model, priors, z)
+        weighted = (derivative * weight[:, None, None]).reshape(-1, len(free))
+        H = weighted.T @ derivative.reshape(-1, len(free)) + by_z[:, free].T @ by_z[:, free]
+        g = weighted.T @ errors.ravel() - by_z[:, free].T @ residual
+        diagonal = np.diag(H) + 1e-9 * np.max(np.diag(H))
+        cost = _cost(errors, scale, residual)
+        improved = False
+        for _ in range(12):
+            trial = z.copy()
+            step = np.linalg.solve(H + damping * np.diag(diagonal), g)
+            trial[free] += step
+            trial_errors = rows.target - model.predict(trial, rows)
+            if _cost(trial_errors, scale, prior_rows(model, priors, trial)[0]) < cost:
+                improved = True
+                break
+            damping *= 10.0
+        if not improved:
+            break
+        z, errors, damping = trial, trial_errors, max(damping / 10.0, 1e-12)
+        before, spread = spread, robust_spread(errors, rows)
+        settled = np.all(np.abs(spread - before) < 1e-3 * before)
+        if settled and np.sqrt(step @ H @ step) < 1e-2 * np.sqrt(len(step)):
+            break
+    sizes = [span.stop - span.start for _, span in rows.spans]
+    return z, float(np.dot(sizes, np.log(spread)))
+
+
+def _squares(errors: FloatArray) -> FloatArray:
+    return np.einsum('ni,ni->n', errors, errors)
+
+
+def robust_spread(errors: FloatArray, rows: Rows) -> FloatArray:
+    """Return the robust standard deviation per axis of each sensor's errors, m, (sensors,)."""
+    length = np.sqrt(_squares(errors))
+    return np.array([np.median(length[s]) / MEDIAN_CHI3 + RESOLUTION_M for _, s in rows.spans])
+
+
+def _cost(errors: FloatArray, scale: FloatArray, prior_residual: FloatArray) -> float:
+    width = CAUCHY_WIDTH**2
+    data = 0.5 * width * np.sum(np.log1p(_squares(errors) / (width * scale**2)))
+    return float(data + 0.5 * prior_residual @ prior_residual)

@@ -1,0 +1,277 @@
+"""The posterior of a model that is linear about a point: its mode, its width, draws from it.
+
+Given the noise, the parameters are then Gaussian, with a mean and a precision that follow from
+a handful of Gram matrices whatever the noise: a rotation of well under a degree bends so little
+that this is nearly the exact posterior, which makes it the proposal of the exact sampler.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.posterior import RESOLUTION_M, Posterior
+from remaster_ros.calibration.priors import prior_rows
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.types import FloatArray
+
+# Steps to the mode end when they are shorter than this, in standard deviations. Where the
+# predictions bend along a badly known direction they shorten slowly: then this is near enough for
+# proposals, which the sampler corrects.
+SETTLED, NEAR_ENOUGH = 1e-3, 0.1
+MOST_STEPS = 50
+
+
+def linearise(posterior: Posterior, z: FloatArray) -> Linearisation:
+    """Return the posterior with the predictions replaced by their tangent at z (size,)."""
+    model, free = posterior.model, posterior.free
+
+    def joined(rows: Rows) -> FloatArray:
+        # One matrix holds derivative and error: its Gram matrix holds all the products needed.
+        errors = rows.target - model.predict(z, rows)
+        return np.concatenate((model.jacobian(z, rows)[:, :, free], errors[:, :, None]), axis=2)
+
+    residual, by_z = prior_rows(model, posterior.priors, z)
+    rows = np.column_stack((-by_z[:, free], residual))
+    return Linearisation(posterior, z, posterior.gram(joined, len(free) + 1), rows.T @ rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """The posterior of a model that is linear about ``z``: Gaussian given the noise.
+
+    Attributes
+    ----------
+    posterior
+        The one it approximates.
+    z
+        Pinned parameters, (size,).
+    cells
+        Gram matrix of [derivative | error] in each of the posterior's cells, (cells, f+1, f+1).
+    prior
+        Gram matrix of the priors, (f+1, f+1).
+    """
+
+    posterior: Posterior
+    z: FloatArray
+    cells: FloatArray
+    prior: FloatArray
+
+    def gram(self, eta: FloatArray) -> FloatArray:
+        """Return the weighted Gram matrices (..., f+1, f+1) for noise coordinates (..., e)."""
+        return np.tensordot(1.0 / self.posterior.variances(eta), self.cells, axes=1) + self.prior
+
+    def conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the Gaussian of the free parameters given the noise, and the noise's density.
+
+        Parameters
+        ----------
+        eta
+            (..., e).
+
+        Returns
+        -------
+        mean
+            Free pinned parameters, (..., f).
+        cholesky
+            Lower Cholesky factor of the precision, (..., f, f).
+        log_marginal
+            Log density of the noise coordinates with the parameters integrated out, (...).
+        """
+        factor, pull, log_marginal = self.whitened(eta)
+        step = np.linalg.solve(np.swapaxes(factor, -1, -2), pull[..., None])[..., 0]
+        return self.z[self.posterior.free] + step, factor, log_marginal
+
+    def whitened(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the same Gaussian as its factor L and the vector L' (mean - z), and the density.
+
+        All follow from one factor of the bordered matrix: its last row holds the vector, its last
+        entry the root of what the parameters leave of the weighted sum of squares.
+        """
+        posterior = self.posterior
+        gram = self.gram(eta)
+        f = len(posterior.free)
+        # The scale of the parameters (rad, m) and of their information differs by many powers.
+        information = np.diagonal(gram, axis1=-2, axis2=-1).copy()
+        if not np.all(information[..., :f] > 0.0):
+            raise np.linalg.LinAlgError('a parameter without any information')
+        # Data without any noise leave nothing, and rounding may leave less than that.
+        gram[..., f, f] += 1e-9 + 1e-12 * information[..., f]
+        information[..., f] = 1.0
+        scale = np.sqrt(information)
+        factor = np.linalg.cholesky(gram / (scale[..., :, None] * scale[..., None, :]))
+        factor *= scale[..., :, None]
+        inner = factor[..., :f, :f]
+        log_scale = np.log(posterior.variances(eta)) @ posterior.freedom
+        log_marginal = (
+            posterior.log_noise_prior(eta)
+            - 0.5 * (log_scale + factor[..., f, f] ** 2)
+            - log_determinant(inner)
+        )
+        return inner, factor[..., f, :f], log_marginal
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """Where the linearised posterior peaks, and how wide it is.
+
+    Attributes
+    ----------
+    z
+        Pinned parameters, (size,).
+    eta
+        (e,).
+    eta_covariance
+        (e, e).
+    linearisation
+        About z.
+    """
+
+    z: FloatArray
+    eta: FloatArray
+    eta_covariance: FloatArray
+    linearisation: Linearisation
+
+    @property
+    def log_evidence(self) -> float:
+        """Log likelihood of the noise at the mode, the parameters integrated out."""
+        marginal = self.linearisation.whitened(self.eta)[2]
+        return float(marginal - self.linearisation.posterior.log_noise_prior(self.eta))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the free pinned parameters at the mode's noise, (f, f)."""
+        root = np.linalg.inv(self.linearisation.whitened(self.eta)[0])
+        return root.T @ root
+
+
+def find_mode(posterior: Posterior, eta: FloatArray | None = None) -> Mode:
+    """Find the mode by Gauss–Newton steps, the noise at the peak of its marginal density.
+
+    Parameters
+    ----------
+    posterior
+        With ``reference`` near the mode (see `start.robust_start`).
+    eta
+        Where to begin the search of the noise, (e,); from the errors at the reference where None.
+
+    Raises
+    ------
+    InsufficientDataError
+        When the steps do not settle: the rows do not determine the free parameters.
+    """
+    z = posterior.reference
+    eta = _noise_guess(posterior) if eta is None else eta
+    size = np.inf
+    try:
+        for _ in range(MOST_STEPS):
+            linearisation = linearise(posterior, z)
+            eta = _noise_peak(linearisation, eta)
+            mean, factor, _ = linearisation.conditional(eta)
+            step = mean - z[posterior.free]
+            z = posterior.parameters(mean)
+            # The step in units of the posterior's own spread.
+            size = float(np.linalg.norm(np.swapaxes(factor, -1, -2) @ step))
+            if size < SETTLED:
+                break
+        if size < NEAR_ENOUGH:
+            linearisation = linearise(posterior, z)
+            return Mode(z, eta, _noise_covariance(linearisation, eta), linearisation)
+    except np.linalg.LinAlgError:
+        # A parameter without any information: the same remedy as steps that never end.
+        pass
+    raise InsufficientDataError(
+        'the fit does not settle: the observations hardly determine the parameters; '
+        'measure more poses, spread further'
+    )
+
+
+def _noise_guess(posterior: Posterior) -> FloatArray:
+    errors = posterior.rows.target - posterior.model.predict(posterior.reference, posterior.rows)
+    sums = posterior.sums_of_squares(errors)
+    sigmas, ratios = [], []
+    for index in range(len(posterior.channels)):
+        mine = [i for i, cell in enumerate(posterior.cells) if cell.channel == index]
+        inner = [i for i in mine if posterior.cells[i].size == 0]
+        outer = [i for i in mine if posterior.cells[i].size > 0]
+        common = sums[outer].sum() / posterior.freedom[outer].sum()
+        variance = sums[inner].sum() / posterior.freedom[inner].sum() if inner else common
+        sigma = np.sqrt(variance + RESOLUTION_M**2)
+        sigmas.append(np.log(sigma))
+        if index in posterior.separable:
+            sizes = [posterior.cells[i].size for i in outer]
+            share = np.average(sizes, weights=posterior.freedom[outer])
+            ratios.append(np.arcsinh(np.sqrt(max(common - variance, 0.0) / share) / sigma))
+    return np.array(sigmas + ratios)
+
+
+def _noise_peak(linearisation: Linearisation, start: FloatArray) -> FloatArray:
+    """Climb to the peak of the noise's log density by Newton steps no longer than 1."""
+    peak = start
+    for _ in range(100):
+        value, gradient, precision = _noise_curvature(linearisation, peak)
+        values, vectors = np.linalg.eigh(precision)
+        # Uphill also where the density is not yet concave.
+        step = vectors @ ((vectors.T @ gradient) / np.maximum(np.abs(values), 0.1))
+        step /= max(1.0, float(np.linalg.norm(step)))
+        if np.linalg.norm(step) < 1e-4:
+            break
+        tries = peak + step * 0.5 ** np.arange(8.0)[:, None]
+        heights = linearisation.whitened(tries)[2]
+        if np.max(heights) <= value:
+            break
+        peak = tries[np.argmax(heights)]
+    count = len(linearisation.posterior.channels)
+    return np.concatenate((peak[:count], np.abs(peak[count:])))
+
+
+def _noise_covariance(linearisation: Linearisation, peak: FloatArray) -> FloatArray:
+    """Return the noise's covariance by its curvature; of a pose_sigma near zero by its spread."""
+    precision = _noise_curvature(linearisation, peak)[2]
+    count = len(linearisation.posterior.channels)
+    std = 1.0 / np.sqrt(np.maximum(np.diag(precision), 0.45))
+    spread = {}
+    for index in range(count, len(peak)):
+        if peak[index] < 2.0 * std[index]:
+            # From a thousandth of a sigma to as much as matters, evenly in the logarithm.
+            ratio = np.geomspace(1e-3, 5.0, 100)
+            points = np.repeat(peak[None], len(ratio), axis=0)
+            points[:, index] = ratio
+            log_weight = linearisation.whitened(points)[2]
+            weight = np.exp(log_weight - log_weight.max()) * ratio
+            spread[index] = float(np.average((ratio - peak[index]) ** 2, weights=weight))
+    values, vectors = np.linalg.eigh(precision)
+    covariance: FloatArray = (vectors / np.maximum(values, 0.45)) @ vectors.T
+    for index, square in spread.items():
+        # At the boundary there is no tangent to correlate by.
+        covariance[index], covariance[:, index] = 0.0, 0.0
+        covariance[index, index] = max(square, 1e-6)
+    return covariance
+
+
+def _noise_curvature(
+    linearisation: Linearisation, at: FloatArray
+) -> tuple[float, FloatArray, FloatArray]:
+    """Return the noise's log density, its gradient and its negative second derivative.
+
+    Differences, all in one batch: the density costs microseconds, its derivative a page.
+    """
+    e, step = len(at), 0.02
+    unit = step * np.eye(e)
+    first, second = np.triu_indices(e, 1)
+    corners = [at + a * unit[first] + b * unit[second] for a in (1, -1) for b in (1, -1)]
+    points = np.concatenate((at[None], at + unit, at - unit, *corners))
+    value = linearisation.whitened(points)[2]
+    plus, minus = value[1 : e + 1], value[e + 1 : 2 * e + 1]
+    four = value[2 * e + 1 :].reshape(4, -1)
+    curvature = np.diag((plus + minus - 2.0 * value[0]) / step**2)
+    mixed = (four[0] - four[1] - four[2] + four[3]) / (4.0 * step**2)
+    curvature[first, second] = curvature[second, first] = mixed
+    return float(value[0]), (plus - minus) / (2.0 * step), -curvature
+
+
+def log_determinant(factor: FloatArray) -> FloatArray:
+    """Return the log determinant of triangular factors (..., f, f), (...)."""
+    return np.sum(np.log(np.diagonal(factor, axis1=-2, axis2=-1)), axis=-1)

@@ -1,0 +1,168 @@
+"""Is the error that a fit leaves what noise explains? Judged without the fitted noise.
+
+The fitted noise is whatever the model leaves: it takes up a tracker that was moved, a soft joint,
+a sensor of the wrong scale, and calls it noise. Two figures owe less to the model's errors: the
+standard deviation that the sensor states with its readings, and how far the errors of the joint
+solutions of one pose, which the sensor sees at one place, lie apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements
+
+# Errors that all solutions of a pose share belong to a sensor's noise as well: 0.5 mm beside
+# 0.23 mm in the source paper, which makes the whole 2.4 times the scatter within poses.
+MOST = 2.5
+# A soft joint errs differently at each solution of a pose. Scatter within poses beyond this many
+# times what the sensor states is not the sensor's, and an arm that repeats itself has no more.
+SCATTER = 5.0
+# The worst errors are left out of the comparison: single gross errors are named elsewhere.
+WORST_SHARE = 0.05
+LARGEST_SPREAD = 2.0
+MEAN_LENGTH = float(np.sqrt(8.0 / np.pi))
+"""Mean length of a vector of three independent standard normal numbers."""
+MEDIAN_LENGTH = 1.5382
+"""Its median."""
+
+
+@dataclass(frozen=True)
+class NoiseCheck:
+    """The error that a fit leaves at one sensor, and what noise explains of it.
+
+    Attributes
+    ----------
+    sensor
+        Its name.
+    error_m
+        Mean 3-D error on the rows judged, without the worst twentieth, m.
+    stated_m
+        Standard deviation per axis that the sensor states with its readings (RMS), m; None where
+        no reading has one.
+    within_m
+        Standard deviation per axis of the errors within poses, m; None where no pose has two.
+    poses
+        That were judged. The mean of few may lie far from that of many.
+    spread
+        How many times larger noise makes the error on held-out rows, as few poses tell the
+        parameters by halves; 1 on fitted rows.
+    """
+
+    sensor: str
+    error_m: float
+    stated_m: float | None
+    within_m: float | None
+    poses: int
+    spread: float = 1.0
+
+    @property
+    def noise_m(self) -> float | None:
+        """Noise per axis that may be counted on, m; None where nothing tells."""
+        if self.stated_m is None or self.within_m is None:
+            return self.stated_m if self.within_m is None else self.within_m
+        return max(self.stated_m, min(self.within_m, SCATTER * self.stated_m))
+
+    @property
+    def noise_error_m(self) -> float | None:
+        """Mean 3-D error that this noise makes on the rows judged, m."""
+        return None if self.noise_m is None else MEAN_LENGTH * self.spread * self.noise_m
+
+    @property
+    def explained(self) -> bool:
+        """Whether noise explains the error; not where nothing tells the noise."""
+        if self.noise_error_m is None:
+            return False
+        few = 1.0 + 1.0 / np.sqrt(self.poses)
+        return bool(self.error_m <= MOST * few * self.noise_error_m)
+
+
+def check_noise(
+    measurements: Measurements,
+    sensor_names: Sequence[str],
+    residuals: FloatArray,
+    left_out: IntArray,
+    parameters: int,
+) -> tuple[NoiseCheck, ...]:
+    """Compare what a fit leaves with the noise, sensor by sensor.
+
+    Parameters
+    ----------
+    measurements
+        n observations. Those held out are judged where the sensor has any, else those fitted.
+    sensor_names
+        In index order.
+    residuals
+        Measured minus modelled positions, m, (n, 3).
+    left_out
+        ``observation`` of every row that was not fitted.
+    parameters
+        How many were fitted, without those of the noise.
+    """
+    kept = ~np.isin(measurements.observation, left_out)
+    spread = _spread(measurements.select(kept & ~measurements.is_validation), parameters)
+    checks = []
+    for index, name in enumerate(sensor_names):
+        mine = kept & (measurements.sensor == index)
+        if not mine.any():
+            continue
+        held_out = mine & measurements.is_validation
+        judged = held_out if held_out.any() else mine
+        lengths = np.sort(np.linalg.norm(residuals[judged], axis=1))
+        most = len(lengths) - int(WORST_SHARE * len(lengths))
+        checks.append(
+            NoiseCheck(
+                name,
+                float(lengths[:most].mean()),
+                _stated(measurements.std[mine]),
+                _within(measurements, residuals, mine),
+                len(np.unique(measurements.pose[judged])),
+                spread if held_out.any() else 1.0,
+            )
+        )
+    return tuple(checks)
+
+
+def _spread(fitted: Measurements, parameters: int) -> float:
+    """Return how many times the noise the error is where the parameters were not fitted.
+
+    That of a linear model with the noise of poses: three numbers for each pose of each sensor.
+    """
+    poses = np.unique(np.stack((fitted.pose, fitted.sensor)), axis=1).shape[1]
+    free = max(3 * poses - parameters - 1, 1)
+    return float(np.sqrt(1.0 + min(parameters / free, LARGEST_SPREAD**2 - 1.0)))
+
+
+def _stated(std: FloatArray) -> float | None:
+    """Return the RMS of the standard deviations (n, 3), NaN where unknown."""
+    known = std[np.isfinite(std)]
+    rms = float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
+    # A column of zeros says that there is no figure, not that there is no noise.
+    return rms if rms > 0.0 else None
+
+
+def _within(measurements: Measurements, residuals: FloatArray, rows: BoolArray) -> float | None:
+    """Return the standard deviation per axis within poses, m, by the median over the rows.
+
+    A sensor that was moved while one of the poses was visited does not count.
+    """
+    _, group = np.unique(
+        np.stack((measurements.pose[rows], measurements.marker[rows])), axis=1, return_inverse=True
+    )
+    group = group.reshape(-1)
+    size = np.bincount(group)
+    mean = (
+        np.stack([np.bincount(group, weights=column) for column in residuals[rows].T], axis=1)
+        / size[:, None]
+    )
+    several = size[group] > 1
+    if not several.any():
+        return None
+    apart = (residuals[rows] - mean[group])[several]
+    count = size[group][several]
+    # The mean of few lies nearer to each of them than the true one does.
+    lengths = np.linalg.norm(apart, axis=1) * np.sqrt(count / (count - 1.0))
+    return float(np.median(lengths)) / MEDIAN_LENGTH

@@ -1,0 +1,247 @@
+"""Gross errors: rows that are far more likely to be mistakes than noise, named one by one.
+
+A mixture: most rows have the noise of the others, a small share has an error many times as wide;
+share and width are found by expectation maximisation (Dempster, Laird and Rubin 1977). A row is
+judged against what the other rows of its pose say (the pose-common error), a whole pose against
+the other poses. What is gross with a probability of `CERTAIN` is left out.
+
+The standard deviations are robust, the larger of what the median and what the 80 % quantile of the
+errors say, so that errors with more than Gaussian tails, which real robots have, are not eaten.
+The mixture's limit then comes to lie between 6 and 7 of them: of Gaussian errors of known size it
+calls fewer than one in 5 million gross.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.posterior import RESOLUTION_M
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.types import BoolArray, FloatArray
+
+# A row is left out from this probability on.
+CERTAIN = 0.99
+# What is known of gross errors before: their share as if so many of a hundred rows had been seen,
+# and that they are at least so many standard deviations wide.
+PRIOR_GROSS = 0.1
+PRIOR_ROWS = 100.0
+NARROWEST = 20.0
+# More than this share is no accident: the model or the session is wrong.
+LARGEST_SHARE = 0.1
+_QUANTILES = (0.5, 0.8)
+# The same quantiles of the length of a standard normal vector in three dimensions.
+_EXPECTED = np.array([1.5381722545, 2.1544437046])
+# The 80 % quantile may say this many times the median's standard deviation; more than a fifth of
+# gross errors shows in it.
+TAIL_LIMIT = 4.0
+# A sensor brings some ten unknowns. With fewer rows the robust fit follows half of them closely,
+# whatever they are, and their errors say nothing of the others'.
+FEWEST_TO_JUDGE = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What `judge` found, row by row in the order of `Rows`.
+
+    Attributes
+    ----------
+    gross
+        True where the row is to be left out, (n,).
+    why
+        The reason with its numbers; '' where kept, n strings.
+    """
+
+    gross: BoolArray
+    why: tuple[str, ...]
+
+
+def find_outliers(
+    rows: Rows,
+    refit: Callable[[BoolArray], FloatArray],
+    errors: FloatArray,
+    sensor_names: Sequence[str],
+) -> Judgement:
+    """Leave gross rows out and fit again until the same rows stay out.
+
+    Parameters
+    ----------
+    rows
+        All rows, good and bad.
+    refit
+        Fits the rows that are True, (n,), and returns the errors of all, m, (n, 3).
+    errors
+        Errors of a first, robust fit, m, (n, 3).
+    sensor_names
+        For the messages.
+
+    Raises
+    ------
+    InsufficientDataError
+        When more than a tenth of a sensor's rows would have to go, or cannot even be told.
+    """
+    _require_majority(rows, errors, sensor_names)
+    gross = np.zeros(len(rows), dtype=bool)
+    judgement = judge(rows, errors, gross)
+    for _ in range(20):
+        if np.array_equal(judgement.gross, gross):
+            break
+        gross = judgement.gross
+        judgement = judge(rows, refit(~gross), gross)
+    _guard(rows, judgement.gross, sensor_names)
+    return judgement
+
+
+def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
+    """Judge every row by the rows not yet called gross.
+
+    In each pose at most one row is called gross that was not before: a bad row makes its
+    neighbours look bad too, as long as it is among them.
+    """
+    group = rows.group_of_row
+    sensor = rows.group_sensor[group]
+    good = ~gross
+    count = rows.group_sum(good.astype(float), axis=0)
+    total = rows.group_sum(errors * good[:, None], axis=0)
+    sigma, pose_sigma = robust_noise(rows, errors, good)
+
+    # What the other good rows of the pose say of the error it shares.
+    others = count[group] - good
+    mean = (total[group] - errors * good[:, None]) / np.maximum(others, 1.0)[:, None]
+    variance, common = sigma[sensor] ** 2, pose_sigma[sensor] ** 2
+    share = others * common / (variance + others * common)
+    spread = np.sqrt(variance + common * (1.0 - share))
+    deviation = np.linalg.norm(errors - share[:, None] * mean, axis=1)
+    sigmas = deviation / spread
+
+    probability = np.zeros(len(rows))
+    for _, span in rows.spans:
+        probability[span] = gross_probability(sigmas[span])
+    new = probability > CERTAIN
+    worst = np.zeros(len(count))
+    np.maximum.at(worst, group, np.where(gross, 0.0, sigmas))
+    gross_now = new & (gross | (sigmas == worst[group]))
+    why = [
+        f'residual {_mm(d)} mm, {s:.0f} sigma; gross with probability {_percent(p)}' if g else ''
+        for d, s, p, g in zip(deviation, sigmas, probability, gross_now, strict=True)
+    ]
+
+    # A pose whose rows agree with each other, and with no other pose.
+    pose_mean = total / np.maximum(count, 1.0)[:, None]
+    pose_spread = np.sqrt(
+        pose_sigma[rows.group_sensor] ** 2 + sigma[rows.group_sensor] ** 2 / np.maximum(count, 1.0)
+    )
+    pose_sigmas = np.linalg.norm(pose_mean, axis=1) / pose_spread
+    off = np.zeros(len(count))
+    for index, _ in rows.spans:
+        mine = (rows.group_sensor == index) & (count > 1)
+        off[mine] = gross_probability(pose_sigmas[mine])
+    for index in np.flatnonzero(off > CERTAIN).tolist():
+        start = int(rows.group_start[index])
+        for row in range(start, start + rows.group_size[index]):
+            gross_now[row] = True
+            why[row] = (
+                f'residual {_mm(float(np.linalg.norm(errors[row])))} mm: the whole pose is off by '
+                f'{pose_sigmas[index]:.0f} sigma; gross with probability {_percent(off[index])}'
+            )
+    return Judgement(gross_now, tuple(why))
+
+
+def gross_probability(sigmas: FloatArray) -> FloatArray:
+    """Return how probable it is that each of three-dimensional errors is gross.
+
+    Parameters
+    ----------
+    sigmas
+        Lengths of the errors in standard deviations of good ones, (n,).
+
+    Returns
+    -------
+    ndarray
+        (n,), under a mixture of two Gaussians whose share and width fit these errors.
+    """
+    square = sigmas**2
+    share, excess = PRIOR_GROSS / PRIOR_ROWS, NARROWEST**2
+    probability = np.zeros(len(square))
+    for _ in range(100):
+        before = probability
+        log_odds = (
+            np.log(share / (1.0 - share))
+            - 1.5 * np.log1p(excess)
+            + 0.5 * square * excess / (1.0 + excess)
+        )
+        probability = 1.0 / (1.0 + np.exp(-np.clip(log_odds, -500.0, 500.0)))
+        if np.max(np.abs(probability - before), initial=0.0) < 1e-6:
+            break
+        total = float(probability.sum())
+        share = (total + PRIOR_GROSS) / (len(square) + PRIOR_ROWS)
+        excess = float(probability @ (square / 3.0 - 1.0) + NARROWEST**2) / (total + 1.0)
+        excess = max(excess, NARROWEST**2)
+    return probability
+
+
+def robust_noise(rows: Rows, errors: FloatArray, good: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Estimate sigma and pose_sigma of each sensor, m, (sensors,) each, unmoved by a few outliers.
+
+    Where poses have one row each all of the error counts as sigma.
+    """
+    group = rows.group_of_row
+    count = rows.group_sum(good.astype(float), axis=0)
+    mean = rows.group_sum(errors * good[:, None], axis=0) / np.maximum(count, 1.0)[:, None]
+    # Deviations from the mean of n rows are smaller than sigma by (n - 1) / n in variance.
+    inflation = np.sqrt(count / np.maximum(count - 1.0, 1.0))[group]
+    deviation = np.linalg.norm(errors - mean[group], axis=1) * inflation
+    sensors = len(rows.spans)
+    sigma, pose_sigma = np.zeros(sensors), np.zeros(sensors)
+    for index, span in rows.spans:
+        paired = good[span] & (count[group[span]] > 1)
+        poses = (rows.group_sensor == index) & (count > 0)
+        pose_total = _robust_scale(np.linalg.norm(mean[poses], axis=1))
+        if not paired.any():
+            sigma[index] = pose_total
+            continue
+        sigma[index] = _robust_scale(deviation[span][paired])
+        own = sigma[index] ** 2 * np.mean(1.0 / count[poses])
+        pose_sigma[index] = np.sqrt(max(pose_total**2 - own, 0.0))
+    return sigma, pose_sigma
+
+
+def _robust_scale(lengths: FloatArray) -> float:
+    """Return the standard deviation per axis of three-dimensional errors of these lengths."""
+    return float(np.max(np.quantile(lengths, _QUANTILES) / _EXPECTED)) + RESOLUTION_M
+
+
+def _require_majority(rows: Rows, errors: FloatArray, sensor_names: Sequence[str]) -> None:
+    """Refuse data in which gross errors are so many that the others cannot be told."""
+    for sensor, span in rows.spans:
+        if span.stop - span.start < FEWEST_TO_JUDGE:
+            continue
+        half, most = np.quantile(np.linalg.norm(errors[span], axis=1), _QUANTILES)
+        if most / _EXPECTED[1] > TAIL_LIMIT * (half / _EXPECTED[0] + RESOLUTION_M):
+            raise InsufficientDataError(
+                f"sensor '{sensor_names[sensor]}': half of the observations agree within "
+                f'{_mm(half)} mm, but a fifth is off by more than {_mm(most)} mm: too many gross '
+                'errors to name them; look for mixed-up markers or a sensor that was moved'
+            )
+
+
+def _guard(rows: Rows, gross: BoolArray, sensor_names: Sequence[str]) -> None:
+    for sensor, span in rows.spans:
+        out, of = int(gross[span].sum()), span.stop - span.start
+        if out > max(1.0, LARGEST_SHARE * of):
+            raise InsufficientDataError(
+                f"sensor '{sensor_names[sensor]}': {out} of {of} observations are gross errors, "
+                'too many to leave out; look for mixed-up markers or a sensor that was moved'
+            )
+
+
+def _mm(length: float) -> str:
+    return f'{length * 1e3:.1f}'
+
+
+def _percent(probability: float) -> str:
+    """Return a probability in words that never say certain."""
+    return f'{100.0 * probability:.1f} %' if probability < 0.999 else 'above 99.9 %'

@@ -1,0 +1,306 @@
+"""The source paper's estimator, exactly: equations 8 and 12 to 16 of Van Wyk et al.
+
+Kept to compare with: it does not converge within its 2e5 steps, and one chain alone hides that.
+Several chains run side by side, each from a three-point registration of its own, so that R-hat
+can tell. Units inside are the paper's, mm and degrees, because its proposals are one number for
+both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from remaster_ros.calibration.estimate import Problem
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.identifiability import Gauge, find_gauge
+from remaster_ros.calibration.initial_guess import referenced, register
+from remaster_ros.calibration.laplace import find_mode
+from remaster_ros.calibration.metropolis import Chains, random_walk_sampler
+from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.posterior import Posterior
+from remaster_ros.calibration.priors import TIGHTEST_PRIOR
+from remaster_ros.calibration.result import Sampled
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import inverse, transform
+from remaster_ros.types import FloatArray, IntArray, Measurements
+
+STEPS = 200_000
+BURN_IN_SHARE = 0.875
+HALF_WIDTH = 0.0125
+START_SIGMA_MM = 1.0
+# A triangle counts as non-collinear when its area is at least this share of its longest side
+# squared (0.43 for an equilateral one).
+FLATTEST_TRIANGLE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class PaperPosterior:
+    """Equation 15 for one or more sensors, for several chains at once.
+
+    A state is, per sensor, x, y, z in mm and alpha, beta, gamma in degrees (Theta_1); the offsets
+    of all joints in degrees (Theta_2); and sigma per sensor in mm.
+
+    Attributes
+    ----------
+    chain
+        The nominal robot.
+    rows
+        The observations; `Rows.target` is not used.
+    measured
+        Measured positions in each sensor's frame N, in the order of ``rows``, m, (n, 3).
+    markers
+        Nominal markers in the tool frame, m, (markers, 3).
+    T_N_R
+        Three-point registration that each chain starts from, (chains, sensors, 4, 4).
+    """
+
+    chain: SerialChain
+    rows: Rows
+    measured: FloatArray
+    markers: FloatArray
+    T_N_R: FloatArray
+
+    @property
+    def sensors(self) -> int:
+        """Number of sensors."""
+        return self.T_N_R.shape[1]
+
+    def start(self) -> FloatArray:
+        """Return the paper's first state for every chain, (chains, d): zeros, and sigma 1 mm."""
+        chains = len(self.T_N_R)
+        zeros = np.zeros((chains, 6 * self.sensors + len(self.chain)))
+        return np.concatenate((zeros, np.full((chains, self.sensors), START_SIGMA_MM)), axis=1)
+
+    def split(self, states: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return registrations T_N_R, offsets in rad and sigma in m of states (chains, ..., d)."""
+        turned = 6 * self.sensors
+        theta_1 = states[..., :turned].reshape(*states.shape[:-1], self.sensors, 6)
+        between = states.ndim - 2
+        initial = self.T_N_R.reshape(len(self.T_N_R), *(1,) * between, self.sensors, 4, 4)
+        correction = transform(_euler_zyx(np.radians(theta_1[..., 3:])), 1e-3 * theta_1[..., :3])
+        offsets = np.radians(states[..., turned : turned + len(self.chain)])
+        return correction @ initial, offsets, 1e-3 * states[..., -self.sensors :]
+
+    def log_density(self, states: FloatArray) -> FloatArray:
+        """Return the logarithm of eq. 15 of states (chains, d), (chains,); -inf for sigma <= 0."""
+        T_N_R, offsets, sigma = self.split(states)
+        points = self.chain.positions(
+            self.rows.q, self.markers[self.rows.marker], offsets[:, None, :]
+        )
+        value = np.zeros(len(states))
+        positive = np.all(sigma > 0.0, axis=1)
+        for sensor, span in self.rows.spans:
+            turn, shift = T_N_R[:, sensor, :3, :3], T_N_R[:, sensor, None, :3, 3]
+            errors = self.measured[span] - shift - points[:, span] @ np.swapaxes(turn, -1, -2)
+            # Eq. 7, in mm as sigma is.
+            cost = 1e6 * np.einsum('cni,cni->c', errors, errors)
+            scale = np.where(positive, 1e3 * sigma[:, sensor], 1.0)
+            exponent = 3 * (span.stop - span.start) + 2
+            value -= exponent * np.log(scale) + cost / (2.0 * scale**2)
+        return np.where(positive, value, -np.inf)
+
+
+def paper_posterior(
+    chain: SerialChain,
+    measurements: Measurements,
+    rows: Rows,
+    markers: FloatArray,
+    sensor_names: tuple[str, ...],
+    chains: int,
+    rng: np.random.Generator,
+) -> PaperPosterior:
+    """Draw three points per chain and sensor for the initial registrations, and assemble."""
+    measured = measurements.position[rows.source]
+    nominal = chain.positions(rows.q, markers[rows.marker])
+    T_N_R = np.empty((chains, len(sensor_names), 4, 4))
+    for sensor, span in rows.spans:
+        for index in range(chains):
+            three = span.start + _three_points(nominal[span], sensor_names[sensor], rng)
+            T_R_N = register(nominal[three], measured[three], sensor_names[sensor])
+            T_N_R[index, sensor] = inverse(T_R_N)
+    return PaperPosterior(chain, rows, measured, markers, T_N_R)
+
+
+def sample_paper(
+    posterior: PaperPosterior,
+    *,
+    steps: int,
+    rng: np.random.Generator,
+    progress: Callable[[float], None] | None = None,
+) -> Chains:
+    """Run the paper's chain: all parameters at once by U(-0.0125, 0.0125) mm and deg, eq. 16."""
+    start = posterior.start()
+    return random_walk_sampler(
+        posterior.log_density,
+        lambda source: source.uniform(-HALF_WIDTH, HALF_WIDTH, start.shape),
+        start=start,
+        steps=steps,
+        burn_in=int(BURN_IN_SHARE * steps),
+        rng=rng,
+        trace_every=max(1, steps // 1000),
+        progress=progress,
+    )
+
+
+def fit_paper(
+    problem: Problem,
+    *,
+    chains: int,
+    steps: int,
+    rng: np.random.Generator,
+    progress: Callable[[float], None] | None = None,
+) -> Sampled:
+    """Fit a problem as the paper does: markers at nominal, nothing left out, nothing held.
+
+    Parameters
+    ----------
+    problem
+        What to fit.
+    chains, steps
+        How many chains, and how many steps of each in all.
+    rng
+        Source of all randomness.
+    progress
+        Called with the share done.
+    """
+    measurements, chain = problem.measurements, problem.chain
+    identity = problem.empty_model()
+    rows = Rows.of(measurements, problem.fitted, identity.reference)
+    target = paper_posterior(
+        chain, measurements, rows, problem.markers, problem.sensor_names, chains, rng
+    )
+    run = sample_paper(target, steps=steps, rng=rng, progress=progress)
+    # Registrations of all chains as corrections to their mean, about the data's centroid.
+    T_N_R = target.split(run.draws)[0]
+    model = referenced(identity, measurements, problem.fitted, inverse(T_N_R[0, -1]))
+    x, _ = _paper_natural(target, model, run.draws)
+    mean = x.reshape(-1, model.size).mean(axis=0)
+    model = referenced(identity, measurements, problem.fitted, model.T_R_N(mean))
+    rows = Rows.of(measurements, problem.fitted, model.reference)
+    x, sigma = _paper_natural(target, model, run.draws)
+    trace, trace_sigma = _paper_natural(target, model, run.trace)
+    fitted = np.arange(model.joints + 6 * len(model.sensor_names))
+    at_mean = model.vector(model.offsets(mean), problem.markers)
+    # Over the markers too: that the paper takes their places as exact tells nothing about them.
+    found = find_gauge(model, at_mean, rows, problem.marker_priors(model))
+    gauge = _paper_gauge(found, model)
+    unseen = np.zeros(model.joints, dtype=bool)
+    unseen[gauge.held] = True
+    z = model.pinned(x)
+    fixed = z.copy()
+    fixed[..., gauge.held] = 0.0
+    # Markers do not move here: their place is the mean in natural parameters, not in pinned ones.
+    middle = model.natural(fixed).reshape(-1, model.size).mean(axis=0)
+    names = model.names[: len(fitted)]
+    names += tuple(f'noise.{sensor}.sigma' for sensor in model.sensor_names)
+    free = fitted[model.joints :]
+    flat = replace(
+        Posterior.of(model, rows, (), free, model.vector(np.zeros(model.joints), problem.markers)),
+        separable=(),
+    )
+    return Sampled(
+        model=model,
+        z=z,
+        z_mean=model.pinned(middle),
+        sigma=sigma,
+        pose_sigma=np.zeros_like(sigma),
+        total_noise=np.repeat(sigma[..., None], 2, axis=-1),
+        trace=np.concatenate((trace[..., fitted], trace_sigma), axis=-1),
+        draws=np.concatenate((x[..., fitted], sigma), axis=-1),
+        names=names,
+        separable=(),
+        name=f'paper: random-walk Metropolis, {steps} steps, the last eighth kept',
+        acceptance_rate=run.acceptance_rate,
+        gauge=gauge,
+        unfixed=unseen,
+        taken_as_known=_taken_as_known(found, model, problem.marker_std_m),
+        z_before=find_mode(flat).z,
+        left_out=(),
+    )
+
+
+def _paper_natural(
+    target: PaperPosterior, model: Model, states: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return natural parameters and sigma of the paper's states."""
+    T_N_R, offsets, sigma = target.split(states)
+    shape = (*states.shape[:-1], model.size)
+    x = np.broadcast_to(model.vector(np.zeros(model.joints), target.markers), shape).copy()
+    x[..., : model.joints] = offsets
+    return model.with_corrections(x, model.reference @ T_N_R), sigma
+
+
+def _paper_gauge(gauge: Gauge, model: Model) -> Gauge:
+    """Say of every direction that the paper's flat prior leaves it open."""
+    held = {f'{model.names[index]} = 0' for index in gauge.held}
+
+    def reworded(fixed_by: str) -> str:
+        if fixed_by in held:
+            return (
+                'nothing: its prior is flat and the chain wanders along it (registrations and '
+                f'markers are given for {fixed_by})'
+            )
+        return f'taking the marker as known exactly, where there is no more than {fixed_by}'
+
+    words = {d.fixed_by: reworded(d.fixed_by) for d in gauge.directions}
+    why = []
+    for text in gauge.why:
+        for old, new in words.items():
+            text = text.replace(f'fixed by {old}', f'fixed by {new}')
+        why.append(text)
+    return Gauge(
+        tuple(replace(d, fixed_by=words[d.fixed_by]) for d in gauge.directions),
+        gauge.held,
+        tuple(why),
+    )
+
+
+def _taken_as_known(gauge: Gauge, model: Model, marker_std_m: FloatArray) -> FloatArray:
+    """Return the std that markers as well as they are known leave each offset, rad, (k,)."""
+    variance = np.zeros(model.joints)
+    for direction in gauge.directions:
+        entries = direction.combination
+        pull = 0.0
+        for index, std in enumerate(marker_std_m):
+            moved = [entries.get(name, 0.0) for name in model.names[model.marker(index)]]
+            pull += float(np.sum(np.square(moved))) / max(float(std), TIGHTEST_PRIOR) ** 2
+        for joint, name in enumerate(model.chain.joint_names):
+            if pull > 0.0:
+                variance[joint] += entries.get(name, 0.0) ** 2 / pull
+    variance[gauge.held] = 0.0
+    return np.sqrt(variance)
+
+
+def _three_points(points: FloatArray, sensor: str, rng: np.random.Generator) -> IntArray:
+    """Draw three points that do not lie on a line; their indices, (3,)."""
+    for _ in range(1000):
+        if len(points) < 3:
+            break
+        three = rng.choice(len(points), 3, replace=False)
+        sides = points[three] - points[np.roll(three, 1)]
+        area = 0.5 * np.linalg.norm(np.cross(sides[0], sides[1]))
+        if area > FLATTEST_TRIANGLE * np.max(np.sum(sides**2, axis=1)):
+            return three
+    raise InsufficientDataError(
+        f"sensor '{sensor}': no three of its {len(points)} points make a triangle to register "
+        'by; measure poses that are spread further'
+    )
+
+
+def _euler_zyx(angles: FloatArray) -> FloatArray:
+    """Return Rz(alpha) Ry(beta) Rx(gamma) for angles (..., 3), rad, (..., 3, 3)."""
+    (sa, sb, sg), (ca, cb, cg) = (
+        np.moveaxis(function(angles), -1, 0) for function in (np.sin, np.cos)
+    )
+    return np.stack(
+        (
+            np.stack((ca * cb, ca * sb * sg - sa * cg, ca * sb * cg + sa * sg), axis=-1),
+            np.stack((sa * cb, sa * sb * sg + ca * cg, sa * sb * cg - ca * sg), axis=-1),
+            np.stack((-sb, cb * sg, cb * cg), axis=-1),
+        ),
+        axis=-2,
+    )

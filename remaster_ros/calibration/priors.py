@@ -1,0 +1,95 @@
+"""What is known before the data: markers, base frames and offsets, Gaussian.
+
+Numpy in, numpy out; how a session or a file says so is read in `storage`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.calibration.model import Model
+from remaster_ros.kinematics.transforms import (
+    matrix_from_quaternion_xyzw,
+    matrix_to_rotation_vector,
+)
+from remaster_ros.types import BasePrior, FloatArray
+
+# A prior std of 0 in a session means "as good as known": a micrometre, a microradian.
+TIGHTEST_PRIOR = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """A Gaussian prior as a function of the natural parameters.
+
+    Attributes
+    ----------
+    description
+        How the report names it: 'the prior on marker sir, 0.5 mm per axis'.
+    residual
+        Natural parameters (..., size) to whitened residuals (..., m), standard normal a priori.
+    """
+
+    description: str
+    residual: Callable[[FloatArray], FloatArray]
+
+
+def marker_prior(model: Model, marker: int, nominal: FloatArray, std_m: float) -> Prior:
+    """Return what is known of a marker before: near its nominal place, std_m per axis."""
+    where = model.marker(marker)
+    width = max(std_m, TIGHTEST_PRIOR)
+    return Prior(
+        f'the prior on marker {model.marker_names[marker]}, {std_m * 1e3:g} mm per axis',
+        lambda x: (x[..., where] - nominal) / width,
+    )
+
+
+def offset_prior(model: Model, joint: int, mean: float, std: float) -> Prior:
+    """Return what is known of a joint's offset before, rad."""
+    width = max(std, TIGHTEST_PRIOR)
+    return Prior(
+        f'the prior on {model.chain.joint_names[joint]}, {np.degrees(std):g} deg',
+        lambda x: (x[..., joint : joint + 1] - mean) / width,
+    )
+
+
+def base_prior(model: Model, sensor: int, prior: BasePrior) -> Prior:
+    """Return what is known of a sensor's registration T_R_N before."""
+    known = matrix_from_quaternion_xyzw(prior.rotation_xyzw)
+    widths = max(prior.std_m, TIGHTEST_PRIOR), max(prior.std_rad, TIGHTEST_PRIOR)
+
+    def residual(x: FloatArray) -> FloatArray:
+        T_R_N = model.T_R_N(x)[..., sensor, :, :]
+        shift = (T_R_N[..., :3, 3] - prior.translation_m) / widths[0]
+        turn = matrix_to_rotation_vector(T_R_N[..., :3, :3] @ known.T) / widths[1]
+        return np.concatenate((shift, turn), axis=-1)
+
+    return Prior(f'the prior on the base frame of {model.sensor_names[sensor]}', residual)
+
+
+def prior_rows(
+    model: Model, priors: Sequence[Prior], z: FloatArray, *, natural: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Return residuals (m,) of all priors and their derivative (m, size) at z.
+
+    Numerical differences: the priors are smooth, few, and written as plain functions. ``natural``
+    says that z and the derivative are in natural, not in pinned coordinates.
+    """
+    # Priors are on the core; theta's is linear, so differences would only cost.
+    step, core = 1e-6 * np.eye(model.core, model.size), model.core
+    points = np.concatenate((z[None], z + step, z - step))
+    x = points if natural else model.natural(points)
+    values = np.concatenate(
+        [np.zeros((len(x), 0)), *(prior.residual(x) for prior in priors)], axis=-1
+    )
+    by_z = np.zeros((values.shape[1], model.size))
+    by_z[:, :core] = (values[1 : core + 1] - values[core + 1 :]).T / 2e-6
+    root = model.extension_root
+    by_theta = np.concatenate((np.zeros((len(root), core)), root), axis=1)
+    return (
+        np.concatenate((values[0], root @ model.theta(z))),
+        np.concatenate((by_z, by_theta)),
+    )

@@ -1,0 +1,1 @@
+"""What becomes of a measured configuration: pairing, plausibility, references."""

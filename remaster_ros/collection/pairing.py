@@ -1,0 +1,322 @@
+"""A settled configuration + joint states + marker readings -> observations, or the reason why not.
+
+Everything is decided on the messages' own time stamps and never on their time of arrival, so a
+bag replayed at any speed gives the same observations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.types import FloatArray, MarkerReading
+
+
+@dataclass(frozen=True)
+class SensorRules:
+    """How one sensor's reading is taken.
+
+    Attributes
+    ----------
+    sensor, marker
+        Names as in the session.
+    single_shot
+        True for an instrument that measures on request and integrates by itself (a laser
+        tracker); False for a stream that is averaged over the dwell.
+    dwell_s
+        Length of the average after the arm has settled, s (streams).
+    min_samples
+        While the dwell has fewer, it is prolonged, up to the time-out: a marker that was hidden
+        for a moment costs a moment and not the configuration (streams).
+    max_std_m
+        A larger standard deviation on any axis over the dwell is no still marker, m (streams).
+    timeout_s
+        How long after the dwell (stream) or settling (single shot) a reading may stay out, s.
+    """
+
+    sensor: str
+    marker: str
+    single_shot: bool = False
+    dwell_s: float = 0.5
+    min_samples: int = 5
+    max_std_m: float = 0.5e-3
+    timeout_s: float = 2.0
+
+
+@dataclass(frozen=True)
+class PairedReading:
+    """One sensor's accepted reading at one configuration.
+
+    Attributes
+    ----------
+    stamp_s
+        End of the dwell, or the time of the single shot, s.
+    q
+        Mean reported joint positions from settling to `stamp_s`, rad, (k,).
+    position, std
+        Mean marker position and sample standard deviation (None for a single shot), m, (3,).
+    samples
+        Samples in the mean.
+    """
+
+    sensor: str
+    marker: str
+    stamp_s: float
+    q: FloatArray
+    position: FloatArray
+    std: FloatArray | None
+    samples: int
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Why a sensor has no observation at a configuration.
+
+    Attributes
+    ----------
+    reason
+        A word to count by: ``moving``, ``unseen``, ``clock``, ``stale``, ``too_few``,
+        ``unsteady``, ``frozen``, ``swapped``, ``device``, ``absent`` or ``not_waited``.
+    detail
+        One line with the numbers.
+    """
+
+    sensor: str
+    reason: str
+    detail: str
+
+
+LONGEST_GAP_S = 5.0
+"""Without a report of the joints for so long nobody knows that the arm stood still, s."""
+
+CLOCK_BACK_S = 0.1
+"""A report that is older than the last one by more than this comes from a clock set back, s."""
+
+
+class Pairing:
+    """Collect what belongs to one settled configuration and decide on each sensor.
+
+    Parameters
+    ----------
+    settled_stamp_s
+        When the arm was judged settled, s. Nothing captured before it is ever used.
+    q_settled
+        Reported joint positions then, rad, (k,).
+    sensors
+        The rules, one per sensor.
+    motion_tolerance
+        A report further than this from `q_settled` on any joint means the arm moved, rad.
+    require
+        Whom the arm waits for: ``all`` sensors, ``any`` of them, or one by its name. A sensor
+        that is not required and has no reading by then is left out.
+    """
+
+    def __init__(
+        self,
+        settled_stamp_s: float,
+        q_settled: FloatArray,
+        sensors: tuple[SensorRules, ...],
+        motion_tolerance: float = 5e-4,
+        require: str = 'all',
+    ) -> None:
+        self.settled_stamp_s = settled_stamp_s
+        self.q_settled = np.asarray(q_settled, float)
+        self.rules = {rules.sensor: rules for rules in sensors}
+        self.motion_tolerance = motion_tolerance
+        self.require = require
+        self.decided: dict[str, PairedReading | Rejection] = {}
+        self._decided_s: dict[str, float] = {}
+        self._now_s = self._looked_s = settled_stamp_s
+        self._excused_s = dict.fromkeys(self.rules, 0.0)
+        self._silent_s = dict.fromkeys(self.rules, 0.0)
+        self._words: dict[str, int] = {}
+        self._joints: list[tuple[float, FloatArray]] = []
+        self._readings: dict[str, list[MarkerReading]] = {name: [] for name in self.rules}
+
+    def add_joint_state(self, stamp_s: float, q: FloatArray) -> None:
+        """Take a report of the joint positions, rad, (k,), in the order of their arrival."""
+        if self._joints and stamp_s < self._now_s - CLOCK_BACK_S:
+            detail = f'the clock of joint_states went back by {self._now_s - stamp_s:.1f} s'
+            self._reject_rest('clock', detail)
+        elif stamp_s > self._now_s:
+            self._now_s = stamp_s
+            self._joints.append((stamp_s, np.asarray(q, float)))
+            self._decide(stamp_s)
+
+    def add_reading(self, sensor: str, reading: MarkerReading) -> None:
+        """Take one marker reading; older than the settling, or of an unknown sensor: ignored."""
+        if sensor in self._readings and reading.stamp_s > self.settled_stamp_s:
+            self._readings[sensor].append(reading)
+            self._decide(reading.stamp_s)
+
+    def fail(self, sensor: str, detail: str) -> None:
+        """Note that the device itself said that there is no measurement."""
+        self._set(Rejection(sensor, 'device', detail))
+
+    def give_up(
+        self, now_s: float, absent: Collection[str] = (), words: Mapping[str, int] | None = None
+    ) -> None:
+        """Reject every sensor whose time is over at `now_s`.
+
+        A cut cable shows only when the heartbeat is over, and simulated time may run faster than
+        that: a required sensor is not rejected before its node has been heard again, and if that
+        turns out to be absent, all of its silence is excused.
+
+        Parameters
+        ----------
+        now_s
+            Stamp of the latest joint state, s.
+        absent
+            Sensors that are not there at all now: a required one is waited for, and the time is
+            not counted; another one is left out.
+        words
+            How often each sensor's node has been heard (`Presence.words`); without it, or for a
+            sensor that is not in it, silence means nothing.
+        """
+        passed = max(now_s - self._looked_s, 0.0)
+        self._looked_s = now_s
+        for name in absent:
+            if name in self.rules and self.is_required(name):
+                self._excused_s[name] += self._silent_s[name] + passed
+                self._silent_s[name] = 0.0
+            elif name in self.rules:
+                self._set(Rejection(name, 'absent', 'it is not there, and not required'))
+        self._listen(words or {}, passed, absent)
+        for name, rules in self.rules.items():
+            allowed = self._allowed_s(rules)
+            unsure = self.is_required(name) and self._silent_s[name] > 0.0
+            if now_s > self.settled_stamp_s + allowed and not unsure:
+                self._set(self._late(rules, allowed))
+
+    def _listen(self, words: Mapping[str, int], passed_s: float, absent: Collection[str]) -> None:
+        """Add up how long each sensor's node has said nothing that is not excused yet."""
+        for name in self.rules:
+            if name in words and words[name] == self._words.get(name) and name not in absent:
+                self._silent_s[name] += passed_s
+            else:
+                self._silent_s[name] = 0.0
+        self._words = dict(words)
+
+    def has_reading(self, sensor: str) -> bool:
+        """Whether anything of a sensor has come."""
+        return bool(self._readings[sensor])
+
+    def is_required(self, sensor: str) -> bool:
+        """Whether the arm waits for this sensor."""
+        return self.require in ('all', 'any', sensor)
+
+    @property
+    def complete(self) -> bool:
+        """Whether the arm need not wait any longer."""
+        if len(self.decided) == len(self.rules):
+            return True
+        if self.require == 'any':
+            return any(isinstance(item, PairedReading) for item in self.decided.values())
+        return self.require in self.decided
+
+    def finish(self) -> None:
+        """Leave out the sensors that the arm did not wait for."""
+        self._reject_rest('not_waited', f'the arm waits for {self.require}')
+
+    def waited_s(self) -> dict[str, float]:
+        """How long the arm stood for whom, s: from one sensor's decision to the next one's."""
+        waited, since = dict.fromkeys(self.rules, 0.0), self.settled_stamp_s
+        for name, at in sorted(self._decided_s.items(), key=lambda item: item[1]):
+            waited[name], since = at - since, at
+        return waited
+
+    def _set(self, item: PairedReading | Rejection) -> None:
+        if item.sensor not in self.decided:
+            self.decided[item.sensor] = item
+            self._decided_s[item.sensor] = self._now_s
+
+    def _reject_rest(self, reason: str, detail: str) -> None:
+        for name in self.rules:
+            self._set(Rejection(name, reason, detail))
+
+    def _allowed_s(self, rules: SensorRules) -> float:
+        """How long after the settling a sensor may stay out, s."""
+        dwell_s = 0.0 if rules.single_shot else rules.dwell_s
+        return dwell_s + rules.timeout_s + self._excused_s[rules.sensor]
+
+    def _late(self, rules: SensorRules, allowed: float) -> Rejection:
+        count = len(self._readings[rules.sensor])
+        if 0 < count < rules.min_samples and not rules.single_shot:
+            detail = f'{count} usable samples in {allowed:.1f} s (at least {rules.min_samples})'
+            return Rejection(rules.sensor, 'too_few', detail)
+        what = 'no joint state followed the reading' if count else 'no reading'
+        return Rejection(
+            rules.sensor, 'stale', f'{what} within {allowed:.1f} s after the arm settled'
+        )
+
+    def _decide(self, stamp_s: float) -> None:
+        for name, rules in self.rules.items():
+            if name in self.decided:
+                continue
+            readings = self._readings[name]
+            if rules.single_shot:
+                if not readings:
+                    continue
+                end = readings[0].stamp_s
+                used = readings[:1]
+            else:
+                dwell = self._dwell(rules, readings)
+                if dwell is None:
+                    continue
+                end, used = dwell
+            # Without a later joint state nobody knows that the arm stood still to the end.
+            if not self._joints or self._joints[-1][0] < end:
+                continue
+            self._set(self._judge(rules, used, end))
+
+    def _dwell(
+        self, rules: SensorRules, readings: list[MarkerReading]
+    ) -> tuple[float, list[MarkerReading]] | None:
+        """End of a stream's dwell and the readings in it; None while it lasts."""
+        end = self.settled_stamp_s + rules.dwell_s
+        # The dwell is over for this sensor once it has sent something later than its end.
+        if not readings or readings[-1].stamp_s <= end:
+            return None
+        used = [reading for reading in readings if reading.stamp_s <= end]
+        if len(used) < rules.min_samples:
+            if len(readings) < rules.min_samples:
+                return None
+            used = readings[: rules.min_samples]
+            end = used[-1].stamp_s
+            if end > self.settled_stamp_s + self._allowed_s(rules):
+                return None
+        return end, used
+
+    def _judge(
+        self, rules: SensorRules, used: list[MarkerReading], end: float
+    ) -> PairedReading | Rejection:
+        stamps = np.array([stamp for stamp, _ in self._joints])
+        q = np.array([joints for _, joints in self._joints])
+        # The first report at or after the end is part of the proof of stillness, not of the mean.
+        until = int(np.searchsorted(stamps, end)) + 1
+        moved = np.max(np.abs(q[:until] - self.q_settled))
+        if not moved <= self.motion_tolerance:
+            detail = f'a joint moved {moved:.2e} rad (allowed {self.motion_tolerance:.1e})'
+            return Rejection(rules.sensor, 'moving', detail)
+        gap = float(np.max(np.diff(stamps[:until], prepend=self.settled_stamp_s)))
+        if gap > LONGEST_GAP_S:
+            detail = f'no report of the joints for {gap:.1f} s (or their clock jumped)'
+            return Rejection(rules.sensor, 'unseen', detail)
+        inside = q[stamps <= end]
+        q_mean = inside.mean(axis=0) if len(inside) else q[0]
+        positions = np.array([reading.position for reading in used]).reshape(-1, 3)
+        if rules.single_shot:
+            std = None
+        else:
+            std = positions.std(axis=0, ddof=1) if len(used) > 1 else np.zeros(3)
+            if not np.all(std <= rules.max_std_m):
+                detail = f'std {1e3 * std.max():.3f} mm (allowed {1e3 * rules.max_std_m:.3f} mm)'
+                return Rejection(rules.sensor, 'unsteady', detail)
+            if len(used) > 1 and not np.any(np.ptp(positions, axis=0)):
+                detail = f'{len(used)} readings are the same to the last bit'
+                return Rejection(rules.sensor, 'frozen', detail)
+        return PairedReading(
+            rules.sensor, rules.marker, end, q_mean, positions.mean(axis=0), std, len(used)
+        )

@@ -1,0 +1,100 @@
+"""Is a reading this marker, measured now? Against the robot's own motion, before it is recorded.
+
+A stray that is taken for the marker (swapped) stands still or moves in a way of its own: seen from
+the tool, it is not where the marker is. A frozen instrument repeats its last reading wherever the
+arm goes. Neither can be told from the reading alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from remaster_ros.collection.pairing import PairedReading, Rejection
+from remaster_ros.kinematics import transforms
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.types import FloatArray
+
+LEARNING = 6
+"""Readings of a sensor after which its usual deviation is known."""
+UNUSUAL = 6.0
+"""So many times the usual deviation is another marker."""
+SMALLEST_M = 0.01
+"""No smaller deviation counts as another marker, m: offsets bend the field of deviations."""
+MOVED_M = 1e-3
+"""A marker that should have moved further than this cannot have the same reading, m."""
+
+
+class Plausibility:
+    """Compare readings with where the robot's model has the marker.
+
+    The model is off by what the calibration is to find: millimetres to a few centimetres. A
+    reading further off than `max_deviation_m`, or than six times what is usual for its sensor,
+    is of something else.
+
+    Parameters
+    ----------
+    chain
+        The arm.
+    markers
+        Nominal marker positions in the tool frame, m, (3,) each.
+    max_deviation_m
+        Beyond this no marker is what it should be, m.
+    """
+
+    def __init__(
+        self, chain: SerialChain, markers: Mapping[str, FloatArray], max_deviation_m: float = 0.05
+    ) -> None:
+        self._chain, self._markers = chain, markers
+        self._max_deviation_m = max_deviation_m
+        self._usual: dict[str, list[float]] = {}
+        self._last: dict[str, PairedReading] = {}
+
+    def judge(
+        self, reading: PairedReading, T_R_N: FloatArray | None, *, anywhere: bool = False
+    ) -> PairedReading | Rejection:
+        """Return the reading, or why it is none.
+
+        Parameters
+        ----------
+        reading
+            As paired.
+        T_R_N
+            The sensor in the robot base, (4, 4); None before it is registered.
+        anywhere
+            Of a reference, whose very deviation tells that something was moved: anything up to
+            `max_deviation_m`.
+        """
+        name = reading.sensor
+        marker_R = self._place(reading)
+        last = self._last.get(name)
+        if last is not None and np.array_equal(last.position, reading.position):
+            moved = float(np.linalg.norm(marker_R - self._place(last)))
+            if moved > MOVED_M:
+                detail = f'the same to the last bit, though the arm moved it {1e3 * moved:.0f} mm'
+                return Rejection(name, 'frozen', detail)
+        if T_R_N is not None:
+            measured_R = transforms.apply(T_R_N, reading.position)
+            deviation = float(np.linalg.norm(measured_R - marker_R))
+            allowed = self._max_deviation_m if anywhere else self._allowed_m(name)
+            if not deviation <= allowed:
+                detail = (
+                    f'{1e3 * deviation:.0f} mm from where the robot has the marker (allowed '
+                    f'{1e3 * allowed:.0f} mm): another marker, or the sensor was moved?'
+                )
+                return Rejection(name, 'swapped', detail)
+            if not anywhere:
+                self._usual.setdefault(name, []).append(deviation)
+        self._last[name] = reading
+        return reading
+
+    def _place(self, reading: PairedReading) -> FloatArray:
+        """Where the robot's model has the marker, in R, m, (3,)."""
+        return self._chain.positions(reading.q, np.asarray(self._markers[reading.marker], float))
+
+    def _allowed_m(self, sensor: str) -> float:
+        usual = self._usual.get(sensor, ())
+        if len(usual) < LEARNING:
+            return self._max_deviation_m
+        return min(self._max_deviation_m, max(SMALLEST_M, UNUSUAL * float(np.median(usual))))

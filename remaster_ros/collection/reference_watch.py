@@ -1,0 +1,427 @@
+"""Has anything changed since the references were first measured? What, when and by how much.
+
+The references are measured twice at the beginning: how far the two rounds lie apart is what arm
+and sensor together repeat to, the noise that every later difference is held against. Each later
+round is held against them by F tests; the probabilities of a false alarm of all rounds of a
+session, however many, add up to what is stated (alpha spending: round r spends 6 / (π r)² of it).
+Only a round that differs is then asked for its cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import stats
+
+from remaster_ros.collection.reference_causes import Cause, Place, causes
+from remaster_ros.kinematics import transforms
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.planning.tour_order import nearest_solution
+from remaster_ros.types import FloatArray, IntArray
+
+FALSE_ALARM = 0.01
+"""Probability that a session in which nothing changes has any alarm."""
+STOP_M = 0.5e-3
+"""A change of this size stops a collection where nothing else is asked for."""
+LEAST_STD_M = 2e-6
+"""No sensor and no arm repeat better than this."""
+FEWEST_FREEDOMS = 6
+"""With fewer repeated numbers a sensor's noise is not known."""
+LOOKS_ALIKE = 6.0
+"""Causes whose information criteria differ by less than this (odds of 20) are not told apart."""
+UNEXPLAINED_P = 1e-4
+UNEXPLAINED_SHARE = 0.05
+"""What a cause leaves of the displacements is the straight line's share of it, up to here."""
+
+
+@dataclass(frozen=True)
+class ReferenceReading:
+    """A marker at a reference configuration, as recorded.
+
+    Attributes
+    ----------
+    configuration
+        Its number in the session.
+    position, std
+        In the sensor's frame N, and over the dwell (None for a single shot), m, (3,).
+    """
+
+    configuration: int
+    sensor: str
+    marker: str
+    q: FloatArray
+    position: FloatArray
+    stamp_s: float
+    std: FloatArray | None = None
+    samples: int = 1
+
+
+@dataclass(frozen=True)
+class Change:
+    """What has changed.
+
+    Attributes
+    ----------
+    kind
+        ``sensor``, ``base``, ``marker``, ``tool``, ``joint``, or ``unexplained`` (no one cause) or
+        ``unsteady`` (the references do not repeat from the first).
+    subject
+        For people.
+    drifts
+        Whether it grows with time; else it came at once.
+    size_m
+        Largest displacement of a marker at a reference.
+    turn_rad
+        Of the sensor, base, tool or joint; None where nothing turns.
+    after, before
+        Configurations that it happened between: the last one that was as at first (None where it
+        was so from the first) and the first one that was not.
+    p_value
+        Of the round that told it.
+    look_alikes
+        Other subjects that explain the same readings.
+    """
+
+    kind: str
+    subject: str
+    drifts: bool
+    size_m: float
+    turn_rad: float | None
+    after: int | None
+    before: int
+    p_value: float
+    look_alikes: tuple[str, ...] = ()
+
+    def describe(self) -> str:
+        """Return it in a sentence."""
+        turn = ''
+        if self.turn_rad is not None:
+            turn = f' and turned by {np.rad2deg(self.turn_rad) * 60:.1f} arc minutes'
+            if self.kind == 'joint':
+                turn = f' ({np.rad2deg(self.turn_rad):.4f} degrees)'
+        how = ', growing with time,' if self.drifts else ''
+        since = f'between configurations {self.after} and {self.before}'
+        if self.after is None:
+            since = f'up to configuration {self.before}'
+        alike = f'; it looks the same as: {", ".join(self.look_alikes)}' * bool(self.look_alikes)
+        size = f'the references are off by up to {1e3 * self.size_m:.2f} mm{turn}'
+        return f'{self.subject}{how} {since}: {size}{alike}'
+
+
+@dataclass
+class _Round:
+    """Readings of one visit to the references, by reference and sensor."""
+
+    rows: dict[tuple[int, str], ReferenceReading] = field(default_factory=dict)
+    judged: bool = False
+    alarmed: bool = False
+
+    @property
+    def configurations(self) -> list[int]:
+        return [row.configuration for row in self.rows.values()]
+
+
+class ReferenceWatch:
+    """Judge round after round of the references.
+
+    Parameters
+    ----------
+    chain
+        The arm as drawn: what it moves between two visits, by less than its repeatability.
+    markers
+        Nominal positions in the tool frame, m, (3,).
+    stop_m
+        Two first rounds that lie further apart than this tell nothing of later changes, m.
+    false_alarm
+        See `FALSE_ALARM`.
+
+    Attributes
+    ----------
+    change
+        The last one found since the beginning or `accept`; None where nothing has changed.
+    """
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        markers: Mapping[str, FloatArray],
+        stop_m: float = STOP_M,
+        false_alarm: float = FALSE_ALARM,
+    ) -> None:
+        self._chain, self._stop_m, self._false_alarm = chain, stop_m, false_alarm
+        self._markers = {name: np.asarray(place, float) for name, place in markers.items()}
+        self._references: list[FloatArray] = []
+        self._rounds: list[_Round] = []
+        self._open = False
+        self._begin = 0
+        self._begins: set[int] = set()
+        self._tests = 0
+        self.change: Change | None = None
+
+    @property
+    def rounds(self) -> int:
+        """How many rounds have begun."""
+        return len(self._rounds)
+
+    def add(self, reading: ReferenceReading) -> None:
+        """Take a reading; one at a reference that this round has already begins the next round."""
+        if self.begins_round(reading):
+            self._rounds.append(_Round())
+            self._open = True
+        key = self._key(reading)
+        if key[0] == len(self._references):
+            self._references.append(np.asarray(reading.q, float))
+        self._rounds[-1].rows[key] = reading
+
+    def begins_round(self, reading: ReferenceReading) -> bool:
+        """Tell whether `add` would take a reading for the first of another round."""
+        return not self._open or self._key(reading) in self._rounds[-1].rows
+
+    def _key(self, reading: ReferenceReading) -> tuple[int, str]:
+        known = None
+        if self._references:
+            known = nearest_solution(np.array(self._references), reading.q)
+        return len(self._references) if known is None else known, reading.sensor
+
+    def end_round(self) -> None:
+        """Take what comes next for another round: the arm went elsewhere in between."""
+        self._open = False
+
+    def accept(self) -> None:
+        """Take the next round for how things are from now on: a person has seen to the change."""
+        if self.change is not None and self.change.kind == 'unsteady':
+            # What they repeat to is still to be found.
+            self._rounds = []
+        self._begin, self._open, self.change = len(self._rounds), False, None
+        self._begins.add(self._begin)
+
+    def judge(self, T_R_N: Mapping[str, FloatArray]) -> Change | None:
+        """Judge the last round, once; return what has changed, None where nothing has.
+
+        Parameters
+        ----------
+        T_R_N
+            Sensor -> its frame in R, (4, 4); a first registration is good enough, since only
+            differences count. A sensor without one is not judged.
+        """
+        number = len(self._rounds) - 1
+        if number < 0 or self._rounds[number].judged:
+            return self.change
+        noise = self._noise(T_R_N)
+        self._rounds[number].judged = True
+        if number == 1:
+            return self._unsteady(noise)
+        if number < 2 or number <= self._begin:
+            return self.change
+        self._tests += 1
+        alpha = self._false_alarm * 6.0 / (np.pi * self._tests) ** 2
+        p_value = self._p_value(number, noise, T_R_N)
+        self.change = None
+        if p_value < alpha:
+            self.change = self._explain(number, noise, T_R_N, p_value)
+        self._rounds[number].alarmed = self.change is not None
+        return self.change
+
+    # Noise
+
+    def _noise(self, T_R_N: Mapping[str, FloatArray]) -> dict[str, tuple[float, int]]:
+        """Return standard deviation per axis, m, and degrees of freedom, by sensor.
+
+        From the differences of successive rounds in which nothing was found: of the first two, and
+        of later ones as they come. A slow drift makes hardly any, so it is not taken for noise.
+        No less than the mean over a dwell has by its own scatter.
+        """
+        quiet = [r.judged and not r.alarmed for r in self._rounds]
+        steps = [
+            i
+            for i in range(1, self.rounds)
+            if i == 1 or (quiet[i - 1] and quiet[i] and i not in self._begins)
+        ]
+        found = {}
+        for sensor in T_R_N:
+            pairs = [
+                (self._rounds[i - 1].rows[key], row, i)
+                for i in steps
+                for key, row in self._rounds[i].rows.items()
+                if key[1] == sensor and key in self._rounds[i - 1].rows
+            ]
+            T = T_R_N[sensor]
+            apart = np.array([self._off(b, T) - self._off(a, T) for a, b, _ in pairs])
+            if apart.size < FEWEST_FREEDOMS:
+                continue
+            known = [
+                float(np.mean(row.std**2)) / max(row.samples, 1)
+                for pair in pairs
+                for row in pair[:2]
+                if row.std is not None
+            ]
+            least = float(np.mean(known)) if known else 0.0
+            variance = max(float(np.mean(apart**2)) / 2.0, least, LEAST_STD_M**2)
+            # Successive differences share readings: each further one counts two thirds.
+            own = 3 * sum(i == 1 for _, _, i in pairs)
+            freedoms = own + int((apart.size - own) * 2 / 3)
+            found[sensor] = float(np.sqrt(variance)), freedoms
+        return found
+
+    def _unsteady(self, noise: Mapping[str, tuple[float, int]]) -> Change | None:
+        """Return that the first two rounds lie so far apart that nothing is seen by them."""
+        if not noise:
+            return None
+        sensor, (std, _) = max(noise.items(), key=lambda item: item[1][0])
+        if np.sqrt(6.0) * std < self._stop_m:
+            return None
+        self.change = Change(
+            'unsteady',
+            f'{sensor} and the arm do not repeat: something is loose, or was moved,',
+            False,
+            float(np.sqrt(6.0) * std),
+            None,
+            None,
+            max(self._rounds[1].configurations),
+            0.0,
+        )
+        return self.change
+
+    def _off(self, row: ReferenceReading, T_R_N: FloatArray) -> FloatArray:
+        """Return measured minus nominal marker position in R, m, (3,): less the arm's own part."""
+        nominal = self._chain.positions(row.q, self._markers[row.marker])
+        return np.asarray(transforms.apply(T_R_N, row.position) - nominal)
+
+    # Changes
+
+    def _p_value(
+        self,
+        number: int,
+        noise: Mapping[str, tuple[float, int]],
+        T_R_N: Mapping[str, FloatArray],
+    ) -> float:
+        """Return the p-value that a round is as the first ones were.
+
+        The smallest of several tests, times their number (Bonferroni), half of it for each kind:
+        all differences of a sensor, whatever they look like; and what each cause explains of all
+        of them, which finds a change in one direction far sooner.
+        """
+        first = [self._begin] if self._begin else [0, 1]
+        places, rows = [], []
+        for key, row in self._rounds[number].rows.items():
+            before = [self._rounds[i].rows.get(key) for i in first]
+            if key[1] not in noise:
+                continue
+            T = T_R_N[key[1]]
+            offs = [self._off(b, T) for b in before if b is not None]
+            if offs:
+                std = noise[key[1]][0] * np.sqrt(1.0 + 1.0 / len(offs))
+                rows.append((std, (self._off(row, T) - np.mean(offs, axis=0)) / std))
+                places.append(Place(row.q, row.sensor, row.marker, self._markers[row.marker]))
+        if not rows:
+            return 1.0
+        std = np.array([row[0] for row in rows])
+        z = np.array([row[1] for row in rows])
+        whole, single = [], []
+        for sensor, (_, freedoms) in noise.items():
+            mine = z[[place.sensor == sensor for place in places]]
+            if len(mine):
+                whole.append(stats.f.sf(np.mean(mine**2), mine.size, freedoms))
+        freedoms = min(freedoms for _, freedoms in noise.values())
+        for cause in causes(self._chain, places):
+            signal = (cause.jacobian / std[:, None, None]).reshape(z.size, -1)
+            basis, size, _ = np.linalg.svd(signal, full_matrices=False)
+            basis = basis[:, size > 1e-9 * max(size[0], 1e-300)]
+            if basis.shape[1]:
+                explained = float(np.sum((basis.T @ z.ravel()) ** 2))
+                single.append(stats.f.sf(explained / basis.shape[1], basis.shape[1], freedoms))
+        return 2.0 * min(min(tests) * len(tests) for tests in (whole, single) if tests)
+
+    def _explain(
+        self,
+        number: int,
+        noise: Mapping[str, tuple[float, int]],
+        T_R_N: Mapping[str, FloatArray],
+        p_value: float,
+    ) -> Change:
+        """Find the cause, and when it came, that explain the rounds best (by BIC)."""
+        rounds = range(self._begin, number + 1)
+        keys = [
+            key
+            for key in sorted(self._rounds[number].rows)
+            if key[1] in noise and any(key in self._rounds[i].rows for i in rounds if i != number)
+        ]
+        rows = [
+            (i, g) for i in rounds for g, key in enumerate(keys) if key in self._rounds[i].rows
+        ]
+        group = np.array([g for _, g in rows])
+        at = np.array([i for i, _ in rows])
+        read = [self._rounds[i].rows[keys[g]] for i, g in rows]
+        scale = np.array([1.0 / noise[row.sensor][0] for row in read])[:, None]
+        off = np.array([self._off(row, T_R_N[row.sensor]) for row in read])
+        y = _centered(off, group) * scale
+        stamps = np.array([row.stamp_s for row in read])
+        places = [
+            Place(row.q, row.sensor, row.marker, self._markers[row.marker])
+            for row in (self._rounds[number].rows[key] for key in keys)
+        ]
+        steps = [i for i in rounds if i > self._begin and (i > 1 or self._begin)]
+        patterns: list[tuple[int | None, FloatArray]] = []
+        patterns += [(i, (at >= i).astype(float)) for i in steps]
+        if len(steps) > 1:
+            # One later round cannot tell a drift from a step.
+            span = max(float(np.ptp(stamps)), 1e-9)
+            patterns.append((None, (stamps - stamps.min()) / span))
+        fits: list[tuple[float, float, FloatArray, Cause, int | None]] = []
+        data = max(y.size - 3 * len(keys), 2)
+        known = min(freedoms for _, freedoms in noise.values())
+        for cause in causes(self._chain, places):
+            per_row = cause.jacobian[group]
+            for step, course in patterns:
+                x = _centered(course[:, None, None] * per_row, group) * scale[..., None]
+                flat = x.reshape(-1, x.shape[-1])
+                theta, _, rank, _ = np.linalg.lstsq(flat, y.ravel(), rcond=None)
+                left = float(np.sum((y.ravel() - flat @ theta) ** 2))
+                # Student's: the noise that differences are counted in is an estimate itself.
+                score = (known + data) * np.log1p(left / known) + rank * np.log(data)
+                score += LOOKS_ALIKE if step is None else 0.0
+                fits.append((score, left, theta, cause, step))
+        score, left, theta, cause, step = min(fits, key=lambda fit: fit[0])
+        freedoms = max(data - len(theta), 1)
+        poor = stats.f.sf(left / freedoms, freedoms, known)
+        share = np.sqrt(left / max(float(np.sum(y**2)), 1e-300))
+        first_new = number if step is None else step
+        earlier = [c for i in range(first_new) for c in self._rounds[i].configurations]
+        after, before = max(earlier, default=None), min(self._rounds[first_new].configurations)
+        if step is None:
+            after = max(self._rounds[self._begin].configurations)
+        if poor < UNEXPLAINED_P and share > UNEXPLAINED_SHARE:
+            last = {g: off[j] for j, (i, g) in enumerate(rows) if i == number}
+            first = {g: off[j] for j, (i, g) in reversed(list(enumerate(rows)))}
+            size = max(float(np.linalg.norm(last[g] - first[g])) for g in last)
+            subject = 'something changed that no single cause explains'
+            return Change('unexplained', subject, False, size, None, after, before, p_value)
+        alike = {
+            other.subject
+            for value, _, _, other, when in fits
+            if value < score + LOOKS_ALIKE and other.subject != cause.subject
+        }
+        size = float(np.max(np.linalg.norm(cause.jacobian @ theta, axis=-1)))
+        turned = theta[cause.shifts :]
+        return Change(
+            cause.kind,
+            cause.subject,
+            step is None,
+            size,
+            float(np.linalg.norm(turned)) if len(turned) else None,
+            after,
+            before,
+            p_value,
+            tuple(sorted(alike)),
+        )
+
+
+def _centered(values: FloatArray, group: IntArray) -> FloatArray:
+    """Return values (n, ...) less the mean of their group, (n,): where each began is unknown."""
+    count = np.bincount(group)
+    total = np.zeros((len(count), *values.shape[1:]))
+    np.add.at(total, group, values)
+    mean = total / count.reshape(-1, *(1,) * (values.ndim - 1))
+    return np.asarray(values - mean[group])

@@ -1,0 +1,204 @@
+"""Three ready ways to use the offsets: re-master, an offset layer, or a corrected URDF.
+
+The true joint angle is the reported one plus the offset. Each way corrects all of it, so only one
+may be in use at a time.
+
+An offset that the data cannot tell is in none of the three: its mean is a choice of the fit (0, or
+where the marker's nominal place leads), and applied it would move the arm for no reason. Each file
+says which joints are left out, and why.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree
+
+import numpy as np
+
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import matrix_from_rpy, rotation_vector_to_matrix
+from remaster_ros.session.safe_yaml import dump_yaml
+from remaster_ros.types import FloatArray
+
+if TYPE_CHECKING:
+    from remaster_ros.calibration.result import FitResult
+
+REMASTER_FILE = 'remaster.txt'
+LAYER_FILE = 'offset_layer.yaml'
+URDF_FILE = 'robot_calibrated.urdf'
+
+_PROLOG = re.compile(r'(?:\s*(?:<\?.*?\?>|<!--.*?-->))*\s*', re.DOTALL)
+_LIMITS = {
+    'limit': {'lower', 'upper'},
+    'safety_controller': {'soft_lower_limit', 'soft_upper_limit'},
+}
+
+
+def exports(result: FitResult) -> dict[str, str]:
+    """Return the three files of the folder ``apply`` next to fit.json: name -> text."""
+    return {
+        REMASTER_FILE: remaster_text(result),
+        LAYER_FILE: layer_text(result),
+        URDF_FILE: calibrated_urdf(
+            result.session.urdf,
+            result.chain,
+            np.where(result.identifiable, result.joint_offsets, 0.0),
+            notes=(
+                *(f'CHECK FIRST: {line}' for line in result.implausible),
+                *(
+                    f'left out, not identifiable: {joint}: {why}'
+                    for joint, why in left_out(result).items()
+                ),
+            ),
+        ),
+    }
+
+
+def left_out(result: FitResult) -> dict[str, str]:
+    """Return the joints whose offsets are not applied -> what the data cannot tell them from."""
+    return {
+        joint: why
+        for joint, known, why in zip(
+            result.joint_names, result.identifiable, result.why, strict=True
+        )
+        if not known
+    }
+
+
+def remaster_text(result: FitResult) -> str:
+    """Return the instructions for re-mastering on the robot's own pad."""
+    rows = []
+    for i in np.flatnonzero(result.identifiable):
+        offset, std = np.degrees((result.joint_offsets[i], result.joint_offsets_std[i]))
+        name = result.joint_names[i]
+        rows.append(f'  {name:<20} {offset:>+12.4f} {std:>10.4f} {0.0 - offset:>+16.4f}')
+    head = f'  {"joint":<20} {"offset, deg":>12} {"std, deg":>10} {"drive to, deg":>16}'
+    notes = [f'  {joint}: {why}' for joint, why in left_out(result).items()]
+    return '\n'.join(
+        [
+            f'Joint zero-offsets of robot {result.chain.name!r}',
+            f'(URDF with SHA-256 {result.session.urdf_sha256})',
+            '',
+            *(f'CHECK FIRST: {line}' for line in result.implausible),
+            *(('',) if result.implausible else ()),
+            'The true joint angle is the reported one plus the offset. Use ONE of three ways,',
+            'never two at once:',
+            '',
+            '1. Re-master on the pad: drive each joint to the angle in the last column, as the',
+            "   robot reports it now, and set that place as the joint's new zero.",
+            f'2. An offset layer between planner and controller: {LAYER_FILE}.',
+            f'3. A corrected robot model for planner and controller: {URDF_FILE}.',
+            '',
+            *((head, *rows) if rows else ('  No joint: these data tell no offset.',)),
+            *(('', 'Left out of all three, as the data cannot tell their offsets. Leave these',
+               'joints as they are:', *notes) if notes else ()),
+            '',
+            'Afterwards measure a few poses again and run "remaster accuracy": it shows whether',
+            'the offsets are in use.',
+            '',
+        ]
+    )  # fmt: skip
+
+
+def layer_text(result: FitResult) -> str:
+    """Return the offsets as a ROS 2 parameter file for an offset layer."""
+    head = (
+        '# Joint zero-offsets, rad. A layer between planner and controller:\n'
+        '#   command to the controller = planned angle - offset\n'
+        '#   angle to the planner      = reported angle + offset\n'
+        "# Shift the joint limits as well: the controller's limits apply to its own angles.\n"
+    )  # fmt: skip
+    for line in result.implausible:
+        head += f'# CHECK FIRST: {line}\n'
+    missing = left_out(result)
+    for joint, why in missing.items():
+        head += f'# Left out, not identifiable: {joint}: {" ".join(why.split())}\n'
+    known = np.flatnonzero(result.identifiable)
+    lists: dict[str, list[str] | list[float]] = {
+        'joint_names': [result.joint_names[i] for i in known],
+        'joint_offsets': [float(result.joint_offsets[i]) for i in known],
+        'joint_offsets_std': [float(result.joint_offsets_std[i]) for i in known],
+        'left_out': list(missing),
+    }
+    parameters = {
+        'robot': result.chain.name,
+        'urdf_sha256': result.session.urdf_sha256,
+        # ROS cannot tell the type of an empty list.
+        **{key: values for key, values in lists.items() if values},
+    }
+    return head + dump_yaml({'/**': {'ros__parameters': parameters}})
+
+
+def calibrated_urdf(
+    urdf: str,
+    chain: SerialChain,
+    joint_offsets: FloatArray,
+    notes: Sequence[str] = (),
+) -> str:
+    """Return the URDF whose kinematics at reported angles is that of the true ones.
+
+    Each joint's origin is turned by its offset about its axis, and its limits are shifted the
+    other way, so that they still stop the arm in the same places. A joint that mimics one of them
+    follows the true angle. What names the joints elsewhere (``<transmission>``,
+    ``<ros2_control>``, ``<gazebo>``) means reported angles and stays as it is.
+
+    Parameters
+    ----------
+    urdf
+        The nominal robot, as `chain` was read from.
+    chain
+        Its joints.
+    joint_offsets
+        rad, (k,).
+    notes
+        What else a comment in the file says, such as the joints left out.
+    """
+    parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
+    root = ElementTree.fromstring(urdf, parser)
+    # The robot's own children: a <transmission> or <ros2_control> has joints of the same names.
+    joints = {joint.get('name'): joint for joint in root.findall('joint')}
+    for name, axis, offset in zip(chain.joint_names, chain.axes, joint_offsets, strict=True):
+        if offset == 0.0:
+            continue
+        joint = joints[name]
+        origin = joint.find('origin')
+        if origin is None:
+            origin = ElementTree.Element('origin', xyz='0 0 0', rpy='0 0 0')
+            joint.insert(0, origin)
+        rpy = [float(angle) for angle in origin.get('rpy', '0 0 0').split()]
+        turned = matrix_from_rpy(rpy) @ rotation_vector_to_matrix(offset * axis)
+        origin.set('rpy', ' '.join(repr(angle) for angle in _rpy(turned)))
+        for tag, keys in _LIMITS.items():
+            for element in joint.findall(tag):
+                for key in keys.intersection(element.keys()):
+                    element.set(key, repr(float(element.attrib[key]) - float(offset)))
+        for other in joints.values():
+            for mimic in other.findall('mimic'):
+                if mimic.get('joint') == name:
+                    share = float(mimic.get('multiplier', '1')) * float(offset)
+                    mimic.set('offset', repr(float(mimic.get('offset', '0')) + share))
+    for text in (*reversed(notes), 'joint origins and limits hold the calibrated zero-offsets'):
+        # Two hyphens would end the comment.
+        note = ElementTree.Comment(f' {re.sub("-(?=-)", "- ", text).rstrip("-")} ')
+        note.tail = '\n  '
+        root.insert(0, note)
+    # What stands before the root (who made the model, under which licence) is no part of the tree.
+    prolog = _PROLOG.match(urdf)
+    head = prolog.group() if prolog else ''
+    return head + ElementTree.tostring(root, encoding='unicode') + '\n'
+
+
+def _rpy(rotation: FloatArray) -> tuple[float, float, float]:
+    """Return roll, pitch, yaw of R = Rz(yaw) Ry(pitch) Rx(roll), exact at pitch ±90° too.
+
+    The roll is taken after undoing the yaw, so that where the two act alike, an error in one is
+    made good by the other.
+    """
+    R = rotation
+    yaw = np.arctan2(R[1, 0], R[0, 0])
+    s, c = np.sin(yaw), np.cos(yaw)
+    pitch = np.arctan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
+    roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return float(roll), float(pitch), float(yaw)

@@ -1,0 +1,1 @@
+"""What the joint offsets leave unexplained, and its physical cause."""

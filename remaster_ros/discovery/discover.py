@@ -1,0 +1,246 @@
+"""What the simulation gets wrong: its cause by name, the model extended by it, the gain measured.
+
+`discover_session` looks at what the offsets model leaves, screens every cell of place, driver and
+form, and adds what passes (`discovery_select`). Optimization rows decide; validation rows only
+measure the gain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from remaster_ros.calibration.estimate import Estimate, Problem, estimate
+from remaster_ros.calibration.fit import fit_session
+from remaster_ros.calibration.outliers import find_outliers
+from remaster_ros.calibration.result import FitResult
+from remaster_ros.calibration.sampling import Progress, silent
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.evidence import Solution, solve
+from remaster_ros.discovery.explain import FoundEffect, describe
+from remaster_ros.discovery.gain import (
+    Gain,
+    gain_of,
+    noise_by_range,
+    pose_common_fraction,
+)
+from remaster_ros.discovery.marker_offsets import loosened, moved_markers
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.stepwise_selection import Search, Selection
+from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
+from remaster_ros.discovery.to_extension import extension_of
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.types import BoolArray, FloatArray, IntArray, Session
+
+Verdict = Literal['effects', 'none', 'undetermined']
+# Of the means, in standard deviations: 400 effective draws, enough for values of two figures.
+PRECISION = 0.05
+# A cause with this share of the gain is one of the leaders.
+LEADING_SHARE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Discovery:
+    """What was found in a session.
+
+    Attributes
+    ----------
+    verdict
+        'effects', 'none', or 'undetermined' where the leading explanations tie.
+    effects
+        The causes, the largest first.
+    gain
+        On the validation rows.
+    pose_common_fraction
+        Share of the remaining noise that all rows of a pose have in common.
+    noise_by_range
+        By sensor: ratio of the errors far to near, and the p-value that they are equal.
+    outliers
+        ``observation`` of every row set aside, with the reason.
+    untestable
+        Name of an effect -> why this session cannot show it.
+    groups
+        The cells of each effect that was searched for, in the order of ``effects``.
+    selection
+        How the cells were found.
+    residuals
+        What the search worked on.
+    offsets_before
+        Zero-offsets without the effects, and their stds (NaN where the gauge holds them), rad.
+    fit
+        The sampled fit, with the effects where there are any.
+    thinning
+        Which part of a large session was searched, and what the rest says; None for all of it.
+    """
+
+    verdict: Verdict
+    effects: tuple[FoundEffect, ...]
+    gain: Gain
+    pose_common_fraction: float
+    noise_by_range: Mapping[str, Mapping[str, float]]
+    outliers: tuple[tuple[int, str], ...]
+    untestable: Mapping[str, str]
+    offsets_before: tuple[FloatArray, FloatArray]
+    groups: tuple[tuple[Cell, ...], ...]
+    selection: Selection
+    residuals: Residuals
+    fit: FitResult
+    thinning: Thinning | None = None
+
+
+def discover_session(
+    session: Session,
+    *,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+    clock: Callable[[], float] | None = None,
+) -> Discovery:
+    """Find what the offsets model leaves out, and extend it.
+
+    Parameters
+    ----------
+    session
+        As read from its folder.
+    rng
+        Source of all randomness: the same one gives the same result.
+    progress
+        Called with the stage and the share of it that is done.
+    clock
+        Returns seconds, to time the samplers.
+
+    Raises
+    ------
+    InputError
+        A session that does not fit its robot.
+    InsufficientDataError
+        Data that do not allow an answer.
+    """
+    report = progress if progress is not None else silent
+    findings = find_causes(session, rng=rng, progress=report)
+    residuals, solution = findings.residuals, findings.selection.solution
+    fit = fit_session(
+        session,
+        rng=rng,
+        clock=clock,
+        priors=loosened(session, findings.effects),
+        precision=PRECISION,
+        extension=extension_of(residuals, solution) if solution.cells else None,
+        progress=lambda _, share: report('sampling the extended model', share),
+    )
+    effects = tuple(effect.sampled(fit) for effect in findings.effects)
+    verdict: Verdict = 'effects' if effects else 'none'
+    # A tie over a small remainder does not put the rest in doubt.
+    if any(effect.tied and (effect.share or 0.0) > LEADING_SHARE for effect in effects):
+        verdict = 'undetermined'
+    return Discovery(
+        verdict=verdict,
+        effects=effects,
+        gain=gain_of(findings.before, solution, fit, rng),
+        pose_common_fraction=pose_common_fraction(solution),
+        noise_by_range=noise_by_range(residuals, solution),
+        outliers=fit.left_out,
+        untestable=findings.untestable,
+        offsets_before=_offsets(findings.before),
+        groups=findings.groups,
+        selection=findings.selection,
+        residuals=residuals,
+        fit=fit,
+        thinning=findings.thinning,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What is found before anything is sampled; fields as in `Discovery`.
+
+    ``before`` is the fit of the session as it is, without any effect.
+    """
+
+    before: Estimate
+    residuals: Residuals
+    selection: Selection
+    groups: tuple[tuple[Cell, ...], ...]
+    effects: tuple[FoundEffect, ...]
+    untestable: Mapping[str, str]
+    thinning: Thinning | None
+
+
+def find_causes(session: Session, *, rng: np.random.Generator, progress: Progress) -> Findings:
+    """Search a session for causes; see `discover_session`."""
+    progress('offsets', 0.0)
+    before = found = estimate(Problem.of(session))
+    residuals = Residuals.of(found)
+    bare = solve(residuals, ())
+    moved = moved_markers(found, residuals, bare) if bare is not None else ()
+    if moved:
+        # A marker that is pulled to where it is not leaves errors for other causes to explain.
+        found = estimate(Problem.of(session, loosened(session, moved)))
+        residuals = Residuals.of(found)
+    pool = draw_rows(found.problem.measurements, found.problem.fitted, rng)
+    thinned = len(pool) < len(found.problem.fitted)
+    if thinned:
+        residuals = residuals.only(np.intersect1d(pool, found.kept), found.model.reference)
+    untestable = {
+        name: why for name, effect in EFFECTS.items() if (why := effect.needs(residuals.scene))
+    }
+    cells = [
+        cell
+        for name, effect in EFFECTS.items()
+        if name not in untestable and name != 'marker_offset'
+        for cell in effect.cells(residuals.scene)
+    ]
+    search = Search(
+        residuals,
+        tuple(cells),
+        rng,
+        lambda data, solution: _judged(found, data, solution, pool),
+        lambda share: progress('searching causes', share),
+    )
+    selection = search.run()
+    residuals = search.data
+    groups, effects = describe(
+        residuals, selection, cells, lambda share: progress('comparing look-alikes', share)
+    )
+    effects += moved_markers(found, residuals, selection.solution)
+    thinning = None
+    if thinned:
+        thinning = judge_by_others(
+            residuals, found.kept, residuals.rows.source, selection.empty, selection.solution
+        )
+    return Findings(before, residuals, selection, groups, effects, untestable, thinning)
+
+
+def _offsets(found: Estimate) -> tuple[FloatArray, FloatArray]:
+    """Return the zero-offsets of the fit without effects and their stds, rad, (k,) each."""
+    joints = found.model.joints
+    std = np.full(joints, np.nan)
+    free = found.posterior.free
+    angles = free < joints
+    std[free[angles]] = np.sqrt(np.diag(found.mode.covariance)[: len(free)][angles])
+    return found.model.offsets(found.mode.z), std
+
+
+def _judged(
+    found: Estimate, residuals: Residuals, solution: Solution, pool: IntArray
+) -> Residuals:
+    """Return the residuals of the rows of the pool that the extended model does not call gross."""
+    problem = found.problem
+    every = residuals.only(pool, found.model.reference)
+    left = every.left(solution)
+
+    def refit(keep: BoolArray) -> FloatArray:
+        return left
+
+    try:
+        gross = find_outliers(every.rows, refit, left, problem.sensor_names).gross
+    except InsufficientDataError:
+        # What is left has long tails: no reason to set a tenth of the rows aside.
+        return residuals
+    kept = np.sort(every.rows.source[~gross])
+    if np.array_equal(kept, np.sort(residuals.rows.source)):
+        return residuals
+    return residuals.only(kept, found.model.reference)

@@ -1,0 +1,44 @@
+"""Backlash: where a joint stops depends on the side it came from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from remaster_ros.discovery.effects.base import Cell, Columns, Effect, at_joint, needs_approach
+from remaster_ros.discovery.effects.context import Scene
+
+
+def cells(scene: Scene) -> Iterator[Cell]:
+    """One cell per joint: δq_j = b_j sign(q_j - from_q_j)."""
+    for joint in scene.moving:
+
+        def columns(scene: Scene, joint: int = joint) -> Columns:
+            return at_joint(joint, scene.approach[:, joint - 1])
+
+        yield Cell(
+            name=EFFECT.name,
+            joints=(joint,),
+            place=EFFECT.place,
+            driver=EFFECT.driver,
+            form=EFFECT.form,
+            parameters=(f'half_backlash_{joint}',),
+            unit=EFFECT.unit,
+            columns=columns,
+            drawn_from=scene.joints,
+        )
+
+
+EFFECT = Effect(
+    name='backlash',
+    place='joint_angle',
+    driver='approach',
+    form='step',
+    equation='δq_j = ½ B_j sign(q_j − from_q_j)',
+    source='Nordin & Gutman 2002, Automatica 38',
+    unit='rad',
+    plausible=(1e-5, 2e-3),
+    sentence='Where {subject} stops depends on the side it comes from (gear play).',
+    separate_by='each pose approached from both sides, by small and by large moves',
+    cells=cells,
+    needs=needs_approach,
+)

@@ -1,0 +1,181 @@
+"""A cell: where an error enters, what drives it, in which form; and a named effect made of such.
+
+The true joint angle is the reported one plus the zero-offset plus effects at the place
+``joint_angle``. Everything else displaces the marker.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.types import FloatArray
+
+Place = Literal[
+    'joint_angle', 'link_translation', 'link_rotation', 'base_rotation', 'marker', 'sensor_frame'
+]
+PLACES: tuple[Place, ...] = (
+    'joint_angle',
+    'link_translation',
+    'link_rotation',
+    'base_rotation',
+    'marker',
+    'sensor_frame',
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """What one unit of each of m parameters does to each of n rows.
+
+    Attributes
+    ----------
+    at
+        Index of the joint whose angle it adds to; None where it displaces the marker.
+    values
+        Added joint angle, rad per unit, (n, m), or displacement in R, m per unit, (n, 3, m).
+    """
+
+    at: int | None
+    values: FloatArray
+
+    @property
+    def size(self) -> int:
+        """Number of parameters m."""
+        return self.values.shape[-1]
+
+    def displacement(self, scene: Scene) -> FloatArray:
+        """Return the displacement of the marker in R to first order, m per unit, (n, 3, m)."""
+        if self.at is None:
+            return self.values
+        return scene.jacobian[:, :, self.at, None] * self.values[:, None, :]
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One candidate cause: a place, a driver and a form, with its parameters.
+
+    Attributes
+    ----------
+    name
+        Of the named effect; 'unnamed' for the rest.
+    joints
+        1-based; () where none.
+    place, driver, form
+        As discovery.json has them.
+    parameters, unit
+        Name of each of the m parameters, and their common unit.
+    columns
+        What a unit of each does.
+    drawn_from
+        How many cells like it are tried: its prior probability is that of its kind over this.
+    penalty
+        For free forms: precision of the parameters, (m, m), up to the smoothness; None else.
+    variant
+        Tells cells of the same name and joints apart: the order of a harmonic, an axis.
+    subject
+        The sensor or marker it is about; '' where it is about joints or the whole arm.
+    """
+
+    name: str
+    joints: tuple[int, ...]
+    place: Place
+    driver: str
+    form: str
+    parameters: tuple[str, ...]
+    unit: str
+    columns: Callable[[Scene], Columns]
+    drawn_from: int = 1
+    penalty: FloatArray | None = None
+    variant: str = ''
+    subject: str = ''
+
+    @property
+    def size(self) -> int:
+        """Number of parameters m."""
+        return len(self.parameters)
+
+    @property
+    def key(self) -> tuple[str, tuple[int, ...], str, str, str, str]:
+        """What makes this cell another than the others."""
+        return self.name, self.joints, self.place, self.driver, self.form, self.label
+
+    @property
+    def label(self) -> str:
+        """Subject and variant in one."""
+        return f'{self.subject} {self.variant}'.strip()
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """A physical cause with a name: everything that the program knows of it.
+
+    Attributes
+    ----------
+    name
+        As in discovery.json.
+    place, driver, form
+        Of its cells.
+    equation, source
+        What it does, and where that is written.
+    unit
+        Of its parameters.
+    plausible
+        Range of size that real machines have, in ``unit``.
+    sentence
+        For a technician; ``{subject}`` (its joints or sensor), ``{other}`` (the joint that
+        drives) and ``{driver}`` are filled in.
+    separate_by
+        Which measurements tell it from others.
+    cells
+        All of its cells for a scene.
+    needs
+        Tells why a scene cannot show it; '' where it can.
+    """
+
+    name: str
+    place: Place
+    driver: str
+    form: str
+    equation: str
+    source: str
+    unit: str
+    plausible: tuple[float, float]
+    sentence: str
+    separate_by: str
+    cells: Callable[[Scene], Iterable[Cell]]
+    needs: Callable[[Scene], str] = field(default=lambda scene: '')
+
+
+def at_joint(joint: int, *features: FloatArray) -> Columns:
+    """Return columns that add features (n,) to the angle of a joint (1-based)."""
+    return Columns(joint - 1, np.stack(features, axis=-1))
+
+
+def displaced(*shifts: FloatArray) -> Columns:
+    """Return columns that displace the marker by shifts (n, 3) in R, m per unit."""
+    return Columns(None, np.stack(shifts, axis=-1))
+
+
+def turned(scene: Scene, axes: Sequence[FloatArray], about: FloatArray) -> Columns:
+    """Return columns that turn the marker about points (n, 3), m, by axes (n, 3), rad per unit."""
+    return displaced(*(np.cross(axis, scene.points - about) for axis in axes))
+
+
+def needs_gravity(scene: Scene) -> str:
+    """Say why gravity's effects cannot be tested; '' where they can."""
+    return '' if scene.has_gravity else 'the URDF has no link masses, so gravity is unknown'
+
+
+def needs_approach(scene: Scene) -> str:
+    """Say why approach and last move cannot be tested; '' where they can."""
+    return '' if scene.has_approach else 'where the arm came from (from_q) is not recorded'
+
+
+def needs_time(scene: Scene) -> str:
+    """Say why drift cannot be tested; '' where it can."""
+    return '' if scene.has_time else 'all rows have the same time'

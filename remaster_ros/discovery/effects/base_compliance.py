@@ -1,0 +1,54 @@
+"""Base compliance: the arm's weight tips the stand it is bolted to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell, Columns, Effect, needs_gravity, turned
+from remaster_ros.discovery.effects.context import Scene
+
+
+def cells(scene: Scene) -> Iterator[Cell]:
+    """One compliance for all directions, or one about each horizontal axis."""
+
+    def isotropic(scene: Scene) -> Columns:
+        return turned(scene, [scene.base_moment], np.zeros(3))
+
+    def by_axis(scene: Scene) -> Columns:
+        axes = [scene.base_moment * unit for unit in np.eye(3)[:2]]
+        return turned(scene, axes, np.zeros(3))
+
+    for variant, columns, parameters in (
+        ('isotropic', isotropic, ('base_compliance',)),
+        ('by axis', by_axis, ('base_compliance_x', 'base_compliance_y')),
+    ):
+        yield Cell(
+            name=EFFECT.name,
+            joints=(),
+            place=EFFECT.place,
+            driver=EFFECT.driver,
+            form=EFFECT.form,
+            parameters=parameters,
+            unit=EFFECT.unit,
+            columns=columns,
+            drawn_from=2,
+            variant=variant,
+        )
+
+
+EFFECT = Effect(
+    name='base_compliance',
+    place='base_rotation',
+    driver='gravity_moment',
+    form='linear',
+    equation='δp = (c M(q)) × p, M = Σ r × m g about the origin of R',
+    source='Nubiola & Bonev 2013, Robot. Comput.-Integr. Manuf. 29 (base and stiffness)',
+    unit='rad/(N m)',
+    plausible=(1e-7, 1e-4),
+    sentence='The base gives way under the weight of the arm (loose bolts or a soft stand).',
+    separate_by='the same poses at several angles of joint 1, with and without a payload',
+    cells=cells,
+    needs=needs_gravity,
+)

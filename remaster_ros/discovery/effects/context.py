@@ -1,0 +1,310 @@
+"""Everything an effect may depend on, row by row, at the solution of the offsets model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import apply
+from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements
+
+GRAVITY = (0.0, 0.0, -9.81)
+# A joint that moved less than this stays on the flank of its gears that it was on.
+STILL_RAD = 1e-4
+# A joint that turns less than this in all stands still.
+LEAST_TURN_RAD = 1e-2
+# A driver known in a smaller share of the rows cannot be tested.
+KNOWN_SHARE = 0.8
+# Temperatures that vary less than this drive nothing that could be seen.
+LEAST_WARMING_K = 0.2
+# Rows of a block: frames and Jacobians of so many take some ten megabytes.
+BLOCK_ROWS = 10_000
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The rows of a session as effects see them: n rows, k joints.
+
+    Attributes
+    ----------
+    chain
+        The nominal robot.
+    measurements
+        All rows; ``sensor`` and ``marker`` are indices into the names below.
+    sensor_names, marker_names
+        In the order of those indices.
+    joint_offsets
+        As fitted, rad, (k,).
+    markers
+        As fitted, in the tool frame, m, (markers, 3).
+    T_R_N
+        As fitted, (sensors, 4, 4).
+    """
+
+    chain: SerialChain
+    measurements: Measurements
+    sensor_names: tuple[str, ...]
+    marker_names: tuple[str, ...]
+    joint_offsets: FloatArray
+    markers: FloatArray
+    T_R_N: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of rows n."""
+        return len(self.measurements)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints k."""
+        return len(self.chain)
+
+    @property
+    def sensor(self) -> IntArray:
+        """Sensor index, (n,)."""
+        return self.measurements.sensor
+
+    @property
+    def marker(self) -> IntArray:
+        """Marker index, (n,)."""
+        return self.measurements.marker
+
+    @cached_property
+    def q(self) -> FloatArray:
+        """Joint angles with the zero-offsets, rad, (n, k)."""
+        return self.measurements.q + self.joint_offsets
+
+    @cached_property
+    def frames(self) -> FloatArray:
+        """Frame after each joint in R, (n, k, 4, 4)."""
+        return self.chain.frames(self.q)
+
+    @cached_property
+    def tool(self) -> FloatArray:
+        """Tool frame in R, (n, 4, 4)."""
+        return self.frames[:, -1] @ self.chain.T_fixed[-1]
+
+    @cached_property
+    def points(self) -> FloatArray:
+        """Modelled markers in R, m, (n, 3)."""
+        return apply(self.tool, self.markers[self.marker])
+
+    @cached_property
+    def jacobian(self) -> FloatArray:
+        """Velocity of the marker about each joint, m/rad, (n, 3, k)."""
+        return self.chain.position_jacobian(self.q, self.markers[self.marker])
+
+    @cached_property
+    def gravity_torque(self) -> FloatArray:
+        """Gravity's torque about each joint, N m, (n, k)."""
+        return self.chain.gravity_torque(self.q, GRAVITY)
+
+    @cached_property
+    def gravity_moment(self) -> FloatArray:
+        """Gravity's moment on each link about its joint, all that hangs on it, N m, (n, k, 3)."""
+        masses = self.chain.masses
+        moments = masses[:, None] * apply(self.frames, self.chain.centers_of_mass)
+        carried = np.cumsum(moments[:, ::-1], axis=1)[:, ::-1]
+        mass = np.cumsum(masses[::-1])[::-1]
+        arms = carried - mass[:, None] * self.frames[..., :3, 3]
+        return np.cross(arms, np.array(GRAVITY))
+
+    @cached_property
+    def base_moment(self) -> FloatArray:
+        """Gravity's moment of the whole arm about the origin of R, N m, (n, 3)."""
+        centers = apply(self.frames, self.chain.centers_of_mass)
+        moment = np.sum(self.chain.masses[:, None] * centers, axis=1)
+        return np.cross(moment, np.array(GRAVITY))
+
+    @cached_property
+    def has_gravity(self) -> bool:
+        """Does the URDF have link masses?"""
+        return self.chain.has_inertials
+
+    @cached_property
+    def last_move(self) -> FloatArray:
+        """How far each joint moved to get here, rad, (n, k); 0 where unknown."""
+        return np.nan_to_num(self.measurements.q - self.measurements.from_q, nan=0.0)
+
+    @cached_property
+    def approach(self) -> FloatArray:
+        """Sign of each joint's last move that was a move at all, (n, k); 0 before the first."""
+        sign = np.where(np.abs(self.last_move) > STILL_RAD, np.sign(self.last_move), 0.0)
+        order = np.argsort(self.measurements.stamp_s, kind='stable')
+        # The last row in time at or before each row at which the joint moved.
+        moved = np.where(sign[order] != 0.0, np.arange(len(self))[:, None], -1)
+        last = np.maximum.accumulate(moved, axis=0)
+        kept = np.take_along_axis(sign[order], np.maximum(last, 0), axis=0)
+        approach = np.zeros_like(sign)
+        approach[order] = np.where(last >= 0, kept, 0.0)
+        return approach
+
+    @cached_property
+    def has_approach(self) -> bool:
+        """Is it known where the arm came from?"""
+        known = np.all(np.isfinite(self.measurements.from_q), axis=1)
+        return bool(len(known) and np.mean(known) >= KNOWN_SHARE)
+
+    @cached_property
+    def elapsed_s(self) -> FloatArray:
+        """Time since the first row, s, (n,)."""
+        return self.measurements.stamp_s - self.measurements.stamp_s.min()
+
+    @cached_property
+    def has_time(self) -> bool:
+        """Do the rows lie apart in time?"""
+        return bool(np.ptp(self.elapsed_s) > 0.0)
+
+    @cached_property
+    def warming(self) -> FloatArray:
+        """Temperature above that of the first row that knows one, K, (n,); 0 where unknown."""
+        given = self.measurements.temperature_c
+        known = np.isfinite(given)
+        if not known.any():
+            return np.zeros(len(self))
+        first = given[known][np.argmin(self.measurements.stamp_s[known])]
+        return np.where(known, given - first, 0.0)
+
+    @cached_property
+    def has_temperature(self) -> bool:
+        """Is the temperature known, and does it vary?"""
+        known = np.isfinite(self.measurements.temperature_c)
+        return bool(np.mean(known) >= KNOWN_SHARE and np.ptp(self.warming) >= LEAST_WARMING_K)
+
+    @cached_property
+    def sensor_turn(self) -> FloatArray:
+        """Rotation of the row's sensor frame, R_R_N, (n, 3, 3)."""
+        return self.T_R_N[self.sensor, :3, :3]
+
+    @cached_property
+    def in_sensor(self) -> FloatArray:
+        """Modelled markers in the frame N of the row's sensor, m, (n, 3)."""
+        shift = self.points - self.T_R_N[self.sensor, :3, 3]
+        return np.einsum('nji,nj->ni', self.sensor_turn, shift)
+
+    @cached_property
+    def centers(self) -> FloatArray:
+        """Mean of the modelled markers that each sensor saw, in R, m, (sensors, 3)."""
+        points = self.chain.positions(
+            self.measurements.q, self.markers[self.marker], self.joint_offsets
+        )
+        # A sensor without rows has no cell that asks for its centre.
+        seen = [points[self.seen_by(sensor)] for sensor in range(len(self.sensor_names))]
+        return np.array([rows.mean(axis=0) if len(rows) else np.zeros(3) for rows in seen])
+
+    @cached_property
+    def range_m(self) -> FloatArray:
+        """Distance from the row's sensor, m, (n,)."""
+        return np.linalg.norm(self.in_sensor, axis=1)
+
+    def at(self, rows: IntArray) -> Scene:
+        """Return the scene of some rows, by their indices in this one and in that order.
+
+        Every value is that which the row has here, also where it depends on other rows: time
+        since the first row, the move before, a sensor's centre.
+        """
+        return PartOfScene(
+            self.chain,
+            self.measurements.select(rows),
+            self.sensor_names,
+            self.marker_names,
+            self.joint_offsets,
+            self.markers,
+            self.T_R_N,
+            self,
+            rows,
+        )
+
+    def blocks(self, rows: int = BLOCK_ROWS) -> Iterator[tuple[slice, Scene]]:
+        """Give the scene in runs of so many rows, each with its place; a small one as it is.
+
+        What a block computes goes with it, so memory does not grow with the rows.
+        """
+        if len(self) <= rows:
+            yield slice(0, len(self)), self
+            return
+        for start in range(0, len(self), rows):
+            where = slice(start, min(start + rows, len(self)))
+            yield where, self.at(np.arange(where.start, where.stop))
+
+    def seen_by(self, sensor: int) -> BoolArray:
+        """Return which rows a sensor measured, (n,)."""
+        return self.sensor == sensor
+
+    @cached_property
+    def moving(self) -> tuple[int, ...]:
+        """Joints (1-based) that take more than one angle."""
+        span = np.ptp(self.measurements.q, axis=0)
+        return tuple(int(joint) + 1 for joint in np.flatnonzero(span > LEAST_TURN_RAD))
+
+    def links(self) -> Sequence[int]:
+        """Return the links, 1-based, whose geometry can matter: from joint j to joint j + 1.
+
+        What lies before joint 1 is part of the registration, behind the last joint of the marker.
+        """
+        return range(1, self.joints)
+
+    def joint_origin(self, joint: int) -> FloatArray:
+        """Return the origin of a joint (1-based) in R, m, (n, 3)."""
+        return self.frames[:, joint - 1, :3, 3]
+
+    def link_rotation(self, joint: int) -> FloatArray:
+        """Return the rotation of the link moved by a joint (1-based) in R, (n, 3, 3)."""
+        return self.frames[:, joint - 1, :3, :3]
+
+
+@dataclass(frozen=True, eq=False)
+class PartOfScene(Scene):
+    """Some rows of a scene; what depends on more than a row itself is that of the whole.
+
+    Attributes
+    ----------
+    whole, rows
+        The scene, and which of its rows these are, (n,).
+    """
+
+    whole: Scene
+    rows: IntArray
+
+    @cached_property
+    def approach(self) -> FloatArray:
+        """As of the whole, (n, k)."""
+        return self.whole.approach[self.rows]
+
+    @cached_property
+    def has_approach(self) -> bool:
+        """As of the whole."""
+        return self.whole.has_approach
+
+    @cached_property
+    def elapsed_s(self) -> FloatArray:
+        """Time since the first row of the whole, s, (n,)."""
+        return self.whole.elapsed_s[self.rows]
+
+    @cached_property
+    def has_time(self) -> bool:
+        """As of the whole."""
+        return self.whole.has_time
+
+    @cached_property
+    def warming(self) -> FloatArray:
+        """Temperature above that of the whole's first row that knows one, K, (n,)."""
+        return self.whole.warming[self.rows]
+
+    @cached_property
+    def has_temperature(self) -> bool:
+        """As of the whole."""
+        return self.whole.has_temperature
+
+    @cached_property
+    def centers(self) -> FloatArray:
+        """As of the whole, (sensors, 3)."""
+        return self.whole.centers
+
+    @cached_property
+    def moving(self) -> tuple[int, ...]:
+        """As of the whole."""
+        return self.whole.moving

@@ -1,0 +1,56 @@
+"""Encoder eccentricity: a code disc off its axis reads wrong once and twice a turn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell, Columns, Effect, at_joint
+from remaster_ros.discovery.effects.context import Scene
+
+# Orders tried together: the disc off centre, the disc or its bearing oval, both.
+ORDERS = ((1,), (2,), (1, 2))
+
+
+def cells(scene: Scene) -> Iterator[Cell]:
+    """Sine and cosine of the joint's own angle."""
+    for joint in scene.moving:
+        for orders in ORDERS:
+
+            def columns(
+                scene: Scene, joint: int = joint, orders: tuple[int, ...] = orders
+            ) -> Columns:
+                angle = scene.measurements.q[:, joint - 1]
+                waves = [wave(order * angle) for order in orders for wave in (np.sin, np.cos)]
+                return at_joint(joint, *waves)
+
+            yield Cell(
+                name=EFFECT.name,
+                joints=(joint,),
+                place=EFFECT.place,
+                driver=EFFECT.driver,
+                form=EFFECT.form,
+                parameters=tuple(
+                    f'{wave}{order}_{joint}' for order in orders for wave in ('sin', 'cos')
+                ),
+                unit=EFFECT.unit,
+                columns=columns,
+                drawn_from=scene.joints * len(ORDERS),
+                variant='+'.join(map(str, orders)),
+            )
+
+
+EFFECT = Effect(
+    name='encoder_eccentricity',
+    place='joint_angle',
+    driver='own_angle',
+    form='sin/cos',
+    equation='δq_j = Σ_{h=1,2} a_h sin(h q_j) + b_h cos(h q_j)',
+    source='Sanders et al., encoder eccentricity; Lou et al. 2014, Rev. Sci. Instrum. 85',
+    unit='rad',
+    plausible=(1e-5, 5e-3),
+    sentence='The angle reading of {subject} errs once or twice per turn (encoder off centre).',
+    separate_by='poses that turn the joint through its whole range, at the same gravity torque',
+    cells=cells,
+)

@@ -1,0 +1,43 @@
+"""Encoder scale: a joint turns a little more than it reports, in proportion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from remaster_ros.discovery.effects.base import Cell, Columns, Effect, at_joint
+from remaster_ros.discovery.effects.context import Scene
+
+
+def cells(scene: Scene) -> Iterator[Cell]:
+    """One cell per joint: δq_j = s_j q_j."""
+    for joint in scene.moving:
+
+        def columns(scene: Scene, joint: int = joint) -> Columns:
+            return at_joint(joint, scene.measurements.q[:, joint - 1])
+
+        yield Cell(
+            name=EFFECT.name,
+            joints=(joint,),
+            place=EFFECT.place,
+            driver=EFFECT.driver,
+            form=EFFECT.form,
+            parameters=(f'scale_{joint}',),
+            unit=EFFECT.unit,
+            columns=columns,
+            drawn_from=scene.joints,
+        )
+
+
+EFFECT = Effect(
+    name='encoder_scale',
+    place='joint_angle',
+    driver='own_angle',
+    form='linear',
+    equation='δq_j = s_j q_j',
+    source='Mooring, Roth & Driels 1991, Fundamentals of Manipulator Calibration, ch. 2',
+    unit='rad/rad',
+    plausible=(1e-6, 1e-2),
+    sentence='The true turn of {subject} is not what is reported (gear ratio or encoder scale).',
+    separate_by='poses that turn the joint through its whole range',
+    cells=cells,
+)

@@ -1,0 +1,68 @@
+"""Joint axis tilt: a joint's axis is not parallel or square to the one before as drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell, Columns, Effect, turned
+from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.types import FloatArray
+
+# A tilt along the axis before is, with that joint's zero-offset, another name for a shift of the
+# link: of the two the shift is the simpler.
+RARITY = 3
+
+
+def cells(scene: Scene) -> Iterator[Cell]:
+    """Each joint after the first, about the axes of its frame that are not its own axis."""
+    for joint in range(2, scene.joints + 1):
+        directions = tilt_directions(scene, joint)
+        # A tilt has any direction; on a whole arm some of them are other names for a link's.
+        for axes in (''.join(directions), *directions):
+
+            def columns(
+                scene: Scene,
+                joint: int = joint,
+                chosen: tuple[FloatArray, ...] = tuple(directions[axis] for axis in axes),
+            ) -> Columns:
+                fixed = scene.chain.T_fixed[joint - 1][:3, :3]
+                turn = scene.link_rotation(joint - 1) @ fixed
+                return turned(scene, [turn @ axis for axis in chosen], scene.joint_origin(joint))
+
+            yield Cell(
+                name=EFFECT.name,
+                joints=(joint,),
+                place=EFFECT.place,
+                driver=EFFECT.driver,
+                form=EFFECT.form,
+                parameters=tuple(f'tilt_{axis}_{joint}' for axis in axes),
+                unit=EFFECT.unit,
+                columns=columns,
+                drawn_from=(scene.joints - 1) * (1 if len(axes) > 1 else RARITY * len(directions)),
+                variant=axes,
+            )
+
+
+def tilt_directions(scene: Scene, joint: int) -> dict[str, FloatArray]:
+    """Return the axes of a joint's frame (at angle zero) that are not along its own axis."""
+    own = scene.chain.axes[joint - 1]
+    return {
+        name: axis for name, axis in zip('xyz', np.eye(3), strict=True) if abs(axis @ own) < 0.9
+    }
+
+
+EFFECT = Effect(
+    name='joint_axis_tilt',
+    place='link_rotation',
+    driver='constant',
+    form='constant',
+    equation='δp = (R u φ) × (p − o_j), u ⊥ axis j, fixed to the link before joint j',
+    source='Hayati & Mirmirani 1985, J. Robotic Systems 2 (the fifth parameter)',
+    unit='rad',
+    plausible=(1e-5, 2e-2),
+    sentence='The axis of {subject} is tilted against its drawing.',
+    separate_by='all joint solutions of each pose: the tilt changes sign with the branch',
+    cells=cells,
+)

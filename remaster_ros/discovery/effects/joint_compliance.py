@@ -1,0 +1,44 @@
+"""Joint compliance: gravity's torque winds a joint up."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from remaster_ros.discovery.effects.base import Cell, Columns, Effect, at_joint, needs_gravity
+from remaster_ros.discovery.effects.context import Scene
+
+
+def cells(scene: Scene) -> Iterator[Cell]:
+    """One cell per joint: δq_j = c_j τ_j."""
+    for joint in range(1, scene.joints + 1):
+
+        def columns(scene: Scene, joint: int = joint) -> Columns:
+            return at_joint(joint, scene.gravity_torque[:, joint - 1])
+
+        yield Cell(
+            name=EFFECT.name,
+            joints=(joint,),
+            place=EFFECT.place,
+            driver=EFFECT.driver,
+            form=EFFECT.form,
+            parameters=(f'compliance_{joint}',),
+            unit=EFFECT.unit,
+            columns=columns,
+            drawn_from=scene.joints,
+        )
+
+
+EFFECT = Effect(
+    name='joint_compliance',
+    place='joint_angle',
+    driver='gravity_torque',
+    form='linear',
+    equation='δq_j = c_j τ_j(q), τ = axis · Σ (r × m g)',
+    source='Spong 1987, J. Dyn. Sys. Meas. Control 109; Klodmann et al. 2011 (DLR LWR)',
+    unit='rad/(N m)',
+    plausible=(1e-6, 1e-3),
+    sentence='The weight it carries winds up {subject} (soft gearbox or bearing).',
+    separate_by='the same poses with and without a payload on the tool',
+    cells=cells,
+    needs=needs_gravity,
+)

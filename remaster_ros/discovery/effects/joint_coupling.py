@@ -1,0 +1,58 @@
+"""Joint coupling: one joint's angle depends on another's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell, Columns, Effect, at_joint
+from remaster_ros.discovery.effects.context import Scene
+
+
+def cells(scene: Scene) -> Iterator[Cell]:
+    """Joint j by every other joint l: linear, or sine and cosine."""
+    count = 2 * scene.joints * max(1, len(scene.moving) - 1)
+    for joint in range(1, scene.joints + 1):
+        for other in scene.moving:
+            if other == joint:
+                continue
+
+            def linear(scene: Scene, joint: int = joint, other: int = other) -> Columns:
+                return at_joint(joint, scene.measurements.q[:, other - 1])
+
+            def waves(scene: Scene, joint: int = joint, other: int = other) -> Columns:
+                angle = scene.measurements.q[:, other - 1]
+                return at_joint(joint, np.sin(angle), np.cos(angle))
+
+            pair = f'{joint}_by_{other}'
+            for form, columns, parameters in (
+                ('linear', linear, (f'coupling_{pair}',)),
+                ('sin/cos', waves, (f'sin_{pair}', f'cos_{pair}')),
+            ):
+                yield Cell(
+                    name=EFFECT.name,
+                    joints=(joint, other),
+                    place=EFFECT.place,
+                    driver=f'angle_of_joint_{other}',
+                    form=form,
+                    parameters=parameters,
+                    unit='rad/rad' if form == 'linear' else 'rad',
+                    columns=columns,
+                    drawn_from=count,
+                )
+
+
+EFFECT = Effect(
+    name='joint_coupling',
+    place='joint_angle',
+    driver='other_angle',
+    form='linear or sin/cos',
+    equation='δq_j = c q_l, or a sin q_l + b cos q_l, l ≠ j',
+    source='Sciavicco & Siciliano 2000, Modelling and Control, sec. 5 (coupled transmissions)',
+    unit='rad/rad',
+    plausible=(1e-6, 1e-2),
+    sentence='The angle of {subject} follows the angle of {other} (coupled drives).',
+    separate_by='poses that turn one of the two joints and hold the other',
+    cells=cells,
+)

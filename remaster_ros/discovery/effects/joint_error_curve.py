@@ -1,0 +1,69 @@
+"""Joint error curve: an error that follows the joint's own angle in any shape."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell, Columns, Effect
+from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.splines import basis, centers, knot_vector, roughness
+from remaster_ros.types import FloatArray
+
+# The finest: gearbox errors have structure down to a few degrees; finer overfits any session.
+FINEST_KNOTS = np.radians(4.0)
+# A shape with a name that explains as much is the better answer.
+RARITY = 10
+# Below this many configurations per knot the curve is coarser.
+ROWS_PER_KNOT = 6.0
+
+
+def knots_of(scene: Scene, joint: int) -> FloatArray:
+    """Return the knots of a joint's curve: over its angles, as fine as the rows allow, rad."""
+    angle = scene.measurements.q[:, joint - 1]
+    low, high = float(angle.min()), float(angle.max())
+    configurations = len(np.unique(scene.measurements.configuration))
+    spacing = max(FINEST_KNOTS, (high - low) * ROWS_PER_KNOT / configurations)
+    return knot_vector(low, max(high, low + 3.0 * spacing), spacing)
+
+
+def cells(scene: Scene) -> Iterator[Cell]:
+    """One curve per joint."""
+    for joint in scene.moving:
+        knots = knots_of(scene, joint)
+        angles = np.degrees(centers(knots))
+
+        def columns(scene: Scene, joint: int = joint, knots: FloatArray = knots) -> Columns:
+            values = basis(scene.measurements.q[:, joint - 1], knots)
+            return Columns(joint - 1, values)
+
+        yield Cell(
+            name=EFFECT.name,
+            joints=(joint,),
+            place=EFFECT.place,
+            driver=EFFECT.driver,
+            form=EFFECT.form,
+            parameters=tuple(f'curve_{joint}_at_{angle:+.1f}deg' for angle in angles),
+            unit=EFFECT.unit,
+            columns=columns,
+            drawn_from=RARITY * scene.joints,
+            penalty=roughness(len(angles)),
+        )
+
+
+EFFECT = Effect(
+    name='joint_error_curve',
+    place='joint_angle',
+    driver='own_angle',
+    form='free',
+    equation='δq_j = Σ_i w_i B_i(q_j), cubic B-splines, smoothness by the evidence',
+    source='Eilers & Marx 1996, Statistical Science 11 (P-splines)',
+    unit='rad',
+    plausible=(1e-6, 5e-3),
+    sentence='The error of {subject} follows its own angle (gearbox or encoder): '
+    'the curve shows where.',
+    separate_by='poses that step the joint through its range, all else held; '
+    'with and without a payload',
+    cells=cells,
+)

@@ -1,0 +1,66 @@
+"""Link length: a joint's axis lies elsewhere on the link before it than the drawing says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell, Columns, Effect, displaced
+from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.types import FloatArray
+
+
+def cells(scene: Scene) -> Iterator[Cell]:
+    """Each link from joint j to joint j + 1, along its length and across it."""
+    for link in scene.links():
+        directions = link_directions(scene, link)
+        for axis, direction in directions.items():
+
+            def columns(
+                scene: Scene, link: int = link, direction: FloatArray = direction
+            ) -> Columns:
+                return displaced(scene.link_rotation(link) @ direction)
+
+            yield Cell(
+                name=EFFECT.name,
+                joints=(link,),
+                place=EFFECT.place,
+                driver=EFFECT.driver,
+                form=EFFECT.form,
+                parameters=(f'length_{link}' if axis == 'along' else f'offset_{axis}_{link}',),
+                unit=EFFECT.unit,
+                columns=columns,
+                drawn_from=len(scene.links()) * len(directions),
+                variant=axis,
+            )
+
+
+def link_directions(scene: Scene, link: int) -> dict[str, FloatArray]:
+    """Return the axes of the frame of a link, and its own direction where it is none of them."""
+    shift = scene.chain.T_fixed[link][:3, 3]
+    length = np.linalg.norm(shift)
+    axes = dict(zip('xyz', np.eye(3), strict=True))
+    if length < 1e-3:
+        return axes
+    along = shift / length
+    parallel = {name for name, axis in axes.items() if abs(axis @ along) > 0.999}
+    return {
+        'along': along,
+        **{name: axis for name, axis in axes.items() if name not in parallel},
+    }
+
+
+EFFECT = Effect(
+    name='link_length',
+    place='link_translation',
+    driver='constant',
+    form='constant',
+    equation='δp = R_j(q) d, d in the frame of the link that joint j moves',
+    source='Hayati & Mirmirani 1985, J. Robotic Systems 2; Everett et al. 1987',
+    unit='m',
+    plausible=(1e-5, 5e-3),
+    sentence='The link after {subject} is longer, shorter or offset against its drawing.',
+    separate_by='poses that fold and stretch the arm, with the tool turned at each',
+    cells=cells,
+)

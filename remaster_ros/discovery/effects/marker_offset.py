@@ -1,0 +1,50 @@
+"""Marker offset: the marker is not where the session says it is on the tool."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from remaster_ros.discovery.effects.base import Cell, Columns, Effect, displaced
+from remaster_ros.discovery.effects.context import Scene
+
+
+def cells(scene: Scene) -> Iterator[Cell]:
+    """Each marker, along the axes of the tool frame.
+
+    The offsets model fits the markers already: this cell is judged by how far the fit moved them,
+    against how well the session claims to know them.
+    """
+    for index, name in enumerate(scene.marker_names):
+
+        def columns(scene: Scene, index: int = index) -> Columns:
+            mine = (scene.marker == index)[:, None]
+            turn = scene.tool[:, :3, :3]
+            return displaced(*(turn[:, :, axis] * mine for axis in range(3)))
+
+        yield Cell(
+            name=EFFECT.name,
+            joints=(),
+            place=EFFECT.place,
+            driver=EFFECT.driver,
+            form=EFFECT.form,
+            parameters=tuple(f'{axis}_{name}' for axis in 'xyz'),
+            unit=EFFECT.unit,
+            columns=columns,
+            drawn_from=len(scene.marker_names),
+            subject=name,
+        )
+
+
+EFFECT = Effect(
+    name='marker_offset',
+    place='marker',
+    driver='constant',
+    form='constant',
+    equation='δp = R_tool(q) d',
+    source='eq. 8 of Van Wyk et al. with the marker as a parameter',
+    unit='m',
+    plausible=(1e-5, 2e-2),
+    sentence='The marker {subject} is not where the session says it is on the tool.',
+    separate_by='the marker measured against the tool plate, or the last joint turned by itself',
+    cells=cells,
+)

@@ -1,0 +1,65 @@
+"""Registration drift: the sensor's frame creeps against the robot's base."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell, Columns, Effect, displaced, needs_time
+from remaster_ros.discovery.effects.context import Scene
+
+
+def cells(scene: Scene) -> Iterator[Cell]:
+    """Each sensor's frame shifts steadily, or shifts and turns."""
+    for index, name in enumerate(scene.sensor_names):
+
+        def shift(scene: Scene, index: int = index) -> Columns:
+            amount = (scene.elapsed_s * scene.seen_by(index))[:, None]
+            return displaced(*(amount * scene.sensor_turn[:, :, axis] for axis in range(3)))
+
+        def motion(scene: Scene, index: int = index) -> Columns:
+            mine = scene.seen_by(index)
+            amount = (scene.elapsed_s * mine)[:, None]
+            arms = scene.points - scene.centers[index]
+            axes = [scene.sensor_turn[:, :, axis] for axis in range(3)]
+            shifts = [amount * axis for axis in axes]
+            # A turn seen at one metre, which has the unit of the shifts.
+            turns = [amount * np.cross(axis, arms) for axis in axes]
+            return displaced(*shifts, *turns)
+
+        shifts = tuple(f'drift_{axis}_{name}' for axis in 'xyz')
+        turns = tuple(f'drift_r{axis}_{name}' for axis in 'xyz')
+        for variant, columns, parameters in (
+            ('shift', shift, shifts),
+            ('shift and turn', motion, shifts + turns),
+        ):
+            yield Cell(
+                name=EFFECT.name,
+                joints=(),
+                place=EFFECT.place,
+                driver=EFFECT.driver,
+                form=EFFECT.form,
+                parameters=parameters,
+                unit=EFFECT.unit,
+                columns=columns,
+                drawn_from=2 * len(scene.sensor_names),
+                variant=variant,
+                subject=name,
+            )
+
+
+EFFECT = Effect(
+    name='registration_drift',
+    place='sensor_frame',
+    driver='time',
+    form='linear',
+    equation='δp = v t (+ ω t × (p − centroid)), in the sensor frame N',
+    source='tripod and mount creep; ISO 10360-10 drift checks',
+    unit='m/s',
+    plausible=(1e-10, 2e-6),
+    sentence='The sensor {subject} creeps against the robot base while measuring.',
+    separate_by='fixed reference markers measured again and again, and poses repeated in time',
+    cells=cells,
+    needs=needs_time,
+)

@@ -1,0 +1,74 @@
+"""Sensor distortion: straight lines come out bent, more so far from the sensor's axis."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell, Columns, Effect, displaced
+from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.types import FloatArray
+
+# No lens bends lengths about the sensor's origin, and over most rooms it looks like a plain scale.
+SPHERE_RARITY = 20
+
+
+def cells(scene: Scene) -> Iterator[Cell]:
+    """Each sensor: radial about its z axis, in metres or in field angle, or about its origin."""
+    for index, name in enumerate(scene.sensor_names):
+        for variant in ('radial', 'radial angle', 'radial sphere', 'quadratic'):
+
+            def columns(scene: Scene, index: int = index, variant: str = variant) -> Columns:
+                mine = scene.seen_by(index)[:, None]
+                shifts = [
+                    np.einsum('nij,nj->ni', scene.sensor_turn, shift * mine)
+                    for shift in distortions(scene.in_sensor, variant)
+                ]
+                return displaced(*shifts)
+
+            axes = 'xyz' if variant == 'quadratic' else ''
+            kind = variant.replace(' ', '_')
+            yield Cell(
+                name=EFFECT.name,
+                joints=(),
+                place=EFFECT.place,
+                driver=EFFECT.driver,
+                form='quadratic' if axes else 'radial',
+                parameters=tuple(f'{kind}_{axis}_{name}' for axis in axes) or (f'{kind}_{name}',),
+                unit='1/m' if axes else ('m/m' if 'angle' in variant else '1/m^2'),
+                columns=columns,
+                drawn_from=4
+                * len(scene.sensor_names)
+                * (SPHERE_RARITY if variant == 'radial sphere' else 1),
+                variant=variant,
+                subject=name,
+            )
+
+
+def distortions(p: FloatArray, variant: str) -> list[FloatArray]:
+    """Return the displacements in the sensor frame, m per unit, (n, 3) each, at p (n, 3)."""
+    across = p * (1.0, 1.0, 0.0)
+    square = np.sum(across**2, axis=1)[:, None]
+    if variant == 'radial':
+        return [square * across]
+    if variant == 'radial angle':
+        return [square / np.maximum(p[:, 2:] ** 2, 1e-2) * across]
+    if variant == 'radial sphere':
+        return [np.sum(p**2, axis=1)[:, None] * p]
+    return [square * axis for axis in np.eye(3)]
+
+
+EFFECT = Effect(
+    name='sensor_distortion',
+    place='sensor_frame',
+    driver='position',
+    form='quadratic, radial',
+    equation='δp = k r² p with r the distance from the sensor axis (or origin), or k r² e',
+    source='Brown 1971, Photogrammetric Engineering 37',
+    unit='1/m^2',
+    plausible=(1e-5, 1e-1),
+    sentence='The sensor {subject} distorts towards the edge of its view (lens calibration).',
+    separate_by='poses towards the edges of the sensor view, or the sensor moved and turned',
+    cells=cells,
+)

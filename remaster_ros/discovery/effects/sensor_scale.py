@@ -1,0 +1,63 @@
+"""Sensor scale: a sensor measures lengths too long or too short, in proportion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell, Columns, Effect, displaced
+from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.types import FloatArray
+
+
+def cells(scene: Scene) -> Iterator[Cell]:
+    """Each sensor: one scale, one along its z axis (depth), or one per axis."""
+    for index, name in enumerate(scene.sensor_names):
+
+        def stretch(scene: Scene, along: FloatArray, index: int = index) -> FloatArray:
+            stretched = (scene.in_sensor * along) * scene.seen_by(index)[:, None]
+            return np.einsum('nij,nj->ni', scene.sensor_turn, stretched)
+
+        def isotropic(scene: Scene, stretch=stretch) -> Columns:  # type: ignore[no-untyped-def]
+            return displaced(stretch(scene, np.ones(3)))
+
+        def depth(scene: Scene, stretch=stretch) -> Columns:  # type: ignore[no-untyped-def]
+            return displaced(stretch(scene, np.eye(3)[2]))
+
+        def by_axis(scene: Scene, stretch=stretch) -> Columns:  # type: ignore[no-untyped-def]
+            return displaced(*(stretch(scene, axis) for axis in np.eye(3)))
+
+        for variant, columns, parameters in (
+            ('', isotropic, (f'scale_{name}',)),
+            ('depth', depth, (f'scale_z_{name}',)),
+            ('by axis', by_axis, tuple(f'scale_{axis}_{name}' for axis in 'xyz')),
+        ):
+            yield Cell(
+                name=EFFECT.name,
+                joints=(),
+                place=EFFECT.place,
+                driver=EFFECT.driver,
+                form=EFFECT.form,
+                parameters=parameters,
+                unit=EFFECT.unit,
+                columns=columns,
+                drawn_from=3 * len(scene.sensor_names),
+                variant=variant,
+                subject=name,
+            )
+
+
+EFFECT = Effect(
+    name='sensor_scale',
+    place='sensor_frame',
+    driver='position',
+    form='linear',
+    equation='measured = (1 + s) p in the sensor frame, for all axes or one',
+    source='camera calibration wands; ISO 10360-10',
+    unit='m/m',
+    plausible=(1e-6, 1e-2),
+    sentence='The sensor {subject} measures lengths in the wrong scale (calibrate it again).',
+    separate_by='a calibrated length bar in several places of the volume',
+    cells=cells,
+)

@@ -1,0 +1,44 @@
+"""Settling: a joint is measured before it has arrived, short by a share of its last move."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from remaster_ros.discovery.effects.base import Cell, Columns, Effect, at_joint, needs_approach
+from remaster_ros.discovery.effects.context import Scene
+
+
+def cells(scene: Scene) -> Iterator[Cell]:
+    """One cell per joint: δq_j = -s_j (q_j - from_q_j)."""
+    for joint in scene.moving:
+
+        def columns(scene: Scene, joint: int = joint) -> Columns:
+            return at_joint(joint, -scene.last_move[:, joint - 1])
+
+        yield Cell(
+            name=EFFECT.name,
+            joints=(joint,),
+            place=EFFECT.place,
+            driver=EFFECT.driver,
+            form=EFFECT.form,
+            parameters=(f'settling_{joint}',),
+            unit=EFFECT.unit,
+            columns=columns,
+            drawn_from=scene.joints,
+        )
+
+
+EFFECT = Effect(
+    name='settling',
+    place='joint_angle',
+    driver='last_move',
+    form='linear',
+    equation='δq_j = −s_j (q_j − from_q_j)',
+    source='creep and position error of a first-order servo after a move',
+    unit='rad/rad',
+    plausible=(1e-5, 1e-2),
+    sentence='When measured, {subject} still lags by a share of the last move (wait longer).',
+    separate_by='longer waiting before each measurement, and large moves from both sides',
+    cells=cells,
+    needs=needs_approach,
+)

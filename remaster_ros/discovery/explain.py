@@ -1,0 +1,306 @@
+"""The chosen cells as causes: grouped by name, compared with their look-alikes, put in words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from remaster_ros.calibration.result import FitResult
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.evidence import Solution, solve
+from remaster_ros.discovery.families import grouped, log_prior
+from remaster_ros.discovery.gain import shares
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.screening import Catalogue, screen
+from remaster_ros.discovery.stepwise_selection import Selection
+
+# Look-alikes within this of the evidence are named; within the other, the leaders tie.
+CONFUSABLE = 5.0
+# Odds of twenty to one are no proof.
+TIED = 3.0
+SHORTLIST = 10
+# The screening keeps the noise fixed, which costs it this much of the evidence.
+SCREENING_ERROR = 5.0
+# Columns that agree to this in every pose are the same change under two names.
+SAME = 1.0 - 1e-6
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of an effect: posterior mean and standard deviation in its unit."""
+
+    name: str
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class LookAlike:
+    """Another cause that explains the data nearly as well.
+
+    Attributes
+    ----------
+    name, joints
+        As of an effect.
+    log_evidence_gain
+        Of the look-alike in the effect's place.
+    separate_by
+        Which measurements would decide.
+    same
+        No measurement of these markers could: the two displace every pose alike.
+    """
+
+    name: str
+    joints: tuple[int, ...]
+    log_evidence_gain: float
+    separate_by: str
+    same: bool = False
+
+
+@dataclass(frozen=True)
+class FoundEffect:
+    """A cause; fields as in discovery.json.
+
+    Attributes
+    ----------
+    size_m
+        RMS of what it does to the marker after absorption, over the fitted rows, m.
+    share
+        Of the gain on held-out poses, the causes added in their order; None where it was not the
+        residuals that told.
+    tied
+        A look-alike that measurements could tell apart explains the data as well.
+    """
+
+    name: str
+    joints: tuple[int, ...]
+    place: str
+    driver: str
+    form: str
+    parameters: tuple[Parameter, ...]
+    p_value: float
+    log_evidence_gain: float
+    confusable_with: tuple[LookAlike, ...]
+    cause: str
+    size_m: float
+    share: float | None = None
+    tied: bool = False
+
+    def sampled(self, result: FitResult) -> FoundEffect:
+        """Return the effect with its parameters as the extended model's posterior has them."""
+        index = {name: i for i, name in enumerate(result.theta_names)}
+        parameters = tuple(
+            replace(
+                parameter,
+                value=float(result.theta[index[parameter.name]]),
+                std=float(result.theta_std[index[parameter.name]]),
+            )
+            if parameter.name in index
+            else parameter
+            for parameter in self.parameters
+        )
+        return replace(self, parameters=parameters)
+
+
+def describe(
+    data: Residuals,
+    selection: Selection,
+    cells: Sequence[Cell],
+    progress: Callable[[float], None],
+) -> tuple[tuple[tuple[Cell, ...], ...], tuple[FoundEffect, ...]]:
+    """Return the chosen cells grouped to causes, and the causes, the largest first."""
+    solution = selection.solution
+    if not solution.cells:
+        return (), ()
+    catalogue = Catalogue.of(data, [cell for cell in cells if cell.name != 'gear_periodic'])
+    groups = sorted(grouped(solution.cells), key=lambda group: -_size(data, solution, group))
+    parts = shares(data, groups, solution)
+    effects = []
+    for count, (group, share) in enumerate(zip(groups, parts, strict=True)):
+        progress(count / len(groups))
+        effects.append(_described(data, selection, catalogue, group, share))
+    return tuple(groups), tuple(effects)
+
+
+def _described(
+    data: Residuals,
+    selection: Selection,
+    catalogue: Catalogue,
+    group: tuple[Cell, ...],
+    share: float,
+) -> FoundEffect:
+    solution = selection.solution
+    first = group[0]
+    wheres = dict(zip(solution.cells, solution.slices(), strict=True))
+    parameters = tuple(
+        Parameter(name, float(value), float(np.sqrt(variance)), cell.unit)
+        for cell in group
+        for name, value, variance in zip(
+            cell.parameters,
+            solution.parameters[wheres[cell]],
+            np.diag(solution.covariance)[wheres[cell]],
+            strict=True,
+        )
+    )
+    rest = tuple(cell for cell in solution.cells if cell not in group)
+    without = solve(data, rest, solution, prior=log_prior(rest, catalogue.cells))
+    gain = sum(step.log_evidence_gain for step in selection.steps)
+    if without is not None:
+        gain = solution.log_evidence - without.log_evidence
+    p_values = [step.p_value for step in selection.steps if set(step.cells) & set(group)]
+    if not p_values:
+        # It came in exchange for what had passed.
+        p_values = [max(step.p_value for step in selection.steps)]
+    alike: tuple[LookAlike, ...] = ()
+    if without is not None and len(group) == 1:
+        alike = _look_alikes(data, solution, without, catalogue, first)
+    effect = FoundEffect(
+        name=first.name,
+        joints=_joints(group),
+        place=first.place,
+        driver=first.driver,
+        form=first.form,
+        parameters=parameters,
+        p_value=float(min(p_values)),
+        log_evidence_gain=float(gain),
+        confusable_with=alike,
+        cause=in_words(group, data.scene) + _also_called(alike),
+        size_m=_size(data, solution, group),
+        share=share,
+        tied=any(not other.same and other.log_evidence_gain > gain - TIED for other in alike),
+    )
+    return effect
+
+
+def _also_called(alike: Sequence[LookAlike]) -> str:
+    """Say which other names the same displacement has; '' where it has none."""
+    names = [
+        f'{other.name.replace("_", " ")} of {_listed(other.joints)}'
+        if other.joints
+        else other.name.replace('_', ' ')
+        for other in alike
+        if other.same
+    ]
+    if not names:
+        return ''
+    return (
+        f' Exactly the same errors come from {" or ".join(names)}: no measurement of this marker '
+        'tells them apart, and either name corrects the arm.'
+    )
+
+
+def _joints(group: Sequence[Cell]) -> tuple[int, ...]:
+    if len({cell.joints for cell in group}) == 1:
+        return group[0].joints
+    return tuple(sorted({joint for cell in group for joint in cell.joints}))
+
+
+def _look_alikes(
+    data: Residuals,
+    solution: Solution,
+    without: Solution,
+    catalogue: Catalogue,
+    cell: Cell,
+) -> tuple[LookAlike, ...]:
+    """Return the other causes that explain nearly as much in a cell's place."""
+    score = screen(data, catalogue, replace(without, noise=solution.noise)).score
+    best: dict[tuple[str, tuple[int, ...]], LookAlike] = {}
+    own = [i for i, other in enumerate(catalogue.cells) if other.key == cell.key]
+    least = score[own[0]] - SCREENING_ERROR - CONFUSABLE if own else -np.inf
+    for index in np.argsort(-score)[:SHORTLIST]:
+        other = catalogue.cells[index]
+        if score[index] < least or not np.isfinite(score[index]):
+            break
+        if (other.name, other.joints) == (cell.name, cell.joints):
+            continue
+        cells = (*without.cells, other)
+        fit = solve(data, cells, solution, prior=log_prior(cells, catalogue.cells))
+        if fit is None or fit.log_evidence < solution.log_evidence - CONFUSABLE:
+            continue
+        gain = fit.log_evidence - without.log_evidence
+        key = (other.name, other.joints)
+        if key in best and best[key].log_evidence_gain >= gain:
+            continue
+        same = _same(data, solution, cell, other)
+        best[key] = LookAlike(
+            other.name, other.joints, float(gain), separate_by(cell, other, same), same
+        )
+    return tuple(sorted(best.values(), key=lambda alike: -alike.log_evidence_gain))
+
+
+def _same(data: Residuals, solution: Solution, cell: Cell, other: Cell) -> bool:
+    """Do two cells displace the marker alike, whatever the data's noise?"""
+    if cell.size != other.size or cell.driver != other.driver:
+        return False
+    base = data.base.reshape(3 * len(data), -1)
+    spaces = []
+    for columns in (data.columns([cell]), data.columns([other])):
+        flat = columns.reshape(3 * len(data), -1)
+        flat = flat / np.linalg.norm(flat, axis=0)
+        spaces.append(np.linalg.qr(flat - base @ (base.T @ flat))[0])
+    cosines = np.linalg.svd(spaces[0].T @ spaces[1], compute_uv=False)
+    return bool(cosines.min() > SAME)
+
+
+def _size(
+    data: Residuals,
+    solution: Solution,
+    group: tuple[Cell, ...],
+) -> float:
+    """Return the RMS of a cause's displacement after absorption by the offsets model, m."""
+    wheres = dict(zip(solution.cells, solution.slices(), strict=True))
+    shift = np.zeros((len(data), 3))
+    for cell in group:
+        shift += data.columns([cell]) @ solution.parameters[wheres[cell]]
+    flat, base = shift.ravel(), data.base.reshape(3 * len(data), -1)
+    left = flat - base @ (base.T @ flat)
+    return float(np.sqrt(np.sum(left**2) / len(data)))
+
+
+def separate_by(cell: Cell, other: Cell, same: bool) -> str:
+    """Say which measurements tell two causes apart."""
+    if same:
+        return (
+            'no pose of this marker can: both displace it alike '
+            '(another name for the same change of the kinematics)'
+        )
+    texts = [
+        EFFECTS[c.name].separate_by.format(driver=c.driver.replace('_', ' '))
+        for c in (cell, other)
+    ]
+    return '; and '.join(dict.fromkeys(texts))
+
+
+def in_words(group: Sequence[Cell], scene: Scene) -> str:
+    """Return the sentence for a technician, with what the session cannot tell."""
+    first = group[0]
+    joints = _joints(group)
+    subject = first.subject or _listed(joints if first.name != 'joint_coupling' else joints[:1])
+    other = f'joint {joints[1]}' if len(joints) > 1 else ''
+    place = first.place.replace('_', ' ')
+    if first.joints:
+        place += f' of joint {first.joints[0]}'
+    if first.subject:
+        place += f' of {first.subject}'
+    sentence = EFFECTS[first.name].sentence.format(
+        subject=subject, other=other, driver=first.driver.replace('_', ' '), place=place
+    )
+    sentence = sentence[:1].upper() + sentence[1:]
+    if not scene.has_gravity and first.place == 'joint_angle' and 'angle' in first.driver:
+        sentence += (
+            ' It may be gravity that bends the arm: without link masses in the URDF '
+            'nobody can tell the two apart.'
+        )
+    return sentence
+
+
+def _listed(joints: Sequence[int]) -> str:
+    names = [str(joint) for joint in joints]
+    if len(names) < 2:
+        return f'joint {"".join(names)}'
+    return f'joints {", ".join(names[:-1])} and {names[-1]}'

@@ -1,0 +1,56 @@
+"""Causes that come together: families of cells, their prior probability, grouping by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell
+
+# Physical causes that strike all joints or links of an arm alike.
+FAMILIES: tuple[tuple[str, ...], ...] = (
+    ('joint_compliance',),
+    ('encoder_eccentricity',),
+    ('encoder_scale',),
+    ('backlash',),
+    ('settling',),
+    ('link_length', 'joint_axis_tilt'),
+    ('joint_error_curve',),
+)
+
+
+def relatives(cells: Sequence[Cell], cell: Cell) -> int:
+    """Return how many of the cells are of a cell's family; 1 where it has none."""
+    family = next((family for family in FAMILIES if cell.name in family), ())
+    return max(1, sum(other.name in family for other in cells))
+
+
+def log_prior(cells: Sequence[Cell], catalogue: Sequence[Cell]) -> float:
+    """Return the log prior probability of a set: cell by cell, or by whole families.
+
+    Cells of a family come together more often than each by its own chance: given the family, each
+    of its members is in or out.
+    """
+    total = 0.0
+    rest = list(cells)
+    for family in FAMILIES:
+        mine = [cell for cell in rest if cell.name in family]
+        if not mine:
+            continue
+        rest = [cell for cell in rest if cell.name not in family]
+        members = len({(cell.name, cell.joints) for cell in catalogue if cell.name in family})
+        alone = -sum(np.log(cell.drawn_from) for cell in mine)
+        total += max(alone, -members * np.log(2.0))
+    return float(total - sum(np.log(cell.drawn_from) for cell in rest))
+
+
+def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
+    """Return the cells of each cause together, in the order of their first."""
+    groups: dict[tuple[str, ...], list[Cell]] = {}
+    for cell in cells:
+        key: tuple[str, ...] = (cell.name, cell.driver, cell.form, cell.subject)
+        if cell.name in ('unnamed', 'joint_coupling', 'gear_periodic'):
+            key += (str(cell.joints), cell.variant if cell.name == 'unnamed' else '')
+        groups.setdefault(key, []).append(cell)
+    return [tuple(group) for group in groups.values()]

@@ -1,0 +1,123 @@
+"""What the causes gain: on held-out poses, against the noise, metric by metric, cause by cause."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from remaster_ros.calibration.accuracy import accuracy_of
+from remaster_ros.calibration.estimate import Estimate
+from remaster_ros.calibration.result import FitResult, predicted_rows
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.evidence import Solution, solve
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.types import BoolArray, FloatArray
+
+
+@dataclass(frozen=True)
+class Gain:
+    """RMS of the 3-D error over all validation rows, m; None where there are none.
+
+    Attributes
+    ----------
+    held_out_rms_before_m, held_out_rms_after_m
+        With offsets only, and with the effects.
+    noise_floor_m
+        What the estimated noise alone leaves.
+    metrics
+        'relative' and 'post_registration', each 'before' and 'after', as in fit.json; empty
+        without validation rows.
+    """
+
+    held_out_rms_before_m: float | None
+    held_out_rms_after_m: float | None
+    noise_floor_m: float
+    metrics: Mapping[str, Any]
+
+
+def gain_of(found: Estimate, solution: Solution, fit: FitResult, rng: np.random.Generator) -> Gain:
+    """Measure the gain of the sampled fit over the fit with offsets only."""
+    measurements = found.problem.measurements
+    held_out = measurements.is_validation
+    variance = 3.0 * (solution.noise.sigma**2 + solution.noise.pose_sigma**2)
+    rows = held_out if held_out.any() else ~held_out
+    floor = float(np.sqrt(np.mean(variance[measurements.sensor[rows]])))
+    if not held_out.any():
+        return Gain(None, None, floor, {})
+    before = predicted_rows(found.problem, found.model, found.mode.z)
+    after = measurements.position - fit.residuals_after
+    metrics = accuracy_of(
+        measurements, {'validation': np.flatnonzero(held_out)}, before, after, None, rng
+    )['validation']
+    assert metrics is not None
+    return Gain(
+        rms(measurements.position - before, held_out),
+        rms(fit.residuals_after, held_out),
+        floor,
+        {name: metrics[name] for name in ('relative', 'post_registration')},
+    )
+
+
+def rms(errors: FloatArray, rows: BoolArray) -> float:
+    """Return the RMS of the 3-D error of the given rows, m."""
+    return float(np.sqrt(np.mean(np.sum(errors[rows] ** 2, axis=1))))
+
+
+def shares(data: Residuals, groups: Sequence[tuple[Cell, ...]], solution: Solution) -> list[float]:
+    """Return how much of the mean-square error each cause takes away, added in this order.
+
+    On held-out rows where there are any. All are refitted at each step; together they make 1.
+    """
+    rows = data.scene.measurements.is_validation
+    if not rows.any():
+        rows = np.isin(np.arange(len(rows)), data.rows.source)
+    left: list[float] = []
+    chosen: tuple[Cell, ...] = ()
+    for group in ((), *groups):
+        chosen += group
+        fit = solution if len(chosen) == len(solution.cells) else solve(data, chosen, solution)
+        # A part that cannot be fitted alone changes nothing until it can.
+        left.append(left[-1] if fit is None else rms(data.unexplained(fit), rows) ** 2)
+    total = left[0] - left[-1]
+    return [
+        float((before - after) / total) if total > 0.0 else 0.0
+        for before, after in itertools.pairwise(left)
+    ]
+
+
+def pose_common_fraction(solution: Solution) -> float:
+    """Return the share of the noise's variance that rows of one pose have in common."""
+    common = np.sum(solution.noise.pose_sigma**2)
+    return float(common / (common + np.sum(solution.noise.sigma**2)))
+
+
+def noise_by_range(data: Residuals, solution: Solution) -> dict[str, dict[str, float]]:
+    """Compare errors near and far from each sensor.
+
+    Returns
+    -------
+    dict
+        Sensor -> ``near_m`` and ``far_m``, the quartiles of the range; ``far_over_near``, the
+        ratio of the RMS errors beyond them; ``p_value`` of the rank correlation of range and
+        error.
+    """
+    rows = data.rows
+    length = np.linalg.norm(data.left(solution), axis=1)
+    found = {}
+    for sensor, span in rows.spans:
+        distance = data.part.range_m[span]
+        low, high = np.quantile(distance, (0.25, 0.75))
+        near, far = length[span][distance <= low], length[span][distance >= high]
+        p_value = 1.0 if np.ptp(distance) == 0.0 else spearmanr(distance, length[span])[1]
+        found[data.scene.sensor_names[sensor]] = {
+            'near_m': float(low),
+            'far_m': float(high),
+            'far_over_near': float(np.sqrt(np.mean(far**2) / np.mean(near**2))),
+            'p_value': float(p_value),
+        }
+    return found

@@ -1,0 +1,147 @@
+"""Markers that are not where the session says: judged by how far the fit moved them.
+
+The offsets model fits the markers, so a wrong one leaves no residuals. With I the information of
+the data alone on a marker's position, everything else fitted, and d̂ their estimate, a marker known
+to s per axis gives u = I (d̂ − nominal) ~ N(0, I + s² I²) if the session is right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import chi2
+
+from remaster_ros.calibration.estimate import Estimate
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.evidence import Solution
+from remaster_ros.discovery.explain import FoundEffect, Parameter
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.types import BoolArray, FloatArray, Priors, Session
+
+MARKER_OFFSET = 'marker_offset'
+# What the prior pulled back is further off than the fit says.
+FURTHER = 3.0
+# Family-wise error over all markers.
+SIGNIFICANCE = 0.002
+# A direction counts where the data know it this many times better than the session, in variance.
+KNOWN_BETTER = 4.0
+# An axis of the tool with this share in directions that the data cannot see is said to be hidden.
+HIDDEN = 0.1
+
+
+def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple[FoundEffect, ...]:
+    """Return an effect for every marker that the fit moved further than the session allows."""
+    model, problem = found.model, found.problem
+    x = model.natural(found.mode.z)
+    jacobian = model.natural_jacobian(x, data.rows)
+    columns = data.columns(solution.cells)
+    joined = np.concatenate((jacobian, columns), axis=2)
+    white = data.whitened(joined, solution.noise).reshape(3 * len(data), -1)
+    error = data.whitened(data.errors, solution.noise).ravel()
+    std = max(problem.session.marker_std_m, 1e-6)
+    effects = []
+    for index, name in enumerate(problem.marker_names):
+        where = model.marker(index)
+        others = np.delete(white, np.arange(where.start, where.stop), axis=1)
+        own = white[:, where]
+        own = own - _projected(others, own)
+        information = own.T @ own
+        # Estimate of the data alone: the fitted place plus the step without the prior.
+        moved = x[where] - problem.markers[index]
+        pull = own.T @ error + information @ moved
+        values, axes = np.linalg.eigh(information)
+        seen = values * std**2 > KNOWN_BETTER
+        if not seen.any():
+            continue
+        u = axes.T @ pull
+        square = float(np.sum(u[seen] ** 2 / (values[seen] + (values[seen] * std) ** 2)))
+        p_value = float(chi2.sf(square, seen.sum()))
+        if p_value * len(problem.marker_names) > SIGNIFICANCE:
+            continue
+        inverse = axes[:, seen] / values[seen] @ axes[:, seen].T
+        by_data = inverse @ pull
+        covariance = inverse + _unseen(by_data, problem.markers[index], axes, seen)
+        blind = np.sum(axes[:, ~seen] ** 2, axis=1) > HIDDEN
+        effects.append(_effect(name, by_data, covariance, blind, p_value, square, int(seen.sum())))
+    return tuple(effects)
+
+
+def loosened(session: Session, moved: Sequence[FoundEffect]) -> Priors | None:
+    """Return priors that let markers go as far as they were found to be; None if none has moved.
+
+    Parameters
+    ----------
+    session
+        What says where they should be.
+    moved
+        As `moved_markers` returns them; other effects count for nothing.
+    """
+    places = {}
+    for effect in moved:
+        if effect.name == MARKER_OFFSET:
+            name = effect.parameters[0].name.removeprefix('x_')
+            std = float(np.hypot(session.marker_std_m, FURTHER * (effect.size_m or 0.0)))
+            places[name] = (session.markers[name], std)
+    return Priors(markers=places) if places else None
+
+
+def _unseen(moved: FloatArray, place: FloatArray, axes: FloatArray, seen: BoolArray) -> FloatArray:
+    """Return the covariance due to directions that the data cannot see, m², (3, 3).
+
+    A marker moves about as far in them as in the others. Around the last joint's axis it moves on
+    a circle, which changes its radius at second order.
+    """
+    typical = np.sum(moved**2) / max(1, int(seen.sum()))
+    hidden = axes[:, ~seen]
+    covariance = typical * hidden @ hidden.T
+    radius = np.linalg.norm(place[:2])
+    if hidden.shape[1] and radius > 0.0:
+        inward = np.append(place[:2] / radius, 0.0)
+        covariance += 0.5 * (typical / radius) ** 2 * np.outer(inward, inward)
+    return covariance
+
+
+def _projected(others: FloatArray, own: FloatArray) -> FloatArray:
+    scale = np.linalg.norm(others, axis=0)
+    left, singular, _ = np.linalg.svd(
+        others / np.where(scale > 0.0, scale, 1.0), full_matrices=False
+    )
+    left = left[:, singular > 1e-9 * singular[0]]
+    return left @ (left.T @ own)
+
+
+def _effect(
+    name: str,
+    moved: FloatArray,
+    covariance: FloatArray,
+    blind: BoolArray,
+    p_value: float,
+    square: float,
+    rank: int,
+) -> FoundEffect:
+    effect = EFFECTS[MARKER_OFFSET]
+    cause = effect.sentence.format(subject=name)
+    if blind.any():
+        unseen = ' and '.join(axis for axis, hidden in zip('xyz', blind, strict=True) if hidden)
+        cause += (
+            f' How far along {unseen} of the tool these poses tell only in part: '
+            'around the last axis it trades with the zero-offset.'
+        )
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return FoundEffect(
+        name=effect.name,
+        joints=(),
+        place=effect.place,
+        driver=effect.driver,
+        form=effect.form,
+        parameters=tuple(
+            Parameter(f'{axis}_{name}', float(v), float(s), effect.unit)
+            for axis, v, s in zip('xyz', moved, std, strict=True)
+        ),
+        p_value=p_value,
+        log_evidence_gain=0.5 * (square - rank),
+        confusable_with=(),
+        cause=cause,
+        size_m=float(np.linalg.norm(moved)),
+    )

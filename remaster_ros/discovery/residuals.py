@@ -1,0 +1,227 @@
+"""What the discovery works on: the residuals of the offsets model, its noise, its absorption.
+
+The noise is that of `posterior`: independent per row with sigma, plus a part common to the rows of
+one sensor at one pose with pose_sigma. What registrations, offsets and markers can absorb is
+projected out with flat priors everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from remaster_ros.calibration.estimate import Estimate
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.laplace import Mode
+from remaster_ros.calibration.outliers import robust_noise
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.context import BLOCK_ROWS, Scene
+from remaster_ros.types import BoolArray, FloatArray, IntArray
+
+# Directions of the offsets model below this share of the largest are its gauge.
+ROUNDING = 1e-8
+# Bytes of displacements that are kept for the next fit; only those of large sessions are more.
+KEPT_BYTES = 1 << 28
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Standard deviations of each sensor, m, (sensors,): per row, and common to a pose."""
+
+    sigma: FloatArray
+    pose_sigma: FloatArray
+
+
+class Fit(Protocol):
+    """Cells with their parameters (m,), and the step of the base columns (p,) beside them."""
+
+    @property
+    def cells(self) -> tuple[Cell, ...]:
+        """The cells."""
+
+    @property
+    def parameters(self) -> FloatArray:
+        """Their parameters, (m,)."""
+
+    @property
+    def base(self) -> FloatArray:
+        """Coefficients of the base columns, (p,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """n rows, sorted by sensor and pose, with what the offsets model leaves of them.
+
+    Attributes
+    ----------
+    scene
+        All rows of the session at the solution of the offsets model.
+    rows
+        The rows worked on; ``source`` are their indices in the scene.
+    errors
+        Measured minus modelled, in base coordinates, m, (n, 3).
+    base
+        What the offsets model can absorb, orthonormal columns, (n, 3, p).
+    full_base
+        The same columns for every row of the session, (all rows, 3, p).
+    full_errors
+        Errors of every row of the session, m, (all rows, 3).
+    full_jacobian
+        Derivative of the prediction by the model's natural parameters, (all rows, 3, size).
+    noise
+        A robust first estimate.
+    """
+
+    scene: Scene
+    rows: Rows
+    errors: FloatArray
+    base: FloatArray
+    full_base: FloatArray
+    full_errors: FloatArray
+    full_jacobian: FloatArray
+    noise: Noise
+
+    @classmethod
+    def of(cls, found: Estimate) -> Residuals:
+        """Take over a fit with offsets: its residuals on the rows it kept."""
+        return cls.at(found, found.mode)
+
+    @classmethod
+    def at(cls, found: Estimate, mode: Mode) -> Residuals:
+        """Take over the rows a fit kept, with the residuals of another mode of its model."""
+        problem, model = found.problem, found.model
+        x = model.natural(mode.z)
+        scene = Scene(
+            problem.chain,
+            problem.measurements,
+            problem.sensor_names,
+            problem.marker_names,
+            model.offsets(x),
+            model.markers(x),
+            model.T_R_N(x),
+        )
+        count = len(scene)
+        every = Rows.of(problem.measurements, np.arange(count), model.reference)
+        full_errors = np.empty((count, 3))
+        full_jacobian = np.empty((count, 3, model.size))
+        for first, last in every.blocks(BLOCK_ROWS):
+            block = every.of_groups(first, last)
+            full_errors[block.source] = block.target - model.predict(mode.z, block)
+            full_jacobian[block.source] = model.natural_jacobian(x, block)
+
+        rows = Rows.of(problem.measurements, found.kept, model.reference)
+        flat = full_jacobian[rows.source].reshape(-1, model.size)
+        scale = np.linalg.norm(flat, axis=0)
+        scale = np.where(scale > 0.0, scale, 1.0)
+        _, singular, vectors = np.linalg.svd(flat / scale, full_matrices=False)
+        seen = singular > ROUNDING * singular[0]
+        full_base = full_jacobian @ ((vectors[seen] / scale).T / singular[seen])
+        sigma, pose_sigma = robust_noise(rows, full_errors[rows.source], np.ones(len(rows), bool))
+        return cls(
+            scene,
+            rows,
+            full_errors[rows.source],
+            full_base[rows.source],
+            full_base,
+            full_errors,
+            full_jacobian,
+            Noise(sigma, pose_sigma),
+        )
+
+    def only(self, source: IntArray, reference: FloatArray) -> Residuals:
+        """Return the same on other rows of the session."""
+        rows = Rows.of(self.scene.measurements, np.sort(source), reference)
+        return replace(
+            self, rows=rows, errors=self.full_errors[rows.source], base=self.full_base[rows.source]
+        )
+
+    def __len__(self) -> int:
+        """Return the number of rows n."""
+        return len(self.rows)
+
+    @property
+    def sensors(self) -> int:
+        """Number of sensors."""
+        return len(self.scene.sensor_names)
+
+    @cached_property
+    def part(self) -> Scene:
+        """The scene of the rows worked on, in their order.
+
+        What the search needs of hundreds of causes is computed on these rows alone.
+        """
+        return self.scene.at(self.rows.source)
+
+    @cached_property
+    def _displacements(self) -> dict[Cell, FloatArray]:
+        """What `columns` has computed so far: a search fits the same few cells again and again."""
+        return {}
+
+    @cached_property
+    def separable(self) -> BoolArray:
+        """Where the pose-common part can be told apart, (sensors,)."""
+        several = self.rows.group_sensor[self.rows.group_size > 1]
+        return np.isin(np.arange(self.sensors), several)
+
+    @cached_property
+    def pose_of_row(self) -> IntArray:
+        """Number of each row's pose, counted from 0 over all sensors, (n,)."""
+        poses = self.scene.measurements.pose[self.rows.source]
+        return np.unique(poses, return_inverse=True)[1]
+
+    @property
+    def poses(self) -> int:
+        """Number of poses."""
+        return int(self.pose_of_row.max()) + 1
+
+    def columns(self, cells: Sequence[Cell]) -> FloatArray:
+        """Return what a unit of each parameter displaces in the rows worked on, (n, 3, c)."""
+        kept = self._displacements
+        for cell in cells:
+            if cell not in kept:
+                kept[cell] = cell.columns(self.part).displacement(self.part)
+        parts = [kept[cell] for cell in cells]
+        joined = np.concatenate([np.zeros((len(self), 3, 0)), *parts], axis=2)
+        while len(kept) > 1 and sum(values.nbytes for values in kept.values()) > KEPT_BYTES:
+            del kept[next(iter(kept))]
+        return joined
+
+    def displaced(self, cells: Sequence[Cell], parameters: FloatArray) -> FloatArray:
+        """Return what cells with these parameters displace in every row, m, (all rows, 3)."""
+        shift = np.zeros((len(self.scene), 3))
+        for where, scene in self.scene.blocks():
+            start = 0
+            for cell in cells:
+                columns = cell.columns(scene).displacement(scene)
+                shift[where] += columns @ parameters[start : start + cell.size]
+                start += cell.size
+        return shift
+
+    def unexplained(self, fit: Fit) -> FloatArray:
+        """Return what a fit leaves of the errors in every row of the session, m, (all rows, 3)."""
+        left: FloatArray = self.full_errors - self.full_base @ fit.base
+        return left - self.displaced(fit.cells, fit.parameters)
+
+    def left(self, fit: Fit) -> FloatArray:
+        """Return the same in the rows worked on, m, (n, 3)."""
+        explained: FloatArray = self.base @ fit.base + self.columns(fit.cells) @ fit.parameters
+        return self.errors - explained
+
+    def whitened(self, values: NDArray[Any], noise: Noise) -> NDArray[Any]:
+        """Return values (n, ...) in units of the noise: independent of variance 1 in all rows."""
+        rows = self.rows
+        sensor = rows.group_sensor
+        size = rows.group_size
+        root = np.sqrt(noise.sigma[sensor] ** 2 + size * noise.pose_sigma[sensor] ** 2)
+        # deviations / sigma + mean / root = values / sigma - mean (1 / sigma - 1 / root)
+        less = (1.0 / noise.sigma[sensor] - 1.0 / root) / size
+        flat = values.reshape(len(values), -1)
+        common = rows.group_sum(flat, axis=0) * less[:, None].astype(flat.dtype)
+        scale = 1.0 / noise.sigma[sensor][rows.group_of_row]
+        white = flat * scale[:, None].astype(flat.dtype) - common[rows.group_of_row]
+        return white.reshape(values.shape)

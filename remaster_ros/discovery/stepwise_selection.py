@@ -1,0 +1,365 @@
+"""Which cells the residuals ask for: forward by the evidence, in groups, with second thoughts.
+
+A round screens all cells beside the set found so far and tries the best of them, and every
+physical group as a whole (all joints sag, all links are off), less the members that do not pay.
+The proposal of the highest evidence joins if it passes two tests: its p-value over all cells
+tried, and its gain on poses left out in turn. After each round, members that no longer pay leave,
+and each is exchanged for whatever explains more in its place, since the first step sees a mixture
+of causes.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from remaster_ros.discovery.cross_validation import held_out_error, worth_of
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.evidence import Solution, solve
+from remaster_ros.discovery.families import FAMILIES, grouped, log_prior, relatives
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.screening import Catalogue, Screening, screen
+from remaster_ros.types import FloatArray
+
+# Family-wise error of one round.
+SIGNIFICANCE = 0.01
+DRAWS = 300
+# Error of keeping a member of a family that has passed as a whole.
+SIGNIFICANCE_OF_ONE = 0.05
+DRAWS_OF_ONE = 200
+SHORTLIST = 8
+ROUNDS = 8
+FOLDS = 10
+# What leaves less than this share of the held-out error out is not worth a parameter.
+LEAST_GAIN = 0.01
+# The evidence must rise by this for an exchange: no to and fro between equals.
+HYSTERESIS = 0.5
+MOST_EXCHANGED = 6
+MOST_MERGED = 4
+# So many cells of one family are a family.
+WHOLE = 3
+# A member of a family has to raise the evidence by this: a free form of no size costs nothing.
+MEMBER = 1.0
+# A cell whose loss would cost this much evidence need not be tested by itself.
+BEYOND_DOUBT = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One cell set that joined: with what p-value, held-out gain and evidence."""
+
+    cells: tuple[Cell, ...]
+    p_value: float
+    held_out_share: float
+    log_evidence_gain: float
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The outcome: the fit without and with the cells, and how they were found.
+
+    Attributes
+    ----------
+    empty, solution
+        Fit of the offsets model alone, and with the cells.
+    steps
+        What joined, in order.
+    rejected
+        The last proposal, which failed a test; None where none was left.
+    """
+
+    empty: Solution
+    solution: Solution
+    steps: tuple[Step, ...]
+    rejected: Step | None
+
+
+@dataclass(eq=False)
+class Search:
+    """The search on one set of residuals.
+
+    Attributes
+    ----------
+    data
+        The residuals; fewer or more rows as a better model tells gross errors better.
+    cells
+        All that are tried.
+    rng
+        Source of all randomness.
+    judge
+        Residuals and a fit to the same residuals without the rows that it shows to be gross.
+    progress
+        Called with the share that is done.
+    """
+
+    data: Residuals
+    cells: tuple[Cell, ...]
+    rng: np.random.Generator
+    judge: Callable[[Residuals, Solution], Residuals]
+    progress: Callable[[float], None]
+
+    def __post_init__(self) -> None:
+        self._cheap = np.array([cell.name != 'gear_periodic' for cell in self.cells])
+        self._look_at(self.data)
+
+    def _look_at(self, data: Residuals) -> None:
+        self.data = data
+        self.catalogue = Catalogue.of(data, self.cells)
+        order = self.rng.permutation(data.poses)
+        self._fold_of_pose = order % min(FOLDS, data.poses)
+        # The larger set is compared with many smaller ones in turn.
+        self._last_held_out: tuple[Solution | None, float] = None, np.nan
+
+    def run(self, given: Solution | None = None) -> Selection:
+        """Search until nothing passes both tests."""
+        empty = self.fit(())
+        assert empty is not None
+        solution, steps, rejected = given or empty, [], None
+        for count in range(ROUNDS):
+            self.progress(count / (count + 2.0))
+            screening = screen(self.data, self.catalogue, solution, rng=self.rng, draws=DRAWS)
+            if screening.score.max() <= 0.0:
+                break
+            proposal = self.propose(solution, screening)
+            if proposal is None or proposal[0].log_evidence <= solution.log_evidence:
+                break
+            candidate, p_value = self.earned(proposal[0]), proposal[1]
+            if candidate.log_evidence <= solution.log_evidence:
+                break
+            share = self.held_out_share(solution, candidate)
+            new = tuple(cell for cell in candidate.cells if cell not in solution.cells)
+            step = Step(new, p_value, share, candidate.log_evidence - solution.log_evidence)
+            if p_value > SIGNIFICANCE or share < _least_share(solution, candidate):
+                rejected = step
+                break
+            steps.append(step)
+            solution = self.exchange(self.prune(candidate))
+            solution = self._judged(self.earned(self.keep_what_pays(solution)))
+        empty = self.fit(())
+        assert empty is not None
+        return Selection(empty, solution, tuple(steps), rejected)
+
+    def _judged(self, solution: Solution) -> Solution:
+        """Set aside what the better model shows to be gross, and fit again without it."""
+        data = self.judge(self.data, solution)
+        if data is self.data:
+            return solution
+        self._look_at(data)
+        again = self.fit(solution.cells, solution)
+        return solution if again is None else self.prune(again)
+
+    def fit(self, cells: Sequence[Cell], start: Solution | None = None) -> Solution | None:
+        """Fit a set with its prior probability."""
+        return solve(self.data, cells, start, prior=log_prior(cells, self.catalogue.cells))
+
+    def propose(self, solution: Solution, screening: Screening) -> tuple[Solution, float] | None:
+        """Return the set of the highest evidence one step on, with the p-value of the step."""
+        best: tuple[Solution, float] | None = None
+        for index in np.argsort(-screening.score)[:SHORTLIST]:
+            if not np.isfinite(screening.score[index]):
+                continue
+            candidate = self.fit((*solution.cells, self.catalogue.cells[index]), solution)
+            if candidate is not None and (
+                best is None or candidate.log_evidence > best[0].log_evidence
+            ):
+                best = candidate, screening.p_value(float(screening.score[index]))
+        for family in FAMILIES:
+            if not self._promising(family, screening):
+                continue
+            candidate = self.grown(solution, family)
+            if candidate is not None and (
+                best is None or candidate.log_evidence > best[0].log_evidence
+            ):
+                gain = candidate.log_evidence - solution.log_evidence
+                best = candidate, screening.p_value(gain)
+        return best
+
+    def _promising(self, family: tuple[str, ...], screening: Screening) -> bool:
+        """Does at least one member of a family raise the evidence by itself?"""
+        mine = [cell.name in family for cell in self.catalogue.cells]
+        return bool(np.any(screening.score[mine] > 0.0))
+
+    def grown(self, solution: Solution, family: tuple[str, ...]) -> Solution | None:
+        """Return the set with all of a family that the data can see, less what does not pay."""
+        members = [cell for cell in self.catalogue.cells if cell.name in family]
+        if family == ('encoder_eccentricity',):
+            members = [cell for cell in members if cell.variant == '1+2']
+        if 'joint_axis_tilt' in family:
+            members = [cell for cell in members if len(cell.parameters) == 1]
+        present = {(cell.name, cell.joints, cell.label) for cell in solution.cells}
+        others = [cell for cell in members if (cell.name, cell.joints, cell.label) not in present]
+        new = self.visible(solution.cells, others)
+        if len(new) < 2:
+            return None
+        grown = self.fit((*solution.cells, *new), solution)
+        return None if grown is None else self.prune(grown, set(new))
+
+    def visible(self, given: Sequence[Cell], cells: Sequence[Cell]) -> list[Cell]:
+        """Return the cells that add something to base, given and earlier ones, in order."""
+        if not cells:
+            return []
+        if cells[0].penalty is not None:
+            return list(cells)
+        data = self.data
+        fixed = [cell for cell in given if cell.penalty is None]
+        start = np.concatenate((data.base, data.columns(fixed)), axis=2)
+        known, _ = np.linalg.qr(_unit(start.reshape(3 * len(data), -1)))
+        kept = []
+        for cell in cells:
+            block = _unit(data.columns([cell]).reshape(3 * len(data), -1))
+            left = block - known @ (known.T @ block)
+            left -= known @ (known.T @ left)
+            if np.linalg.svd(left, compute_uv=False)[-1] < FAMILY_ABSORBED:
+                continue
+            kept.append(cell)
+            known = np.concatenate((known, np.linalg.qr(left)[0]), axis=1)
+        return kept
+
+    def prune(self, solution: Solution, among: set[Cell] | None = None) -> Solution:
+        """Drop, one by one, the cells without which the evidence is higher."""
+        price = np.log(3.0 * len(self.data))
+        while solution.cells:
+            worth = []
+            for cell, where in zip(solution.cells, solution.slices(), strict=True):
+                if among is not None and cell not in among:
+                    worth.append(np.inf)
+                    continue
+                worth.append(worth_of(solution, cell, where, price))
+            order = np.argsort(worth)
+            for index in order[:2]:
+                # Wald's estimate of the loss chooses; the evidence itself decides.
+                if worth[index] > 2.0:
+                    return solution
+                rest = (*solution.cells[:index], *solution.cells[index + 1 :])
+                smaller = self.fit(rest, solution)
+                if smaller is not None and smaller.log_evidence > solution.log_evidence:
+                    solution = smaller
+                    break
+            else:
+                return solution
+        return solution
+
+    def exchange(self, solution: Solution) -> Solution:
+        """Replace cells, one at a time, by what explains more in their place."""
+        if len(solution.cells) > MOST_EXCHANGED:
+            return solution
+        for _ in range(MOST_EXCHANGED):
+            better = self._best_exchange(solution)
+            if better is None:
+                return solution
+            solution = self.prune(better)
+        return solution
+
+    def _best_exchange(self, solution: Solution) -> Solution | None:
+        """Return the best fit with one cell, or two, replaced by one other; None if none gains."""
+        best = None
+        # A family found as a whole stays one: part of it looks like many other things.
+        loose = [cell for cell in solution.cells if relatives(solution.cells, cell) < WHOLE]
+        removed = [{cell} for cell in loose]
+        if len(loose) <= MOST_MERGED:
+            removed += [set(pair) for pair in itertools.combinations(loose, 2)]
+        for cells in removed:
+            for candidate in self.replacements(solution, cells, 3):
+                limit = solution if best is None else best
+                if candidate.log_evidence > limit.log_evidence + HYSTERESIS:
+                    best = candidate
+        if best is not None and self.held_out_share(solution, best) < 0.0:
+            return None
+        return best
+
+    def keep_what_pays(self, solution: Solution) -> Solution:
+        """Drop the causes without which poses left out are predicted better."""
+        for group in grouped(solution.cells):
+            if len(group) == len(solution.cells):
+                continue
+            rest = tuple(cell for cell in solution.cells if cell not in group)
+            without = self.fit(rest, solution)
+            if without is not None and self.held_out_share(without, solution) < 0.0:
+                solution = without
+        return solution
+
+    def earned(self, solution: Solution) -> Solution:
+        """Drop, the weakest first, the members of families that do not pay by themselves.
+
+        A family passes its tests as a whole. Each member has still to raise the evidence, to
+        predict poses left out, and to beat itself on surrogate residuals.
+        """
+        price = np.log(3.0 * len(self.data))
+        tested: set[Cell] = set()
+        while True:
+            weak = [
+                (worth, index)
+                for index, (cell, where) in enumerate(
+                    zip(solution.cells, solution.slices(), strict=True)
+                )
+                if cell not in tested
+                and relatives(solution.cells, cell) > 1
+                and (worth := worth_of(solution, cell, where, price)) < BEYOND_DOUBT
+            ]
+            if not weak:
+                return solution
+            _, index = min(weak)
+            cell = solution.cells[index]
+            tested.add(cell)
+            rest = (*solution.cells[:index], *solution.cells[index + 1 :])
+            without = self.fit(rest, solution)
+            if without is not None and not self._pays(cell, without, solution):
+                solution = without
+
+    def _pays(self, cell: Cell, without: Solution, solution: Solution) -> bool:
+        """Does a cell pass the tests of a step by itself?"""
+        if solution.log_evidence - without.log_evidence < MEMBER:
+            return False
+        if self.held_out_share(without, solution) <= 0.0:
+            return False
+        own = np.array([other.key == cell.key for other in self.catalogue.cells])
+        screening = screen(
+            self.data, self.catalogue, without, rng=self.rng, draws=DRAWS_OF_ONE, chosen=own
+        )
+        return screening.p_value(float(screening.score[own][0])) <= SIGNIFICANCE_OF_ONE
+
+    def replacements(self, solution: Solution, cells: set[Cell], count: int) -> list[Solution]:
+        """Return fits with the best other cells in the place of these, best first."""
+        rest = tuple(other for other in solution.cells if other not in cells)
+        without = self.fit(rest, solution)
+        if without is None:
+            return []
+        without = replace(without, noise=solution.noise)
+        chosen = self._cheap & np.array([other not in cells for other in self.catalogue.cells])
+        score = screen(self.data, self.catalogue, without, chosen=chosen).score
+        found = []
+        for index in np.argsort(-score)[:count]:
+            if np.isfinite(score[index]):
+                other = self.fit((*rest, self.catalogue.cells[index]), solution)
+                if other is not None:
+                    found.append(other)
+        return sorted(found, key=lambda fit: -fit.log_evidence)
+
+    def held_out_share(self, smaller: Solution, larger: Solution) -> float:
+        """Return the share of the squared error on poses left out that the larger set saves."""
+        if self._last_held_out[0] is not larger:
+            after = held_out_error(self.data, larger, larger.noise, self._fold_of_pose)
+            self._last_held_out = larger, float(after.sum())
+        before = held_out_error(self.data, smaller, larger.noise, self._fold_of_pose)
+        return float(1.0 - self._last_held_out[1] / before.sum())
+
+
+def _least_share(solution: Solution, candidate: Solution) -> float:
+    """Return the share of the held-out error that a candidate has to save.
+
+    What needs no more parameters than the set it replaces has only to do no worse: a family of
+    curves that stood in for a weaker cause gives way to it.
+    """
+    return LEAST_GAIN if len(candidate.parameters) > len(solution.parameters) else 0.0
+
+
+# A member of a family that the others explain to this share of its size is another name for them.
+FAMILY_ABSORBED = 1e-3
+
+
+def _unit(columns: FloatArray) -> FloatArray:
+    norm = np.linalg.norm(columns, axis=0)
+    return columns / np.where(norm > 0.0, norm, 1.0)

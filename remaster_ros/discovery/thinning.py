@@ -1,0 +1,135 @@
+"""Large sessions: the search looks at some rows, and what it finds is held against the rest.
+
+The search tries hundreds of causes on hundreds of surrogates, in memory that grows with the rows:
+0.1 MB each. An effect stands out of the noise with the root of their number, so beyond
+`MOST_ROWS` rows little is gained: an effect that 100,000 rows just show is a quarter of the size
+of one that 5,000 just show, a few hundredths of the noise of one reading. So the search is given
+a part of them, drawn evenly over time and sensors. Everything else works on all rows: the offsets
+before, the sampled model with the causes, the gain. And the rows that the search has not seen
+tell whether its causes, frozen, hold.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.discovery.evidence import Solution
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.types import FloatArray, IntArray, Measurements
+
+MOST_ROWS = 5_000
+"""Sessions of fewer are searched whole."""
+FEWEST_POSES = 500
+"""Of the poses that the same sensors saw: rather fewer rows of each than fewer poses."""
+FEWEST_ROWS = 2
+"""Of a sensor at a pose: what is common to a pose shows in no single row."""
+
+
+@dataclass(frozen=True)
+class Thinning:
+    """What the search looked at, and what the other rows say of it.
+
+    Attributes
+    ----------
+    searched, rows
+        Rows that were searched, and all that could have been.
+    others_rms_before_m, others_rms_after_m
+        RMS of the 3-D error over the rows that were not, m: what the offsets leave, and what is
+        left with the causes as the search fitted them, frozen.
+    """
+
+    searched: int
+    rows: int
+    others_rms_before_m: float
+    others_rms_after_m: float
+
+
+def draw_rows(
+    measurements: Measurements,
+    rows: IntArray,
+    rng: np.random.Generator,
+    most: int = MOST_ROWS,
+) -> IntArray:
+    """Return about `most` of the given rows, drawn evenly over time; all where they are fewer.
+
+    Whole poses are drawn, one of every few consecutive ones that the same sensors saw. Where that
+    would leave few poses, `FEWEST_POSES` are, with fewer rows of each.
+
+    Parameters
+    ----------
+    measurements
+        The session's.
+    rows
+        Indices to choose from, (n,).
+    rng
+        Source of randomness; not used where all are returned.
+
+    Returns
+    -------
+    ndarray
+        Indices in rising order, (m,).
+    """
+    if len(rows) <= most:
+        return rows
+    share = most / len(rows)
+    rows = rows[np.lexsort((rows, measurements.stamp_s[rows]))]
+    _, first, pose = np.unique(measurements.pose[rows], return_index=True, return_inverse=True)
+    seen = np.zeros((len(first), int(measurements.sensor.max()) + 1), bool)
+    seen[pose, measurements.sensor[rows]] = True
+    kept = []
+    kinds = np.unique(seen, axis=0, return_inverse=True)[1].ravel()
+    for kind in range(int(kinds.max()) + 1):
+        poses = np.flatnonzero(kinds == kind)
+        poses = poses[np.argsort(first[poses])]
+        wanted = share * len(poses)
+        drawn = poses
+        if len(poses) > FEWEST_POSES:
+            drawn = poses[_one_of_each(len(poses), max(FEWEST_POSES, round(wanted)), rng)]
+        mine = np.flatnonzero(np.isin(pose, drawn))
+        if wanted < FEWEST_POSES:
+            group = pose[mine] * seen.shape[1] + measurements.sensor[rows[mine]]
+            mine = mine[_some_of_each_group(group, wanted / len(drawn), rng)]
+        kept.append(rows[mine])
+    return np.sort(np.concatenate(kept))
+
+
+def judge_by_others(
+    data: Residuals, rows: IntArray, searched: IntArray, empty: Solution, solution: Solution
+) -> Thinning:
+    """Hold the causes, frozen, against the rows that the search has not seen.
+
+    Parameters
+    ----------
+    data
+        The residuals that were searched; they know all rows.
+    rows, searched
+        Indices of the rows that could have been searched, and of those that were.
+    empty, solution
+        Fit of the offsets alone, and with the causes.
+    """
+    others = np.setdiff1d(rows, searched)
+
+    def left(fit: Solution) -> float:
+        errors: FloatArray = data.unexplained(fit)[others]
+        return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+    return Thinning(len(searched), len(rows), left(empty), left(solution))
+
+
+def _one_of_each(count: int, strata: int, rng: np.random.Generator) -> IntArray:
+    """Cut 0 … count − 1 into runs of about equal length and draw one number of each."""
+    edges = np.linspace(0, count, strata + 1).astype(np.int64)
+    return edges[:-1] + (rng.random(strata) * np.diff(edges)).astype(np.int64)
+
+
+def _some_of_each_group(group: IntArray, share: float, rng: np.random.Generator) -> IntArray:
+    """Return indices of a share of each group's members, evenly in their order."""
+    order = np.argsort(group, kind='stable')
+    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
+    kept = []
+    for start, size in zip(starts, np.diff(np.append(starts, len(group))), strict=True):
+        wanted = min(int(size), max(FEWEST_ROWS, round(share * size)))
+        kept.append(order[start + _one_of_each(int(size), wanted, rng)])
+    return np.sort(np.concatenate(kept))

@@ -1,1 +1,0 @@
-"""Sockets and threads around the protocols; no ROS."""

@@ -1,1 +1,0 @@
-"""Fake devices that speak the real wire formats, behind one hidden World."""

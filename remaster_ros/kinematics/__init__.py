@@ -1,0 +1,1 @@
+"""The arm: chain, inverse kinematics, bodies and the free paths between configurations."""

@@ -1,0 +1,225 @@
+"""Convex bodies for collision checks: boxes, cylinders, spheres, capsules and hulls of points.
+
+Each shape lies about the origin of a frame of its own. A body is a shape fastened to one link of
+the arm, or to the base. Meshes are read elsewhere and handed in as arrays of points.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import ConvexHull, QhullError
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.transforms import apply, transform
+from remaster_ros.types import FloatArray, IntArray
+
+# A cylinder is inside a prism with so many sides drawn around it; 0.5 % of its radius wider.
+_SIDES = 32
+# More points than this are replaced by the corners of the box around them.
+_MOST_POINTS = 60
+_GOLDEN = (1 + 5**0.5) / 2
+# Corners of a regular dodecahedron with the unit sphere inside it, (20, 3).
+_AROUND_A_BALL = np.array(
+    [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    + [
+        np.roll([0, a / _GOLDEN, b * _GOLDEN], turn).tolist()
+        for a in (-1, 1)
+        for b in (-1, 1)
+        for turn in range(3)
+    ]
+) / (3**0.5 * 0.7946544722917661)
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A convex set: the hull of `points`, grown by a disc across z and by a ball.
+
+    Attributes
+    ----------
+    kind
+        ``box``, ``cylinder``, ``sphere``, ``capsule`` or ``hull``.
+    points
+        m, (n, 3).
+    disc
+        Radius of the disc across z that is swept over the points (a cylinder), m.
+    ball
+        Radius of the ball that is swept over the points (sphere, capsule), m.
+    """
+
+    kind: str
+    points: FloatArray
+    disc: float = 0.0
+    ball: float = 0.0
+
+    @cached_property
+    def outline(self) -> FloatArray:
+        """Points whose hull contains the shape, m, (n, 3)."""
+        points = self.points
+        if self.disc > 0.0:
+            angle = np.arange(_SIDES) * (2 * np.pi / _SIDES)
+            radius = self.disc / np.cos(np.pi / _SIDES)
+            ring = radius * np.column_stack((np.cos(angle), np.sin(angle), 0 * angle))
+            points = (points[:, None] + ring).reshape(-1, 3)
+        if self.ball > 0.0:
+            points = (points[:, None] + self.ball * _AROUND_A_BALL).reshape(-1, 3)
+        return points
+
+    @cached_property
+    def capsule(self) -> tuple[FloatArray, FloatArray, float]:
+        """Both ends (m, (3,)) and the radius (m) of a capsule that contains the shape."""
+        if self.kind in ('sphere', 'capsule', 'cylinder'):
+            return self.points[0], self.points[-1], self.ball + self.disc
+        best = (np.zeros(3), np.zeros(3), np.inf, np.inf)
+        middle = (self.points.min(axis=0) + self.points.max(axis=0)) / 2
+        principal = np.linalg.svd(self.points - self.points.mean(axis=0))[2]
+        for axis in (*np.eye(3), *principal):
+            along = (self.points - middle) @ axis
+            across = self.points - middle - along[:, None] * axis
+            # The line goes through the middle of what lies across it.
+            centre = middle + (across.min(axis=0) + across.max(axis=0)) / 2
+            centre = centre - ((centre - middle) @ axis) * axis
+            off = self.points - centre
+            wide = np.linalg.norm(off - (off @ axis)[:, None] * axis, axis=1)
+            radius = float(wide.max())
+            # The round ends may cover what lies near the line: the segment can be shorter.
+            reach = np.sqrt(np.maximum(radius**2 - wide**2, 0.0))
+            low, high = float(np.min(along + reach)), float(np.max(along - reach))
+            if high < low:
+                low = high = (low + high) / 2
+            volume = np.pi * radius**2 * (high - low) + 4 / 3 * np.pi * radius**3
+            if volume < best[3]:
+                best = (centre + low * axis, centre + high * axis, radius, volume)
+        # A hair for rounding: the points lie on the surface.
+        return best[0], best[1], best[2] + 1e-9
+
+    @property
+    def is_its_capsule(self) -> bool:
+        """Whether the capsule around the shape is the shape itself."""
+        return self.kind in ('sphere', 'capsule')
+
+
+def box(size_m: ArrayLike) -> Shape:
+    """Return a box with these edge lengths along x, y, z, m, (3,)."""
+    size = _positive('box', size_m, 3)
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    return Shape('box', corners * size / 2)
+
+
+def cylinder(radius_m: float, length_m: float) -> Shape:
+    """Return a cylinder along z, its middle at the origin."""
+    radius, length = _positive('cylinder', (radius_m, length_m), 2)
+    return Shape('cylinder', np.array([[0, 0, -length / 2], [0, 0, length / 2]]), disc=radius)
+
+
+def sphere(radius_m: float) -> Shape:
+    """Return a sphere about the origin."""
+    (radius,) = _positive('sphere', (radius_m,), 1)
+    return Shape('sphere', np.zeros((1, 3)), ball=radius)
+
+
+def capsule(start: ArrayLike, end: ArrayLike, radius_m: float) -> Shape:
+    """Return the points within a radius of the straight line between two points, m, (3,)."""
+    (radius,) = _positive('capsule', (radius_m,), 1)
+    return Shape('capsule', np.array([start, end], dtype=float), ball=radius)
+
+
+def hull(points: ArrayLike) -> Shape:
+    """Return the convex hull of points (a mesh's vertices), m, (n, 3).
+
+    Raises
+    ------
+    InputError
+        Points that are not finite, or that all lie in one plane: nothing can be inside.
+    """
+    points = np.asarray(points, dtype=float)
+    if points.ndim != 2 or points.shape[1:] != (3,) or not np.all(np.isfinite(points)):
+        raise InputError(f'collision: a mesh of shape {points.shape}, or not finite; give (n, 3)')
+    try:
+        corners = points[np.sort(ConvexHull(points).vertices)]
+    except (QhullError, ValueError):
+        raise InputError(
+            f'collision: the {len(points)} points of a mesh all lie in one plane; a body needs '
+            'a volume'
+        ) from None
+    return Shape('hull', corners)
+
+
+def _positive(kind: str, values: ArrayLike, count: int) -> FloatArray:
+    array = np.asarray(values, dtype=float)
+    if array.shape != (count,) or not np.all((array > 0.0) & (array < np.inf)):
+        raise InputError(
+            f'collision: a {kind} with sizes {array.tolist()}; {count} positive m are needed'
+        )
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A shape fastened to a link.
+
+    Attributes
+    ----------
+    name
+        For messages.
+    link
+        0 for the base, i for what moves with joint i (1-based).
+    shape
+        The shape.
+    T_link_body
+        Where it is in the frame after that joint (in the base for 0), (4, 4).
+    role
+        ``link``, ``tool`` (tool and markers) or ``obstacle``.
+    """
+
+    name: str
+    link: int
+    shape: Shape
+    T_link_body: FloatArray = field(default_factory=lambda: np.eye(4))
+    role: str = 'link'
+
+    @cached_property
+    def outline(self) -> FloatArray:
+        """Points whose hull contains the body, in the link's frame, m, (n, 3)."""
+        return apply(self.T_link_body, self.shape.outline)
+
+    @cached_property
+    def capsule(self) -> tuple[FloatArray, FloatArray, float]:
+        """Both ends and the radius of a capsule around it, in the link's frame, m."""
+        a, b, radius = self.shape.capsule
+        return apply(self.T_link_body, a), apply(self.T_link_body, b), radius
+
+
+def obstacle(
+    name: str, center_m: ArrayLike, size_m: ArrayLike, rotation: ArrayLike | None = None
+) -> Body:
+    """Return a box that stands in the base frame; `rotation` is (3, 3), none for upright."""
+    turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=float)
+    return Body(name, 0, box(size_m), transform(turn, np.asarray(center_m, float)), 'obstacle')
+
+
+def triangles(points: FloatArray) -> IntArray:
+    """Return the triangles of the hull of points (n, 3), facing outwards, (m, 3)."""
+    found = ConvexHull(points)
+    faces = found.simplices.astype(np.int64)
+    a, b, c = (points[faces[:, i]] for i in range(3))
+    inwards = np.sum(np.cross(b - a, c - a) * found.equations[:, :3], axis=1) < 0.0
+    faces[inwards] = faces[inwards][:, ::-1]
+    return faces
+
+
+def enclosing_points(points: FloatArray) -> FloatArray:
+    """Return few points whose hull contains all of these (n, 3): (m, 3), m at most 60."""
+    if len(points) > 8:
+        with suppress(QhullError):  # all in one plane: kept as they are
+            points = points[np.sort(ConvexHull(points).vertices)]
+    if len(points) <= _MOST_POINTS:
+        return points
+    low, high = points.min(axis=0), points.max(axis=0)
+    return (
+        np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
+    )

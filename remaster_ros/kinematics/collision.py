@@ -1,0 +1,611 @@
+"""Is a configuration, or the whole way between two, free of collisions, with clearance?
+
+The arm is a set of convex `bodies`; so are the obstacles, and the floor is a plane. Bounding
+capsules, all at once in NumPy, exclude most pairs; what they cannot exclude is measured by coal
+(distances between convex shapes; negative where they overlap).
+
+Clearance covers what is not known yet. Each joint's zero-offset is unknown by ``unknown_offset``
+(1 degree unless stated), independently of the others: two bodies may be nearer to each other than
+the model has it by unknown_offset · √(Σ lever²), summed over the joints between the two. A lever
+is the largest distance of the outer body from the joint's axis at that configuration; for the
+floor only its horizontal part counts, and a vertical axis has none. A fixed margin comes on top:
+
+    kept = margin + unknown_offset · √(Σ lever²)
+
+The margin includes half a step of a swept path: a path is checked so finely that no body moves by
+more than 10 mm relative to another from one check to the next, so that it is nowhere nearer than
+5 mm less than at the checks.
+
+Not checked are, by this rule: bodies of one link; links next to each other, which their joint
+keeps apart (tools and markers are checked against the link before theirs); two bodies of the arm
+that overlap as modelled in 95 % of sampled configurations; and a body that overlaps an obstacle
+or the floor in every one. Bodies that come nearer than what is kept in 95 % of the configurations
+(all of them for obstacles and floor), but do not overlap, are kept from touching only. `left_out`
+names them all. The base itself touches the floor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from math import ceil, degrees, radians
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.bodies import Body, capsule, enclosing_points
+from remaster_ros.kinematics.convex_distance import ConvexDistances
+from remaster_ros.kinematics.line_of_sight import LinkCapsules, segment_distance
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import apply, inverse
+from remaster_ros.types import BoolArray, FloatArray, IntArray
+
+SELF_COLLISION = 'self-collision'
+FLOOR = 'hits the floor'
+OBSTACLE = 'hits an obstacle'
+
+STEP_M = 0.01
+"""No two bodies move by more relative to each other between two checks of a path, m."""
+HALF_STEP_M = STEP_M / 2
+RESERVE_M = 0.002
+"""What a planner keeps on top: an arm that stands a little off its path is still free, m."""
+
+ESCAPE_STEP_M = 0.002
+"""The same on a way out, m."""
+ESCAPE_TOLERANCE_M = 1e-4
+"""How much nearer what is too near may come from one check of a way out to the next, m."""
+
+_STRIDE = 8
+_SAMPLES = 300
+_MOST = 0.95
+_LIMIT_TOLERANCE_RAD = 1e-6
+
+
+def arm_bodies(chain: SerialChain, given: Sequence[Body], link_radius: float) -> list[Body]:
+    """Add a capsule along each link that has no body: from its joint to the next one, or the tip.
+
+    Parameters
+    ----------
+    chain
+        The arm.
+    given
+        What is known of the arm, its tool and its markers.
+    link_radius
+        Radius of the capsules, m.
+    """
+    covered = {body.link for body in given if body.role == 'link'}
+    bodies = list(given)
+    for link in range(len(chain) + 1):
+        if link not in covered:
+            name = 'the base' if link == 0 else f'the link of {chain.joint_names[link - 1]}'
+            end = chain.T_fixed[link][:3, 3]
+            bodies.append(Body(name, link, capsule(np.zeros(3), end, link_radius)))
+    return bodies
+
+
+@dataclass(frozen=True)
+class Shortfall:
+    """Two bodies nearer to each other than is kept: which configuration, which pair, m."""
+
+    index: int
+    pair: int
+    distance: float
+    kept: float
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """The bodies at configurations: frames (n, k + 1, 4, 4), ends of capsules (n, B, 3), m."""
+
+    frames: FloatArray
+    a: FloatArray
+    b: FloatArray
+
+
+class CollisionModel:
+    """The arm with its tool and markers, the obstacles and the floor around it.
+
+    Parameters
+    ----------
+    chain
+        The arm.
+    bodies
+        Everything; see `arm_bodies`. Bodies on link 0 stand still.
+    floor_z
+        Height of the floor in R, m; None where there is none to hit.
+    margin
+        Fixed part of the clearance, m; at least half a step of a swept path, 5 mm.
+    unknown_offset
+        What a joint's zero-offset may be off by, rad.
+    link_radius
+        Of the capsules that stand for the links in the line of sight, m.
+
+    Attributes
+    ----------
+    chain
+        The arm.
+    bodies
+        All bodies, by link.
+    left_out
+        What is not checked, or only for contact, and why, in words.
+    """
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        bodies: Sequence[Body],
+        *,
+        floor_z: float | None = 0.0,
+        margin: float = 0.008,
+        unknown_offset: float = radians(1.0),
+        link_radius: float = 0.075,
+    ) -> None:
+        if not HALF_STEP_M <= margin < np.inf:
+            raise InputError(
+                f'collision: the clearance is {margin} m; at least {HALF_STEP_M} m are needed, '
+                'half a step of a swept path'
+            )
+        if not 0.0 <= unknown_offset < np.pi / 4:
+            raise InputError(
+                f'collision: the unknown offset is {degrees(unknown_offset):g} deg; it must be '
+                'from 0 to 45 deg'
+            )
+        outside = [body.name for body in bodies if not 0 <= body.link <= len(chain)]
+        if outside:
+            raise InputError(f'collision: {outside[0]} is fastened to no link of the arm')
+        self.chain, self.floor_z = chain, floor_z
+        self.margin, self.unknown_offset = margin, unknown_offset
+        self._sight = LinkCapsules(chain, link_radius)
+        self.bodies = tuple(sorted(bodies, key=lambda body: body.link))
+        self.left_out: tuple[str, ...] = ()
+        self._link = np.array([body.link for body in self.bodies], dtype=np.int64)
+        ends = [body.capsule for body in self.bodies]
+        self._a = np.array([a for a, _, _ in ends]).reshape(-1, 3)
+        self._b = np.array([b for _, b, _ in ends]).reshape(-1, 3)
+        self._radius = np.array([radius for _, _, radius in ends])
+        self._convex = ConvexDistances([(body.shape, body.T_link_body) for body in self.bodies])
+        self._reach = self._reaches()
+        self._set_pairs(*self._possible_pairs())
+        self._apply_rule()
+
+    # What is asked
+
+    def trouble(self, q: ArrayLike, extra: float = 0.0) -> str:
+        """Say what is too near at a configuration, rad, (k,); '' where it is free.
+
+        `extra` is kept on top of the clearance, m.
+        """
+        found = self.shortfalls(np.asarray(q, dtype=float)[None], extra)
+        if not found:
+            return ''
+        return self.words(min(found, key=lambda short: short.distance - short.kept))
+
+    def path_trouble(self, waypoints: ArrayLike, extra: float = 0.0) -> str:
+        """Say what is wrong on the way along configurations (n, k), straight in joint space.
+
+        Parameters
+        ----------
+        waypoints
+            rad, (n, k), n >= 1.
+        extra
+            Kept on top of the clearance, m.
+
+        Returns
+        -------
+        str
+            '' where every point of the way is within the joint limits and free.
+        """
+        q = np.asarray(waypoints, dtype=float)
+        if q.ndim != 2 or q.shape[1] != len(self.chain) or not len(q):
+            raise ValueError(f'a path of shape {q.shape}; it must be (n, {len(self.chain)})')
+        if not np.all(np.isfinite(q)):
+            return 'a joint angle of the path is not finite'
+        limits = self._limit_trouble(q)
+        if limits:
+            return limits
+        if len(q) == 1:
+            return self.trouble(q[0], extra)
+        for start, end in pairwise(q):
+            found = self._sweep(start, end, extra)
+            if found is not None:
+                return f'on the way, {self.words(found)}'
+        return ''
+
+    def escape_trouble(self, waypoints: ArrayLike, *, ends_free: bool = True) -> str:
+        """Say what is wrong with a way out (n, k) of a margin or a contact; '' for nothing.
+
+        What is too near at its start never comes nearer on the way (by more than 0.1 mm from one
+        check to the next), everything else stays as far as is kept, the end is free (with
+        `ends_free`), and no joint leaves its limits.
+
+        Parameters
+        ----------
+        waypoints
+            rad, (n, k), n >= 1.
+        """
+        q = np.asarray(waypoints, dtype=float)
+        if not np.all(np.isfinite(q)):
+            return 'a joint angle of the path is not finite'
+        outside = np.maximum(self.chain.lower - q, q - self.chain.upper)
+        further = outside - np.maximum(outside[0], 0.0)
+        if np.max(further) > _LIMIT_TOLERANCE_RAD:
+            return self._limit_trouble(q)
+        parts = [q[:1]]
+        for a, b in pairwise(q):
+            steps = max(1, ceil(self.travel(a, b) / ESCAPE_STEP_M))
+            parts.append(a + np.arange(1, steps + 1)[:, None] / steps * (b - a))
+        q = np.concatenate(parts)
+        found = self.shortfalls(q)
+        at = [{short.pair: short for short in found if short.index == i} for i in range(len(q))]
+        first = at[0]
+        for i, now in enumerate(at):
+            for pair, short in now.items():
+                if pair not in first:
+                    return f'on the way out, {self.words(short)}'
+                before = at[i - 1].get(pair) if i else short
+                if before is None or short.distance < before.distance - ESCAPE_TOLERANCE_M:
+                    return f'on the way out it comes nearer: {self.words(short)}'
+        if ends_free and at[-1]:
+            return f'at the end of the way out, {self.words(next(iter(at[-1].values())))}'
+        return ''
+
+    def travel(self, start: FloatArray, end: FloatArray) -> float:
+        """Bound how far any point of the arm moves between configurations, m, or relatively."""
+        return float((self._levers @ np.abs(end - start)).max(initial=0.0))
+
+    def pair_distances(self, q: FloatArray, pairs: IntArray) -> FloatArray:
+        """Return the distances of pairs (p,) (see `Shortfall`) at configurations (n, k), m."""
+        placed = self._place(q)
+        bounds = self._lower_bounds(placed)
+        for column in pairs:
+            rows = np.arange(len(q))
+            decided = self._measure_cheap(placed, rows, np.full(len(q), column), bounds)
+            for row in rows[~decided]:
+                bounds[row, column] = self._measure(placed, int(row), int(column))
+        return bounds[:, pairs]
+
+    def reasons(
+        self, q: ArrayLike, extra: float = 0.0
+    ) -> np.ndarray[tuple[int], np.dtype[np.str_]]:
+        """Return why configurations (m, k) are not free, or '', (m,)."""
+        q = np.asarray(q, dtype=float).reshape(-1, len(self.chain))
+        reasons = np.full(len(q), '', dtype=f'U{len(OBSTACLE)}')
+        for short in self.shortfalls(q, extra, first=True):
+            reasons[short.index] = self._category(short.pair)
+        return reasons
+
+    def free_mask(self, q: ArrayLike, extra: float = 0.0) -> BoolArray:
+        """Tell which configurations (m, k) are free, (m,)."""
+        return self.reasons(q, extra) == ''
+
+    def hides(self, q: ArrayLike, marker_T: ArrayLike, sensor_R: ArrayLike) -> BoolArray:
+        """Tell whether a link stands between a marker and a sensor; see `LinkCapsules.hides`."""
+        return self._sight.hides(q, marker_T, sensor_R)
+
+    @cached_property
+    def extent_points(self) -> tuple[FloatArray, ...]:
+        """For each joint, points in the frame after it that enclose what it carries, (n_i, 3).
+
+        Their hull contains the link, and on the last one tool and markers: of everything that
+        moves with the link one of them is the fastest.
+        """
+        extents = []
+        for link in range(1, len(self.chain) + 1):
+            own = [body.outline for body in self.bodies if body.link == link]
+            extents.append(enclosing_points(np.concatenate(own or [np.zeros((1, 3))])))
+        return tuple(extents)
+
+    def shortfalls(
+        self, q: FloatArray, extra: float = 0.0, *, first: bool = False
+    ) -> list[Shortfall]:
+        """Return every pair that is nearer than is kept at configurations (n, k).
+
+        With `first` one of each configuration is enough.
+        """
+        return self._examine(self._place(q), extra, first=first)[0]
+
+    def words(self, short: Shortfall) -> str:
+        """Put a shortfall into words."""
+        inner, outer = self._pair_names(short.pair)
+        kept = f'{1e3 * short.kept:.0f} mm is kept'
+        if short.distance < 0.0:
+            return f'{outer} reaches {-1e3 * short.distance:.0f} mm into {inner}, {kept}'
+        return f'{outer} {1e3 * short.distance:.0f} mm from {inner}, {kept}'
+
+    def _limit_trouble(self, q: FloatArray) -> str:
+        """Say which waypoint (n, k) is outside the joint limits."""
+        chain = self.chain
+        over = np.maximum(chain.lower - q, q - chain.upper)
+        if np.max(over) <= _LIMIT_TOLERANCE_RAD:
+            return ''
+        row, joint = np.unravel_index(int(np.argmax(over)), over.shape)
+        return (
+            f'{chain.joint_names[joint]} at {np.degrees(q[row, joint]):.2f} deg, its limits are '
+            f'{np.degrees(chain.lower[joint]):.2f} to {np.degrees(chain.upper[joint]):.2f} deg'
+        )
+
+    # Pairs: two bodies, or a body and the floor (its inner body is -1)
+
+    def _possible_pairs(self) -> tuple[IntArray, IntArray]:
+        inner, outer = [], []
+        for j, second in enumerate(self.bodies):
+            if second.link == 0:
+                continue
+            for i, one in enumerate(self.bodies[:j]):
+                near = second.link - one.link <= 1 and {one.role, second.role} == {'link'}
+                if one.link < second.link and not near:
+                    inner.append(i)
+                    outer.append(j)
+            if self.floor_z is not None:
+                inner.append(-1)
+                outer.append(j)
+        return np.array(inner, dtype=np.int64), np.array(outer, dtype=np.int64)
+
+    def _set_pairs(
+        self, inner: IntArray, outer: IntArray, contact_only: BoolArray | None = None
+    ) -> None:
+        self._inner, self._outer = inner, outer
+        self._is_floor = inner < 0
+        shapes = [body.shape for body in self.bodies]
+        links = np.where(self._is_floor, 0, self._link[inner] if len(self._link) else 0)
+        # A box that stands still bounds flat and long bodies better than a capsule around it.
+        self._is_box = np.array(
+            [i >= 0 and self._link[i] == 0 and shapes[i].kind == 'box' for i in inner], dtype=bool
+        )
+        self._is_exact = np.array(
+            [
+                i >= 0 and shapes[i].is_its_capsule and shapes[j].is_its_capsule
+                for i, j in zip(inner, outer)
+            ],
+            dtype=bool,
+        )
+        joints = np.arange(1, len(self.chain) + 1)
+        between = joints > links[:, None]
+        # A first joint about the vertical moves nothing up or down.
+        upright = abs((self.chain.T_fixed[0][:3, :3] @ self.chain.axes[0])[2]) > 1 - 1e-12
+        if upright:
+            between[self._is_floor, 0] = False
+        self._between = between & (joints <= self._link[outer][:, None])
+        self._levers = np.where(self._between, self._reach[outer], 0.0)
+        self._contact_only = (
+            np.zeros(len(inner), dtype=bool) if contact_only is None else contact_only
+        )
+        self._most_kept = np.where(
+            self._contact_only,
+            0.0,
+            self.margin + self.unknown_offset * np.linalg.norm(self._levers, axis=1),
+        )
+        self._kinds = (
+            np.flatnonzero(self._is_floor),
+            np.flatnonzero(self._is_box),
+            np.flatnonzero(~self._is_floor & ~self._is_box),
+        )
+
+    def _apply_rule(self) -> None:
+        """Leave out what overlaps by construction; see the module's text."""
+        low = np.where(np.isfinite(self.chain.lower), self.chain.lower, -np.pi)
+        high = np.where(np.isfinite(self.chain.upper), self.chain.upper, np.pi)
+        q = low + np.random.default_rng(0).random((_SAMPLES, len(self.chain))) * (high - low)
+        touching, near = np.zeros(len(self._inner)), np.zeros(len(self._inner))
+        # With the planner's reserve: it must not drop all that the construction brings so near.
+        for short in self.shortfalls(q, RESERVE_M):
+            near[short.pair] += 1
+            touching[short.pair] += short.distance < 0.0
+        is_self = np.array([self._category(pair) == SELF_COLLISION for pair in range(len(near))])
+        share = np.where(is_self, _MOST, 1.0) * _SAMPLES
+        out, contact_only = touching >= share, near >= share
+        for pair in np.flatnonzero(out | contact_only):
+            inner, outer = self._pair_names(int(pair))
+            how = 'overlap by construction, not checked' if out[pair] else 'checked for contact'
+            self.left_out += (f'{inner} and {outer}: {how}',)
+        self._set_pairs(self._inner[~out], self._outer[~out], contact_only[~out])
+
+    def _category(self, pair: int) -> str:
+        if self._is_floor[pair]:
+            return FLOOR
+        inner = self.bodies[self._inner[pair]]
+        return OBSTACLE if inner.role == 'obstacle' else SELF_COLLISION
+
+    def _pair_names(self, pair: int) -> tuple[str, str]:
+        inner = 'the floor' if self._is_floor[pair] else self.bodies[self._inner[pair]].name
+        return inner, self.bodies[self._outer[pair]].name
+
+    def _reaches(self) -> FloatArray:
+        """Bound each body's distance from each joint's axis in any configuration, m, (B, k)."""
+        chain = self.chain
+        reach = np.zeros((len(self.bodies), len(chain)))
+        for b, body in enumerate(self.bodies):
+            far = 0.0
+            points = body.outline
+            for joint in range(body.link - 1, -1, -1):
+                # What a further joint turns stays as far from that joint's origin.
+                axis = chain.axes[joint]
+                across = np.linalg.norm(points - (points @ axis)[:, None] * axis, axis=1)
+                reach[b, joint] = far + across.max()
+                far += np.linalg.norm(points, axis=1).max()
+                points = chain.T_fixed[joint][None, :3, 3]
+        return reach
+
+    # Distances
+
+    def _place(self, q: FloatArray) -> _Placed:
+        frames = np.empty((len(q), len(self.chain) + 1, 4, 4))
+        frames[:, 0] = np.eye(4)
+        frames[:, 1:] = self.chain.frames(q)
+        own = frames[:, self._link]
+        rotation, origin = own[..., :3, :3], own[..., :3, 3]
+        a = (rotation @ self._a[:, :, None])[..., 0] + origin
+        b = (rotation @ self._b[:, :, None])[..., 0] + origin
+        return _Placed(frames, a, b)
+
+    def _lower_bounds(self, placed: _Placed) -> FloatArray:
+        """Return what each pair is apart at least, m, (n, P)."""
+        a, b, radius = placed.a, placed.b, self._radius
+        bounds = np.empty((len(a), len(self._inner)))
+        floor, boxes, others = self._kinds
+        if len(floor):
+            own = self._outer[floor]
+            lowest = np.minimum(a[:, own, 2], b[:, own, 2]) - radius[own]
+            bounds[:, floor] = lowest - (self.floor_z or 0.0)
+        for i in np.unique(self._inner[boxes]):
+            pairs = boxes[self._inner[boxes] == i]
+            own = self._outer[pairs]
+            T = inverse(self.bodies[i].T_link_body)
+            ends = np.stack((apply(T, a[:, own]), apply(T, b[:, own])))
+            half = self.bodies[i].shape.points.max(axis=0)
+            gaps = np.maximum(ends.min(axis=0) - half, -half - ends.max(axis=0))
+            bounds[:, pairs] = np.linalg.norm(np.maximum(gaps, 0.0), axis=-1) - radius[own]
+        if len(others):
+            i, j = self._inner[others], self._outer[others]
+            apart = segment_distance(a[:, i], b[:, i], a[:, j], b[:, j])
+            bounds[:, others] = apart - radius[i] - radius[j]
+        return bounds
+
+    def _kept(self, placed: _Placed, rows: IntArray, pairs: IntArray) -> FloatArray:
+        """Return the clearance of pairs (c,) at configurations (c,), m, (c,)."""
+        frames = placed.frames[rows, 1:]
+        axes = (frames[..., :3, :3] @ self.chain.axes[:, :, None])[..., 0]
+        own = self._outer[pairs]
+        ends = np.stack((placed.a[rows, own], placed.b[rows, own]), axis=1)
+        arms = np.cross(axes[:, None], ends[:, :, None] - frames[:, None, :, :3, 3])
+        on_floor = self._is_floor[pairs]
+        level = np.sqrt(np.maximum(0.0, 1.0 - axes[..., 2] ** 2))
+        radius = self._radius[own][:, None]
+        levers = np.where(
+            on_floor[:, None],
+            np.abs(arms[..., 2]).max(axis=1) + radius * level,
+            np.linalg.norm(arms, axis=-1).max(axis=1) + radius,
+        )
+        levers = np.where(self._between[pairs], levers, 0.0)
+        kept = self.margin + self.unknown_offset * np.linalg.norm(levers, axis=1)
+        # At most what the bound says: the capsule around a body is wider than the body.
+        return np.minimum(kept, self._most_kept[pairs])
+
+    def _extra(self, extra: float) -> FloatArray:
+        """Return what is kept on top, m, (P,): nothing where only contact counts."""
+        return np.where(self._contact_only, 0.0, extra)
+
+    def _measure(self, placed: _Placed, row: int, pair: int) -> float:
+        """Return the distance of a pair of bodies, m, negative where they overlap."""
+        inner, outer = int(self._inner[pair]), int(self._outer[pair])
+        frames = placed.frames[row]
+        return self._convex.distance(
+            inner, frames[self._link[inner]], outer, frames[self._link[outer]]
+        )
+
+    def _measure_cheap(
+        self, placed: _Placed, rows: IntArray, pairs: IntArray, bounds: FloatArray
+    ) -> BoolArray:
+        """Put distances that need no coal into `bounds` (n, P); return which were, (c,)."""
+        on_floor = self._is_floor[pairs]
+        for pair in np.unique(pairs[on_floor]):
+            own = rows[pairs == pair]
+            outer = int(self._outer[pair])
+            shape = self.bodies[outer].shape
+            T = placed.frames[own, self._link[outer]] @ self.bodies[outer].T_link_body
+            lowest = np.min(T[:, 2, :3] @ shape.points.T, axis=1) + T[:, 2, 3]
+            lowest = lowest - shape.ball - shape.disc * np.hypot(T[:, 2, 0], T[:, 2, 1])
+            bounds[own, pair] = lowest - (self.floor_z or 0.0)
+        return on_floor | self._is_exact[pairs]
+
+    def _candidates(
+        self, placed: _Placed, bounds: FloatArray, is_open: BoolArray | None, extra: float
+    ) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
+        """Return what may be too near: rows, pairs, what is kept, and whether it is decided.
+
+        What needs no coal is measured; of that only what is too near is returned.
+        """
+        on_top = self._extra(extra)
+        may = bounds < self._most_kept + on_top
+        rows, pairs = np.nonzero(may if is_open is None else may & is_open)
+        if not len(rows):
+            return rows, pairs, np.empty(0), np.empty(0, dtype=bool)
+        kept = self._kept(placed, rows, pairs) + on_top[pairs]
+        near = bounds[rows, pairs] < kept
+        rows, pairs, kept = rows[near], pairs[near], kept[near]
+        decided = self._measure_cheap(placed, rows, pairs, bounds)
+        near = bounds[rows, pairs] < kept
+        return rows[near], pairs[near], kept[near], decided[near]
+
+    def _examine(
+        self, placed: _Placed, extra: float, *, first: bool = False, one: bool = False
+    ) -> tuple[list[Shortfall], FloatArray]:
+        """Return shortfalls, and distances or lower bounds of them (n, P).
+
+        With `first` one of each configuration is enough, with `one` a single one.
+        """
+        bounds = self._lower_bounds(placed)
+        rows, pairs, kept, decided = self._candidates(placed, bounds, None, extra)
+        found: list[Shortfall] = []
+        done: set[int] = set()
+        # What is decided comes first, then what is probably too near: the rest costs more.
+        for n in np.lexsort((bounds[rows, pairs] - kept, self._is_floor[pairs], ~decided)):
+            row, pair = int(rows[n]), int(pairs[n])
+            if first and row in done:
+                continue
+            if not decided[n]:
+                bounds[row, pair] = self._measure(placed, row, pair)
+            if bounds[row, pair] < kept[n]:
+                found.append(Shortfall(row, pair, float(bounds[row, pair]), float(kept[n])))
+                done.add(row)
+                if one:
+                    break
+        return found, bounds
+
+    # Swept paths
+
+    def _sweep(self, start: FloatArray, end: FloatArray, extra: float) -> Shortfall | None:
+        """Return something that is too near on the straight way in joint space."""
+        travel = self._levers @ np.abs(end - start)
+        steps = max(1, ceil(float(travel.max(initial=0.0)) / STEP_M))
+        grid = np.unique(np.append(np.arange(0, steps, _STRIDE), steps))
+        share = np.arange(steps + 1) / steps
+        q = start + share[:, None] * (end - start)
+        # Most ways that are not free show it at one of these.
+        found, _ = self._examine(self._place(q[[steps // 2, steps // 4, -1]]), extra, one=True)
+        if found:
+            return found[0]
+        found, distances = self._examine(self._place(q[grid]), extra, one=True)
+        if found:
+            return found[0]
+        # Where neither end of an interval excludes a pair, all of the interval is looked at.
+        least = distances[:-1] + distances[1:] - np.diff(grid)[:, None] / steps * travel
+        is_open = least / 2 < self._most_kept + self._extra(extra - HALF_STEP_M)
+        open_ones = np.flatnonzero(is_open.any(axis=1))
+        inside = [np.arange(grid[row] + 1, grid[row + 1]) for row in open_ones]
+        if not sum(map(len, inside)):
+            return None
+        which = is_open[np.repeat(open_ones, [len(part) for part in inside])]
+        return self._look_closely(q, np.concatenate(inside), which, travel / steps, extra)
+
+    def _look_closely(
+        self,
+        q: FloatArray,
+        inside: IntArray,
+        is_open: BoolArray,
+        per_step: FloatArray,
+        extra: float,
+    ) -> Shortfall | None:
+        """Check some steps (m,) of a way (n, k): the pairs (m, P) that are open there."""
+        placed = self._place(q[inside])
+        bounds = self._lower_bounds(placed)
+        rows, pairs, kept, decided = self._candidates(placed, bounds, is_open, extra)
+        if decided.any():
+            n = int(np.argmax(decided))
+            row, pair = int(rows[n]), int(pairs[n])
+            return Shortfall(row, pair, float(bounds[row, pair]), float(kept[n]))
+        most = self._most_kept + self._extra(extra)
+        beyond = np.full(len(per_step), -1.0)
+        for n in range(len(rows)):
+            row, pair = int(rows[n]), int(pairs[n])
+            if inside[row] < beyond[pair]:
+                continue
+            distance = self._measure(placed, row, pair)
+            if distance < kept[n]:
+                return Shortfall(row, pair, distance, float(kept[n]))
+            # So many steps further it cannot have come nearer than what is kept at most.
+            beyond[pair] = inside[row] + (distance - most[pair]) / max(per_step[pair], 1e-12)
+        return None

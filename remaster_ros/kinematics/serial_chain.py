@@ -1,0 +1,394 @@
+"""A serial chain of revolute joints from a URDF: kinematics with zero-offsets, gravity torques.
+
+The true joint angle is the reported one plus the zero-offset, everywhere. All methods take any
+number of leading dimensions in ``q``, ``points`` and ``joint_offsets``, and broadcast them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.transforms import apply, inverse, rotation_vector_to_matrix
+from remaster_ros.kinematics.urdf import UrdfJoint, UrdfModel, parse_urdf
+from remaster_ros.types import BoolArray, FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class SerialChain:
+    """The joints between two links of a robot, base to tip; fixed joints are merged.
+
+    Attributes
+    ----------
+    name
+        The robot's name in the URDF.
+    joint_names
+        Names of the k joints.
+    base_link, tip_link
+        Frame R and frame T.
+    lower, upper
+        Joint limits, rad, (k,); infinite for continuous joints.
+    velocity_limits
+        rad/s, (k,); infinite where the URDF gives none.
+    T_fixed
+        What lies before each joint and, last, from the last joint's link to the tip,
+        (k + 1, 4, 4).
+    axes
+        Unit joint axes in the joint frames, (k, 3).
+    masses, centers_of_mass
+        Mass that moves with each joint (its link and all that is fastened to it), kg, (k,), and
+        its centre in the frame after the joint, m, (k, 3).
+    has_inertials
+        False where no moving link has a mass: gravity's effects cannot be computed.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    base_link: str
+    tip_link: str
+    lower: FloatArray
+    upper: FloatArray
+    velocity_limits: FloatArray
+    T_fixed: FloatArray
+    axes: FloatArray
+    masses: FloatArray
+    centers_of_mass: FloatArray
+    has_inertials: bool
+
+    @classmethod
+    def from_urdf(
+        cls, text: str, base_link: str | None = None, tip_link: str | None = None
+    ) -> SerialChain:
+        """Read the chain from URDF text.
+
+        Joints off the chain (a gripper's fingers, say) count as fixed at zero: their masses hang
+        on the link that carries them.
+
+        Parameters
+        ----------
+        text
+            Contents of the URDF file.
+        base_link
+            Frame R; the root link where None.
+        tip_link
+            Frame T; where None, the only link that carries no other.
+
+        Raises
+        ------
+        InputError
+            Text that is no URDF, missing links, no way from base to tip, a joint on the way that
+            is neither revolute, continuous nor fixed, or limits that are missing or reversed.
+        """
+        model = parse_urdf(text)
+        base_link = model.root if base_link is None else base_link
+        if tip_link is None:
+            leaves = model.leaves()
+            if len(leaves) != 1:
+                raise InputError(
+                    f'URDF: the arm has several ends ({", ".join(leaves)}); name the tip link'
+                )
+            tip_link = leaves[0]
+        joints = _joints_between(model, base_link, tip_link)
+
+        moving: list[UrdfJoint] = []
+        T_fixed = [np.eye(4)]
+        for joint in joints:
+            T_fixed[-1] = T_fixed[-1] @ joint.origin
+            if joint.kind != 'fixed':
+                _require_revolute(joint)
+                moving.append(joint)
+                T_fixed.append(np.eye(4))
+        if not moving:
+            raise InputError(
+                f"URDF: no joint moves between '{base_link}' and '{tip_link}'; name other links"
+            )
+
+        first_moments, masses = _carried_masses(model, moving)
+        with_mass = np.where(masses > 0.0, masses, 1.0)
+        limits = [_limits(joint) for joint in moving]
+        return cls(
+            name=model.name,
+            joint_names=tuple(joint.name for joint in moving),
+            base_link=base_link,
+            tip_link=tip_link,
+            lower=np.array([lower for lower, _, _ in limits]),
+            upper=np.array([upper for _, upper, _ in limits]),
+            velocity_limits=np.array([velocity for _, _, velocity in limits]),
+            T_fixed=np.array(T_fixed),
+            axes=np.array([joint.axis for joint in moving]),
+            masses=masses,
+            centers_of_mass=first_moments / with_mass[:, None],
+            has_inertials=bool(masses.any()),
+        )
+
+    def __len__(self) -> int:
+        """Return the number of joints k."""
+        return len(self.joint_names)
+
+    def with_offsets(self, joint_offsets: FloatArray) -> SerialChain:
+        """Return the arm with zero-offsets (rad, (k,)) built in: it takes reported angles.
+
+        Where ``frames`` of reported angles q are is where the arm is, and its limits are those of
+        the reported angles at its stops.
+        """
+        T_fixed = self.T_fixed.copy()
+        turns = rotation_vector_to_matrix(self.axes * np.asarray(joint_offsets)[:, None])
+        T_fixed[:-1, :3, :3] = T_fixed[:-1, :3, :3] @ turns
+        return replace(
+            self,
+            T_fixed=T_fixed,
+            lower=self.lower - joint_offsets,
+            upper=self.upper - joint_offsets,
+        )
+
+    def within_limits(self, q: ArrayLike, tolerance: float = 0.0) -> BoolArray:
+        """Tell whether all joints of q (..., k) are within limits (+ tolerance, rad), (...)."""
+        q = np.asarray(q, dtype=float)
+        inside = (q >= self.lower - tolerance) & (q <= self.upper + tolerance)
+        return np.all(inside, axis=-1)
+
+    def frames(self, q: ArrayLike, joint_offsets: ArrayLike | None = None) -> FloatArray:
+        """Return the frame after each joint in R.
+
+        Parameters
+        ----------
+        q
+            Joint angles, rad, (..., k).
+        joint_offsets
+            Zero-offsets added to q, rad, (..., k); None for the nominal robot.
+
+        Returns
+        -------
+        ndarray
+            T_R_link for each joint's link, (..., k, 4, 4).
+        """
+        sine, cosine = self._sine_cosine(q, joint_offsets)
+        batch = sine.shape[:-1]
+        frames = np.empty((*batch, len(self), 4, 4))
+        frames[..., 3, :] = (0.0, 0.0, 0.0, 1.0)
+        rotation, origin = np.eye(3), np.zeros(3)
+        for i, fixed in enumerate(self.T_fixed[:-1]):
+            origin = origin + rotation @ fixed[:3, 3]
+            rotation = rotation @ fixed[:3, :3]
+            # Rodrigues: R(q) = I + sin(q) K + (1 - cos(q)) K^2, K the axis' cross-product matrix.
+            turn = (
+                np.eye(3)
+                + sine[..., i, None, None] * self._cross[i]
+                + (1.0 - cosine[..., i, None, None]) * self._cross_squared[i]
+            )
+            rotation = rotation @ turn
+            frames[..., i, :3, :3] = rotation
+            frames[..., i, :3, 3] = origin
+        return frames
+
+    def forward(self, q: ArrayLike, joint_offsets: ArrayLike | None = None) -> FloatArray:
+        """Return the tool pose T_R_T, (..., 4, 4), for joint angles (..., k); see `frames`."""
+        return self.frames(q, joint_offsets)[..., -1, :, :] @ self.T_fixed[-1]
+
+    def positions(
+        self, q: ArrayLike, points: ArrayLike, joint_offsets: ArrayLike | None = None
+    ) -> FloatArray:
+        """Return where points of the tool frame are in R: the fast path of the fit.
+
+        Turns vectors instead of multiplying matrices, and joins the sines of q (n, k) and of
+        joint_offsets (B, 1, k) by the addition theorem, so that a batch of offsets costs no
+        trigonometry over its whole shape.
+
+        Parameters
+        ----------
+        q
+            Joint angles, rad, (..., k).
+        points
+            Points in the tool frame T, m, (..., 3).
+        joint_offsets
+            Zero-offsets, rad, (..., k).
+
+        Returns
+        -------
+        ndarray
+            m, (..., 3).
+        """
+        sine, cosine = self._sine_cosine(q, joint_offsets)
+        points = np.asarray(points, dtype=float)
+        x, y, z = (points[..., i] for i in range(3))
+        for i in range(len(self), -1, -1):
+            R, t = self.T_fixed_z[i, :3, :3], self.T_fixed_z[i, :3, 3]
+            x, y, z = (
+                R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0],
+                R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1],
+                R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2],
+            )
+            if i > 0:
+                s, c = sine[..., i - 1], cosine[..., i - 1]
+                x, y = c * x - s * y, s * x + c * y
+        return np.stack((x, y, z), axis=-1)
+
+    def position_jacobian(
+        self, q: ArrayLike, points: ArrayLike, joint_offsets: ArrayLike | None = None
+    ) -> FloatArray:
+        """Return the derivative of `positions` by q (or, the same, by the zero-offsets).
+
+        Column i is axis_i × (p − o_i), the velocity of the point about joint i.
+
+        Returns
+        -------
+        ndarray
+            m/rad, (..., 3, k).
+        """
+        frames = self.frames(q, joint_offsets)
+        tip = frames[..., -1, :, :] @ self.T_fixed[-1]
+        return self.velocities(frames, apply(tip, points))
+
+    def velocities(self, frames: FloatArray, points: FloatArray) -> FloatArray:
+        """Return the same, (..., 3, k), for points in R (..., 3) and `frames` (..., k, 4, 4)."""
+        arms = points[..., None, :] - frames[..., :3, 3]
+        return np.swapaxes(np.cross(self.axes_in_base(frames), arms), -1, -2)
+
+    def gravity_torque(
+        self,
+        q: ArrayLike,
+        gravity: ArrayLike = (0.0, 0.0, -9.81),
+        joint_offsets: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Return gravity's torque about each joint: axis · (r × m g) over what hangs on it.
+
+        Positive where gravity turns the joint its own way; a motor that holds the arm still has
+        to apply the negative.
+
+        Parameters
+        ----------
+        q
+            Joint angles, rad, (..., k).
+        gravity
+            Acceleration in R, m/s², (3,).
+        joint_offsets
+            Zero-offsets, rad, (..., k).
+
+        Returns
+        -------
+        ndarray
+            N m, (..., k); zeros where the URDF has no masses (`has_inertials`).
+        """
+        frames = self.frames(q, joint_offsets)
+        centers = apply(frames, self.centers_of_mass)
+        moments = self.masses[:, None] * centers
+        # Sums over the joint's own link and all further out.
+        carried_moment = np.cumsum(moments[..., ::-1, :], axis=-2)[..., ::-1, :]
+        carried_mass = np.cumsum(self.masses[::-1])[::-1]
+        arms = carried_moment - carried_mass[:, None] * frames[..., :3, 3]
+        torque = np.cross(arms, np.asarray(gravity, dtype=float))
+        return np.sum(self.axes_in_base(frames) * torque, axis=-1)
+
+    def axes_in_base(self, frames: FloatArray) -> FloatArray:
+        """Return the joint axes in R, (..., k, 3), of frames (..., k, 4, 4)."""
+        return (frames[..., :3, :3] @ self.axes[:, :, None])[..., 0]
+
+    def _sine_cosine(
+        self, q: ArrayLike, joint_offsets: ArrayLike | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return sine and cosine of q + joint_offsets, each (..., k)."""
+        q = np.asarray(q, dtype=float)
+        if q.ndim == 0 or q.shape[-1] != len(self):
+            raise ValueError(f'q has shape {q.shape}; its last size must be {len(self)}')
+        sine, cosine = np.sin(q), np.cos(q)
+        if joint_offsets is None:
+            return sine, cosine
+        offset_sine, offset_cosine = np.sin(joint_offsets), np.cos(joint_offsets)
+        return (
+            sine * offset_cosine + cosine * offset_sine,
+            cosine * offset_cosine - sine * offset_sine,
+        )
+
+    @cached_property
+    def _cross(self) -> FloatArray:
+        """Cross-product matrices of the axes, (k, 3, 3)."""
+        # Row j of the cross product is axis × e_j, which is column j of K.
+        return np.swapaxes(np.cross(self.axes[:, None, :], np.eye(3)), -1, -2)
+
+    @cached_property
+    def _cross_squared(self) -> FloatArray:
+        """Squares of the cross-product matrices, (k, 3, 3)."""
+        return self._cross @ self._cross
+
+    @cached_property
+    def T_fixed_z(self) -> FloatArray:
+        """`T_fixed` of the same arm with every joint frame turned so that its axis is Z."""
+        turns = np.broadcast_to(np.eye(4), (len(self) + 2, 4, 4)).copy()
+        for turn, axis in zip(turns[1:-1], self.axes, strict=True):
+            # The shortest turn from Z to the axis; which one does not matter.
+            tilt = np.cross((0.0, 0.0, 1.0), axis)
+            sine = np.linalg.norm(tilt)
+            if sine < 1e-12:
+                turn[:3, :3] = np.diag([1.0, np.sign(axis[2]), np.sign(axis[2])])
+            else:
+                rotation_vector = tilt / sine * np.arctan2(sine, axis[2])
+                turn[:3, :3] = rotation_vector_to_matrix(rotation_vector)
+        return inverse(turns[:-1]) @ self.T_fixed @ turns[1:]
+
+
+def _joints_between(model: UrdfModel, base_link: str, tip_link: str) -> list[UrdfJoint]:
+    """Return the joints from base to tip, in that order."""
+    for link in (base_link, tip_link):
+        if link not in model.links:
+            raise InputError(f"URDF: there is no link '{link}'; it has {', '.join(model.links)}")
+    joints = []
+    here = tip_link
+    while here != base_link:
+        if here not in model.parent_joint:
+            raise InputError(f"URDF: link '{tip_link}' does not hang on link '{base_link}'")
+        joint = model.parent_joint[here]
+        joints.append(joint)
+        here = joint.parent
+    return joints[::-1]
+
+
+def _require_revolute(joint: UrdfJoint) -> None:
+    if joint.kind not in ('revolute', 'continuous'):
+        raise InputError(
+            f"URDF: joint '{joint.name}' is {joint.kind}; "
+            'only revolute, continuous and fixed joints are supported between base and tip'
+        )
+    if joint.mimic:
+        raise InputError(
+            f"URDF: joint '{joint.name}' mimics another joint; that is not supported on the arm"
+        )
+
+
+def _limits(joint: UrdfJoint) -> tuple[float, float, float]:
+    """Return lower, upper and velocity limit; a velocity of 0 or none means unknown."""
+    velocity = joint.velocity or np.inf
+    if velocity < 0.0:
+        raise InputError(f"URDF: the velocity limit of joint '{joint.name}' is negative")
+    if joint.kind == 'continuous':
+        return -np.inf, np.inf, velocity
+    if joint.lower is None or joint.upper is None:
+        raise InputError(
+            f"URDF: joint '{joint.name}' has no position limits; write <limit lower upper>"
+        )
+    if joint.lower >= joint.upper:
+        raise InputError(
+            f"URDF: joint '{joint.name}' has limits {joint.lower} to {joint.upper} rad; "
+            'the lower must be below the upper'
+        )
+    return joint.lower, joint.upper, velocity
+
+
+def _carried_masses(model: UrdfModel, moving: list[UrdfJoint]) -> tuple[FloatArray, FloatArray]:
+    """Sum first moments (kg m, (k, 3), in the frame after each joint) and masses (kg, (k,))."""
+    index = {joint.child: i for i, joint in enumerate(moving)}
+    first_moments, masses = np.zeros((len(moving), 3)), np.zeros(len(moving))
+    for link in model.links.values():
+        here, T_here_link = link.name, np.eye(4)
+        while here not in index and here in model.parent_joint:
+            joint = model.parent_joint[here]
+            T_here_link = joint.origin @ T_here_link
+            here = joint.parent
+        if here in index:
+            i = index[here]
+            masses[i] += link.mass
+            first_moments[i] += link.mass * apply(T_here_link, link.center_of_mass)
+    return first_moments, masses

@@ -1,0 +1,268 @@
+"""A strict reader of URDF text: the links, joints, limits and masses, nothing else.
+
+Meshes, materials and the like are passed over. What does not fit is refused with one line that
+names the joint or link; nothing is guessed.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.transforms import matrix_from_rpy, transform
+from remaster_ros.types import FloatArray
+
+_LARGEST = 1e6
+"""No robot has a length (m), angle (rad) or mass (kg) above it; larger ones would overflow."""
+_XACRO = (
+    'URDF: this is xacro, from which a URDF is still to be made; expand it: '
+    'ros2 run xacro xacro FILE > robot.urdf'
+)
+_NO_LIMIT = 1e300
+"""Some programs write a huge limit, such as 1e16, where they mean none."""
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfLink:
+    """One link: its mass (kg; 0 without ``<inertial>``) and centre of mass (m, link frame)."""
+
+    name: str
+    mass: float
+    center_of_mass: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfJoint:
+    """One joint as written.
+
+    Attributes
+    ----------
+    kind
+        ``type`` of the URDF: revolute, continuous, fixed, prismatic, floating, planar.
+    origin
+        T_parent_joint, (4, 4).
+    axis
+        Unit vector in the joint frame, (3,); X for a joint that is fixed.
+    lower, upper, velocity
+        Limits as written, rad and rad/s; None where absent.
+    mimic
+        True where the joint follows another one.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: FloatArray
+    axis: FloatArray
+    lower: float | None
+    upper: float | None
+    velocity: float | None
+    mimic: bool
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfModel:
+    """A robot as a tree: ``parent_joint`` maps each link but the root to its joint."""
+
+    name: str
+    root: str
+    links: Mapping[str, UrdfLink]
+    parent_joint: Mapping[str, UrdfJoint]
+
+    def leaves(self) -> list[str]:
+        """Return the links that carry nothing, in file order."""
+        parents = {joint.parent for joint in self.parent_joint.values()}
+        return [name for name in self.links if name not in parents]
+
+
+def parse_urdf(text: str) -> UrdfModel:
+    """Read URDF text.
+
+    Raises
+    ------
+    InputError
+        Malformed XML, a DOCTYPE or entity declaration, a joint to a missing link, two links or
+        joints of one name, a link with two parents, a loop, or a number that is none.
+    """
+    # The keyword is case-sensitive in XML, so text without it cannot declare an entity.
+    if '<!DOCTYPE' in text or '<!ENTITY' in text:
+        raise InputError('URDF: it declares a DOCTYPE or entities; remove the declaration')
+    try:
+        robot = ElementTree.fromstring(text)
+    # A ValueError where the text holds what no encoding can write.
+    except (ElementTree.ParseError, ValueError) as error:
+        if '<xacro:' in text:  # Without its namespace, which is not well-formed.
+            raise InputError(_XACRO) from None
+        raise InputError(f'URDF: not well-formed XML ({error})') from None
+    # What xacro has expanded may still declare its namespace, but has no element of it.
+    if any(_is_xacro(element) for element in robot.iter()):
+        raise InputError(_XACRO)
+    if robot.tag != 'robot':
+        raise InputError(f'URDF: the outermost element is <{robot.tag}>, not <robot>')
+
+    links: dict[str, UrdfLink] = {}
+    for element in robot.findall('link'):
+        link = _link(element)
+        if link.name in links:
+            raise InputError(f"URDF: two links are named '{link.name}'")
+        links[link.name] = link
+
+    parent_joint: dict[str, UrdfJoint] = {}
+    names: set[str] = set()
+    for element in robot.findall('joint'):
+        joint = _joint(element)
+        for end in (joint.parent, joint.child):
+            if end not in links:
+                raise InputError(
+                    f"URDF: joint '{joint.name}' names link '{end}', which is missing"
+                )
+        if joint.name in names:
+            raise InputError(f"URDF: two joints are named '{joint.name}'")
+        if joint.child in parent_joint:
+            other = parent_joint[joint.child].name
+            raise InputError(
+                f"URDF: link '{joint.child}' hangs on two joints, '{other}' and '{joint.name}'"
+            )
+        names.add(joint.name)
+        parent_joint[joint.child] = joint
+
+    roots = [name for name in links if name not in parent_joint]
+    if len(roots) != 1:
+        found = ', '.join(roots) if roots else 'none, the links form a loop'
+        raise InputError(f'URDF: a robot is a tree with one root link; found {found}')
+    _refuse_loops(links, roots[0], parent_joint)
+    return UrdfModel(robot.get('name', ''), roots[0], links, parent_joint)
+
+
+def _is_xacro(element: ElementTree.Element) -> bool:
+    """Tell an element of xacro's namespace, of which there are several spellings."""
+    # Comments have a function for their tag.
+    tag = element.tag if isinstance(element.tag, str) else ''
+    return tag.startswith('{') and tag.partition('}')[0].endswith('xacro')
+
+
+def _refuse_loops(links: Iterable[str], root: str, parent_joint: Mapping[str, UrdfJoint]) -> None:
+    """Refuse links whose ancestors form a loop apart from the root."""
+    hanging = {root}
+    for link in links:
+        here, path = link, {link}
+        while here not in hanging:
+            here = parent_joint[here].parent
+            if here in path:
+                raise InputError(f"URDF: link '{link}' is part of a loop; a robot is a tree")
+            path.add(here)
+        hanging |= path
+
+
+def _link(element: ElementTree.Element) -> UrdfLink:
+    name = attribute(element, 'name', 'a link')
+    where = f"link '{name}'"
+    inertial = element.find('inertial')
+    if inertial is None:
+        return UrdfLink(name, 0.0, np.zeros(3))
+    mass_element = inertial.find('mass')
+    if mass_element is None:
+        raise InputError(f'URDF: {where} has <inertial> without <mass>')
+    mass = _number(attribute(mass_element, 'value', where), f'the mass of {where}')
+    if mass < 0.0:
+        raise InputError(f'URDF: the mass of {where} is {mass} kg; it cannot be negative')
+    return UrdfLink(name, mass, origin_of(inertial, where)[:3, 3])
+
+
+def _joint(element: ElementTree.Element) -> UrdfJoint:
+    name = attribute(element, 'name', 'a joint')
+    where = f"joint '{name}'"
+    ends = {}
+    for end in ('parent', 'child'):
+        child = element.find(end)
+        if child is None:
+            raise InputError(f'URDF: {where} has no <{end}>')
+        ends[end] = attribute(child, 'link', f'<{end}> of {where}')
+    kind = attribute(element, 'type', where)
+    limit = element.find('limit')
+    limits: dict[str, float | None] = {}
+    for key in ('lower', 'upper', 'velocity'):
+        written = None if limit is None else limit.get(key)
+        limits[key] = None if written is None else _number(written, f'{key} of {where}', _NO_LIMIT)
+    _check_what_is_passed_over(element, where)
+    return UrdfJoint(
+        name=name,
+        kind=kind,
+        parent=ends['parent'],
+        child=ends['child'],
+        origin=origin_of(element, where),
+        axis=_axis(element, kind, where),
+        lower=limits['lower'],
+        upper=limits['upper'],
+        velocity=limits['velocity'],
+        mimic=element.find('mimic') is not None,
+    )
+
+
+def _check_what_is_passed_over(element: ElementTree.Element, where: str) -> None:
+    """Refuse numbers that are none where this reader needs none, but a calibrated copy does."""
+    for tag, keys in (
+        ('mimic', ('multiplier', 'offset')),
+        ('safety_controller', ('soft_lower_limit', 'soft_upper_limit')),
+    ):
+        for found in element.findall(tag):
+            for key in keys:
+                if (text := found.get(key)) is not None:
+                    _number(text, f'{key} of {where}', _NO_LIMIT)
+
+
+def _axis(element: ElementTree.Element, kind: str, where: str) -> FloatArray:
+    """Return the unit axis of a joint in its frame; X where it is not given, as URDF has it."""
+    axis_element = element.find('axis')
+    # CAD exporters write an axis of 0 0 0 where there is none to move about.
+    if axis_element is None or kind in ('fixed', 'floating'):
+        return np.array([1.0, 0.0, 0.0])
+    axis = numbers(attribute(axis_element, 'xyz', where), 3, f'the axis of {where}')
+    length = math.hypot(*axis)
+    if not 1e-6 < length < 1e6:
+        raise InputError(f'URDF: the axis of {where} has length {length:g}; give a unit vector')
+    return axis / length
+
+
+def origin_of(element: ElementTree.Element, where: str) -> FloatArray:
+    """Return the place that ``<origin>`` gives, (4, 4); the identity where there is none."""
+    origin = element.find('origin')
+    if origin is None:
+        return np.eye(4)
+    xyz = numbers(origin.get('xyz', '0 0 0'), 3, f'the origin xyz of {where}')
+    rpy = numbers(origin.get('rpy', '0 0 0'), 3, f'the origin rpy of {where}')
+    return transform(matrix_from_rpy(rpy), xyz)
+
+
+def attribute(element: ElementTree.Element, key: str, where: str) -> str:
+    """Return an attribute that has to be there; `where` names its place in messages."""
+    value = element.get(key, '')
+    if not value:
+        raise InputError(f"URDF: {where} has no attribute '{key}'")
+    return value
+
+
+def numbers(text: str, count: int, what: str) -> FloatArray:
+    """Return so many numbers, (count,); `what` names them in messages."""
+    words = text.split()
+    if len(words) != count:
+        needed = 'three numbers are needed' if count == 3 else f'{count} is needed'
+        raise InputError(f"URDF: {what} is '{text}'; {needed}")
+    return np.array([_number(word, what) for word in words])
+
+
+def _number(text: str, what: str, largest: float = _LARGEST) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        hint = ' (run xacro on the file first)' if '$' in text else ''
+        raise InputError(f"URDF: {what} is '{text}', not a number{hint}") from None
+    if not abs(value) <= largest:
+        raise InputError(f"URDF: {what} is '{text}', not a finite number of at most {largest:g}")
+    return value

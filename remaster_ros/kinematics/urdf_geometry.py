@@ -1,0 +1,133 @@
+"""The collision geometry of a URDF: which shapes hang on which joint of the arm, and where."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.bodies import Body, Shape, box, cylinder, hull, sphere
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import inverse
+from remaster_ros.kinematics.urdf import attribute, numbers, origin_of, parse_urdf
+from remaster_ros.types import FloatArray
+
+MeshReader = Callable[[str], FloatArray | None]
+"""Takes a mesh's file name as the URDF writes it; returns its vertices, m, (n, 3).
+
+None leaves that shape out."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinkShape:
+    """One ``<collision>`` element: its link, its place in the link's frame, its shape."""
+
+    link: str
+    T_link_shape: FloatArray
+    shape: Shape
+
+
+def link_shapes(text: str, read_mesh: MeshReader) -> list[LinkShape]:
+    """Read all collision elements of URDF text (that `parse_urdf` accepts).
+
+    Parameters
+    ----------
+    text
+        Contents of the URDF file.
+    read_mesh
+        Called for each mesh; what it returns is taken as its convex hull, scaled.
+
+    Raises
+    ------
+    InputError
+        A geometry that is missing, unknown or has no volume, or what `read_mesh` raises.
+    """
+    found = []
+    for link in ElementTree.fromstring(text).findall('link'):
+        name = link.get('name', '')
+        for element in link.findall('collision'):
+            where = f"the collision geometry of link '{name}'"
+            geometry = element.find('geometry')
+            if geometry is None or not len(geometry):
+                raise InputError(f'URDF: {where} is empty; write a box, cylinder, sphere or mesh')
+            try:
+                shape = _shape(geometry[0], where, read_mesh)
+            except InputError as error:
+                raise InputError(_with_place(str(error), where)) from None
+            if shape is not None:
+                found.append(LinkShape(name, origin_of(element, where), shape))
+    return found
+
+
+def _with_place(message: str, where: str) -> str:
+    return message if where in message else f'URDF: {where}: {message}'
+
+
+def _shape(element: ElementTree.Element, where: str, read_mesh: MeshReader) -> Shape | None:
+    if element.tag == 'box':
+        return box(numbers(attribute(element, 'size', where), 3, f'the size of {where}'))
+    if element.tag == 'sphere':
+        return sphere(*numbers(attribute(element, 'radius', where), 1, f'the radius of {where}'))
+    if element.tag in ('cylinder', 'capsule'):
+        radius = numbers(attribute(element, 'radius', where), 1, f'the radius of {where}')
+        length = numbers(attribute(element, 'length', where), 1, f'the length of {where}')
+        if element.tag == 'cylinder':
+            return cylinder(radius[0], length[0])
+        # The few programs that write capsules mean the length without the round ends.
+        ends = np.array([[0, 0, -length[0] / 2], [0, 0, length[0] / 2]])
+        cylinder(radius[0], length[0])  # refuses sizes that are none
+        return Shape('capsule', ends, ball=float(radius[0]))
+    if element.tag == 'mesh':
+        vertices = read_mesh(attribute(element, 'filename', where))
+        if vertices is None:
+            return None
+        scale = numbers(element.get('scale', '1 1 1'), 3, f'the scale of {where}')
+        return hull(np.asarray(vertices, dtype=float) * scale)
+    raise InputError(
+        f'URDF: {where} is a <{element.tag}>; a box, cylinder, sphere or mesh is needed'
+    )
+
+
+def chain_bodies(text: str, chain: SerialChain, read_mesh: MeshReader) -> list[Body]:
+    """Return the URDF's collision geometry as bodies on the links of the arm.
+
+    What is fastened rigidly to a link moves with it. Joints off the arm (a gripper's fingers)
+    count as fixed at zero, as for the masses.
+
+    Parameters
+    ----------
+    text
+        The URDF that the chain was read from.
+    chain
+        The arm.
+    read_mesh
+        See `link_shapes`.
+    """
+    model = parse_urdf(text)
+    index = {
+        joint.child: chain.joint_names.index(joint.name)
+        for joint in model.parent_joint.values()
+        if joint.name in chain.joint_names
+    }
+
+    def carrier(link: str) -> tuple[int, FloatArray]:
+        """Return which joint carries a link (0: none), and T_carrier_link."""
+        here, T = link, np.eye(4)
+        while here not in index and here in model.parent_joint:
+            joint = model.parent_joint[here]
+            T = joint.origin @ T
+            here = joint.parent
+        return (index[here] + 1, T) if here in index else (0, T)
+
+    # Links that no joint of the arm carries were just placed in the root's frame.
+    T_base_root = inverse(carrier(chain.base_link)[1])
+    bodies = []
+    for found in link_shapes(text, read_mesh):
+        link, T = carrier(found.link)
+        if link == 0:
+            T = T_base_root @ T
+        bodies.append(Body(found.link, link, found.shape, T @ found.T_link_shape))
+    return bodies

@@ -1,0 +1,152 @@
+"""What the planner announced: the pose under way and its joint solutions, from two topics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from std_msgs.msg import Header
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from remaster_ros.errors import InputError
+from remaster_ros.nodes.messages import duration_of, stamp_key
+from remaster_ros.planning.tour_order import Stop, nearest_solution
+from remaster_ros.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Announced:
+    """A pose under way.
+
+    Attributes
+    ----------
+    pose, split
+        As in the session.
+    ids
+        The planner's own numbers of the joint solutions, in the order published.
+    plan
+        The plan that both are numbered by.
+    stamp
+        Names this announcement; the same pose announced again has another one.
+    last
+        Whether it is the last reference of a round.
+    """
+
+    pose: int
+    split: str
+    ids: tuple[int, ...]
+    plan: str
+    stamp: str = ''
+    last: bool = False
+
+
+def waypoints_message(stop: Stop, joint_names: Sequence[str], header: Header) -> JointTrajectory:
+    """Return remaster/joint_waypoints of a stop.
+
+    The configurations to go through before each solution, in order; ``time_from_start.sec`` is 1
+    + the index of the solution they lead to, as in joint_solutions. Empty where all ways are
+    straight.
+    """
+    message = JointTrajectory(joint_names=list(joint_names))
+    message.header = header
+    message.points = [
+        JointTrajectoryPoint(positions=q.tolist(), time_from_start=duration_of(i + 1.0))
+        for i, path in enumerate(stop.paths)
+        for q in path
+    ]
+    return message
+
+
+def waypoints_by_solution(
+    message: JointTrajectory, joint_names: Sequence[str]
+) -> dict[int, FloatArray]:
+    """Group remaster/joint_waypoints by the solution that they lead to.
+
+    Parameters
+    ----------
+    message
+        See `waypoints_message`; its joints may be in any order.
+    joint_names
+        The wanted order of joints.
+
+    Returns
+    -------
+    dict
+        Index of the solution -> configurations to go through before it, rad, (n, k), n >= 1;
+        without those that a straight way leads to.
+
+    Raises
+    ------
+    InputError
+        Joints that are missing, points of the wrong length, not finite or out of order.
+    """
+    if not message.points:
+        return {}
+    names = list(message.joint_names)
+    missing = [name for name in joint_names if name not in names]
+    if missing:
+        raise InputError(f'joint_waypoints: {missing[0]} is missing; it has {", ".join(names)}')
+    columns = [names.index(name) for name in joint_names]
+    found: dict[int, list[FloatArray]] = {}
+    last = 0
+    for point in message.points:
+        index = point.time_from_start.sec - 1
+        positions = np.array(point.positions, dtype=float)
+        if positions.shape != (len(names),) or not np.all(np.isfinite(positions)):
+            raise InputError(f'joint_waypoints: a point {point.positions} for {len(names)} joints')
+        if index < last:
+            raise InputError(f'joint_waypoints: solution {index} after solution {last}')
+        last = index
+        found.setdefault(index, []).append(positions[columns])
+    return {index: np.array(points) for index, points in found.items()}
+
+
+class Announcements:
+    """Bring the two together; the last announcement counts.
+
+    Parameters
+    ----------
+    joint_names
+        The wanted order of joints.
+    """
+
+    def __init__(self, joint_names: Sequence[str]) -> None:
+        self._joint_names = tuple(joint_names)
+        self._said: Announced | None = None
+        self._solutions: FloatArray | None = None
+        self._stamp = ''
+
+    def hear_pose(self, values: Mapping[str, str]) -> None:
+        """Take the values of the planner's event ``pose``."""
+        # Bags of the first version have neither ids nor plan.
+        ids = values.get('ids', ' '.join(map(str, range(int(values['solutions'])))))
+        self._said = Announced(
+            int(values['pose']),
+            values['split'],
+            tuple(map(int, ids.split())),
+            values.get('plan', ''),
+            values['stamp'],
+            values.get('last') == 'yes',
+        )
+
+    def hear_solutions(self, message: JointTrajectory) -> None:
+        """Take /remaster/joint_solutions; without points it takes the pose back."""
+        self._stamp, self._solutions = '', None
+        names = list(message.joint_names)
+        if message.points and set(self._joint_names) <= set(names):
+            columns = [names.index(name) for name in self._joint_names]
+            points = np.array([point.positions for point in message.points])
+            self._stamp, self._solutions = stamp_key(message.header.stamp), points[:, columns]
+
+    @property
+    def now(self) -> Announced | None:
+        """The pose under way; None where either topic has not said it."""
+        said = self._said
+        return said if said is not None and said.stamp == self._stamp else None
+
+    def which(self, q: FloatArray) -> int | None:
+        """Return which of the solutions the arm stands at, rad, (k,); None at none."""
+        if self.now is None or self._solutions is None:
+            return None
+        return nearest_solution(self._solutions, q)

@@ -1,0 +1,78 @@
+"""Ask single-shot sensors for their measurement, again where the answer was lost."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from rclpy.client import Client
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+
+from remaster_ros.collection.pairing import Pairing
+
+PATIENCE_WALL_S = 1.0
+"""What an answer says counts after so long: of a refusal the node may say meanwhile that the
+instrument is gone, and of a measurement that was made the reading is on its way."""
+MISSING_WALL_S = 5.0
+"""A service that is not there counts after so long: by then a node that died is absent."""
+
+
+@dataclass
+class _Shot:
+    """A measurement that is wanted since a time, asked for, and answered at another."""
+
+    since_wall: float
+    future: Future | None = None
+    answered_wall: float | None = None
+
+
+class Shots:
+    """The measurements that one configuration after the other needs.
+
+    Parameters
+    ----------
+    clients
+        Client of the measure service (std_srvs/Trigger), per sensor.
+    """
+
+    def __init__(self, clients: Mapping[str, Client]) -> None:
+        self._clients = clients
+        self._pairing: Pairing | None = None
+        self._shots: dict[str, _Shot] = {}
+
+    def look(self, pairing: Pairing, absent: Mapping[str, str]) -> None:
+        """Ask whoever has not been asked for this pairing, and note who refused.
+
+        A sensor that goes absent while it is asked is asked again when it is back, and one whose
+        reading was lost on the way too.
+        """
+        if pairing is not self._pairing:
+            self._pairing, self._shots = pairing, {}
+        now = time.monotonic()
+        for name, client in self._clients.items():
+            if name in absent or name in pairing.decided:
+                self._shots.pop(name, None)
+                continue
+            shot = self._shots.setdefault(name, _Shot(now))
+            if shot.future is not None:
+                self._take_answer(name, shot, pairing, now)
+            elif client.service_is_ready():
+                shot.future = client.call_async(Trigger.Request())
+            elif now - shot.since_wall > MISSING_WALL_S:
+                pairing.fail(name, f'the service {client.srv_name} is not there')
+
+    def _take_answer(self, name: str, shot: _Shot, pairing: Pairing, now: float) -> None:
+        assert shot.future is not None
+        response = shot.future.result() if shot.future.done() else None
+        if response is None:
+            return
+        if shot.answered_wall is None:
+            shot.answered_wall = now
+        if now - shot.answered_wall <= PATIENCE_WALL_S:
+            return
+        if not response.success:
+            pairing.fail(name, response.message)
+        elif not pairing.has_reading(name):
+            del self._shots[name]

@@ -1,0 +1,1 @@
+"""Which configurations are measured, and in which order."""

@@ -1,0 +1,286 @@
+"""Which poses to measure: spread over the workspace, facing the sensor, reachable and visible.
+
+Candidates follow Van Wyk et al., section III-A, equations (2) to (5): a Latin hypercube over
+azimuth, radius, height and roll, the tool's Z axis at the sensor. Each is then reached in all its
+joint solutions, less those that the arm, its limits or the line of sight forbid; every one that
+is dropped is counted with the reason.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import qmc
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.collision import RESERVE_M, CollisionModel
+from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
+from remaster_ros.kinematics.transforms import rotation_vector_to_matrix, transform
+from remaster_ros.types import BoolArray, FloatArray, IntArray
+
+OUT_OF_REACH = 'out of reach'
+JOINT_LIMITS = 'outside the joint limits'
+NO_LINE_OF_SIGHT = 'no line of sight to '  # the sensor's name follows
+
+_FULL_TURN = (0.0, 2 * np.pi)
+
+
+@dataclass(frozen=True)
+class PoseRanges:
+    """The box the candidates are drawn from; the defaults are the paper's.
+
+    Attributes
+    ----------
+    azimuth_rad, radius_m, height_m
+        Cylinder coordinates of the tool about the Z axis of R, (lower, upper).
+    roll_rad
+        Turn about the tool's Z axis, (lower, upper).
+    """
+
+    azimuth_rad: tuple[float, float] = _FULL_TURN
+    radius_m: tuple[float, float] = (0.2, 0.5)
+    height_m: tuple[float, float] = (0.4, 0.8)
+    roll_rad: tuple[float, float] = _FULL_TURN
+
+    def __post_init__(self) -> None:
+        for spec in fields(self):
+            lower, upper = getattr(self, spec.name)
+            if not -np.inf < lower <= upper < np.inf:
+                raise InputError(
+                    f'planning: {spec.name} is {lower} to {upper}; write the lower value first'
+                )
+        if self.radius_m[0] < 0.0:
+            raise InputError(f'planning: radius_m starts at {self.radius_m[0]}; it must be >= 0')
+
+
+@dataclass(frozen=True)
+class LineOfSight:
+    """A sensor that has to see a marker at every configuration.
+
+    Attributes
+    ----------
+    sensor
+        Its name, for the counts.
+    sensor_R
+        Its origin in R, m, (3,).
+    marker_T
+        The marker it follows, in the tool frame, m, (3,).
+    max_angle_rad
+        Largest angle between the tool's Z axis and the line to the sensor at which the marker
+        is still seen; a quarter turn keeps the sensor in front of the tool plate.
+    """
+
+    sensor: str
+    sensor_R: FloatArray
+    marker_T: FloatArray
+    max_angle_rad: float = np.pi / 2
+
+
+@dataclass(frozen=True)
+class PlannedPose:
+    """A tool pose T_R_T, (4, 4), and its usable joint solutions, rad, (m, k), m >= 1."""
+
+    T_R_T: FloatArray
+    solutions: FloatArray
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The poses to visit, and why the other candidates were dropped.
+
+    Attributes
+    ----------
+    poses
+        In the order of the candidates.
+    dropped
+        Reason -> number of poses that lost all their solutions, most of them for this reason.
+    dropped_solutions
+        Reason -> number of joint solutions dropped, of kept poses too; the first reason counts.
+    """
+
+    poses: tuple[PlannedPose, ...]
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    dropped_solutions: Mapping[str, int] = field(default_factory=dict)
+
+
+def candidate_poses(
+    n: int, ranges: PoseRanges, sensor_R: ArrayLike, rng: np.random.Generator
+) -> FloatArray:
+    """Draw tool poses that face a sensor: equations (2) to (5) of Van Wyk et al.
+
+    Parameters
+    ----------
+    n
+        How many.
+    ranges
+        Where from.
+    sensor_R
+        The sensor's origin in R, m, (3,).
+    rng
+        Source of randomness.
+
+    Returns
+    -------
+    ndarray
+        T_R_T, (n, 4, 4).
+
+    Raises
+    ------
+    InputError
+        ``n`` below 1, or a sensor position that is not finite or is itself a candidate's.
+    """
+    sensor_R = np.asarray(sensor_R, dtype=float)
+    if n < 1:
+        raise InputError(f'planning: {n} candidate poses; at least 1 is needed')
+    if sensor_R.shape != (3,) or not np.all(np.isfinite(sensor_R)):
+        raise InputError(f'planning: the sensor position {sensor_R} is not three finite numbers')
+    lower, upper = np.transpose([getattr(ranges, spec.name) for spec in fields(ranges)])
+    # `seed` takes a Generator in every SciPy since 1.7; its new name `rng` only since 1.15.
+    unit = qmc.LatinHypercube(d=len(lower), seed=rng).random(n)
+    azimuth, radius, height, roll = (lower + unit * (upper - lower)).T
+    positions = np.column_stack((radius * np.cos(azimuth), radius * np.sin(azimuth), height))
+
+    to_sensor = sensor_R - positions
+    distance = np.linalg.norm(to_sensor, axis=1, keepdims=True)
+    if np.any(distance < 1e-3):
+        raise InputError(f'planning: the sensor at {sensor_R} m stands among the poses')
+    z = to_sensor / distance  # (2)
+    x = np.cross(z, (0.0, 0.0, 1.0))  # (3)
+    # Below an overhead sensor Z of R is parallel to z; the paper then takes another vector.
+    overhead = np.linalg.norm(x, axis=1) < 1e-6
+    x[overhead] = np.cross(z[overhead], (0.0, 1.0, 0.0))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    y = np.cross(z, x)  # (4)
+    about_z = rotation_vector_to_matrix(roll[:, None] * np.array([0.0, 0.0, 1.0]))
+    return transform(np.stack((x, y, z), axis=-1) @ about_z, positions)  # (5)
+
+
+def plan_poses(
+    inverse_kinematics: InverseKinematics,
+    arm: CollisionModel,
+    candidates: FloatArray,
+    lines_of_sight: Sequence[LineOfSight] = (),
+    limit_margin_rad: float = 0.0,
+) -> Plan:
+    """Keep the candidates' joint solutions that the arm can take and every sensor can see.
+
+    Parameters
+    ----------
+    inverse_kinematics
+        The arm's closed form; its held values decide how many solutions there are.
+    arm
+        The same arm with everything it can hit.
+    candidates
+        T_R_T, (n, 4, 4).
+    lines_of_sight
+        What has to be visible.
+    limit_margin_rad
+        Distance to keep from the joint limits, rad.
+
+    Returns
+    -------
+    Plan
+        With `dropped` and `len(poses)` adding up to n.
+    """
+    chain = inverse_kinematics.chain
+    reachable = [inverse_kinematics.solutions(T, within_limits=False) for T in candidates]
+    within = [inverse_kinematics.solutions(T) for T in candidates]
+    within = [q[chain.within_limits(q, -limit_margin_rad)] for q in within]
+    owner = np.repeat(np.arange(len(within)), [len(q) for q in within])
+    q = np.concatenate([np.empty((0, len(chain))), *within])
+    reasons = _reasons(arm, q, lines_of_sight)
+
+    poses: list[PlannedPose] = []
+    dropped: Counter[str] = Counter()
+    dropped_solutions: Counter[str] = Counter()
+    for i, T in enumerate(candidates):
+        mine = owner == i
+        usable = mine & (reasons == '')
+        # Of equal counts the first entered wins: the reason that came nearest to success.
+        lost = Counter(reasons[mine & ~usable].tolist())
+        if len(within[i]) < len(reachable[i]):
+            lost[JOINT_LIMITS] = len(reachable[i]) - len(within[i])
+        dropped_solutions.update(lost)
+        if usable.any():
+            poses.append(PlannedPose(T, q[usable]))
+        else:
+            dropped[lost.most_common(1)[0][0] if lost else OUT_OF_REACH] += 1
+    return Plan(tuple(poses), dict(dropped), dict(dropped_solutions))
+
+
+def _reasons(
+    arm: CollisionModel, q: FloatArray, lines_of_sight: Sequence[LineOfSight]
+) -> np.ndarray[tuple[int], np.dtype[np.str_]]:
+    """Return why each solution (m, k) is no good, or '', (m,); the first reason wins."""
+    # More than the bridge asks for: an arm that stands a little off a planned way may still move.
+    collisions = arm.reasons(q, RESERVE_M)
+    bad = [collisions != '', *(_unseen(arm, q, sight) for sight in lines_of_sight)]
+    names = [NO_LINE_OF_SIGHT + sight.sensor for sight in lines_of_sight]
+    return np.select(bad, [collisions, *names], default='')
+
+
+def _unseen(arm: CollisionModel, q: FloatArray, sight: LineOfSight) -> BoolArray:
+    """Tell where the marker faces away from the sensor, or the arm is in between, (m,)."""
+    T = arm.chain.forward(q)
+    to_sensor = sight.sensor_R - arm.chain.positions(q, sight.marker_T)
+    facing = np.sum(T[:, :3, 2] * to_sensor, axis=-1) / np.linalg.norm(to_sensor, axis=-1)
+    turned_away = facing < np.cos(sight.max_angle_rad)
+    return turned_away | arm.hides(q, sight.marker_T, sight.sensor_R)
+
+
+def order_by_proximity(points: ArrayLike, start: ArrayLike) -> IntArray:
+    """Order points (n, 3) so that each is the nearest of the rest to the one before it.
+
+    Parameters
+    ----------
+    points
+        m, (n, 3).
+    start
+        Where the tool is now, m, (3,).
+
+    Returns
+    -------
+    ndarray
+        Indices into points, (n,).
+    """
+    points, here = np.asarray(points, dtype=float), np.asarray(start, dtype=float)
+    left = np.ones(len(points), dtype=bool)
+    order = np.empty(len(points), dtype=np.int64)
+    for i in range(len(points)):
+        distances = np.where(left, np.linalg.norm(points - here, axis=-1), np.inf)
+        order[i] = np.argmin(distances)
+        left[order[i]] = False
+        here = points[order[i]]
+    return order
+
+
+def order_solutions(
+    solutions: ArrayLike, q_current: ArrayLike, velocity_limits: ArrayLike = 1.0
+) -> IntArray:
+    """Order joint solutions by how soon the arm can be there from where it is, nearest first.
+
+    All distances are from ``q_current``, not from one solution to the next: the slowest joint's
+    travel, divided by its velocity limit.
+
+    Parameters
+    ----------
+    solutions
+        rad, (m, k).
+    q_current
+        rad, (k,).
+    velocity_limits
+        rad/s, (k,); where a limit is unknown (infinite) it counts as 1 rad/s.
+
+    Returns
+    -------
+    ndarray
+        Indices into solutions, (m,).
+    """
+    limits = np.asarray(velocity_limits, dtype=float)
+    speeds = np.where(np.isfinite(limits), limits, 1.0)
+    travel = np.abs(np.asarray(solutions, dtype=float) - q_current) / speeds
+    return np.argsort(np.max(travel, axis=-1), kind='stable')

@@ -1,0 +1,424 @@
+"""The order of a collection: which pose is next, and its joint solutions nearest first."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.kinematics.collision import CollisionModel
+from remaster_ros.kinematics.free_paths import free_path, is_straight_free
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.planning.candidates import Plan, order_solutions
+from remaster_ros.types import FloatArray
+
+REGISTRATION = 'registration'
+REFERENCE = 'reference'
+FIRST_ROUNDS = 2
+"""The references are measured so often at the beginning: their difference is the noise."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """A pose to visit now.
+
+    Attributes
+    ----------
+    pose
+        Its number in the session; registration poses have numbers of their own, below zero.
+    split
+        ``registration``, ``reference``, ``optimization`` or ``validation``.
+    T_R_T
+        The tool's pose in the robot base, (4, 4).
+    solutions
+        Joint solutions, nearest first, rad, (m, k).
+    index
+        Which of the poses planned for its split.
+    ids
+        Which of that pose's planned solutions each of `solutions` is.
+    paths
+        The way to each of them from the one before (to the first from where the arm stands):
+        configurations to go through in between, rad, (n, k); n = 0 where the straight way is free.
+    unreached
+        The pose's other solutions that no free path leads to.
+    """
+
+    pose: int
+    split: str
+    T_R_T: FloatArray
+    solutions: FloatArray
+    index: int
+    ids: tuple[int, ...]
+    paths: tuple[FloatArray, ...] = ()
+    unreached: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.paths:
+            straight = np.empty((0, self.solutions.shape[1]))
+            object.__setattr__(self, 'paths', (straight,) * len(self.solutions))
+
+    def only(self, ids: Collection[int]) -> Stop:
+        """Return the stop with only these solutions, in the same order.
+
+        The ways stay as they were: they hold for an arm that has visited the others. From
+        anywhere else they are found anew (`Tour.reroute`).
+        """
+        kept = [i for i, number in enumerate(self.ids) if number in ids]
+        return replace(
+            self,
+            solutions=self.solutions[kept],
+            ids=tuple(self.ids[i] for i in kept),
+            paths=tuple(self.paths[i] for i in kept),
+        )
+
+
+class Tour:
+    """Poses by proximity to where the arm is, those to fit and those held out among each other.
+
+    So what drifts or warms up meanwhile is met by both, and not extrapolated from the one to the
+    other; and a collection that ends early has some of both.
+
+    A plan of the split ``reference`` is visited again and again: a round of all its poses, twice
+    at the beginning, then before more than `reference_every` other configurations were visited,
+    and at the end. Its poses come in their order, and each is reached from the one before it, so
+    that backlash is the same each time.
+
+    Parameters
+    ----------
+    chain
+        The arm.
+    plans
+        Split -> its plan.
+    in_order
+        Visit the poses as they come, split by split, instead of the nearest first.
+    one_solution
+        Visit only the nearest solution of each pose.
+    model
+        What the arm must not hit on its way; None where that does not matter (an arm that is
+        computed).
+    reference_every
+        How many configurations lie between two rounds of the references at most; a pose with more
+        solutions than that is not interrupted.
+    """
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        plans: Mapping[str, Plan],
+        *,
+        in_order: bool = False,
+        one_solution: bool = False,
+        model: CollisionModel | None = None,
+        reference_every: int = 0,
+    ) -> None:
+        self._chain, self._model = chain, model
+        self.reference_every = reference_every
+        self.in_order, self.one_solution = in_order, one_solution
+        self.plans = dict(plans)
+        once = {split: plan for split, plan in plans.items() if split != REFERENCE}
+        references = plans.get(REFERENCE)
+        self.references = len(references.poses) if references is not None else 0
+        # Which reference is next, of how many rounds that are due; and what was visited since.
+        self._reference, self._rounds_due = 0, FIRST_ROUNDS if self.references else 0
+        self._since = self.reference_stops = 0
+        self._left = {split: list(range(len(plan.poses))) for split, plan in once.items()}
+        self.poses = {split: len(plan.poses) for split, plan in once.items()}
+        self.configurations = {
+            split: sum(1 if one_solution else len(pose.solutions) for pose in plan.poses)
+            for split, plan in once.items()
+        }
+        self.dropped: Counter[str] = Counter()
+        self.dropped_solutions: Counter[str] = Counter()
+        for plan in plans.values():
+            self.dropped.update(plan.dropped)
+            self.dropped_solutions.update(plan.dropped_solutions)
+        self.visited = 0
+
+    def next(self, q: FloatArray) -> Stop | None:
+        """Return the next stop for an arm at joint positions `q` (rad, (k,)); None at the end."""
+        proposed = self.propose(q)
+        return None if proposed is None else self.take(proposed)
+
+    def propose(self, q: FloatArray) -> Stop | None:
+        """Return what `next` would, and leave the tour as it is: a thread may do this."""
+        if self._rounds_due:
+            return self._propose_reference(q)
+        left = [(split, index) for split, indices in self._left.items() for index in indices]
+        if not left:
+            return self._propose_reference(q) if self.references and self._since else None
+        here = self._chain.forward(q)[:3, 3]
+        places = [self.plans[split].poses[index].T_R_T[:3, 3] for split, index in left]
+        distances = np.linalg.norm(np.array(places) - here, axis=1)
+        split, index = left[0 if self.in_order else int(np.argmin(distances))]
+        solutions = self.plans[split].poses[index].solutions
+        ids, paths, unreached = self._route(split, index, range(len(solutions)), q)
+        if self.references and self._since and self._since + len(ids) > self.reference_every:
+            return self._propose_reference(q)
+        return self._stop(split, index, ids, paths, unreached)
+
+    @property
+    def poses_begun(self) -> int:
+        """How many poses were begun that are no references."""
+        return self.visited - self.reference_stops
+
+    def ask_round(self) -> None:
+        """Begin a round of the references with the next stop."""
+        if self.references:
+            self._reference, self._rounds_due = 0, max(self._rounds_due, 1)
+
+    def _propose_reference(self, q: FloatArray) -> Stop:
+        index = self._reference
+        ids, paths, unreached = self._route(REFERENCE, index, [0], q)
+        return self._stop(REFERENCE, index, ids, paths, unreached)
+
+    def _route_to_reference(self, index: int, q: FloatArray) -> FloatArray | None:
+        """Return what to go through to a reference, by way of the one before it; None for no way.
+
+        rad, (n, k). Where the one before it cannot be reached the way leads there directly.
+        """
+        goals = [pose.solutions[0] for pose in self.plans[REFERENCE].poses]
+        goal, before = goals[index], goals[index - 1]
+        last = free_way(self._model, before, goal, self._chain.velocity_limits, index)
+        if last is not None:
+            if nearest_solution(before[None], q) is not None:
+                return last
+            first = free_way(self._model, q, before, self._chain.velocity_limits, index)
+            if first is not None:
+                return np.concatenate((first, before[None], last))
+        return free_way(self._model, q, goal, self._chain.velocity_limits, index)
+
+    def take(self, proposed: Stop) -> Stop:
+        """Count a proposed stop visited and return it with its number."""
+        return self.go_to(
+            proposed.split, proposed.index, proposed.ids, proposed.paths, proposed.unreached
+        )
+
+    def reroute(self, stop: Stop, q: FloatArray) -> Stop:
+        """Return a stop with the ways to its solutions, and their order, found anew from `q`."""
+        ids, paths, unreached = self._route(stop.split, stop.index, stop.ids, q)
+        solutions = self.plans[stop.split].poses[stop.index].solutions[list(ids)]
+        return replace(
+            stop, solutions=solutions, ids=tuple(ids), paths=tuple(paths), unreached=unreached
+        )
+
+    def go_to(
+        self,
+        split: str,
+        index: int,
+        ids: Sequence[int],
+        paths: Sequence[FloatArray] = (),
+        unreached: Sequence[int] = (),
+    ) -> Stop:
+        """Return the stop at one planned pose with these of its solutions, and count it visited.
+
+        This is how a tour that was begun before takes up where it was: the stops so far, in order.
+        """
+        stop = self._stop(split, index, ids, paths, unreached)
+        if split == REFERENCE:
+            self._begin_reference(index)
+        else:
+            self._left[split].remove(index)
+            self._since += len(ids)
+        self.visited += 1
+        return stop
+
+    def _begin_reference(self, index: int) -> None:
+        """Count a reference visited: the round is over with its last one."""
+        self.reference_stops += 1
+        self._rounds_due = max(self._rounds_due, 1)
+        self._reference = index + 1
+        if self._reference >= self.references:
+            self._reference, self._since = 0, 0
+            self._rounds_due -= 1
+
+    def _stop(
+        self,
+        split: str,
+        index: int,
+        ids: Sequence[int],
+        paths: Sequence[FloatArray],
+        unreached: Sequence[int],
+    ) -> Stop:
+        pose = self.plans[split].poses[index]
+        number = self.visited if split != REGISTRATION else -1 - self.visited
+        solutions = pose.solutions[list(ids)]
+        return Stop(
+            number, split, pose.T_R_T, solutions, index, tuple(ids), tuple(paths), tuple(unreached)
+        )
+
+    def _route(
+        self, split: str, index: int, ids: Iterable[int], q: FloatArray
+    ) -> tuple[list[int], list[FloatArray], tuple[int, ...]]:
+        """Order these solutions of a pose; see `free_order`."""
+        ids = list(ids)
+        if split == REFERENCE:
+            way = self._route_to_reference(index, q) if ids else None
+            return ([], [], tuple(ids)) if way is None else (ids, [way], ())
+        solutions = self.plans[split].poses[index].solutions[ids]
+        # The same draws whenever this pose is planned: a tour can be told again.
+        rng = np.random.default_rng([index, *split.encode()])
+        order, paths = free_order(
+            self._model, q, solutions, self._chain.velocity_limits, rng, self.one_solution
+        )
+        found = [ids[i] for i in order]
+        if self.one_solution:
+            # One is visited; where none can be, one is lost.
+            return found, paths, () if found else tuple(ids[:1])
+        return found, paths, tuple(number for number in ids if number not in found)
+
+    def describe(self) -> str:
+        """Return what was planned and dropped, in a line."""
+        kept = ', '.join(
+            f'{count} {split} poses with {self.configurations[split]} configurations'
+            for split, count in self.poses.items()
+        )
+        reasons = ', '.join(f'{count} {reason}' for reason, count in self.dropped.most_common())
+        watched = (
+            f'; {self.references} reference configurations, measured again every '
+            f'{self.reference_every}'
+        ) * bool(self.references)
+        return f'planned {kept}{watched}; dropped poses: {reasons or "none"}'
+
+
+def free_order(
+    model: CollisionModel | None,
+    q: FloatArray,
+    solutions: FloatArray,
+    velocity_limits: FloatArray,
+    rng: np.random.Generator,
+    one: bool = False,
+) -> tuple[list[int], list[FloatArray]]:
+    """Order joint solutions so that each can be reached from the one before.
+
+    The nearest to where the arm stands of those that a free straight way leads to is first, then
+    the next from there, and so on. Where no straight way is free, one around is looked for, to the
+    nearest first; a solution that cannot be reached is tried again from each that could be.
+
+    Parameters
+    ----------
+    model
+        What must not be hit; with None every straight way is free.
+    q
+        Where the arm stands, rad, (k,).
+    solutions
+        rad, (m, k).
+    velocity_limits
+        rad/s, (k,).
+    rng
+        Source of randomness.
+    one
+        One solution is enough.
+
+    Returns
+    -------
+    order, paths
+        Indices into solutions, without those that could not be reached, and for each the
+        configurations to go through before it, rad, (n, k).
+    """
+    left = [int(i) for i in order_solutions(solutions, q, velocity_limits)]
+    straight = np.empty((0, solutions.shape[1]))
+    if model is None:
+        left = left[:1] if one else left
+        return left, [straight] * len(left)
+    order: list[int] = []
+    paths: list[FloatArray] = []
+    here = q
+    while left:
+        way = straight
+        found = next((i for i in left if is_straight_free(model, here, solutions[i])), None)
+        if found is None:
+            for i in left:
+                around = free_path(model, here, solutions[i], rng)
+                if around is not None:
+                    found, way = i, around[1:-1]
+                    break
+        if found is None:
+            break
+        order.append(found)
+        paths.append(way)
+        if one:
+            break
+        left.remove(found)
+        here = solutions[found]
+    return order, paths
+
+
+def free_way(
+    model: CollisionModel | None,
+    q: FloatArray,
+    goal: FloatArray,
+    velocity_limits: FloatArray,
+    seed: int,
+) -> FloatArray | None:
+    """Return what to go through from `q` to one configuration, rad, (n, k); None for no way.
+
+    The same way each time, for the same ends and seed.
+    """
+    rng = np.random.default_rng([seed, *REFERENCE.encode()])
+    order, paths = free_order(model, q, goal[None], velocity_limits, rng)
+    return paths[0] if order else None
+
+
+def registration_tour(
+    chain: SerialChain,
+    plan: Plan,
+    markers_T: Sequence[FloatArray],
+    model: CollisionModel | None = None,
+) -> Tour:
+    """Choose poses for a three-point registration: the first three span the largest triangle.
+
+    The others follow in case a sensor cannot see one of them.
+
+    Parameters
+    ----------
+    chain
+        The arm.
+    plan
+        Poses that face roughly towards the sensors.
+    markers_T
+        The markers that are seen, in the tool frame, m, (3,) each.
+    model
+        What the arm must not hit on its way.
+
+    Raises
+    ------
+    InsufficientDataError
+        If there are fewer than three poses.
+    """
+    if len(plan.poses) < 3:
+        reasons = ', '.join(f'{count} {reason}' for reason, count in plan.dropped.items())
+        raise InsufficientDataError(
+            f'only {len(plan.poses)} of the poses for the registration can be reached '
+            f'({reasons}); correct rough_position_m of the sensors or the ranges of poses'
+        )
+    # The triangle of the worst-off marker counts: every sensor is registered by its own.
+    points = np.array(
+        [[chain.positions(pose.solutions[0], m) for m in markers_T] for pose in plan.poses]
+    )
+    candidates = list(combinations(range(len(plan.poses)), 3))
+    areas = [
+        np.min(np.linalg.norm(np.cross(points[b] - points[a], points[c] - points[a]), axis=-1))
+        for a, b, c in candidates
+    ]
+    best = candidates[int(np.argmax(areas))]
+    rest = [i for i in range(len(plan.poses)) if i not in best]
+    poses = tuple(plan.poses[i] for i in (*best, *rest))
+    ordered = Plan(poses, plan.dropped, plan.dropped_solutions)
+    return Tour(chain, {REGISTRATION: ordered}, in_order=True, one_solution=True, model=model)
+
+
+def nearest_solution(
+    solutions: FloatArray, q: FloatArray, tolerance_rad: float = 0.02
+) -> int | None:
+    """Return which solution (m, k) the arm stands at, rad; None if no joint-wise match is near.
+
+    The tolerance is far above what an arm that arrived is off by, and far below what tells two
+    solutions of a pose apart.
+    """
+    distance = np.max(np.abs(solutions - q), axis=1)
+    nearest = int(np.argmin(distance))
+    return nearest if distance[nearest] <= tolerance_rad else None

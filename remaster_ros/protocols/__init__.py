@@ -1,1 +1,0 @@
-"""Wire formats: bytes to events and back; no sockets."""

@@ -1,0 +1,1 @@
+"""fit.json and discovery.json, figures and pages."""

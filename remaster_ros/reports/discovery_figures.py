@@ -1,0 +1,276 @@
+"""The figures of a discovery as SVG text: errors by driver, causes with their bands, the gain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from io import StringIO
+from typing import TYPE_CHECKING
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from remaster_ros.discovery.discover import Discovery
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.reports.figures import AFTER, BEFORE, INK, STYLE, WIDTH_IN, log_axis
+from remaster_ros.types import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+ARC_MINUTE = np.radians(1.0 / 60.0)
+BINS = 12
+SCATTER_POINTS = 800
+MOST_CAUSES = 8
+# Of a larger session the curves are drawn at the rows that were searched.
+MOST_DRAWN = 20_000
+
+
+def draw_discovery(discovery: Discovery) -> dict[str, str]:
+    """Return every figure as SVG text, by file name without ending."""
+    figures: dict[str, Callable[[Discovery], Figure]] = {'gain': gain, 'drivers': drivers}
+    if discovery.groups:
+        figures['causes'] = causes
+    texts = {}
+    for name, draw in figures.items():
+        with matplotlib.rc_context({**STYLE, 'svg.hashsalt': name}):
+            out = StringIO()
+            canvas = FigureCanvasSVG(draw(discovery))
+            canvas.print_svg(out, metadata={'Date': None, 'Creator': None})
+        texts[name] = out.getvalue()
+    return texts
+
+
+def gain(discovery: Discovery) -> Figure:
+    """Draw the errors before and after, and their pose-common and within-pose parts."""
+    figure = Figure(figsize=(WIDTH_IN, 2.6), layout='constrained')
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    data, selection = discovery.residuals, discovery.selection
+    held_out = data.scene.measurements.is_validation
+    rows = held_out if held_out.any() else np.isin(np.arange(len(held_out)), data.rows.source)
+    errors = [data.unexplained(fit) for fit in (selection.empty, selection.solution)]
+    lengths = [np.maximum(1e3 * np.linalg.norm(e[rows], axis=1), 1e-4) for e in errors]
+    both = np.concatenate(lengths)
+    low, high = float(np.quantile(both, 0.002)), float(both.max()) * 1.001
+    bins = np.geomspace(low, max(high, 2.0 * low), int(np.clip(3 * np.sqrt(rows.sum()), 8, 45)))
+    for values, color, when in zip(lengths, (BEFORE, AFTER), ('before', 'after'), strict=True):
+        label = f'{when}: mean {values.mean():.3f} mm'
+        left.hist(np.maximum(values, low), bins=bins.tolist(), color=color, alpha=0.5, label=label)
+        left.axvline(values.mean(), color=color, linewidth=1.3)
+    log_axis(left, 'x')
+    left.set_title('Held-out poses' if held_out.any() else 'Fitted poses')
+    left.set_xlabel('3-D error (mm)')
+    left.set_ylabel('observations')
+    left.yaxis.get_major_locator().set_params(integer=True)
+    left.legend(loc='upper left')
+
+    parts, names = [], []
+    for sensor, name in enumerate(data.scene.sensor_names):
+        names.append(name)
+        parts.append(
+            [
+                (1e3 * fit.noise.pose_sigma[sensor], 1e3 * fit.noise.sigma[sensor])
+                for fit in (selection.empty, selection.solution)
+            ]
+        )
+    values = np.array(parts)
+    x = np.arange(len(names))
+    for column, (color, label) in enumerate(((BEFORE, 'before'), (AFTER, 'after'))):
+        for part, shift in ((0, -0.3), (1, 0.1)):
+            right.bar(
+                x + shift + 0.2 * column,
+                values[:, column, part],
+                0.18,
+                color=color,
+                alpha=1.0 if part == 0 else 0.5,
+                label=label if part == 0 else None,
+            )
+    right.set_xticks(
+        np.concatenate((x - 0.2, x + 0.2)).tolist(),
+        [f'{n}\nshared' for n in names] + [f'{n}\nwithin' for n in names],
+    )
+    right.set_ylabel('RMS per axis (mm)')
+    right.set_ylim(0.0, 1.3 * float(values.max()))
+    right.set_title('Errors shared by a pose, and within')
+    right.legend(loc='upper right', ncols=2)
+    return figure
+
+
+def drivers(discovery: Discovery) -> Figure:
+    """Draw, joint by joint, the errors along the joint's motion against every driver."""
+    data, selection = discovery.residuals, discovery.selection
+    scene = data.part
+    by_joint: list[tuple[str, Callable[[int], FloatArray] | None]] = [
+        ('own angle (°)', lambda j: np.degrees(scene.measurements.q[:, j])),
+        ('gravity torque (N m)', lambda j: scene.gravity_torque[:, j]),
+        ('last move (°)', lambda j: np.degrees(scene.last_move[:, j])),
+        ('time (h)', lambda j: scene.elapsed_s / 3600.0),
+        ('temperature (K)', lambda j: scene.warming),
+    ]
+    shown = [True, scene.has_gravity, scene.has_approach, scene.has_time, scene.has_temperature]
+    kept = [pair for pair, show in zip(by_joint, shown, strict=True) if show]
+    joints = scene.joints
+    height = 1.05 * len(kept) + 0.6
+    figure = Figure(figsize=(WIDTH_IN, height))
+    # Fixed margins: to find them for so many panels takes longer than to draw them.
+    axes = figure.subplots(len(kept), joints, squeeze=False, sharey=True)
+    figure.subplots_adjust(
+        left=0.07,
+        right=0.995,
+        bottom=0.4 / height,
+        top=1.0 - 0.38 / height,
+        hspace=0.7,
+        wspace=0.1,
+    )
+    motion = scene.jacobian
+    length = np.maximum(np.linalg.norm(motion, axis=1), 1e-6)
+    fits = [(selection.empty, BEFORE, 'before')]
+    if discovery.groups:
+        fits.append((selection.solution, AFTER, 'after'))
+    for fit, color, _ in fits:
+        left = data.left(fit)
+        along = 1e3 * np.einsum('nij,ni->nj', motion, left) / length
+        for row, (_, value) in enumerate(kept):
+            for joint in range(joints):
+                assert value is not None
+                _binned(axes[row, joint], value(joint), along[:, joint], color)
+    for row, (label, _) in enumerate(kept):
+        for joint in range(joints):
+            ax = axes[row, joint]
+            ax.tick_params(labelsize=5.5, length=2)
+            ax.xaxis.get_major_locator().set_params(nbins=3)
+            if ax.has_data():
+                ax.axhline(0.0, color=INK, linewidth=0.5)
+            else:
+                ax.set_xticks([])
+                ax.text(0.5, 0.5, 'constant', transform=ax.transAxes, ha='center', fontsize=5.5)
+            if row == 0:
+                ax.set_title(f'joint {joint + 1}', fontsize=7.5)
+        axes[row, joints // 2].set_xlabel(label, fontsize=7)
+    figure.supylabel('mean error along the motion of the joint (mm)', fontsize=7.5)
+    handles = [Line2D([], [], color=color, marker='.', label=label) for _, color, label in fits]
+    figure.legend(handles=handles, loc='upper right', ncols=2, fontsize=7, frameon=False)
+    return figure
+
+
+def _binned(ax: Axes, x: FloatArray, y: FloatArray, color: str) -> None:
+    """Draw means with their standard errors in bins of equal counts."""
+    if np.ptp(x) < 1e-3:
+        return
+    groups = np.array_split(np.argsort(x), min(BINS, max(2, len(x) // 8)))
+    centers = [float(x[g].mean()) for g in groups]
+    means = [float(y[g].mean()) for g in groups]
+    spread = [float(y[g].std() / np.sqrt(len(g))) for g in groups]
+    ax.errorbar(
+        centers, means, spread, color=color, linewidth=0.9, elinewidth=0.6, marker='.', ms=3
+    )
+
+
+def causes(discovery: Discovery) -> Figure:
+    """Draw each cause: what is left without it against what drives it, and the fit with band."""
+    panels = [cell for group in discovery.groups for cell in group if cell.place == 'joint_angle']
+    constant = [
+        (effect, group)
+        for effect, group in zip(discovery.effects, discovery.groups, strict=False)
+        if not any(cell in panels for cell in group)
+    ]
+    panels = panels[: 2 * MOST_CAUSES]
+    count = len(panels) + bool(constant)
+    lines = -(-count // 2)
+    figure = Figure(figsize=(WIDTH_IN, 2.2 * lines + 0.2), layout='constrained')
+    axes = list(figure.subplots(lines, 2 if count > 1 else 1, squeeze=False).flat)
+    for cell, ax in zip(panels, axes, strict=False):
+        _cause(ax, discovery, cell)
+    if constant:
+        ax = axes[len(panels)]
+        names = [f'{e.name.replace("_", " ")} {list(e.joints) or ""}' for e, _ in constant]
+        ax.barh(names[::-1], [1e3 * e.size_m for e, _ in constant][::-1], color=AFTER, height=0.5)
+        ax.set_xlabel('RMS at the marker (mm)')
+        ax.set_title('Constant causes, and those of the sensor')
+    for spare in axes[count:]:
+        spare.set_visible(False)
+    return figure
+
+
+def _driver(scene: Scene, cell: Cell) -> tuple[str, FloatArray]:
+    """Return label and value of what drives a cause at a joint's angle, (n,)."""
+    joint = cell.joints[-1] - 1
+    if cell.driver == 'own_angle' or cell.driver.startswith('angle_of'):
+        return f'angle of joint {joint + 1} (°)', np.degrees(scene.measurements.q[:, joint])
+    if cell.driver.startswith('gravity_torque'):
+        return f'gravity torque on joint {joint + 1} (N m)', scene.gravity_torque[:, joint]
+    if cell.driver.startswith('approach'):
+        return f'approach of joint {joint + 1}', scene.approach[:, joint]
+    if cell.driver.startswith('last_move'):
+        return f'last move of joint {joint + 1} (°)', np.degrees(scene.last_move[:, joint])
+    if cell.driver == 'temperature':
+        return 'temperature above the first (K)', scene.warming
+    return 'time (h)', scene.elapsed_s / 3600.0
+
+
+def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
+    """Draw one cause at a joint's angle, in arc minutes."""
+    data, solution = discovery.residuals, discovery.selection.solution
+    whole = len(data.scene) <= MOST_DRAWN
+    scene = data.scene if whole else data.part
+    left = data.unexplained(solution) if whole else data.left(solution)
+    fitted = np.ones(len(scene), dtype=bool)
+    if whole:
+        fitted = np.isin(np.arange(len(scene)), data.rows.source)
+    label, x = _driver(scene, cell)
+    where = dict(zip(solution.cells, solution.slices(), strict=True))[cell]
+    columns = cell.columns(scene)
+    assert columns.at is not None
+    index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
+    chosen = [index[name] for name in cell.parameters]
+    draws = discovery.fit.theta_draws[..., chosen].reshape(-1, len(chosen))
+    draws = draws[:: max(1, len(draws) // 400)]
+    values = columns.values
+    if cell.form in ('free', 'sin/cos'):
+        # A curve's mean is a zero-offset.
+        values = values - values[fitted].mean(axis=0)
+    effect = values @ solution.parameters[where] / ARC_MINUTE
+    spread = (values @ draws.T / ARC_MINUTE).std(axis=1)
+    motion = scene.jacobian[:, :, columns.at]
+    # What is left, as an angle of this joint: only where the marker is far from its axis.
+    square = np.sum(motion**2, axis=1)
+    far = fitted & (square > 0.1 * np.median(square))
+    angle = np.sum(motion * left, axis=1)[far] / square[far] / ARC_MINUTE
+    shown = slice(None, None, max(1, int(far.sum()) // SCATTER_POINTS))
+    points = (effect[far] + angle)[shown]
+    if cell.driver.startswith('approach'):
+        _sides(ax, x, effect, 2.0 * spread, (x[far][shown], points))
+    else:
+        ax.plot(x[far][shown], points, '.', color=BEFORE, markersize=2.5, alpha=0.6)
+        order = np.argsort(x)
+        line, band = effect[order], 2.0 * spread[order]
+        ax.fill_between(x[order], line - band, line + band, color=AFTER, alpha=0.25, linewidth=0)
+        ax.plot(x[order], line, color=AFTER, linewidth=1.3)
+    limit = np.quantile(np.abs(points), 0.99)
+    ax.set_ylim(-1.2 * limit, 1.2 * limit)
+    ax.set_xlabel(label)
+    ax.set_ylabel('arc minutes')
+    ax.set_title(f'joint {cell.joints[0]}: {cell.name.replace("_", " ")}')
+
+
+def _sides(
+    ax: Axes,
+    x: FloatArray,
+    effect: FloatArray,
+    band: FloatArray,
+    shown: tuple[FloatArray, FloatArray],
+) -> None:
+    """Draw a step: the points of each side spread out, and the step's level beside them."""
+    places, points = shown
+    spread_out = places + 0.3 * np.linspace(-1.0, 1.0, len(places))
+    ax.plot(spread_out, points, '.', color=BEFORE, markersize=2.5, alpha=0.6)
+    for side in (-1.0, 1.0):
+        if np.any(x == side):
+            level, width = float(effect[x == side][0]), float(band[x == side][0])
+            span = [side - 0.4, side + 0.4]
+            ax.fill_between(span, level - width, level + width, color=AFTER, alpha=0.25)
+            ax.plot(span, [level, level], color=AFTER, linewidth=1.3)
+    ax.set_xticks([-1.0, 1.0], ['from above', 'from below'])

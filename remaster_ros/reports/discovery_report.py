@@ -1,0 +1,103 @@
+"""report.html of a discovery: one self-contained page that a technician can read."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from remaster_ros.discovery.confirmation import Confirmation, in_words
+from remaster_ros.discovery.discover import Discovery
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.reports.discovery_figures import draw_discovery
+from remaster_ros.reports.fit_json import REPORT_FILE
+from remaster_ros.reports.pages import inlined, page
+from remaster_ros.session.files import make_folder, write_atomically
+
+# Long lists of spline coefficients are for other programs; the figure shows the curve.
+MOST_PARAMETERS = 8
+
+
+def write_discovery_report(
+    discovery: Discovery,
+    confirmation: Confirmation | None,
+    content: dict[str, Any],
+    folder: str | os.PathLike[str],
+) -> Path:
+    """Write report.html, and the figures as SVG files under ``figures``; return its path.
+
+    Parameters
+    ----------
+    discovery, confirmation
+        What was found.
+    content
+        The same as discovery.json has it.
+    folder
+        Where to; made if missing.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to.
+    """
+    folder = Path(folder)
+    drawings = draw_discovery(discovery)
+    make_folder(folder / 'figures')
+    for name, text in drawings.items():
+        write_atomically(folder / 'figures' / f'{name}.svg', text)
+    write_atomically(
+        folder / REPORT_FILE,
+        page(
+            'discovery.html.jinja',
+            found=content,
+            headline=headline(discovery, confirmation),
+            mood='good' if _is_proven(discovery, confirmation) else 'caution',
+            equations={name: effect.equation for name, effect in EFFECTS.items()},
+            sources={name: effect.source for name, effect in EFFECTS.items()},
+            most_parameters=MOST_PARAMETERS,
+            confirmed=in_words(discovery, confirmation) if confirmation else (),
+            drawings={name: inlined(name, text) for name, text in drawings.items()},
+        ),
+    )
+    return folder / REPORT_FILE
+
+
+def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
+    """Whether poses that were never fitted, and the other session if there is one, agree."""
+    if discovery.verdict == 'undetermined':
+        return False
+    if confirmation is not None and not confirmation.same_offsets:
+        return False
+    if discovery.verdict == 'none':
+        return True
+    before, after = discovery.gain.held_out_rms_before_m, discovery.gain.held_out_rms_after_m
+    gains = before is not None and after is not None and after < before
+    return gains and (confirmation is None or confirmation.confirmed)
+
+
+def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> str:
+    """Return the result in one or a few sentences."""
+    gain = discovery.gain
+    change = ''
+    if gain.held_out_rms_before_m is not None and gain.held_out_rms_after_m is not None:
+        change = (
+            f' On poses it never fitted the error goes from '
+            f'{1e3 * gain.held_out_rms_before_m:.3f} to {1e3 * gain.held_out_rms_after_m:.3f} mm '
+            f'RMS; the noise alone is {1e3 * gain.noise_floor_m:.3f} mm.'
+        )
+    if discovery.verdict == 'none':
+        return 'Nothing is there beyond the zero-offsets and the noise.'
+    count = len(discovery.effects)
+    causes = 'one cause' if count == 1 else f'{count} causes'
+    if discovery.verdict == 'undetermined':
+        return (
+            f'Something is there, but two explanations fit equally well: see which measurements '
+            f'would decide.{change}'
+        )
+    if confirmation is not None and not confirmation.confirmed:
+        change += (
+            f' The other session does not confirm {"it" if count == 1 else "them"}: its error is '
+            f'{1e3 * confirmation.rms_after_m:.3f} mm RMS with and '
+            f'{1e3 * confirmation.rms_before_m:.3f} mm without.'
+        )
+    return f'Beyond the zero-offsets there {"is" if count == 1 else "are"} {causes}.{change}'

@@ -1,0 +1,303 @@
+"""The figures of a fit as SVG text: traces, posteriors, errors before and after.
+
+Drawn on Matplotlib figures of their own (no pyplot, no window, no shared state). Lines and text
+are in marker colours, so that a page can swap them for its own in the dark; data colours are
+readable on both.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable, Sequence
+from io import StringIO
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from remaster_ros.types import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+
+    from remaster_ros.calibration.result import FitResult
+
+INK, GRID, PAPER = '#1b1f25', '#d8dce1', '#fefefd'
+BEFORE, AFTER = '#e07b39', '#3b82c4'
+CHAINS = ('#3b82c4', '#e07b39', '#2f9e78', '#b05fb5', '#b08a1e', '#d1495b', '#5f7d95', '#7a6ff0')
+SENSOR_MARKERS = 'os^Dv'
+WIDTH_IN = 8.4
+TRACE_POINTS = 1500
+SCATTER_POINTS = 1500
+WHOLE_TURN_DEG = 359.999
+
+STYLE: Any = {
+    'svg.fonttype': 'none',
+    # Wider than the fonts that pages use: what fits in it is never cut off in them.
+    'font.family': 'sans-serif',
+    'font.sans-serif': ['DejaVu Sans'],
+    'font.size': 8.0,
+    'axes.titlesize': 8.5,
+    'axes.titleweight': 'bold',
+    'axes.titlelocation': 'left',
+    'axes.labelsize': 8.0,
+    'axes.spines.top': False,
+    'axes.spines.right': False,
+    'axes.edgecolor': INK,
+    'axes.labelcolor': INK,
+    'axes.facecolor': 'none',
+    'axes.linewidth': 0.7,
+    'axes.grid': True,
+    'axes.axisbelow': True,
+    # Names come from files: a dollar sign in them is no formula.
+    'text.parse_math': False,
+    'grid.color': GRID,
+    'grid.linewidth': 0.6,
+    'text.color': INK,
+    'xtick.color': INK,
+    'ytick.color': INK,
+    'xtick.labelsize': 7.5,
+    'ytick.labelsize': 7.5,
+    'legend.frameon': False,
+    'legend.fontsize': 7.5,
+    'figure.facecolor': PAPER,
+    'lines.linewidth': 0.6,
+}
+
+
+def draw_figures(result: FitResult) -> dict[str, str]:
+    """Return every figure as SVG text, by file name without ending."""
+    figures: dict[str, Callable[[FitResult], Figure]] = {
+        'posteriors': posteriors,
+        'traces': traces,
+        'errors': errors_by_configuration,
+        'residuals': residual_distribution,
+    }
+    texts = {}
+    for name, draw in figures.items():
+        # The salt makes the same fit give the same file.
+        with matplotlib.rc_context({**STYLE, 'svg.hashsalt': name}):
+            figure = draw(result)
+            out = StringIO()
+            FigureCanvasSVG(figure).print_svg(out, metadata={'Date': None, 'Creator': None})
+        texts[name] = out.getvalue()
+    return texts
+
+
+def posteriors(result: FitResult) -> Figure:
+    """Draw the marginal posterior of each joint's offset with mean and 95 % interval (Fig. 4)."""
+    figure, axes = _joint_panels(result, height_in=1.55)
+    draws = np.degrees(result.joint_offset_draws)
+    for i, ax in enumerate(axes):
+        sample = draws[..., i].ravel()
+        if np.ptp(sample) == 0.0:
+            _say(ax, _short(result.why[i]))
+            continue
+        color = AFTER if result.identifiable[i] else BEFORE
+        ax.hist(sample, bins=60, density=True, histtype='stepfilled', color=color, alpha=0.55)
+        mean, std = np.degrees((result.joint_offsets[i], result.joint_offsets_std[i]))
+        low, high = np.degrees(result.joint_offsets_interval95[i])
+        text = 'not identifiable: where the chains wandered to'
+        if high - low < WHOLE_TURN_DEG:
+            ax.axvspan(low, high, color=color, alpha=0.13, linewidth=0)
+            ax.axvline(mean, color=color, linewidth=1.4)
+            source = '' if result.identifiable[i] else 'from the prior alone: '
+            text = f'{source}{mean:+.4f}° ± {std:.4f}°'.replace('-', '\N{MINUS SIGN}')
+        ax.set_title(text, loc='right', fontweight='normal')
+        ax.set_yticks([])
+        ax.spines['left'].set_visible(False)
+        ax.grid(False)
+        ax.xaxis.set_major_locator(MaxNLocator(5))
+    figure.supxlabel('zero-offset (degrees); line: mean, shaded: 95 % interval', fontsize=8)
+    return figure
+
+
+def traces(result: FitResult) -> Figure:
+    """Draw the chains of each joint's offset from their first state (Fig. 3)."""
+    figure, axes = _joint_panels(result, height_in=1.35)
+    chains, records = result.trace.shape[:2]
+    step = max(1, -(-records // TRACE_POINTS))
+    x = np.arange(0, records, step)
+    columns = {name: i for i, name in enumerate(result.parameter_names)}
+    for i, (joint, ax) in enumerate(zip(result.joint_names, axes, strict=True)):
+        if joint not in columns:
+            _say(ax, _short(result.why[i]))
+            continue
+        values = np.degrees(result.trace[:, ::step, columns[joint]])
+        for chain in range(chains):
+            color = CHAINS[chain % len(CHAINS)]
+            ax.plot(x, values[chain], color=color, alpha=0.8, label=f'chain {chain + 1}')
+        if not result.identifiable[i]:
+            ax.set_title('not identifiable', loc='right', fontweight='normal')
+        ax.set_ylabel('degrees')
+        ax.margins(x=0.01)
+        ax.yaxis.set_major_locator(MaxNLocator(4))
+    if sampled := [ax for ax in axes if ax.lines]:
+        handles, labels = sampled[0].get_legend_handles_labels()
+        legend = figure.legend(handles, labels, loc='outside upper right', ncols=min(chains, 8))
+        for line in legend.get_lines():
+            line.set_linewidth(2.0)
+    figure.supxlabel('recorded state of the chain, from its start', fontsize=8)
+    return figure
+
+
+def errors_by_configuration(result: FitResult) -> Figure:
+    """Draw the error of every row before and after, by configuration and sensor."""
+    m = result.session.measurements
+    before, after = _norms_mm(result)
+    splits = _splits(result)
+    figure, axes = _stacked(len(splits), height_in=2.5)
+    for ax, (title, rows) in zip(axes, splits, strict=True):
+        chosen = np.flatnonzero(rows)
+        note = ''
+        if len(chosen) > SCATTER_POINTS:
+            picked = np.linspace(0, len(chosen) - 1, SCATTER_POINTS).round().astype(int)
+            note = f', {SCATTER_POINTS} of {len(chosen)} rows shown'
+            chosen = chosen[picked]
+        legend = [_legend_entry('_', BEFORE, 'before'), _legend_entry('_', AFTER, 'after')]
+        for sensor, name in enumerate(result.session.sensor_names):
+            mine = chosen[m.sensor[chosen] == sensor]
+            if not len(mine):
+                continue
+            marker = SENSOR_MARKERS[sensor % len(SENSOR_MARKERS)]
+            for errors, color in ((before, BEFORE), (after, AFTER)):
+                ax.plot(
+                    m.configuration[mine],
+                    errors[mine],
+                    marker,
+                    color=color,
+                    markersize=3.2,
+                    markeredgewidth=0,
+                    alpha=0.85,
+                )
+            legend.append(_legend_entry(marker, INK, name))
+        log_axis(ax, 'y')
+        ax.set_title(f'{title}{note}')
+        ax.set_ylabel('3-D error (mm)')
+        ax.set_xlabel('joint configuration, in the order measured')
+        ax.margins(x=0.01)
+        _legend_above(ax, legend)
+    return figure
+
+
+def residual_distribution(result: FitResult) -> Figure:
+    """Draw how large the errors are with and without the offsets."""
+    before, after = _norms_mm(result)
+    splits = _splits(result)
+    figure, axes = _stacked(len(splits), height_in=2.1)
+    for ax, (title, rows) in zip(axes, splits, strict=True):
+        both = np.concatenate((before[rows], after[rows]))
+        floor = max(float(np.quantile(both, 0.002)), 1e-4)
+        count = int(np.clip(3 * np.sqrt(rows.sum()), 8, 45))
+        bins = np.geomspace(floor, max(float(both.max()), 2 * floor) * 1.001, count)
+        for errors, color, when in ((before, BEFORE, 'before'), (after, AFTER, 'after')):
+            mean = float(errors[rows].mean())
+            ax.hist(
+                np.maximum(errors[rows], floor),
+                bins=bins.tolist(),
+                color=color,
+                alpha=0.5,
+                histtype='stepfilled',
+                label=f'{when}: mean {mean:.3f} mm',
+            )
+            ax.axvline(mean, color=color, linewidth=1.3)
+        log_axis(ax, 'x')
+        ax.set_title(title)
+        ax.set_xlabel('3-D error (mm); lines: means')
+        ax.set_ylabel('observations')
+        ax.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+        _legend_above(ax)
+    return figure
+
+
+def _joint_panels(result: FitResult, height_in: float) -> tuple[Figure, list[Axes]]:
+    """Return a figure with one titled panel per joint, two in a row."""
+    joints = result.joint_names
+    rows = -(-len(joints) // 2)
+    figure = Figure(figsize=(WIDTH_IN, height_in * rows + 0.5), layout='constrained')
+    grid = figure.subplots(rows, 2, squeeze=False)
+    axes = list(grid.flat)
+    for spare in axes[len(joints) :]:
+        spare.set_visible(False)
+    for joint, ax in zip(joints, axes, strict=False):
+        ax.set_title(joint)
+    return figure, axes[: len(joints)]
+
+
+def _stacked(count: int, height_in: float) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(WIDTH_IN, height_in * count + 0.2), layout='constrained')
+    return figure, list(figure.subplots(count, 1, squeeze=False).flat)
+
+
+def _legend_above(ax: Axes, handles: list[Line2D] | None = None) -> None:
+    """Put the legend at the right above the panel, in one row."""
+    shown: Sequence[Artist] = ax.get_legend_handles_labels()[0] if handles is None else handles
+    ax.legend(
+        handles=shown,
+        loc='lower right',
+        bbox_to_anchor=(1.0, 1.0),
+        borderaxespad=0.1,
+        ncols=len(shown),
+        handletextpad=0.3,
+        columnspacing=1.2,
+    )
+
+
+def _legend_entry(marker: str, color: str, name: str) -> Line2D:
+    return Line2D(
+        [],
+        [],
+        linestyle='',
+        marker=marker,
+        color=color,
+        markersize=5,
+        markeredgewidth=2.5 if marker == '_' else 0,
+        label=name if len(name) <= 20 else name[:19] + '…',
+    )
+
+
+def _say(ax: Axes, text: str) -> None:
+    """Turn a panel into words."""
+    ax.set_axis_off()
+    lines = textwrap.fill(text, 58)
+    ax.text(0.0, 0.8, lines, transform=ax.transAxes, va='top', linespacing=1.4)
+
+
+def _short(why: str) -> str:
+    """Return the reason up to the remedy, which the page gives in full."""
+    reason = why.split(';')[0]
+    return f'Not identifiable: {reason}.'
+
+
+def log_axis(ax: Axes, which: str) -> None:
+    """Make an axis logarithmic, labelled in plain numbers at 1, 2 and 5."""
+    axis = ax.yaxis if which == 'y' else ax.xaxis
+    (ax.set_yscale if which == 'y' else ax.set_xscale)('log')
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _norms_mm(result: FitResult) -> tuple[FloatArray, FloatArray]:
+    """Return the 3-D error of every row before and after, mm, never quite zero."""
+    before, after = (
+        np.maximum(1e3 * np.linalg.norm(residuals, axis=1), 1e-6)
+        for residuals in (result.residuals_before, result.residuals_after)
+    )
+    return before, after
+
+
+def _splits(result: FitResult) -> list[tuple[str, BoolArray]]:
+    """Return title and rows of the splits that have any; gross errors are not among the fitted."""
+    m = result.session.measurements
+    left_out = np.isin(m.observation, [observation for observation, _ in result.left_out])
+    splits = [
+        ('Validation poses (never fitted)', m.is_validation),
+        ('Optimization poses (fitted)', ~m.is_validation & ~left_out),
+    ]
+    return [(title, rows) for title, rows in splits if rows.any()]

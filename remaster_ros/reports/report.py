@@ -1,0 +1,265 @@
+"""report.html: one self-contained page that says what the fit found and whether to believe it."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import importlib.resources
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from markupsafe import Markup
+
+from remaster_ros.calibration.noise_check import NoiseCheck
+from remaster_ros.collection.reference_session import changes
+from remaster_ros.reports.figures import draw_figures
+from remaster_ros.reports.fit_json import REPORT_FILE, fit_to_dict
+from remaster_ros.reports.pages import inlined, page
+from remaster_ros.session.files import make_folder, write_atomically
+
+if TYPE_CHECKING:
+    from remaster_ros.calibration.result import FitResult
+    from remaster_ros.reports.scene import Scene
+
+# Less than this is no gain a user would notice.
+NOTICEABLE_GAIN = 1.1
+
+
+class Verdict(NamedTuple):
+    """The result in plain words.
+
+    Attributes
+    ----------
+    mood
+        ``good``, ``caution`` or ``bad``.
+    headline
+        One sentence.
+    points
+        What else must be known before the offsets are used.
+    """
+
+    mood: str
+    headline: str
+    points: list[str]
+
+
+def write_report(result: FitResult, folder: str | os.PathLike[str]) -> Path:
+    """Write report.html, and the figures as SVG files under ``figures``; return its path.
+
+    Parameters
+    ----------
+    result
+        The fit.
+    folder
+        Where to; made if missing.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to.
+    """
+    folder = Path(folder)
+    make_folder(folder)
+    drawings = draw_figures(result)
+    make_folder(folder / 'figures')
+    for name, text in drawings.items():
+        write_atomically(folder / 'figures' / f'{name}.svg', text)
+    write_atomically(folder / REPORT_FILE, report_html(result, drawings))
+    return folder / REPORT_FILE
+
+
+def report_html(result: FitResult, drawings: dict[str, str]) -> str:
+    """Return the page; with drawings (of `draw_figures`) it also has the 3-D view."""
+    scene: Scene | None = None
+    if drawings:
+        from remaster_ros.reports.scene import draw_scene
+
+        scene = draw_scene(result)
+    return page(
+        'report.html.jinja',
+        fit=fit_to_dict(result),
+        verdict=verdict(result),
+        accuracy=_accuracy_rows(result),
+        markers=_marker_rows(result),
+        references=_references(result),
+        notes=result.session.notes,
+        drawings={name: inlined(name, text) for name, text in drawings.items()},
+        scene=scene,
+        scene_json=_json({'data': scene.data, 'layout': scene.layout}) if scene else '',
+        plotly=_plotly() if scene else '',
+    )
+
+
+def _references(result: FitResult) -> tuple[int, list[str]]:
+    """Return the rounds of the references, and what changed in the session, a sentence each."""
+    rounds, found = changes(result.session, result.chain, result.T_R_N)
+    return rounds, [f'While it was measured, {change.describe()}.' for change in found]
+
+
+def verdict(result: FitResult) -> Verdict:
+    """Judge a fit in words: what was gained, whether the chains agree, what stays unknown."""
+    validated = result.accuracy['validation'] is not None
+    split = 'validation' if validated else 'optimization'
+    metrics = result.accuracy[split]['post_registration']
+    before, after = metrics['before']['mean_mm'], metrics['after']['mean_mm']
+    gain = before / max(after, 1e-9)
+    where = 'on poses it never fitted' if validated else 'on the fitted poses'
+    change = f'{before:.3f} mm to {after:.3f} mm {where}'
+    unexplained = [check for check in result.noise_checks if not check.explained]
+    if not result.sampler.converged:
+        mood = 'bad'
+        headline = (
+            'The chains have not converged, so nothing is decided yet: '
+            f'for now the mean position error goes from {change}.'
+        )
+    elif gain >= NOTICEABLE_GAIN:
+        times = f'{gain:.1f} times' if gain < 10 else f'{gain:.0f} times'
+        headline = f'The mean position error falls from {change}: {times} smaller.'
+        mood = 'good'
+        if unexplained:
+            mood = 'caution'
+            headline += f' {_dominated(unexplained)}'
+    elif gain > 1 / NOTICEABLE_GAIN:
+        mood = 'caution'
+        headline = (
+            f'The zero-offsets hardly matter here: the mean position error goes from {change}. '
+            + (_dominated(unexplained) if unexplained else 'That is what noise explains.')
+        )
+    else:
+        mood = 'bad'
+        headline = f'The offsets make it worse: the mean position error goes from {change}.'
+
+    points = [_compared(check) for check in unexplained]
+    points += _references(result)[1]
+    if _references(result)[1] and mood == 'good':
+        mood = 'caution'
+    if result.implausible:
+        mood = 'bad'
+        headline += ' Do not apply the offsets yet: they are larger than a mastering is off by.'
+        points = [*result.implausible, *points]
+    if not validated:
+        mood = 'caution' if mood == 'good' else mood
+        points.append(
+            'There are no validation poses, so the gain is not proven: measure some and fit again.'
+        )
+    sampler = result.sampler
+    if sampler.converged:
+        points.append(f'The chains agree with each other ({sampler.message}).')
+    else:
+        points.append(
+            f'Do not trust offsets or uncertainties ({sampler.message}); '
+            'fit again with more draws.'
+        )
+    unknown = [
+        joint
+        for joint, known in zip(result.joint_names, result.identifiable, strict=True)
+        if not known
+    ]
+    count = len(result.joint_names)
+    if unknown:
+        points.append(
+            f'{count - len(unknown)} of {count} zero-offsets are measured. The data cannot tell '
+            f'{" and ".join(unknown)} from something else; the table says from what.'
+        )
+    else:
+        points.append(f'All {count} zero-offsets are measured.')
+    if result.left_out:
+        plural = 's are' if len(result.left_out) > 1 else ' is'
+        points.append(
+            f'{len(result.left_out)} observation{plural} left out as gross errors; '
+            'they are listed below.'
+        )
+    return Verdict(mood, headline, points)
+
+
+def _dominated(unexplained: Sequence[NoiseCheck]) -> str:
+    """Return why the error after is no success, and what to do."""
+    if all(check.noise_m is None for check in unexplained):
+        return 'Whether noise explains what is left, this session cannot tell.'
+    return (
+        'But noise does not explain what is left: other errors dominate; run "remaster discover".'
+    )
+
+
+def _compared(check: NoiseCheck) -> str:
+    """Return the figures of a sensor whose error noise does not explain."""
+    if check.noise_error_m is None:
+        return (
+            f'{check.sensor}: no reading has a standard deviation, and no pose was seen in two '
+            f'joint solutions, so nothing tells how much of the {1e3 * check.error_m:.3f} mm is '
+            'noise: measure poses in all their joint solutions.'
+        )
+    sources = [
+        f'{1e3 * std:.3f} mm per axis {what}'
+        for std, what in (
+            (check.stated_m, 'stated by the sensor'),
+            (check.within_m, 'within a pose'),
+        )
+        if std is not None
+    ]
+    return (
+        f'{check.sensor}: the error after is {1e3 * check.error_m:.3f} mm; noise '
+        f'({", ".join(sources)}) makes {1e3 * check.noise_error_m:.3f} mm. A sensor or base that '
+        'was moved during the session, a soft joint or a worn gear leave such errors, and the '
+        'offsets take up a part of them.'
+    )
+
+
+def _accuracy_rows(result: FitResult) -> list[dict[str, Any]]:
+    """Return one row per split and metric, and the reason where there is no number."""
+    titles = {
+        'post_registration': 'Position, sensor registered (eq.\u00a018)',
+        'relative': 'Distances between solutions of a pose (eq.\u00a017)',
+        'theoretical': 'What the posterior predicts (section V-C)',
+        'paper_theoretical': '… in the robot base, offsets alone, as the paper has it',
+        'theoretical_random': 'The same predicted at 1,000 random configurations',
+        'paper_theoretical_random': '… in the robot base, as the paper has it',
+    }
+    rows = []
+    for split in ('validation', 'optimization'):
+        metrics = result.accuracy[split]
+        if metrics is None:
+            continue
+        for metric, title in titles.items():
+            at_random = metric.endswith('_random')
+            if at_random and split == 'validation':
+                continue  # They are the same for both.
+            sides = metrics[metric]
+            rows.append(
+                {
+                    'split': 'any' if at_random else split,
+                    'title': title,
+                    'cells': [sides.get(side) for side in ('before', 'after')],
+                    'offsets_only': sides.get('after_offsets_only'),
+                    'why': sides.get('why', ''),
+                }
+            )
+    return rows
+
+
+def _marker_rows(result: FitResult) -> list[dict[str, Any]]:
+    return [
+        {
+            'name': name,
+            'position_mm': (1e3 * position).tolist(),
+            'std_mm': (1e3 * result.marker_std_m[name]).tolist(),
+            'moved_mm': 1e3 * float(np.linalg.norm(position - result.session.markers[name])),
+        }
+        for name, position in result.marker_positions.items()
+    ]
+
+
+def _plotly() -> str:
+    """Return plotly.js, compressed and in base64: a third of its size in the page."""
+    script = importlib.resources.files('plotly').joinpath('package_data', 'plotly.min.js')
+    return base64.b64encode(gzip.compress(script.read_bytes(), 9, mtime=0)).decode()
+
+
+def _json(content: Any) -> Markup:
+    """Return JSON that no script element can be left with."""
+    text = json.dumps(content, separators=(',', ':'), allow_nan=False)
+    return Markup(text.replace('<', '\\u003c'))

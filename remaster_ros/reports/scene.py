@@ -1,0 +1,213 @@
+"""The 3-D view of a fit: arm, measured markers, magnified error vectors, sensors (for plotly.js).
+
+Only the description is made here, as plain data; the page brings the script.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from remaster_ros.kinematics.transforms import apply
+from remaster_ros.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from remaster_ros.calibration.result import FitResult
+
+BEFORE, AFTER, ARM, SENSOR, TEXT = '#e07b39', '#3b82c4', '#7d8896', '#2f9e78', '#808a96'
+ARMS_SHOWN = 5
+ROWS_SHOWN = 600
+
+
+class Scene(NamedTuple):
+    """A plotly figure as plain data, and what its caption must say.
+
+    Attributes
+    ----------
+    data, layout
+        For ``Plotly.newPlot``.
+    magnification
+        By what the error vectors are drawn too long.
+    rows_shown, rows
+        How many observations are drawn, of how many.
+    far_sensors
+        Sensors so far off that they are hidden until asked for.
+    """
+
+    data: list[dict[str, Any]]
+    layout: dict[str, Any]
+    magnification: int
+    rows_shown: int
+    rows: int
+    far_sensors: list[str]
+
+
+def draw_scene(result: FitResult) -> Scene:
+    """Return the 3-D view, everything in the robot base R, metres."""
+    m = result.session.measurements
+    shown = _evenly(len(m), ROWS_SHOWN)
+    sensors = [result.session.sensor_names[i] for i in m.sensor[shown]]
+    T_R_N = np.array([result.T_R_N[sensor] for sensor in sensors])
+    T_before = np.array([result.T_R_N_before[sensor] for sensor in sensors])
+    points = apply(T_R_N, m.position[shown])
+    # From where the marker was measured to where the model has it: minus the residual.
+    vectors = {
+        'before': -_rotate(T_before, result.residuals_before[shown]),
+        'after': -_rotate(T_R_N, result.residuals_after[shown]),
+    }
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    typical = float(np.median(np.linalg.norm(vectors['before'], axis=1)))
+    magnification = _round_factor(0.07 * extent / max(typical, 1e-9))
+
+    data = [_arms(result), _points(result, points, shown)]
+    for when, color in (('before', BEFORE), ('after', AFTER)):
+        ends = points + magnification * vectors[when]
+        data.append(
+            _line(
+                _segments(points, ends),
+                f'error {when}, {magnification}\N{MULTIPLICATION SIGN}',
+                color,
+                3.0 if when == 'after' else 2.0,
+            )
+        )
+    centre = points.mean(axis=0)
+    far = []
+    for sensor, T in result.T_R_N.items():
+        distance = float(np.linalg.norm(T[:3, 3] - centre))
+        is_far = distance > 2.5 * max(extent, 0.5)
+        if is_far:
+            far.append(sensor)
+        data.append(_sensor(sensor, T, is_far))
+    return Scene(data, _layout(), magnification, len(shown), len(m), far)
+
+
+def _arms(result: FitResult) -> dict[str, Any]:
+    m = result.session.measurements
+    chosen = m.q[_evenly(len(m), ARMS_SHOWN)]
+    joints = result.chain.frames(chosen, result.joint_offsets)[..., :3, 3]
+    tips = result.chain.forward(chosen, result.joint_offsets)[:, None, :3, 3]
+    base = np.zeros((len(chosen), 1, 3))
+    gap = np.full((len(chosen), 1, 3), np.nan)
+    lines = np.concatenate((base, joints, tips, gap), axis=1).reshape(-1, 3)
+    arms = _line(lines, f'arm, {len(chosen)} of its configurations', ARM, 6.0)
+    return {
+        **arms,
+        'mode': 'lines+markers',
+        'marker': {'size': 3, 'color': ARM},
+        'opacity': 0.75,
+    }
+
+
+def _points(result: FitResult, points: FloatArray, shown: IntArray) -> dict[str, Any]:
+    m = result.session.measurements
+    before, after = (
+        1e3 * np.linalg.norm(residuals[shown], axis=1)
+        for residuals in (result.residuals_before, result.residuals_after)
+    )
+    text = [
+        f'observation {m.observation[row]}, pose {m.pose[row]}, '
+        f'{_plain(result.session.sensor_names[m.sensor[row]])}'
+        f'<br>error {b:.3f} mm before, {a:.3f} mm after'
+        for row, b, a in zip(shown, before, after, strict=True)
+    ]
+    return {
+        'type': 'scatter3d',
+        'mode': 'markers',
+        'name': 'markers as measured',
+        **_xyz(points),
+        'marker': {'size': 2.5, 'color': TEXT},
+        'text': text,
+        'hoverinfo': 'text',
+    }
+
+
+def _sensor(name: str, T_R_N: FloatArray, is_far: bool) -> dict[str, Any]:
+    name = _plain(name)
+    return {
+        'type': 'scatter3d',
+        'mode': 'markers+text',
+        'name': f'sensor {name}',
+        **_xyz(T_R_N[None, :3, 3]),
+        'text': [name],
+        'textposition': 'top center',
+        'textfont': {'color': SENSOR},
+        'marker': {'size': 6, 'symbol': 'diamond', 'color': SENSOR},
+        'hoverinfo': 'text',
+        'visible': 'legendonly' if is_far else True,
+    }
+
+
+def _line(points: FloatArray, name: str, color: str, width: float) -> dict[str, Any]:
+    return {
+        'type': 'scatter3d',
+        'mode': 'lines',
+        'name': name,
+        **_xyz(points),
+        'line': {'color': color, 'width': width},
+        'hoverinfo': 'skip',
+    }
+
+
+def _layout() -> dict[str, Any]:
+    def axis(name: str) -> dict[str, Any]:
+        return {
+            'title': {'text': f'{name} (m)'},
+            'color': TEXT,
+            'gridcolor': 'rgba(128,138,150,0.35)',
+            'zerolinecolor': 'rgba(128,138,150,0.7)',
+            'showbackground': False,
+        }
+
+    return {
+        'scene': {
+            'xaxis': axis('x'),
+            'yaxis': axis('y'),
+            'zaxis': axis('z'),
+            'aspectmode': 'data',
+            'camera': {
+                'eye': {'x': 1.45, 'y': 1.45, 'z': 0.85},
+                'center': {'x': 0, 'y': 0, 'z': -0.1},
+            },
+        },
+        'paper_bgcolor': 'rgba(0,0,0,0)',
+        'font': {'color': TEXT},
+        'modebar': {'bgcolor': 'rgba(0,0,0,0)', 'color': TEXT, 'activecolor': AFTER},
+        'margin': {'l': 0, 'r': 0, 't': 0, 'b': 0},
+        'legend': {'orientation': 'h', 'y': 0, 'yanchor': 'top'},
+    }
+
+
+def _segments(starts: FloatArray, ends: FloatArray) -> FloatArray:
+    """Return start, end, gap, start, end, gap, … for one line trace."""
+    gap = np.full_like(starts, np.nan)
+    return np.stack((starts, ends, gap), axis=1).reshape(-1, 3)
+
+
+def _xyz(points: FloatArray) -> dict[str, list[float | None]]:
+    """Return coordinates to the hundredth of a millimetre, gaps as None."""
+    return {
+        axis: [None if np.isnan(value) else value for value in column]
+        for axis, column in zip('xyz', np.round(points, 5).T.tolist(), strict=True)
+    }
+
+
+def _rotate(T: FloatArray, vectors: FloatArray) -> FloatArray:
+    return np.einsum('nij,nj->ni', T[:, :3, :3], vectors)
+
+
+def _evenly(count: int, most: int) -> IntArray:
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
+
+
+def _round_factor(factor: float) -> int:
+    """Return the largest of 1, 2, 5, 10, 20, … that is at most `factor`, at least 1."""
+    if factor < 2:
+        return 1
+    power = 10 ** int(np.floor(np.log10(factor)))
+    return int(power * max(step for step in (1, 2, 5) if step * power <= factor))
+
+
+def _plain(text: str) -> str:
+    """Plotly reads labels as a kind of HTML, and entities in some places only."""
+    return text.replace('<', '‹').replace('>', '›')

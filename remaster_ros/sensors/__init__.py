@@ -1,0 +1,1 @@
+"""Measuring devices, one folder each: wire format, client, diagnosis."""

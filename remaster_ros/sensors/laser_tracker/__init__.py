@@ -1,0 +1,1 @@
+"""Leica laser trackers by the emScon protocol."""

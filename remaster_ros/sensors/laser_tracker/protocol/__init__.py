@@ -1,0 +1,1 @@
+"""The emScon protocol: bytes to events and back; no sockets."""

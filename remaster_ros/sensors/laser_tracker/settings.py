@@ -1,0 +1,93 @@
+"""What the laser tracker driver is told, and what it returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.types import FloatArray, MarkerReading
+
+
+class TrackerStatus(Enum):
+    """What the instrument last said of itself."""
+
+    DISCONNECTED = 'disconnected'
+    NOT_READY = 'not ready'
+    """Warming up, not initialised, or no reflector locked."""
+    BUSY = 'busy'
+    READY = 'ready'
+    """A reflector is locked; it can be measured."""
+
+
+@dataclass(frozen=True)
+class Environment:
+    """The air between tracker and reflector; it sets the refractive index."""
+
+    temperature_c: float
+    pressure_hpa: float
+    humidity_percent: float
+
+
+@dataclass(frozen=True)
+class LaserTrackerSettings:
+    """What the driver sets on the instrument, and how long it waits.
+
+    Attributes
+    ----------
+    reflector_id
+        The instrument's number of the reflector mounted; None leaves the one it has set.
+    search_radius_m, search_timeout_s
+        Of every search for the reflector, at the reflector's distance.
+    integration_s
+        Averaging time of one measurement.
+    environment
+        None leaves the instrument's own weather station, or what is set there.
+    connect_timeout_s
+        Of the TCP connection, in wall time.
+    reply_timeout_s
+        Of a command that only sets or reads something.
+    initialise_timeout_s
+        Of the initialisation, waiting for the warm-up included.
+    """
+
+    reflector_id: int | None = None
+    search_radius_m: float = 0.05
+    search_timeout_s: float = 10.0
+    integration_s: float = 1.0
+    environment: Environment | None = None
+    connect_timeout_s: float = 5.0
+    reply_timeout_s: float = 5.0
+    initialise_timeout_s: float = 300.0
+
+    def __post_init__(self) -> None:
+        """Refuse what no instrument can do.
+
+        Raises
+        ------
+        InputError
+            Naming the setting.
+        """
+        for name, value in vars(self).items():
+            if name.endswith(('_s', '_m')) and not 0 < value < np.inf:
+                raise InputError(f'laser tracker: {name} is {value}; it must be above 0')
+
+
+@dataclass(frozen=True)
+class TrackerReading(MarkerReading):
+    """One ADM measurement.
+
+    Attributes
+    ----------
+    stamp_s
+        Middle of the integration on the injected clock, s.
+    std
+        The instrument's own standard deviation per axis, m, (3,).
+    """
+
+    std: FloatArray
+    temperature_c: float
+    pressure_hpa: float
+    humidity_percent: float

@@ -1,0 +1,1 @@
+"""OptiTrack cameras by NatNet."""

@@ -1,0 +1,317 @@
+"""An OptiTrack client: sockets and one thread around the NatNet decoder; no ROS.
+
+Nothing that arrives can end the thread: what is foreign, damaged, late or not measured is counted
+with its reason and dropped. The client greets the server again whenever the stream falls silent
+or stops making sense, so a restarted server, or one of another version, is picked up by itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import selectors
+import socket
+import time
+from collections import deque
+from collections.abc import Callable
+
+from remaster_ros.errors import DeviceError
+from remaster_ros.sensors.optitrack.diagnosis import (
+    Diagnosis,
+    NatNetSettings,
+    StreamStatus,
+)
+from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice, MarkerSample
+from remaster_ros.sensors.optitrack.frame_source import Source
+from remaster_ros.sensors.optitrack.marker_follower import MarkerFollower
+from remaster_ros.sensors.optitrack.protocol import natnet
+from remaster_ros.sensors.optitrack.protocol.frames import (
+    BITSTREAM_CHANGED,
+    MODEL_LIST_CHANGED,
+    Frame,
+)
+from remaster_ros.sensors.optitrack.protocol.models import ModelDefinition
+from remaster_ros.sensors.optitrack.protocol.natnet import (
+    Message,
+    MessageId,
+    ProtocolError,
+    ServerInfo,
+)
+from remaster_ros.sensors.optitrack.sockets import (
+    open_multicast_socket,
+    open_socket,
+    port_is_closed,
+)
+
+__all__ = [
+    'Diagnosis',
+    'Dropped',
+    'MarkerChoice',
+    'MarkerSample',
+    'NatNetClient',
+    'NatNetSettings',
+    'StreamStatus',
+]
+
+RETRY_S = 0.5
+KEEPALIVE_S = 1.0
+POLL_S = 0.1
+DATAGRAMS_PER_TURN = 1024
+"""Then the thread looks at its timers again, however fast the datagrams come."""
+DIGEST_S = 0.005
+"""So long a turn decodes and hands on; then the sockets are emptied again."""
+MAX_BACKLOG_BYTES = 1 << 26
+"""What may wait to be decoded: twenty seconds of 1 kHz frames with 50 markers."""
+MALFORMED_IN_A_ROW = 3
+"""Then the version has probably changed, and the server is asked."""
+NEGOTIATION_TRIES = 4
+MAX_DATAGRAM_BYTES = 1 << 16
+_FRAME_ID = MessageId.FRAMEOFDATA.to_bytes(2, 'little')
+
+
+class NatNetClient(MarkerFollower):
+    """Follows one marker of an OptiTrack server, NatNet 2.6 to 4.3, multicast or unicast.
+
+    Parameters
+    ----------
+    settings
+        How to reach the server, and which marker to follow.
+    on_sample
+        Called in the client's thread with every reading. What it raises is logged.
+    clock
+        Gives the time at which a datagram arrived, s.
+
+    Examples
+    --------
+    >>> client = NatNetClient(NatNetSettings(server='192.168.1.10'), print)  # doctest: +SKIP
+    >>> client.start(wait_s=5.0)  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        settings: NatNetSettings,
+        on_sample: Callable[[MarkerSample], object],
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        super().__init__(settings, on_sample, clock)
+        self._command: socket.socket | None = None
+        self._data: socket.socket | None = None
+        self._greet = True
+        self._model_wanted = False
+        self._negotiation_tries = 0
+        self._malformed_in_a_row = 0
+        self._bitstream_changed = False
+        # Received and not yet decoded: datagram, arrival, sender, whether to the data socket.
+        self._backlog: deque[tuple[bytes, float, Source, bool]] = deque()
+        self._backlog_bytes = 0
+        self._due = dict.fromkeys(('connect', 'model', 'keepalive', 'bitstream'), 0.0)
+
+    def _open(self) -> None:
+        settings = self._settings
+        self._command = open_socket(
+            self._interface, 0, purpose='local_interface', remedy='correct local_interface'
+        )
+        if settings.transport == 'multicast':
+            try:
+                self._data = open_multicast_socket(
+                    settings.multicast_group, settings.data_port, self._interface
+                )
+            except DeviceError:
+                self._command.close()
+                self._command = None
+                raise
+
+    def _close(self) -> None:
+        self._send(natnet.encode_plain_request(MessageId.DISCONNECT))
+        for opened in (self._command, self._data):
+            if opened is not None:
+                opened.close()
+        self._command = self._data = None
+        self._backlog.clear()
+        self._backlog_bytes = 0
+
+    def _run(self) -> None:
+        with selectors.DefaultSelector() as selector:
+            for opened in (self._command, self._data):
+                if opened is not None:
+                    selector.register(opened, selectors.EVENT_READ)
+            while not self._stopping.is_set():
+                self._greet = self._release_silent_source() or self._greet
+                self._keep_in_touch(time.monotonic())
+                for key, _ in selector.select(0.0 if self._backlog else POLL_S):
+                    self._receive(key.fileobj)  # type: ignore[arg-type]
+                self._digest_backlog()
+
+    def _keep_in_touch(self, now: float) -> None:
+        """Send the requests that are due."""
+        lost_touch = (
+            self._server is None
+            or self._frame_at is None
+            or now - self._frame_at > self._settings.silence_s
+            or self._greet
+        )
+        negotiating = self._server is not None and self._version is None
+        if lost_touch and not negotiating and self._is_due('connect', now, RETRY_S):
+            self._send(natnet.encode_connect_request('remaster_ros'))
+            if self._server is None:
+                self._port_closed = port_is_closed(
+                    self._server_ip, self._settings.command_port, natnet.encode_echo_request(0)
+                )
+        if self._server is None:
+            return
+        if negotiating and self._is_due('bitstream', now, RETRY_S):
+            self._negotiate(self._server)
+        if self._is_unicast(self._server) and self._is_due('keepalive', now, KEEPALIVE_S):
+            self._send(natnet.encode_plain_request(MessageId.KEEPALIVE))
+        if self._version and self._model_wanted and self._is_due('model', now, RETRY_S):
+            self._send(natnet.encode_plain_request(MessageId.REQUEST_MODELDEF))
+
+    def _is_unicast(self, server: ServerInfo) -> bool:
+        """Tell whether the server streams to those who keep asking; it knows best."""
+        if server.connection is None:
+            return self._settings.transport == 'unicast'
+        return not server.connection.is_multicast
+
+    def _is_due(self, what: str, now: float, every_s: float) -> bool:
+        if now < self._due[what]:
+            return False
+        self._due[what] = now + every_s
+        return True
+
+    def _send(self, datagram: bytes) -> None:
+        if self._command is None:
+            return
+        try:
+            self._command.sendto(datagram, (self._server_ip, self._settings.command_port))
+            self._send_error = ''
+        except OSError as error:
+            self._send_error = error.strerror or str(error)
+
+    def _receive(self, source: socket.socket) -> None:
+        """Empty a socket into the backlog.
+
+        The buffer of a socket is small; a thread that waited long for a processor must not lose
+        more while it decodes what has come.
+        """
+        for _ in range(DATAGRAMS_PER_TURN):
+            try:
+                datagram, sender = source.recvfrom(MAX_DATAGRAM_BYTES)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                self._send_error = error.strerror or str(error)
+                self._stopping.wait(POLL_S)
+                return
+            received_s = self._clock()
+            if self._is_foreign(sender[0]):
+                continue
+            if self._backlog_bytes + len(datagram) > MAX_BACKLOG_BYTES:
+                self._gate.drop(Dropped.OVERRUN)
+                continue
+            self._backlog_bytes += len(datagram)
+            self._backlog.append((datagram, received_s, sender, source is self._data))
+
+    def _digest_backlog(self) -> None:
+        until = time.monotonic() + DIGEST_S
+        while self._backlog:
+            datagram, received_s, sender, from_data_socket = self._backlog.popleft()
+            self._backlog_bytes -= len(datagram)
+            self._digest(datagram, received_s, sender, from_data_socket=from_data_socket)
+            if time.monotonic() >= until:
+                return
+
+    def _digest(
+        self, datagram: bytes, received_s: float, sender: Source, *, from_data_socket: bool
+    ) -> None:
+        """Decode one datagram and act on it.
+
+        Frames are believed from one source; answers from the port that was asked, as whoever
+        else sends on that computer could name another version or another marker.
+        """
+        looks_like_frame = datagram[:2] == _FRAME_ID
+        answers = not from_data_socket and sender[1] == self._settings.command_port
+        if not (answers and not looks_like_frame) and self._is_refused(sender):
+            return
+        if not (answers or looks_like_frame or from_data_socket):
+            self._gate.drop(Dropped.FOREIGN)
+            return
+        try:
+            message_id, _payload = natnet.split_datagram(datagram)
+            is_frame = message_id == MessageId.FRAMEOFDATA
+            if from_data_socket and not is_frame:
+                raise ProtocolError(f'message {message_id} on the data port')
+            if self._version is None and (is_frame or message_id == MessageId.MODELDEF):
+                self._gate.drop(Dropped.UNRESOLVED)
+                return
+            message = natnet.decode_message(datagram, self._version, markers_only=True)
+        except ProtocolError as error:
+            self._note_malformed(error)
+            self._malformed_in_a_row += 1
+            self._greet = self._greet or self._malformed_in_a_row >= MALFORMED_IN_A_ROW
+            return
+        if isinstance(message, Frame):
+            self._take_frame(message, received_s, sender)
+        else:
+            self._take_answer(message)
+
+    def _take_frame(self, frame: Frame, received_s: float, sender: Source) -> None:
+        sample = self._take_whole_frame(frame, received_s, sender)
+        if sender != self._lock.source:
+            return
+        self._malformed_in_a_row = 0
+        bitstream_changed = bool(frame.params & BITSTREAM_CHANGED)
+        if bitstream_changed and not self._bitstream_changed:
+            self._greet = True
+        self._bitstream_changed = bitstream_changed
+        if frame.params & MODEL_LIST_CHANGED:
+            self._model_wanted = True
+        if sample is not None:
+            self._hand_on(sample)
+
+    def _take_answer(self, message: Message) -> None:
+        """Act on what came back on the command channel."""
+        if isinstance(message, ServerInfo):
+            self._take_server(message)
+        elif isinstance(message, ModelDefinition):
+            self._model_wanted = False
+            self._gate.name_assets(message.labelled_assets)
+        elif isinstance(message, natnet.Response):
+            self._take_bitstream(message)
+        elif isinstance(message, natnet.Notice):
+            if message.id == MessageId.UNRECOGNIZED_REQUEST:
+                self._take_bitstream(None)
+            else:
+                self._server = None
+
+    def _take_server(self, server: ServerInfo) -> None:
+        self._server = server
+        self._lock.answer()
+        self._port_closed = False
+        self._malformed_in_a_row = 0
+        self._greet = False
+        self._model_wanted = True
+        self._negotiation_tries = 0
+        # A server that was greeted again may have forgotten what was negotiated.
+        self._version = None if self._settings.wanted_version else server.natnet_version
+
+    def _negotiate(self, server: ServerInfo) -> None:
+        """Ask for the wanted bitstream; without an agreement the server's own is read."""
+        wanted = self._settings.wanted_version
+        if wanted is None or self._negotiation_tries >= NEGOTIATION_TRIES:
+            self._version = server.natnet_version
+            return
+        self._negotiation_tries += 1
+        self._send(natnet.encode_command_request(f'Bitstream,{natnet.format_version(wanted)}'))
+
+    def _take_bitstream(self, answer: natnet.Response | None) -> None:
+        """Take the answer to what `_negotiate` asked; None for a request that was refused."""
+        if self._server is None or self._version is not None:
+            return
+        self._version = self._server.natnet_version
+        if answer is None:
+            return
+        name, _, version = answer.text.partition(',')
+        if name == 'Bitstream':
+            with contextlib.suppress(ValueError):
+                self._version = natnet.parse_version(version)
+        elif answer.code == 0:
+            self._version = self._settings.wanted_version

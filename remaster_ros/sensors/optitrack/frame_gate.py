@@ -1,0 +1,349 @@
+"""From a frame of data to one marker reading, or the reason why not; no sockets, no clocks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.sensors.optitrack.protocol.frames import (
+    MODEL_FILLED,
+    NOT_LIVE,
+    OCCLUDED,
+    UNLABELED,
+    Frame,
+    LabeledMarker,
+)
+from remaster_ros.types import FARTHEST_M, FloatArray
+
+REORDER_WINDOW = 16
+"""A frame number further back than this is a restarted stream, not a late datagram."""
+MOST_LOST = 10_000_000
+"""A frame number further ahead, half a day of frames, is another stream's or damaged."""
+RESTART_S = 1.0
+"""A frame time further back than this is a restarted stream too."""
+MAX_AGE_S = 10.0
+"""A reading that claims to be older when it is sent has stamps of another clock."""
+FROZEN_FRAMES = 10
+"""So many readings in a row that are the same to the last bit are no measurements."""
+JUMP_MARGIN_M = 0.005
+"""Far above any noise; what a marker may move between frames beyond `max_speed_m_s`."""
+
+
+class Dropped(StrEnum):
+    """Why a datagram or a frame gave no reading."""
+
+    FOREIGN = 'foreign'
+    """It came from an address that is not the configured server's, or from a port of it that is
+    not the believed one (`natnet_source`)."""
+    PROBATION = 'probation'
+    """Its source is not believed yet: it must be the only one for a moment."""
+    OVERRUN = 'overrun'
+    """This computer cannot keep up: too much waits to be decoded."""
+    MALFORMED = 'malformed'
+    UNRESOLVED = 'unresolved'
+    """The bitstream version or the marker's id is not known (yet)."""
+    DUPLICATE = 'duplicate'
+    OUT_OF_ORDER = 'out_of_order'
+    STALE = 'stale'
+    """The frame's time did not advance."""
+    NOT_LIVE = 'not_live'
+    """Motive plays a recording."""
+    NOT_PRESENT = 'not_present'
+    AMBIGUOUS = 'ambiguous'
+    """The marker is there twice; with `lone_marker`, another marker is in view."""
+    UNLABELLED = 'unlabelled'
+    OCCLUDED = 'occluded'
+    MODEL_FILLED = 'model_filled'
+    FROZEN = 'frozen'
+    """The same to the last bit in one frame after the other: no measurement."""
+    JUMP = 'jump'
+    """Further from the last reading than the marker could have moved."""
+    IMPLAUSIBLE = 'implausible'
+    """Further away, or longer on its way, than any bar's reading can be."""
+    DISAGREEMENT = 'disagreement'
+    """A third-party client read something else from the same datagram."""
+
+
+@dataclass(frozen=True)
+class MarkerChoice:
+    """Which labelled marker is the calibration marker.
+
+    Attributes
+    ----------
+    rigid_body
+        Name of the rigid body in Motive; '' for the only one.
+    member
+        Number of the marker within that body, from 1.
+    marker_id
+        Id on the wire, ``asset id << 16 | member``; overrides the two above.
+    lone_marker
+        A single sphere that belongs to no rigid body: take the only marker in view, and nothing
+        while there are two. Overrides the three above.
+    max_speed_m_s
+        A reading that implies a faster move is dropped.
+    """
+
+    rigid_body: str = ''
+    member: int = 1
+    marker_id: int | None = None
+    lone_marker: bool = False
+    max_speed_m_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Refuse values that can never match."""
+        if not 1 <= self.member < 1 << 16:
+            raise InputError(f'member: {self.member} is not 1 to 65535 (counted from 1)')
+        if not self.max_speed_m_s > 0:
+            raise InputError(f'max_speed_m_s: {self.max_speed_m_s} is not above 0')
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerSample:
+    """A measured position of the calibration marker.
+
+    Attributes
+    ----------
+    frame_number
+        Number of the frame.
+    timestamp_s
+        Time of the frame on the server, s since the stream started.
+    mid_exposure_s
+        Time of exposure by the server's fine clock, s; another zero than `timestamp_s`. None
+        where the cameras have no such clock (USB cameras, NatNet before 3.0).
+    age_s
+        Time from exposure (or, without such a clock, from the data's arrival at the server) to
+        transmission, s; before 3.0 the server's own estimate of its latency.
+    position
+        In the sensor's frame N, m, (3,).
+    residual_m
+        How well the cameras' rays meet, m per ray; NaN before NatNet 3.
+    received_s
+        When the datagram arrived here, by the clock given to the client, s.
+    """
+
+    frame_number: int
+    timestamp_s: float
+    mid_exposure_s: float | None
+    age_s: float
+    position: FloatArray
+    residual_m: float
+    received_s: float
+
+
+class MarkerGate:
+    """Lets through the readings of one marker and counts everything else with its reason.
+
+    Parameters
+    ----------
+    choice
+        Which marker.
+
+    Attributes
+    ----------
+    dropped
+        Count by reason; every reason is a key from the start.
+    frames, accepted
+        Frames seen, readings let through.
+    lost
+        Frame numbers that never came.
+    restarts
+        How often the frame numbers began again.
+    last_reason
+        Why the latest frame was dropped; None if it was accepted.
+    marker_id
+        Id on the wire; None while unknown, and for a lone marker.
+    problem
+        Why the marker cannot be told from the rest, with the remedy; '' if it can.
+    """
+
+    def __init__(self, choice: MarkerChoice) -> None:
+        self._choice = choice
+        self.dropped: dict[Dropped, int] = dict.fromkeys(Dropped, 0)
+        self.frames = 0
+        self.accepted = 0
+        self.lost = 0
+        self.restarts = 0
+        self.last_reason: Dropped | None = None
+        self.last_labels: tuple[int, ...] = ()
+        self._last_number: int | None = None
+        self._last_timestamp = -math.inf
+        self._last_reading: MarkerSample | None = None
+        self._repeats = 0
+        self.forget_assets()
+
+    @property
+    def resolved(self) -> bool:
+        """Whether a frame can be searched for the marker."""
+        return self._choice.lone_marker or self.marker_id is not None
+
+    def forget_assets(self) -> None:
+        """Drop what is known of the server's rigid bodies."""
+        self.marker_id = None if self._choice.lone_marker else self._choice.marker_id
+        self.problem = '' if self.resolved else 'the server has not named its rigid bodies'
+
+    def name_assets(self, assets: Mapping[str, int]) -> None:
+        """Find the marker's id among the rigid bodies that the server streams.
+
+        Parameters
+        ----------
+        assets
+            Asset id by name.
+        """
+        self.forget_assets()
+        if self.resolved:
+            return
+        name, names = self._choice.rigid_body, ', '.join(sorted(assets)) or 'none'
+        if not name and len(assets) == 1:
+            (name,) = assets
+        if name in assets:
+            self.marker_id = assets[name] << 16 | self._choice.member
+            self.problem = ''
+        elif name:
+            self.problem = f'no rigid body {name!r}; the server streams: {names}'
+        elif assets:
+            self.problem = f'several rigid bodies ({names}): set rigid_body to one of them'
+        else:
+            self.problem = (
+                'the server streams no rigid body: create one from the markers in Motive and '
+                'switch its streaming on, or set lone_marker for a single sphere'
+            )
+
+    def drop(self, reason: Dropped) -> None:
+        """Count something dropped before it became a frame."""
+        self.dropped[reason] += 1
+
+    def pass_over(self, reason: Dropped) -> None:
+        """Count a whole frame that is not looked at; it is compared with no other."""
+        self.frames += 1
+        self.dropped[reason] += 1
+        self.last_reason = reason
+
+    def begin_source(self) -> None:
+        """Compare the frames to come with none before: they are another source's."""
+        self._last_number = None
+        self._last_timestamp = -math.inf
+        self._last_reading = None
+        self._repeats = 0
+
+    def admit(self, frame: Frame, received_s: float, ticks_per_s: int) -> MarkerSample | None:
+        """Return the reading in a frame, or None and count why.
+
+        Parameters
+        ----------
+        frame
+            As decoded.
+        received_s
+            When it arrived, s.
+        ticks_per_s
+            Frequency of the frame's stamps; 0 before NatNet 3.
+        """
+        self.frames += 1
+        found = self._order(frame) or self._find(frame)
+        if isinstance(found, LabeledMarker):
+            reading = _sample(frame, found, received_s, ticks_per_s)
+            found = _implausible(reading) or self._jump(reading) or self._frozen(reading) or found
+        if isinstance(found, Dropped):
+            self.dropped[found] += 1
+            self.last_reason = found
+            return None
+        self._last_reading = reading
+        self.accepted += 1
+        self.last_reason = None
+        return reading
+
+    def disown(self, reason: Dropped) -> None:
+        """Take back the last reading, which turned out not to be one."""
+        self.accepted -= 1
+        self.dropped[reason] += 1
+        self.last_reason = reason
+        self._last_reading = None
+
+    def _order(self, frame: Frame) -> Dropped | None:
+        """Follow the frame numbers and the time."""
+        if frame.params & NOT_LIVE:
+            return Dropped.NOT_LIVE
+        if self._last_number is not None:
+            step = frame.number - self._last_number
+            back_s = self._last_timestamp - frame.timestamp
+            if not -REORDER_WINDOW <= step <= MOST_LOST or back_s > RESTART_S:
+                self.restarts += 1
+                self._last_timestamp = -math.inf
+                self._last_reading = None
+            elif step == 0:
+                return Dropped.DUPLICATE
+            elif step < 0:
+                return Dropped.OUT_OF_ORDER
+            else:
+                self.lost += step - 1
+        self._last_number = frame.number
+        if frame.timestamp <= self._last_timestamp:
+            return Dropped.STALE
+        self._last_timestamp = frame.timestamp
+        return None
+
+    def _find(self, frame: Frame) -> LabeledMarker | Dropped:
+        """Find the marker; never one that is occluded or filled in by the model."""
+        self.last_labels = tuple(marker.id for marker in frame.labeled_markers[:8])
+        if self._choice.lone_marker:
+            found = [m for m in frame.labeled_markers if not m.params & (OCCLUDED | MODEL_FILLED)]
+        elif self.marker_id is not None:
+            found = [m for m in frame.labeled_markers if m.id == self.marker_id]
+        else:
+            return Dropped.UNRESOLVED
+        if len(found) != 1:
+            return Dropped.AMBIGUOUS if found else Dropped.NOT_PRESENT
+        params = found[0].params
+        if params & OCCLUDED:
+            return Dropped.OCCLUDED
+        if params & MODEL_FILLED:
+            return Dropped.MODEL_FILLED
+        if params & UNLABELED and not self._choice.lone_marker:
+            return Dropped.UNLABELLED
+        return found[0]
+
+    def _jump(self, reading: MarkerSample) -> Dropped | None:
+        last = self._last_reading
+        if last is None:
+            return None
+        moved = float(np.linalg.norm(reading.position - last.position))
+        elapsed = reading.timestamp_s - last.timestamp_s
+        if moved > JUMP_MARGIN_M + self._choice.max_speed_m_s * elapsed:
+            return Dropped.JUMP
+        return None
+
+    def _frozen(self, reading: MarkerSample) -> Dropped | None:
+        last = self._last_reading
+        same = last is not None and np.array_equal(reading.position, last.position)
+        self._repeats = self._repeats + 1 if same else 0
+        return Dropped.FROZEN if self._repeats >= FROZEN_FRAMES else None
+
+
+def _implausible(reading: MarkerSample) -> Dropped | None:
+    near = np.max(np.abs(reading.position)) <= FARTHEST_M
+    return None if near and reading.age_s <= MAX_AGE_S else Dropped.IMPLAUSIBLE
+
+
+def _sample(
+    frame: Frame, marker: LabeledMarker, received_s: float, ticks_per_s: int
+) -> MarkerSample:
+    mid_exposure_s = None
+    age_s = max(frame.software_latency, 0.0)
+    if ticks_per_s:
+        if frame.mid_exposure:
+            mid_exposure_s = frame.mid_exposure / ticks_per_s
+        begin = frame.mid_exposure or frame.data_received
+        age_s = max(frame.transmitted - begin, 0) / ticks_per_s if begin else 0.0
+    return MarkerSample(
+        frame_number=frame.number,
+        timestamp_s=frame.timestamp,
+        mid_exposure_s=mid_exposure_s,
+        age_s=age_s,
+        position=np.array(marker.position),
+        residual_m=math.nan if marker.residual is None else marker.residual,
+        received_s=received_s,
+    )

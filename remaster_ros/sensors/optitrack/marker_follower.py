@@ -1,0 +1,236 @@
+"""What every OptiTrack client of ours does: one thread, one marker, one honest account."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+from remaster_ros.errors import DeviceError
+from remaster_ros.sensors.optitrack.diagnosis import (
+    Diagnosis,
+    NatNetSettings,
+    StreamStatus,
+    diagnose,
+)
+from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerGate, MarkerSample
+from remaster_ros.sensors.optitrack.frame_source import Source, SourceLock, Verdict, describe
+from remaster_ros.sensors.optitrack.protocol.frames import Frame
+from remaster_ros.sensors.optitrack.protocol.natnet import ServerInfo, Version
+from remaster_ros.sensors.optitrack.sockets import interface_towards, resolve
+
+FOREIGN_REMEMBERED = 4
+
+_log = logging.getLogger('remaster_ros')
+
+
+class MarkerFollower(ABC):
+    """Follows one marker of an OptiTrack server in a thread of its own.
+
+    Parameters
+    ----------
+    settings
+        How to reach the server, and which marker to follow.
+    on_sample
+        Called in the thread with every reading. What it raises is logged.
+    clock
+        Gives the time at which a datagram arrived, s.
+    """
+
+    def __init__(
+        self,
+        settings: NatNetSettings,
+        on_sample: Callable[[MarkerSample], object],
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self._settings = settings
+        self._on_sample = on_sample
+        self._clock = clock
+        self._gate = MarkerGate(settings.marker)
+        self._lock = SourceLock(settings.silence_s)
+        self._believed_before: Source | None = None
+        self._thread: threading.Thread | None = None
+        self._stopping = threading.Event()
+        self._ready = threading.Event()
+
+        self._server_ip = ''
+        self._interface = ''
+        self._server: ServerInfo | None = None
+        self._version: Version | None = None
+        self._port_closed = False
+        self._send_error = ''
+        self._foreign: tuple[str, ...] = ()
+        self._last_malformed = ''
+        self._frame_at: float | None = None
+        self._sample_at: float | None = None
+
+    def start(self, wait_s: float = 0.0) -> None:
+        """Open the sockets and begin; the client keeps trying until `stop`.
+
+        Parameters
+        ----------
+        wait_s
+            How long to wait for the first frame and the marker's identity, s (wall clock); 0
+            returns at once.
+
+        Raises
+        ------
+        DeviceError
+            If a socket cannot be opened, or nothing useful came within `wait_s`; the message
+            is that of `diagnosis`. The client is stopped then.
+        """
+        settings = self._settings
+        self._server_ip = resolve(settings.server)
+        self._interface = settings.local_interface or interface_towards(
+            self._server_ip, settings.command_port
+        )
+        self._stopping.clear()
+        self._ready.clear()
+        self._open()
+        self._thread = threading.Thread(target=self._run, name='natnet', daemon=True)
+        self._thread.start()
+        if wait_s and not self._ready.wait(wait_s):
+            message = self.diagnosis().message or 'frames come, but no reading of the marker'
+            self.stop()
+            raise DeviceError(f'OptiTrack: {message}')
+
+    def stop(self) -> None:
+        """End the thread and close the sockets; may be repeated."""
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self._close()
+
+    def __enter__(self) -> MarkerFollower:
+        """Start without waiting."""
+        self.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Stop."""
+        self.stop()
+
+    def status(self) -> StreamStatus:
+        """Return a snapshot of what has arrived, been dropped and is known of the server."""
+        now = time.monotonic()
+        gate = self._gate
+        return StreamStatus(
+            server_ip=self._server_ip,
+            interface=self._interface,
+            server=self._server,
+            version=self._version,
+            port_closed=self._port_closed,
+            send_error=self._send_error,
+            silent_s=None if self._frame_at is None else now - self._frame_at,
+            starved_s=None if self._sample_at is None else now - self._sample_at,
+            frames=gate.frames,
+            accepted=gate.accepted,
+            lost=gate.lost,
+            restarts=gate.restarts,
+            dropped=dict(gate.dropped),
+            last_reason=gate.last_reason,
+            foreign=self._foreign,
+            source='' if self._lock.source is None else describe(self._lock.source),
+            sources_taken=self._lock.taken,
+            rivals=tuple(map(describe, self._lock.rivals(now)[:FOREIGN_REMEMBERED])),
+            contestants=tuple(map(describe, self._lock.contestants(now)[:FOREIGN_REMEMBERED])),
+            last_malformed=self._last_malformed,
+            problem=gate.problem,
+            marker_id=gate.marker_id,
+            labels=gate.last_labels,
+        )
+
+    def diagnosis(self) -> Diagnosis:
+        """Tell what is wrong when readings are missing, and the remedy."""
+        return diagnose(self.status(), self._settings)
+
+    @abstractmethod
+    def _open(self) -> None:
+        """Open what `_run` needs; raise `DeviceError`, and leave nothing open then."""
+
+    @abstractmethod
+    def _run(self) -> None:
+        """Work until `_stopping` is set."""
+
+    @abstractmethod
+    def _close(self) -> None:
+        """Close what is open."""
+
+    def _is_foreign(self, address: str) -> bool:
+        """Count and remember a sender that is not the server."""
+        if address == self._server_ip:
+            return False
+        self._gate.drop(Dropped.FOREIGN)
+        if address not in self._foreign and len(self._foreign) < FOREIGN_REMEMBERED:
+            self._foreign = (*self._foreign, address)
+        return True
+
+    def _is_refused(self, source: Source) -> bool:
+        """Count what comes from a port of the server that is not the believed one."""
+        if not self._lock.is_refused(source, time.monotonic()):
+            return False
+        self._gate.drop(Dropped.FOREIGN)
+        return True
+
+    def _release_silent_source(self) -> bool:
+        """Free the lock after a silence; the server must answer before it is given again."""
+        holder = self._lock.source
+        if holder is None or not self._lock.release_if_silent(time.monotonic()):
+            return False
+        _log.warning(
+            'OptiTrack: no frame from %s for %g s; whose frames are believed is decided anew',
+            describe(holder),
+            self._settings.silence_s,
+        )
+        return True
+
+    def _note_malformed(self, what: object) -> None:
+        self._gate.drop(Dropped.MALFORMED)
+        self._last_malformed = str(what)
+
+    def _take_whole_frame(
+        self, frame: Frame, received_s: float, source: Source
+    ) -> MarkerSample | None:
+        """Account for a frame that decoded to its end, and find its reading."""
+        now = time.monotonic()
+        before = self._lock.source
+        verdict = self._lock.judge(source, now)
+        if verdict is Verdict.FOREIGN:
+            self._gate.drop(Dropped.FOREIGN)
+            return None
+        if verdict is Verdict.PROBATION:
+            self._gate.pass_over(Dropped.PROBATION)
+            return None
+        if before is None:
+            self._begin_source(source)
+        self._last_malformed = ''
+        self._frame_at = now
+        connection = self._server.connection if self._server is not None else None
+        ticks_per_s = connection.clock_frequency if connection is not None else 0
+        sample = self._gate.admit(frame, received_s, ticks_per_s)
+        if self._gate.resolved:
+            self._ready.set()
+        return sample
+
+    def _begin_source(self, source: Source) -> None:
+        """Report whose frames are believed from now on."""
+        before, self._believed_before = self._believed_before, source
+        if before is not None and before != source:
+            self._gate.begin_source()
+            _log.warning(
+                'OptiTrack: frames of %s are believed from now on, before it was %s',
+                describe(source),
+                describe(before),
+            )
+        else:
+            _log.info('OptiTrack: frames of %s are believed', describe(source))
+
+    def _hand_on(self, sample: MarkerSample) -> None:
+        self._sample_at = time.monotonic()
+        try:
+            self._on_sample(sample)
+        except Exception:
+            _log.exception('a reading of the OptiTrack marker could not be handed on')

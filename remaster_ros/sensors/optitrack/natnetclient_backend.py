@@ -1,0 +1,247 @@
+"""The optional backend ``client: natnetclient``: PyPI ``natnetclient``, guarded.
+
+That package (LGPL, 2018) reads NatNet 2.6 to 2.10 from a server on the same computer that sends
+its frames unicast to a fixed port. It trusts every datagram, never forgets an old marker and
+waits a minute for silence to end. So it runs here without its own thread: each datagram is first
+checked by our decoder, then read by ``natnetclient`` with its memory cleared, and a reading
+counts only if both agree on it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import socket
+import time
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+from remaster_ros.errors import DeviceError, InputError
+from remaster_ros.sensors.optitrack.diagnosis import Diagnosis, NatNetSettings
+from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerSample
+from remaster_ros.sensors.optitrack.marker_follower import MarkerFollower
+from remaster_ros.sensors.optitrack.protocol import natnet
+from remaster_ros.sensors.optitrack.protocol.frames import (
+    MODEL_FILLED,
+    OCCLUDED,
+    Frame,
+    LabeledMarker,
+)
+from remaster_ros.sensors.optitrack.protocol.natnet import ProtocolError
+from remaster_ros.sensors.optitrack.protocol.wire import OLDEST_VERSION
+from remaster_ros.sensors.optitrack.sockets import open_socket, port_is_closed
+
+NEWEST_READ = (2, 10)
+POLL_S = 0.2
+FAILURES_IN_A_ROW = 3
+"""Then the server's model has probably changed, and natnetclient begins anew."""
+
+
+class NatNetClientBackend(MarkerFollower):
+    """Follows one marker through PyPI ``natnetclient``; same interface as `NatNetClient`.
+
+    Parameters
+    ----------
+    settings
+        Must say ``unicast``; frames are expected on `data_port` of this computer.
+    on_sample, clock
+        As for `NatNetClient`.
+
+    Raises
+    ------
+    InputError
+        If ``natnetclient`` is not installed, or the settings ask for what it cannot do.
+    """
+
+    def __init__(
+        self,
+        settings: NatNetSettings,
+        on_sample: Callable[[MarkerSample], object],
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        if settings.transport != 'unicast' or settings.bitstream:
+            raise InputError(
+                'client: natnetclient receives unicast only and cannot choose the bitstream: set '
+                'transport to unicast and bitstream to "", or client to builtin'
+            )
+        # It puts underscores for the blanks of a name.
+        name = settings.marker.rigid_body.replace(' ', '_')
+        marker = dataclasses.replace(settings.marker, rigid_body=name)
+        super().__init__(dataclasses.replace(settings, marker=marker), on_sample, clock)
+        self._kind = _quiet_client()
+        self._refusal = ''
+
+    def start(self, wait_s: float = 0.0) -> None:
+        """Begin; as `NatNetClient.start`, and a server that is too new is refused at once."""
+        self._refusal = ''
+        super().start(wait_s)
+        if self._refusal:
+            self.stop()
+            raise DeviceError(f'OptiTrack: {self._refusal}')
+
+    def diagnosis(self) -> Diagnosis:
+        """Tell what is wrong when readings are missing, and the remedy."""
+        return Diagnosis('version', self._refusal) if self._refusal else super().diagnosis()
+
+    def _open(self) -> None:
+        # It binds the server's own address; better to find out before it leaves sockets behind.
+        open_socket(
+            self._server_ip,
+            self._settings.data_port,
+            purpose='frames for natnetclient, which needs the server on this computer',
+            remedy='set client to builtin',
+            shared=True,
+        ).close()
+
+    def _close(self) -> None:
+        """Do nothing: `_run` closes what it opens."""
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            if self._greet():
+                client = self._kind.__new__(self._kind)
+                try:
+                    client.__init__(
+                        self._server_ip, self._settings.data_port, self._settings.command_port
+                    )
+                    self._follow(client)
+                except Exception as error:  # natnetclient raises whatever its bugs raise
+                    self._last_malformed = f'natnetclient: {error!r}'
+                finally:
+                    _close_sockets(client)
+            self._stopping.wait(POLL_S)
+
+    def _greet(self) -> bool:
+        """Ask the server's version with our own decoder; refuse what natnetclient cannot read."""
+        request = natnet.encode_connect_request('remaster_ros')
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as command:
+            command.settimeout(POLL_S)
+            try:
+                command.sendto(request, (self._server_ip, self._settings.command_port))
+                answer = natnet.decode_message(command.recv(1 << 16), None)
+            except (OSError, ProtocolError):
+                answer = None
+        if not isinstance(answer, natnet.ServerInfo):
+            self._server = None
+            self._port_closed = port_is_closed(
+                self._server_ip, self._settings.command_port, natnet.encode_echo_request(0)
+            )
+            return False
+        self._server, self._port_closed = answer, False
+        self._lock.answer()
+        self._version = answer.natnet_version
+        self._refusal = ''
+        if not OLDEST_VERSION <= answer.natnet_version <= NEWEST_READ:
+            version = natnet.format_version(answer.natnet_version)
+            self._refusal = (
+                f'natnetclient reads NatNet 2.6 to 2.10, the server streams {version}: set '
+                f'client to builtin'
+            )
+            self._ready.set()
+        return not self._refusal
+
+    def _follow(self, client: Any) -> None:
+        """Read frames until the stream falls silent or natnetclient no longer understands it."""
+        self._gate.name_assets({name: body.id for name, body in client.rigid_bodies.items()})
+        source = client.data_sock._sock
+        source.settimeout(POLL_S)
+        failures = 0
+        heard_at = time.monotonic()
+        while not self._stopping.is_set() and failures < FAILURES_IN_A_ROW:
+            if self._release_silent_source() or (
+                time.monotonic() - heard_at > self._settings.silence_s
+            ):
+                return
+            try:
+                datagram, sender = source.recvfrom(1 << 16)
+            except TimeoutError:
+                continue
+            received_s = self._clock()
+            if self._is_foreign(sender[0]) or self._is_refused(sender):
+                continue
+            try:
+                frame = natnet.decode_message(datagram, self._version)
+                if not isinstance(frame, Frame):
+                    raise ProtocolError('a message on the data port that is no frame')
+            except ProtocolError as error:
+                self._note_malformed(error)
+                continue
+            heard_at = time.monotonic()
+            sample = self._take_whole_frame(frame, received_s, sender)
+            if sender != self._lock.source:
+                continue
+            theirs = _read(client, datagram)
+            failures = failures + 1 if theirs is None else 0
+            if sample is not None:
+                self._compare(sample, theirs)
+
+    def _compare(self, sample: MarkerSample, theirs: tuple[LabeledMarker, ...] | None) -> None:
+        """Hand the reading on if natnetclient has it too: same frame, place and flags."""
+        if theirs is not None and any(
+            marker.position == tuple(sample.position) and not marker.params
+            for marker in theirs
+            if self._gate.marker_id in (None, marker.id)
+        ):
+            self._hand_on(sample)
+        else:
+            self._gate.disown(Dropped.DISAGREEMENT)
+
+
+def _quiet_client() -> Any:
+    """Return natnetclient's client class without its thread and its minute-long first wait."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore', SyntaxWarning)
+            from natnetclient import NatClient
+    except ImportError as error:
+        raise InputError(
+            'client: natnetclient is not installed: pip install natnetclient, or set client to '
+            'builtin'
+        ) from error
+
+    class QuietClient(NatClient):  # type: ignore[misc]
+        def _continuous_get_data(self, sleep_time: float) -> None:
+            """Do not read in the background."""
+
+        def get_data(self) -> None:
+            """Do not wait for a frame while connecting."""
+
+        def parse(self, datagram: bytes) -> None:
+            """Read one datagram as if it had just arrived."""
+            packet = _Packet(datagram)
+            self.data_sock.recv = lambda: packet
+            super().get_data()
+
+    return QuietClient
+
+
+class _Packet:
+    """What natnetclient takes from its sockets."""
+
+    def __init__(self, datagram: bytes) -> None:
+        self._packet = datagram
+
+
+def _read(client: Any, datagram: bytes) -> tuple[LabeledMarker, ...] | None:
+    """Let natnetclient read a datagram; its labelled markers, or None where it fails."""
+    client.labeled_markers.clear()
+    try:
+        client.parse(datagram)
+        return tuple(
+            LabeledMarker(
+                label,
+                tuple(marker.position),
+                marker.size,
+                OCCLUDED * bool(marker.occluded) | MODEL_FILLED * bool(marker.model_solved),
+            )
+            for label, marker in client.labeled_markers.items()
+        )
+    except Exception:  # a fault of natnetclient must not end the thread
+        return None
+
+
+def _close_sockets(client: Any) -> None:
+    for name in ('comm_sock', 'data_sock'):
+        with contextlib.suppress(AttributeError, OSError):
+            getattr(client, name)._sock.close()

@@ -1,0 +1,1 @@
+"""NatNet: bytes to events and back; no sockets."""

@@ -1,0 +1,1 @@
+"""Files: sessions, journals, bags, workcells."""

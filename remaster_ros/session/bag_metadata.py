@@ -1,0 +1,109 @@
+"""metadata.yaml of a rosbag2 bag, version 9 as ROS 2 Jazzy writes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from remaster_ros.session.safe_yaml import dump_yaml
+
+METADATA_FILE = 'metadata.yaml'
+
+# rosbag2 writes an empty bag's start, and QoS "for ever", as these.
+_NEVER_NS = 2**63 - 1
+LATCHED_DEPTH = 10
+"""How many messages of a latched topic a late joiner gets: as the nodes' publishers have it."""
+_FOREVER = {'sec': 9223372036, 'nsec': 854775807}
+
+
+@dataclass
+class TopicMetadata:
+    """A topic as metadata.yaml lists it; ``count`` is the number of its messages so far."""
+
+    topic: str
+    msgtype: str
+    type_hash: str
+    latched: bool
+    count: int = 0
+
+
+@dataclass
+class FileMetadata:
+    """A file of a bag as metadata.yaml lists it; `first_ns` is None where it holds nothing."""
+
+    name: str
+    first_ns: int | None = None
+    last_ns: int = 0
+    count: int = 0
+
+    def add(self, stamp_ns: int) -> None:
+        """Count a message."""
+        if self.first_ns is None:
+            self.first_ns = stamp_ns
+        self.last_ns = stamp_ns
+        self.count += 1
+
+    def span(self) -> dict[str, Any]:
+        """Return start, duration and number of messages as metadata.yaml has them."""
+        first = self.first_ns
+        return {
+            'starting_time': {'nanoseconds_since_epoch': _NEVER_NS if first is None else first},
+            'duration': {'nanoseconds': 0 if first is None else self.last_ns - first},
+            'message_count': self.count,
+        }
+
+
+def metadata_text(files: list[FileMetadata], topics: list[TopicMetadata]) -> str:
+    """Return metadata.yaml for a bag of these MCAP files, in the order recorded."""
+    filled = [file for file in files if file.count]
+    whole = FileMetadata('', count=sum(file.count for file in files))
+    if filled:
+        whole.first_ns, whole.last_ns = filled[0].first_ns, filled[-1].last_ns
+    information: dict[str, Any] = {
+        'version': 9,
+        'storage_identifier': 'mcap',
+        **whole.span(),
+        'topics_with_message_count': [
+            {
+                'topic_metadata': {
+                    'name': topic.topic,
+                    'type': topic.msgtype,
+                    'serialization_format': 'cdr',
+                    'offered_qos_profiles': _qos(topic.latched),
+                    'type_description_hash': topic.type_hash,
+                },
+                'message_count': topic.count,
+            }
+            for topic in topics
+        ],
+        'compression_format': '',
+        'compression_mode': '',
+        'relative_file_paths': [file.name for file in files],
+        'files': [{'path': file.name, **file.span()} for file in files],
+        'custom_data': None,
+        'ros_distro': 'jazzy',
+    }
+    return dump_yaml({'rosbag2_bagfile_information': information})
+
+
+def qos_text(latched: bool) -> str:
+    """Return a topic's offered QoS as the MCAP channel keeps it."""
+    return dump_yaml(_qos(latched))
+
+
+def _qos(latched: bool) -> list[dict[str, Any]]:
+    return [
+        {
+            'history': 'keep_last',
+            # As the publishers offer it: who joins late gets the registration of every sensor.
+            'depth': LATCHED_DEPTH if latched else 10,
+            'reliability': 'reliable',
+            'durability': 'transient_local' if latched else 'volatile',
+            # Copies: YAML would write a shared object as an alias.
+            'deadline': dict(_FOREVER),
+            'lifespan': dict(_FOREVER),
+            'liveliness': 'automatic',
+            'liveliness_lease_duration': dict(_FOREVER),
+            'avoid_ros_namespace_conventions': False,
+        }
+    ]

@@ -1,0 +1,308 @@
+"""Write rosbag2 bags (MCAP) without a ROS installation, and finish those of killed writers.
+
+Written unchunked and flushed message by message, so that a killed writer leaves every message it
+wrote (with MCAP's default chunks, a kill loses the last megabyte). The price is that the file of a
+killed writer has no index and no checksum until `recover_bag` finishes it; the bag is never the
+only copy of an observation.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection
+from pathlib import Path
+from types import TracebackType
+
+from mcap.writer import CompressionType, Writer
+
+from remaster_ros import __version__
+from remaster_ros.errors import DiskError, InputError
+from remaster_ros.session.bag import LATCHED_TOPICS, BagReader
+from remaster_ros.session.bag_metadata import (
+    METADATA_FILE,
+    FileMetadata,
+    TopicMetadata,
+    metadata_text,
+    qos_text,
+)
+from remaster_ros.session.files import (
+    PatientFile,
+    cannot_write,
+    make_new_folder,
+    remove_leftovers,
+    sync_folder,
+    write_atomically,
+)
+from remaster_ros.session.manifest import add_to_manifest, read_manifest
+from remaster_ros.session.message_definitions import definition_of
+
+WAITING_LIMIT = 64 * 1024**2
+"""So many bytes that a full disk does not take are kept in memory; later messages are refused."""
+
+
+class BagWriter:
+    """Write a rosbag2 folder; what `write` returned from survives a kill of this process.
+
+    While the disk is full, messages are kept in memory and written when there is room.
+
+    Parameters
+    ----------
+    folder
+        New or empty; the bag's name is the folder's.
+    latched
+        Topics offered transient_local: who subscribes late still gets their last message.
+    resume
+        Go on with the bag that the folder holds: finish the file of a killed writer, and begin
+        the next one, as rosbag2 does where it splits a bag.
+
+    Raises
+    ------
+    InputError
+        The folder holds files, with `resume` a damaged bag, or cannot be written to.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        latched: Collection[str] = LATCHED_TOPICS,
+        *,
+        resume: bool = False,
+    ) -> None:
+        self.folder = Path(folder)
+        self._latched = latched
+        self._topics: dict[str, TopicMetadata] = {}
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._files: list[FileMetadata] = []
+        self._last_ns = self._shift_ns = 0
+        if resume and any(self.folder.glob('*.mcap')):
+            recover_bag(self.folder)
+            self._learn(BagReader(self.folder))
+        else:
+            if resume:
+                _remove_beginnings(self.folder)
+            make_new_folder(self.folder)
+        name = f'{self.folder.resolve().name}_{len(self._files)}.mcap'
+        self._path = self.folder / name
+        self._own = FileMetadata(name)
+        self._files.append(self._own)
+        self._file: PatientFile | None = PatientFile(self._path)
+        try:
+            self._writer = Writer(
+                # It asks for no more than write and tell.
+                self._file,  # type: ignore[arg-type]
+                compression=CompressionType.NONE,
+                use_chunking=False,
+                enable_data_crcs=True,
+            )
+            self._writer.start('ros2', f'remaster_ros-{__version__}')
+            self._file.flush()
+            self._write_metadata()
+        except BaseException:
+            self._file.close()
+            raise
+        self._metadata_waits = False
+
+    def _learn(self, reader: BagReader) -> None:
+        """Take over what the files so far hold."""
+        self._files = reader.files
+        self._last_ns = reader.end_ns
+        for topic, msgtype in reader.topics.items():
+            type_hash = definition_of(msgtype)[1]
+            latched = topic in self._latched
+            count = reader.counts[topic]
+            self._topics[topic] = TopicMetadata(topic, msgtype, type_hash, latched, count)
+
+    def write(self, topic: str, msgtype: str, cdr: bytes, stamp_ns: int) -> None:
+        """Write one message.
+
+        Stamps that run backwards (a clock was set) are stored as the latest stamp so far, because
+        readers refuse an unindexed file out of order; the given stamp is kept as MCAP's
+        ``publish_time``. Where the clock has started anew since the file before, the whole file
+        is shifted to a second behind it.
+
+        Parameters
+        ----------
+        topic, msgtype
+            Such as ``/joint_states`` and ``sensor_msgs/msg/JointState``.
+        cdr
+            The serialised message.
+        stamp_ns
+            When it was received, nanoseconds since the epoch.
+
+        Raises
+        ------
+        InputError
+            The message type is not one of ROS 2 Jazzy's, a topic changes its type, the stamp is
+            no time, or the bag is closed.
+        DiskError
+            So much waits for the disk already that this message is not kept.
+        """
+        if self._file is None:
+            raise InputError(f'{self.folder}: the bag is closed; start a new one')
+        if not 0 <= stamp_ns < 2**63:
+            raise InputError(f'{topic}: {stamp_ns} ns is no time stamp; give ns since the epoch')
+        if self._file.waiting > WAITING_LIMIT:
+            self._file.flush()
+        if topic not in self._channels:
+            self._add_topic(topic, msgtype)
+        metadata = self._topics[topic]
+        if metadata.msgtype != msgtype:
+            raise InputError(f'{topic}: {msgtype} after {metadata.msgtype}; a topic has one type')
+        if not self._own.count and stamp_ns < self._last_ns:
+            self._shift_ns = self._last_ns + 10**9 - stamp_ns
+        self._last_ns = max(self._last_ns, stamp_ns + self._shift_ns)
+        self._writer.add_message(
+            channel_id=self._channels[topic],
+            log_time=self._last_ns,
+            data=cdr,
+            publish_time=stamp_ns,
+            sequence=metadata.count % 2**32,
+        )
+        if self._metadata_waits and not self._file.waiting:
+            self._list_topics()
+        metadata.count += 1
+        self._own.add(self._last_ns)
+
+    def close(self) -> None:
+        """Finish file, metadata.yaml and checksums, durable on return; again does nothing.
+
+        Raises
+        ------
+        DiskError
+            The disk does not take it; what was written before remains readable.
+        """
+        if self._file is None:
+            return
+        file, self._file = self._file, None
+        self._writer.finish()
+        file.close()
+        try:
+            sync_folder(self.folder)
+        except OSError as error:
+            raise cannot_write(self._path, error) from None
+        self._write_metadata()
+        add_to_manifest(self.folder, self._path.name)
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _add_topic(self, topic: str, msgtype: str) -> None:
+        definition, type_hash = definition_of(msgtype)
+        if msgtype not in self._schemas:
+            self._schemas[msgtype] = self._writer.register_schema(
+                msgtype, 'ros2msg', definition.encode()
+            )
+        self._topics.setdefault(
+            topic, TopicMetadata(topic, msgtype, type_hash, topic in self._latched)
+        )
+        self._channels[topic] = self._writer.register_channel(
+            topic,
+            'cdr',
+            self._schemas[msgtype],
+            {
+                'offered_qos_profiles': qos_text(topic in self._latched),
+                'topic_type_hash': type_hash,
+            },
+        )
+        self._list_topics()
+
+    def _list_topics(self) -> None:
+        """A player takes the topics from here, also those of a bag whose writer was killed."""
+        try:
+            self._write_metadata()
+            self._metadata_waits = False
+        except DiskError:
+            self._metadata_waits = True
+
+    def _write_metadata(self) -> None:
+        text = metadata_text(self._files, list(self._topics.values()))
+        write_atomically(self.folder / METADATA_FILE, text)
+
+
+def recover_bag(folder: str | os.PathLike[str]) -> str:
+    """Finish the bag of a killed writer, so that every MCAP and rosbag2 reader opens it.
+
+    Returns
+    -------
+    str
+        What could not be kept, in words; '' where nothing was lost. A bag that was closed is left
+        as it is.
+
+    Raises
+    ------
+    InputError
+        No such bag, damaged, or not writable.
+    """
+    folder = Path(folder)
+    remove_leftovers(folder)
+    _remove_work(folder)
+    reader = BagReader(folder)
+    last = reader.files[-1]
+    path = folder / last.name
+    if not reader.complete:
+        work = folder / _WORK
+        with BagWriter(work) as writer:
+            for message in reader.messages_of(last):
+                writer.write(*message)
+        try:
+            os.replace(writer._path, path)
+            sync_folder(folder)
+        except OSError as error:
+            raise cannot_write(path, error) from None
+        _remove_work(folder)
+    listed = read_manifest(folder)
+    unlisted = [file.name for file in reader.files if file.name not in listed]
+    if unlisted:
+        write_atomically(folder / METADATA_FILE, _metadata_of(reader))
+    for name in unlisted:
+        add_to_manifest(folder, name)
+    if not reader.torn_bytes:
+        return ''
+    return f'{path}: its last {reader.torn_bytes} bytes were no whole message and are dropped'
+
+
+def _metadata_of(reader: BagReader) -> str:
+    topics = [
+        TopicMetadata(
+            topic,
+            msgtype,
+            definition_of(msgtype)[1],
+            topic in LATCHED_TOPICS,
+            reader.counts[topic],
+        )
+        for topic, msgtype in reader.topics.items()
+    ]
+    return metadata_text(reader.files, topics)
+
+
+_WORK = '.recovery'
+
+
+def _remove_work(folder: Path) -> None:
+    """Remove the work of a recovery that was itself killed, or is done."""
+    work = folder / _WORK
+    try:
+        if work.is_dir():
+            for file in work.iterdir():
+                os.unlink(file)
+            os.rmdir(work)
+            sync_folder(folder)
+    except OSError as error:
+        raise cannot_write(work, error) from None
+
+
+def _remove_beginnings(folder: Path) -> None:
+    """Remove what a writer has left that was killed before its first file was there."""
+    if folder.is_dir():
+        remove_leftovers(folder)
+        if [path.name for path in folder.iterdir()] == [METADATA_FILE]:
+            os.unlink(folder / METADATA_FILE)

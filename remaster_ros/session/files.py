@@ -1,0 +1,287 @@
+"""Reading files from strangers and writing files that survive a crash."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+
+from remaster_ros.errors import DiskError, InputError
+
+
+def read_limited(path: Path, limit: int, missing: str) -> bytes:
+    """Read a regular file of at most `limit` bytes.
+
+    Parameters
+    ----------
+    path
+        The file.
+    limit
+        Largest size accepted, bytes.
+    missing
+        What to tell the user where there is no such file.
+
+    Raises
+    ------
+    InputError
+        No such file, not a regular file, not readable, or larger than `limit`.
+    """
+    try:
+        if not path.exists():
+            raise InputError(f'{path}: no such file; {missing}')
+        if not path.is_file():
+            raise InputError(f'{path}: not a regular file; {missing}')
+        with path.open('rb') as file:
+            data = file.read(limit + 1)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f'{path}: cannot be read ({reason(error)}); check its name and permissions'
+        ) from None
+    if len(data) > limit:
+        raise InputError(f'{path}: larger than {limit} bytes; this is not a file of this format')
+    return data
+
+
+def refuse_utf16(data: bytes, path: Path) -> None:
+    """Raise an `InputError` for text in UTF-16 (or 32), which Windows programs like to save.
+
+    Of Latin text every second byte is zero there, with or without a byte order mark.
+    """
+    even, odd = data[:64:2], data[1:64:2]
+    marked = data.startswith((b'\xff\xfe', b'\xfe\xff'))
+    latin = len(data) > 3 and sorted((any(even), any(odd))) == [False, True]
+    # A text that a power cut ended has zeros behind it, not between.
+    if marked or (latin and (all(even) or all(odd))):
+        raise InputError(f'{path}: this is UTF-16 text; save the file as UTF-8')
+
+
+def decode_text(data: bytes, path: Path) -> str:
+    """Decode UTF-8, with or without a byte order mark; an `InputError` names the line."""
+    refuse_utf16(data, path)
+    try:
+        return data.decode('utf-8-sig')
+    except UnicodeDecodeError as error:
+        line = data.count(b'\n', 0, error.start) + 1
+        raise InputError(f'{path}, line {line}: not UTF-8 text; save the file as UTF-8') from None
+
+
+def make_folder(folder: Path) -> None:
+    """Create an output folder with its parents; an `InputError` says why it cannot be."""
+    try:
+        new = [path for path in (folder, *folder.parents) if not path.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+        # From the top: a folder whose own name is lost takes all in it along.
+        for path in reversed(new):
+            sync_folder(path.parent)
+    except OSError as error:
+        raise cannot_write(folder, error) from None
+
+
+def make_new_folder(folder: Path) -> None:
+    """Create an output folder, or take an empty one; `InputError` where it holds files."""
+    make_folder(folder)
+    try:
+        occupied = any(folder.iterdir())
+    except OSError as error:
+        raise cannot_write(folder, error) from None
+    if occupied:
+        raise InputError(
+            f'{folder}: already holds files, which are not overwritten; name a new or empty folder'
+        )
+
+
+def write_atomically(path: Path, data: str | bytes) -> None:
+    """Replace a file in one step, durable on return: readers see the old text or the new.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to, or the disk is full.
+    """
+    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
+    try:
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+        try:
+            write_all(descriptor, data.encode() if isinstance(data, str) else data)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        os.replace(temporary, path)
+        sync_folder(path.parent)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise cannot_write(path, error) from None
+
+
+def remove_leftovers(folder: Path) -> list[str]:
+    """Remove the temporary files of atomic writes that a crash cut short; return their names."""
+    removed = []
+    for path in sorted(folder.glob('.*.tmp')):
+        try:
+            os.unlink(path)
+        except OSError as error:
+            raise cannot_write(path, error) from None
+        removed.append(path.name)
+    return removed
+
+
+class AppendFile:
+    """A file that grows by pieces, each durable when `append` returns, or not there at all.
+
+    Parameters
+    ----------
+    path
+        The file; made where there is none, its name durable.
+
+    Raises
+    ------
+    InputError
+        The folder or the file cannot be written to.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._descriptor: int | None = None
+        try:
+            self._descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+            self.size = os.fstat(self._descriptor).st_size
+            # Also where it is there: who made it may have been killed before this.
+            sync_folder(path.parent)
+        except OSError as error:
+            self.close()
+            raise cannot_write(path, error) from None
+
+    @property
+    def descriptor(self) -> int:
+        """The open file; an `InputError` where it is closed."""
+        if self._descriptor is None:
+            raise InputError(f'{self.path}: closed; open it again')
+        return self._descriptor
+
+    def append(self, data: bytes) -> None:
+        """Write a piece; durable on return.
+
+        Raises
+        ------
+        DiskError
+            The disk does not take it; the file ends as before. Where the disk does not take
+            that either, the file is closed: nobody knows how it ends until it is read again.
+        """
+        descriptor = self.descriptor
+        try:
+            write_all(descriptor, data)
+            os.fsync(descriptor)
+        except OSError as error:
+            # Half a piece in the middle of the file would make all of it unreadable.
+            with contextlib.suppress(InputError):
+                self.truncate(self.size)
+            raise cannot_write(self.path, error) from None
+        self.size += len(data)
+
+    def truncate(self, size: int) -> None:
+        """Cut the file, durable on return; an `InputError` where the disk does not take it."""
+        try:
+            os.ftruncate(self.descriptor, size)
+            os.fsync(self.descriptor)
+        except OSError as error:
+            self.close()
+            raise cannot_write(self.path, error) from None
+        self.size = size
+
+    def close(self) -> None:
+        """Close the file; closing again does nothing."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+
+class PatientFile:
+    """A new file that holds in memory what a full disk does not take, and writes it later.
+
+    What `write` returned from survives a kill of this process unless it is `waiting`.
+
+    Parameters
+    ----------
+    path
+        The file, which must not be there yet.
+
+    Raises
+    ------
+    DiskError
+        It cannot be made.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._waiting = bytearray()
+        self._given = 0
+        try:
+            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL
+            self._descriptor = os.open(path, flags, 0o666)
+        except OSError as error:
+            raise cannot_write(path, error) from None
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that the disk has not taken yet."""
+        return len(self._waiting)
+
+    def write(self, data: bytes) -> int:
+        """Take a piece."""
+        self._waiting += data
+        self._given += len(data)
+        with contextlib.suppress(DiskError):
+            self.flush()
+        return len(data)
+
+    def tell(self) -> int:
+        """Return how many bytes were taken."""
+        return self._given
+
+    def flush(self) -> None:
+        """Write what waits; `DiskError` where some of it has to wait on."""
+        try:
+            while self._waiting:
+                del self._waiting[: os.write(self._descriptor, self._waiting)]
+        except OSError as error:
+            raise cannot_write(self.path, error) from None
+
+    def close(self) -> None:
+        """Write what waits, durable on return; `DiskError` where the disk does not take it."""
+        try:
+            self.flush()
+            os.fsync(self._descriptor)
+        except OSError as error:
+            raise cannot_write(self.path, error) from None
+        finally:
+            os.close(self._descriptor)
+
+
+def write_all(descriptor: int, data: bytes) -> None:
+    """Write all of `data`, however many calls the system takes for it."""
+    written = 0
+    while written < len(data):
+        written += os.write(descriptor, data[written:])
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in a folder durable: without it a power cut may lose a new file's name."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def cannot_write(path: Path, error: OSError) -> DiskError:
+    """Return the error that says why a file or folder cannot be written, and the remedy."""
+    return DiskError(
+        f'{path}: cannot be written ({reason(error)}); '
+        'name a folder you may write to, with free space'
+    )
+
+
+def reason(error: Exception) -> str:
+    """Return an operating-system error in words, without the path it repeats."""
+    return getattr(error, 'strerror', None) or str(error)

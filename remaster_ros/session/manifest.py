@@ -1,0 +1,128 @@
+"""SHA256SUMS: the checksums of a folder's closed files, as ``sha256sum --check`` reads them."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from remaster_ros.errors import InputError
+from remaster_ros.session.files import (
+    cannot_write,
+    decode_text,
+    read_limited,
+    reason,
+    sync_folder,
+    write_atomically,
+)
+
+MANIFEST = 'SHA256SUMS'
+MANIFEST_LIMIT = 1024**2
+
+_LINE = re.compile(r'([0-9a-f]{64}) [ *]([^\0]+)')
+
+
+def read_manifest(folder: Path) -> dict[str, str]:
+    """Return the checksum of every closed file by its name; nothing where there is no manifest.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or is none; names the line.
+    """
+    path = folder / MANIFEST
+    if not path.exists():
+        return {}
+    text = decode_text(read_limited(path, MANIFEST_LIMIT, 'it was there a moment ago'), path)
+    sums = {}
+    for number, line in enumerate(text.split('\n')[:-1], start=1):
+        match = _LINE.fullmatch(line)
+        if match is None:
+            raise InputError(
+                f'{path}, line {number}: no checksum and file name; take another copy of the file'
+            )
+        sums[match[2]] = match[1]
+    return sums
+
+
+def write_manifest(folder: Path, names: Iterable[str]) -> None:
+    """Write down what these files are now; they must not change as long as it stands.
+
+    Raises
+    ------
+    InputError
+        A file cannot be read, or the folder not written to.
+    """
+    write_sums(folder, {name: sha256_of(folder / name) for name in names})
+
+
+def write_sums(folder: Path, sums: Mapping[str, str]) -> None:
+    """Write down checksums by name of the file, of what the caller put there.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to.
+    """
+    lines = [f'{checksum}  {name}\n' for name, checksum in sorted(sums.items())]
+    write_atomically(folder / MANIFEST, ''.join(lines))
+
+
+def add_to_manifest(folder: Path, name: str) -> None:
+    """Write down one more closed file; what is written down already stays."""
+    lines = {**read_manifest(folder), name: sha256_of(folder / name)}
+    text = ''.join(f'{checksum}  {file}\n' for file, checksum in sorted(lines.items()))
+    write_atomically(folder / MANIFEST, text)
+
+
+def remove_manifest(folder: Path) -> None:
+    """Take the manifest away, durable on return, before its files are changed."""
+    path = folder / MANIFEST
+    try:
+        if path.exists():
+            os.unlink(path)
+            sync_folder(folder)
+    except OSError as error:
+        raise cannot_write(path, error) from None
+
+
+def check_data(sums: dict[str, str], path: Path, data: bytes) -> None:
+    """Refuse the content of a file that is not what was closed; unlisted files pass.
+
+    Raises
+    ------
+    InputError
+        Naming the file.
+    """
+    _compare(sums, path, hashlib.sha256(data).hexdigest())
+
+
+def check_file(sums: dict[str, str], path: Path) -> None:
+    """As `check_data`, for a file too large to hold."""
+    if path.name in sums:
+        _compare(sums, path, sha256_of(path))
+
+
+def sha256_of(path: Path) -> str:
+    """Return a file's checksum in hexadecimal.
+
+    Raises
+    ------
+    InputError
+        It cannot be read.
+    """
+    try:
+        with path.open('rb') as file:
+            return hashlib.file_digest(file, 'sha256').hexdigest()
+    except OSError as error:
+        raise InputError(f'{path}: cannot be read ({reason(error)})') from None
+
+
+def _compare(sums: dict[str, str], path: Path, found: str) -> None:
+    if sums.get(path.name, found) != found:
+        raise InputError(
+            f'{path}: not as it was closed, by its checksum in {MANIFEST}; take another copy '
+            f'(or remove {MANIFEST}, if you changed the file yourself)'
+        )

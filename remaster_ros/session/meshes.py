@@ -1,0 +1,108 @@
+"""Meshes of collision geometry: found as a URDF names them, read into arrays of vertices."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.session.files import read_limited
+from remaster_ros.types import FloatArray
+
+MESH_LIMIT = 64 * 1024**2
+KINDS = ('.stl', '.obj', '.dae', '.ply')
+
+
+def mesh_reader(urdf: Path, mesh_path: Sequence[Path] = ()) -> Callable[[str], FloatArray]:
+    """Return what reads the meshes that a URDF file names.
+
+    ``package://NAME/rest`` is looked for as ``NAME/rest`` in the folders of `mesh_path`, in the
+    share folders of AMENT_PREFIX_PATH, and beside and above the URDF (a package's own URDF lies
+    inside it). ``file://`` and plain names are taken relative to the URDF's folder, then to
+    those of `mesh_path`.
+
+    Parameters
+    ----------
+    urdf
+        The URDF file.
+    mesh_path
+        Folders to look in.
+
+    Returns
+    -------
+    callable
+        File name as written -> vertices, m, (n, 3). It raises InputError where there is no such
+        file or none that can be read; a link without its mesh would be a link that hits nothing.
+    """
+    cache: dict[str, FloatArray] = {}
+
+    def read(name: str) -> FloatArray:
+        if name not in cache:
+            cache[name] = read_mesh(_find(name, urdf, mesh_path))
+        return cache[name]
+
+    return read
+
+
+def _find(name: str, urdf: Path, mesh_path: Sequence[Path]) -> Path:
+    folders: list[Path] = [*mesh_path]
+    if name.startswith('package://'):
+        inside = unquote(name.removeprefix('package://'))
+        prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+        folders += [Path(prefix) / 'share' for prefix in prefixes if prefix]
+        folders += list(urdf.resolve().parents)
+    elif '://' in name and not name.startswith('file://'):
+        raise InputError(f'{urdf}: the mesh {name} cannot be fetched; name a package:// or a file')
+    else:
+        inside = unquote(name.removeprefix('file://'))
+        folders.insert(0, urdf.parent)
+    candidates = [folder / inside for folder in folders]
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise InputError(
+        f'{urdf}: there is no mesh {name} (looked for {", ".join(map(str, candidates[:6]))}); '
+        'give the folder that holds it, or its package, as mesh_path of the cell file, or source '
+        'the workspace of its package'
+    )
+
+
+def read_mesh(path: Path) -> FloatArray:
+    """Return the vertices of a mesh file (STL, OBJ, DAE or PLY), m, (n, 3)."""
+    kind = path.suffix.lower()
+    if kind not in KINDS:
+        raise InputError(f'{path}: a mesh in a format that is not read; use {", ".join(KINDS)}')
+    content = read_limited(path, MESH_LIMIT, 'the URDF names it as a mesh')
+    # Not at import: it takes a second, and most commands read no mesh.
+    import trimesh
+
+    try:
+        loaded = trimesh.load_scene(BytesIO(content), file_type=kind[1:], skip_materials=True)
+        # Instances in their places; COLLADA says how long its unit is.
+        parts: list[Any] = [getattr(part, 'vertices', ()) for part in loaded.dump()]
+        vertices = np.array([point for part in parts for point in part], dtype=float)
+        vertices = vertices.reshape(-1, 3)
+    except Exception as error:
+        # Whatever a parser of foreign bytes raises, one line comes out.
+        raise InputError(f'{path}: no {kind[1:].upper()} mesh ({_line(error)})') from None
+    vertices = vertices * (_collada_unit(content) if kind == '.dae' else 1.0)
+    if len(vertices) < 4 or not np.all(np.isfinite(vertices)):
+        raise InputError(f'{path}: the mesh has {len(vertices)} vertices, or some not finite')
+    return vertices
+
+
+def _collada_unit(content: bytes) -> float:
+    """Return the length of a COLLADA file's unit, m."""
+    import collada
+
+    return float(collada.Collada(BytesIO(content)).assetInfo.unitmeter or 1.0)
+
+
+def _line(error: Exception) -> str:
+    return ' '.join(f'{type(error).__name__}: {error}'.split())[:200]

@@ -1,0 +1,317 @@
+"""observations.csv: text to checked columns and back, every fault named by line and column."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.csv_table import Table, split_line
+from remaster_ros.session.files import decode_text, refuse_utf16
+from remaster_ros.session.sequence_rules import (
+    SPLITS,
+    RowKeys,
+    SequenceRules,
+    keeps_the_rules,
+    row_keys,
+    split_indices,
+)
+from remaster_ros.types import FARTHEST_M, FloatArray, Measurements, Observation
+
+log = logging.getLogger('remaster_ros')
+
+LIMIT_TOLERANCE_RAD = math.radians(1.0)
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The column names of a session with k joints, in the order this package writes them."""
+
+    joints: int
+
+    @property
+    def q(self) -> list[str]:
+        """Reported joint positions."""
+        return [f'q{i}_rad' for i in range(1, self.joints + 1)]
+
+    @property
+    def from_q(self) -> list[str]:
+        """Joint positions the arm came from."""
+        return [f'from_q{i}_rad' for i in range(1, self.joints + 1)]
+
+    @property
+    def effort(self) -> list[str]:
+        """Measured joint torques; these columns are optional."""
+        return [f'effort{i}_nm' for i in range(1, self.joints + 1)]
+
+    position = ('x_m', 'y_m', 'z_m')
+    std = ('std_x_m', 'std_y_m', 'std_z_m')
+
+    def names(self, with_effort: bool = False) -> list[str]:
+        """Return every column's name."""
+        return [
+            *('observation', 'pose', 'configuration', 'split', 'stamp_s', 'sensor', 'marker'),
+            *(*self.q, *self.from_q, *self.position, *self.std, 'samples', 'temperature_c'),
+            *(self.effort if with_effort else ()),
+        ]
+
+
+def parse_observations(
+    data: bytes,
+    path: Path,
+    chain: SerialChain,
+    sensors: Sequence[str],
+    markers: Sequence[str],
+) -> Measurements:
+    """Read observations.csv.
+
+    What was cut off while it was written is dropped with a warning: a last line without its line
+    end, and last lines with the zeros that a power cut leaves.
+
+    Parameters
+    ----------
+    data
+        The file's bytes.
+    path
+        Its name, for messages.
+    chain
+        The robot, for the number of joints and their limits.
+    sensors, markers
+        The names in session.yaml, in their order.
+
+    Raises
+    ------
+    InputError
+        One line naming file, line, column and remedy.
+    """
+    # Before its zeros are taken for those that a power cut leaves.
+    refuse_utf16(data, path)
+    end = _whole_lines(data, most=len(sensors))
+    if end < len(data):
+        torn = data.count(b'\n', 0, end) + 1
+        log.warning('%s, line %d: cut off while being written, and dropped', path, torn)
+    lines = decode_text(data[:end], path).replace('\r\n', '\n').split('\n')[:-1]
+    while lines and not lines[-1]:
+        lines.pop()
+    if not lines:
+        raise InputError(f'{path}: no header line; the first line names the columns')
+    _refuse_other_separators(lines[0], path)
+    names = split_line(lines[0], path, 1)
+    columns = Columns(len(chain))
+    with_effort = _check_names(names, columns, path)
+    if len(lines) < 2:
+        raise InputError(f'{path}: no observations below the header; measure before fitting')
+    table = Table(path, names, lines[1:], first_line=2)
+    measurements = _columns(table, columns, chain, sensors, markers, with_effort)
+    if not keeps_the_rules(measurements):
+        rules = SequenceRules()
+        for row in row_keys(measurements, first_line=2):
+            if problem := rules.problem(row):
+                raise InputError(f'{path}, line {row.line}, {problem}')
+            rules.accept(row)
+    return measurements
+
+
+def _refuse_other_separators(header: str, path: Path) -> None:
+    """Name the separator of a header that has one, but not the comma."""
+    for separator, name in ((';', 'semicolons'), ('\t', 'tabs')):
+        if header.count(separator) > header.count(','):
+            raise InputError(
+                f'{path}, line 1: columns are separated by {name}; save it with commas between '
+                'them, and with points in the numbers'
+            )
+
+
+def _whole_lines(data: bytes, most: int) -> int:
+    """Return how many bytes at the beginning are whole lines.
+
+    The rows of one configuration are written in one piece, a row for each of the (`most`) sensors:
+    zeros further up are no crash's work, and left for the reader to refuse.
+    """
+    end = data.rfind(b'\n') + 1
+    zero = data.find(b'\0')
+    if zero < 0 or data.count(b'\n', zero) > most:
+        return end
+    return data.rfind(b'\n', 0, zero) + 1
+
+
+def check_row(
+    text: str,
+    line: int,
+    path: Path,
+    chain: SerialChain,
+    sensors: Sequence[str],
+    markers: Sequence[str],
+    rules: SequenceRules,
+) -> RowKeys:
+    """Hold one row about to be written to what the reader will demand of it.
+
+    Raises
+    ------
+    InputError
+        As `parse_observations`.
+    """
+    columns = Columns(len(chain))
+    table = Table(path, columns.names(), [text.rstrip('\n')], first_line=line)
+    measurements = _columns(table, columns, chain, sensors, markers, with_effort=False)
+    row = next(row_keys(measurements, first_line=line))
+    if problem := rules.problem(row):
+        raise InputError(f'{path}, line {line}, {problem}')
+    return row
+
+
+def format_header(joints: int, with_effort: bool = False) -> str:
+    """Return the header line of observations.csv."""
+    return ','.join(Columns(joints).names(with_effort)) + '\n'
+
+
+def format_observation(observation: Observation) -> str:
+    """Return one observation as a line of the file; numbers survive the round trip exactly."""
+    o = observation
+    unknown = [''] * len(o.q)
+    cells = [
+        *(str(int(o.observation)), str(int(o.pose)), str(int(o.configuration)), o.split),
+        *(_text(o.stamp_s), o.sensor, o.marker),
+        *map(_text, o.q),
+        *(unknown if o.from_q is None else map(_text, o.from_q)),
+        *map(_text, o.position),
+        *([''] * 3 if o.std is None else map(_text, o.std)),
+        '' if o.samples is None else str(int(o.samples)),
+        '' if o.temperature_c is None else _text(o.temperature_c),
+    ]
+    return ','.join(cells) + '\n'
+
+
+def format_measurements(m: Measurements, sensors: Sequence[str], markers: Sequence[str]) -> str:
+    """Return all observations as the text of the file, header included."""
+
+    def numbers(values: FloatArray) -> list[list[str]]:
+        return [
+            [repr(number) if number == number else '' for number in column]
+            for column in values.T.tolist()
+        ]
+
+    cells = [
+        *(list(map(str, ids.tolist())) for ids in (m.observation, m.pose, m.configuration)),
+        [SPLITS[split] for split in split_indices(m).tolist()],
+        *numbers(m.stamp_s[:, None]),
+        [sensors[sensor] for sensor in m.sensor.tolist()],
+        [markers[marker] for marker in m.marker.tolist()],
+        *(column for values in (m.q, m.from_q, m.position, m.std) for column in numbers(values)),
+        [str(samples) if samples >= 0 else '' for samples in m.samples.tolist()],
+        *numbers(m.temperature_c[:, None]),
+        *(numbers(m.effort) if m.effort is not None else ()),
+    ]
+    lines = map(','.join, zip(*cells, strict=True))
+    return format_header(m.q.shape[1], m.effort is not None) + ''.join(f'{row}\n' for row in lines)
+
+
+def _check_names(names: list[str], columns: Columns, path: Path) -> bool:
+    """Hold the header against the format; return whether the file has effort columns."""
+    where = f'{path}, line 1'
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f'{where}: column {name[:40]!r} is given twice; keep one')
+    for prefix, wanted in (
+        ('q', columns.q),
+        ('from_q', columns.from_q),
+        ('effort', columns.effort),
+    ):
+        suffix = '_nm' if prefix == 'effort' else '_rad'
+        pattern = re.compile(f'{prefix}[0-9]+{suffix}')
+        found = [name for name in names if pattern.fullmatch(name)]
+        if set(found) != set(wanted) and (found or prefix != 'effort'):
+            raise InputError(
+                f'{where}: {len(found)} columns {prefix}…{suffix} for the {columns.joints} joints '
+                f'of the robot between its base_link and tip_link; give {wanted[0]} to '
+                f'{wanted[-1]}, or the right URDF and links in session.yaml'
+            )
+    missing = [name for name in columns.names() if name not in names]
+    if missing:
+        raise InputError(
+            f'{where}: column {", ".join(missing)} is missing; add it, with empty fields where '
+            'the format lets a value be unknown'
+        )
+    unknown = [name for name in names if name not in columns.names(with_effort=True)]
+    if unknown:
+        log.warning('%s: unknown columns are not used: %s', where, ', '.join(map(repr, unknown)))
+    return columns.effort[0] in names
+
+
+def _columns(
+    table: Table,
+    columns: Columns,
+    chain: SerialChain,
+    sensors: Sequence[str],
+    markers: Sequence[str],
+    with_effort: bool,
+) -> Measurements:
+    """Convert and check every column by itself."""
+    split = table.choices('split', SPLITS, f'is none of {", ".join(SPLITS)}; correct it')
+    is_reference = split == SPLITS.index('reference')
+    measurements = Measurements(
+        observation=table.integers('observation'),
+        pose=table.integers('pose'),
+        configuration=table.integers('configuration'),
+        is_validation=split == SPLITS.index('validation'),
+        stamp_s=table.numbers(['stamp_s'])[:, 0],
+        sensor=table.choices('sensor', sensors, _not_among('sensors', sensors)),
+        marker=table.choices('marker', markers, _not_among('markers', markers)),
+        q=table.numbers(columns.q),
+        from_q=table.whole_or_empty(columns.from_q),
+        position=table.numbers(columns.position),
+        std=table.whole_or_empty(columns.std),
+        samples=table.integers('samples', optional=True),
+        temperature_c=table.numbers(['temperature_c'], optional=True)[:, 0],
+        effort=table.numbers(columns.effort, optional=True) if with_effort else None,
+        is_reference=is_reference if is_reference.any() else None,
+    )
+    too_few = np.flatnonzero(
+        (measurements.samples < 1)
+        & np.array([cell != '' for cell in table.cells['samples']], dtype=bool)
+    )
+    if len(too_few):
+        raise table.fault(
+            int(too_few[0]), 'samples', 'is less than 1; leave it empty where unknown'
+        )
+    negative = np.argwhere(measurements.std < 0)
+    if len(negative):
+        row, column = negative[0]
+        raise table.fault(int(row), columns.std[column], 'is negative; correct it')
+    for names, q in ((columns.q, measurements.q), (columns.from_q, measurements.from_q)):
+        outside = np.argwhere(
+            (q < chain.lower - LIMIT_TOLERANCE_RAD) | (q > chain.upper + LIMIT_TOLERANCE_RAD)
+        )
+        if len(outside):
+            row, joint = outside[0]
+            raise table.fault(
+                int(row),
+                names[joint],
+                f'rad is more than 1 degree outside the limits of {chain.joint_names[joint]} '
+                f'({chain.lower[joint]:.6g} to {chain.upper[joint]:.6g} rad); are the units '
+                'radians, the joints base to tip, and the limits of the URDF right?',
+            )
+    far = np.argwhere(np.abs(measurements.position) > FARTHEST_M)
+    if len(far):
+        row, axis = far[0]
+        raise table.fault(
+            int(row),
+            columns.position[axis],
+            f'm is further than {FARTHEST_M:g} m away, beyond any sensor; are the units metres?',
+        )
+    return measurements
+
+
+def _not_among(key: str, names: Sequence[str]) -> str:
+    return f'is not among the {key} of session.yaml ({", ".join(names)}); correct either'
+
+
+def _text(number: float) -> str:
+    return repr(float(number))

@@ -1,0 +1,161 @@
+"""Session folders: the strict reader, and the writer of a whole session."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.files import (
+    decode_text,
+    make_new_folder,
+    read_limited,
+    write_atomically,
+)
+from remaster_ros.session.manifest import check_data, read_manifest
+from remaster_ros.session.observations import format_measurements, parse_observations
+from remaster_ros.session.session_yaml import YAML_LIMIT, parse_header, write_header
+from remaster_ros.types import Measurements, Session
+
+URDF_LIMIT = 16 * 1024**2
+OBSERVATIONS_LIMIT = 1024**3
+
+HEADER = 'session.yaml'
+ROWS = 'observations.csv'
+URDF = 'robot.urdf'
+
+_ATTEMPTS = 10
+
+
+def read_session(folder: str | os.PathLike[str]) -> Session:
+    """Read a session folder (format ``remaster-session/1``), and refuse what does not fit it.
+
+    The folder may be read at any moment, also while it is being written and after a power cut.
+
+    Parameters
+    ----------
+    folder
+        Holds session.yaml, observations.csv and the URDF that session.yaml names.
+
+    Returns
+    -------
+    Session
+        Every number finite, every name known, joints checked against the URDF's chain.
+
+    Raises
+    ------
+    InputError
+        One line naming file, line, column or key, and the remedy.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f'{folder}: no such session folder; give the folder of session.yaml')
+    for _ in range(_ATTEMPTS):
+        sums = read_manifest(folder)
+        try:
+            return _read(folder, sums)
+        except InputError:
+            # A recorder may have closed the session, or gone on with it, while it was read.
+            if read_manifest(folder) == sums:
+                raise
+    raise InputError(f'{folder}: changes faster than it can be read; try again')
+
+
+def _read(folder: Path, sums: dict[str, str]) -> Session:
+    header_path = folder / HEADER
+    data = read_limited(header_path, YAML_LIMIT, 'a session folder holds session.yaml')
+    check_data(sums, header_path, data)
+    header = parse_header(data, header_path)
+    urdf_path = folder / header.robot.urdf
+    data = read_limited(urdf_path, URDF_LIMIT, 'robot.urdf in session.yaml names the URDF')
+    check_data(sums, urdf_path, data)
+    urdf = decode_text(data, urdf_path)
+    chain = read_chain(urdf, urdf_path, header.robot.base_link, header.robot.tip_link)
+    rows_path = folder / ROWS
+    data = read_limited(rows_path, OBSERVATIONS_LIMIT, 'a session folder holds observations.csv')
+    check_data(sums, rows_path, data)
+    measurements = parse_observations(
+        data,
+        rows_path,
+        chain,
+        tuple(header.sensors),
+        tuple(header.markers),
+    )
+    references = None
+    if measurements.is_reference is not None:
+        of_references = measurements.is_reference
+        measurements = replace(measurements, is_reference=None)
+        references = measurements.select(of_references)
+        measurements = measurements.select(~of_references)
+        if not len(measurements):
+            raise InputError(
+                f'{rows_path}: holds rows of split reference alone; measure before fitting'
+            )
+
+    return Session(
+        urdf=urdf,
+        base_link=header.robot.base_link,
+        tip_link=header.robot.tip_link,
+        markers={name: np.array(position) for name, position in header.markers.items()},
+        sensors={name: sensor.marker for name, sensor in header.sensors.items()},
+        measurements=measurements,
+        marker_std_m=header.marker_std_m,
+        settle_s=header.settle_s,
+        base_prior=header.priors(),
+        exit_status=header.exit_status,
+        notes=header.notes,
+        created=header.created,
+        extra=header.extra,
+        references=references,
+    )
+
+
+def write_session(folder: str | os.PathLike[str], session: Session) -> None:
+    """Write a whole session into a new or empty folder; numbers survive the round trip exactly.
+
+    Raises
+    ------
+    InputError
+        The folder holds files or cannot be written to, or the session breaks the format.
+    """
+    folder = Path(folder)
+    chain = read_chain(session.urdf, folder / URDF, session.base_link, session.tip_link)
+    header = write_header(session, URDF, session.exit_status)
+    rows = format_measurements(
+        all_rows(session), session.sensor_names, session.marker_names
+    ).encode()
+    parse_observations(rows, folder / ROWS, chain, session.sensor_names, session.marker_names)
+    make_new_folder(folder)
+    write_atomically(folder / URDF, session.urdf)
+    write_atomically(folder / ROWS, rows)
+    write_atomically(folder / HEADER, header)
+
+
+def all_rows(session: Session) -> Measurements:
+    """Return every row of a session in the order measured, those of the references among them."""
+    m, references = session.measurements, session.references
+    if references is None:
+        return m
+    of_references = np.repeat([False, True], [len(m), len(references)])
+    columns: dict[str, Any] = {
+        name: None
+        if value is None or getattr(references, name) is None
+        else np.concatenate((value, getattr(references, name)))
+        for name, value in vars(m).items()
+    }
+    columns['is_reference'] = of_references
+    merged = Measurements(**columns)
+    return merged.select(np.argsort(merged.observation, kind='stable'))
+
+
+def read_chain(urdf: str, path: Path, base_link: str, tip_link: str) -> SerialChain:
+    """Return the arm of a session; an `InputError` names the URDF file at `path`."""
+    try:
+        return SerialChain.from_urdf(urdf, base_link, tip_link)
+    except InputError as error:
+        raise InputError(f'{path}: {error}') from None

@@ -1,0 +1,118 @@
+"""What must hold between the rows of a session: order, splits, poses and configurations."""
+
+from __future__ import annotations
+
+from collections import ChainMap
+from collections.abc import Iterator, MutableMapping
+from typing import NamedTuple
+
+import numpy as np
+
+from remaster_ros.types import BoolArray, IntArray, Measurements
+
+SPLITS = ('optimization', 'validation', 'reference')
+
+
+class RowKeys(NamedTuple):
+    """What the rules between rows are about, of one row."""
+
+    line: int
+    observation: int
+    pose: int
+    configuration: int
+    split: int
+    stamp_s: float
+
+
+class SequenceRules:
+    """What must hold between rows, given in their order.
+
+    Observation numbers are unique and grow with time, time never runs backwards, a pose belongs
+    to one split and a configuration to one pose.
+    """
+
+    def __init__(self) -> None:
+        self._last: RowKeys | None = None
+        self._of_observation: MutableMapping[int, RowKeys] = {}
+        self._of_pose: MutableMapping[int, RowKeys] = {}
+        self._of_configuration: MutableMapping[int, RowKeys] = {}
+
+    def branch(self) -> SequenceRules:
+        """Return rules that know the same rows; what they accept stays unknown here."""
+        rules = SequenceRules()
+        rules._last = self._last
+        rules._of_observation = ChainMap({}, self._of_observation)
+        rules._of_pose = ChainMap({}, self._of_pose)
+        rules._of_configuration = ChainMap({}, self._of_configuration)
+        return rules
+
+    def problem(self, row: RowKeys) -> str:
+        """Return '' or what is wrong with the next row: "column …: …; remedy"."""
+        same = self._of_observation.get(row.observation)
+        if same is not None:
+            return (
+                f'column observation: {row.observation} is already on line {same.line}; '
+                'number every row once'
+            )
+        last = self._last
+        if last is not None and row.observation < last.observation:
+            return (
+                f'column observation: {row.observation} comes after {last.observation}; '
+                'number the rows in the order measured'
+            )
+        if last is not None and row.stamp_s < last.stamp_s:
+            return (
+                f'column stamp_s: {row.stamp_s} is before the row above it ({last.stamp_s}): '
+                'time runs backwards; give the rows in the order measured'
+            )
+        same = self._of_pose.get(row.pose)
+        if same is not None and same.split != row.split:
+            return (
+                f'column split: pose {row.pose} is {SPLITS[same.split]} on line '
+                f'{same.line} and {SPLITS[row.split]} here; give a pose one split'
+            )
+        same = self._of_configuration.get(row.configuration)
+        if same is not None and same.pose != row.pose:
+            return (
+                f'column configuration: {row.configuration} belongs to pose {same.pose} on line '
+                f'{same.line} and to pose {row.pose} here; give a configuration one pose'
+            )
+        return ''
+
+    def accept(self, row: RowKeys) -> None:
+        """Take a row without a problem as the last one."""
+        self._last = row
+        self._of_observation[row.observation] = row
+        self._of_pose.setdefault(row.pose, row)
+        self._of_configuration.setdefault(row.configuration, row)
+
+
+def keeps_the_rules(m: Measurements) -> bool:
+    """Return whether `SequenceRules` would find no problem, in one look at all rows."""
+
+    def belongs(part: IntArray, whole: IntArray | BoolArray) -> bool:
+        _, first, group = np.unique(part, return_index=True, return_inverse=True)
+        return bool((whole[first][group] == whole).all())
+
+    return bool(
+        (np.diff(m.observation) > 0).all()
+        and (np.diff(m.stamp_s) >= 0).all()
+        and belongs(m.pose, split_indices(m))
+        and belongs(m.configuration, m.pose)
+    )
+
+
+def split_indices(m: Measurements) -> IntArray:
+    """Return the index into `SPLITS` of every row, (n,)."""
+    index = m.is_validation.astype(np.int64)
+    if m.is_reference is not None:
+        index[m.is_reference] = SPLITS.index('reference')
+    return index
+
+
+def row_keys(m: Measurements, first_line: int) -> Iterator[RowKeys]:
+    """Yield the keys of every row, the first being on `first_line` of its file."""
+    lines = range(first_line, first_line + len(m))
+    columns = (m.observation, m.pose, m.configuration, split_indices(m), m.stamp_s)
+    # Plain Python numbers: dictionaries of NumPy scalars are slow.
+    return map(RowKeys, lines, *(column.tolist() for column in columns))

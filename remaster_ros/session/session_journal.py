@@ -1,0 +1,317 @@
+"""The recorder's memory: the session it writes, and what it has decided so far.
+
+A recorder that is started again finds here what it decided before, so that nothing is recorded
+twice, and the points that its sensors were registered by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.collection.pairing import PairedReading
+from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
+from remaster_ros.session.files import read_limited
+from remaster_ros.session.journal import Record
+from remaster_ros.session.reader import HEADER, OBSERVATIONS_LIMIT, ROWS
+from remaster_ros.session.session_writer import ExitStatus, SessionWriter
+from remaster_ros.session.session_yaml import YAML_LIMIT, parse_header
+from remaster_ros.types import FloatArray, Observation, Session, Split
+
+SHIFT_S = 1.0
+"""Time that is put between two rows where the clock ran backwards, s."""
+
+_FINAL = ('recorded', 'partial')
+
+
+class Logbook:
+    """Write a session, new or unfinished, and remember what was decided.
+
+    Parameters
+    ----------
+    folder
+        The session's. A complete session is not written to: `closed` says so from the start.
+    header
+        Everything but the observations.
+
+    Attributes
+    ----------
+    closed
+        The exit status once the session is closed, else ''.
+    plan_id
+        The plan that the configurations are numbered by; '' before the first.
+    observations
+        How many observations there are.
+    notes
+        What a user should know of how the session was found, a line each.
+    registration
+        The readings that the sensors were registered by in the runs before.
+    watched
+        What the references told in the runs before, in order: ``reference`` with the number of the
+        configuration and its readings, ``other`` for any other configuration, ``accepted`` where
+        a person had seen to a change.
+
+    Raises
+    ------
+    InputError
+        The folder holds something else, another process writes it, or it cannot be written to.
+    """
+
+    def __init__(self, folder: Path, header: Session) -> None:
+        self.folder, self._header = folder, header
+        self._writer: SessionWriter | None = None
+        self.closed = self.plan_id = ''
+        self.observations = 0
+        self.notes: list[str] = []
+        self.registration: list[PairedReading] = []
+        self.watched: list[tuple[str, int, list[PairedReading]]] = []
+        self._results: dict[tuple[int, int], str] = {}
+        self._last_pose: int | None = None
+        self._shift_s = 0.0
+        self._told = 0
+        self.reopen()
+
+    def reopen(self) -> None:
+        """Go on with a session that was stopped."""
+        if is_complete(self.folder):
+            rows = read_limited(self.folder / ROWS, OBSERVATIONS_LIMIT, 'it is part of a session')
+            self.observations = rows.count(b'\n') - 1
+            self.closed = 'complete'
+            self.notes = [f'{self.folder}: this session is complete; name a new folder to record']
+            return
+        self._writer, self._told = SessionWriter(self.folder, self._header, resume=True), 0
+        self.closed, self.notes = '', []
+        self.observations = self._writer.observations
+        if self._writer.resumed:
+            self.notes.append(f'{self.folder}: going on after {self.observations} observations')
+        if self._writer.lost:
+            self.notes.append(self._writer.lost)
+        self.registration, self._results, self.watched = [], {}, []
+        for record in self._writer.records:
+            self._replay(record)
+
+    def _replay(self, record: Record) -> None:
+        kind = record['kind']
+        if kind == 'plan':
+            self.plan_id = record['id']
+            self._results = {}
+        elif kind == 'configuration':
+            self._decide(record['pose'], record['solution'], record['result'])
+            readings = [_reading(content) for content in record.get('readings', ())]
+            if record.get('split') == REGISTRATION:
+                self.registration += readings
+            elif record.get('split') == REFERENCE and readings:
+                self.watched.append(('reference', record['number'], readings))
+            elif record.get('rows') and self.watched:
+                self.watched.append(('other', 0, []))
+        elif kind == 'accepted':
+            self.watched.append(('accepted', 0, []))
+        elif kind == 'shift':
+            self._shift_s = record['shift_s']
+
+    def _decide(self, pose: int, solution: int, result: str) -> None:
+        self._results[pose, solution] = result
+        self._last_pose = pose
+
+    def _append(self, record: Record, observations: Sequence[Observation] = ()) -> None:
+        assert self._writer is not None
+        self._writer.record(record, observations)
+
+    def follow(self, plan_id: str) -> bool:
+        """Take the plan that the planner follows; False where the session is of another one."""
+        if plan_id == self.plan_id:
+            return True
+        if self.observations and self.plan_id:
+            return False
+        self._append({'kind': 'plan', 'id': plan_id})
+        self.plan_id, self._results = plan_id, {}
+        return True
+
+    def result(self, pose: int, solution: int) -> str:
+        """Return what a configuration was recorded as, '' where it is still to be recorded."""
+        result = self._results.get((pose, solution), '')
+        return result if result in _FINAL else ''
+
+    def decided(self) -> str:
+        """Return the solutions recorded at the last pose, as ``pose: solution solution …``."""
+        if self._last_pose is None:
+            return ''
+        solutions = [
+            str(solution)
+            for (pose, solution), result in self._results.items()
+            if pose == self._last_pose and result in _FINAL
+        ]
+        return f'{self._last_pose}: {" ".join(solutions)}'
+
+    def write(
+        self,
+        *,
+        pose: int,
+        solution: int,
+        split: str,
+        result: str,
+        reason: str,
+        readings: Sequence[PairedReading],
+        from_q: FloatArray | None,
+        temperatures_c: Sequence[float | None],
+    ) -> int:
+        """Write what became of a configuration; durable on return.
+
+        Parameters
+        ----------
+        pose, solution
+            As the planner numbers them.
+        split
+            ``registration``, ``reference``, ``optimization`` or ``validation``.
+        result, reason
+            ``recorded``, ``partial`` or ``rejected``, and why.
+        readings, temperatures_c
+            What was accepted, and the temperature with each, degrees Celsius, None if unknown.
+        from_q
+            Where the arm came from, rad, (k,); None if unknown.
+
+        Returns
+        -------
+        int
+            The number that the configuration has in the session, where it has readings.
+
+        Raises
+        ------
+        DiskError
+            The disk does not take it; try again when there is room.
+        """
+        record: Record = {
+            'kind': 'configuration',
+            'pose': pose,
+            'solution': solution,
+            'split': split,
+            'result': result,
+            'reason': reason,
+        }
+        number = 0 if self._writer is None else self._writer.configurations
+        if split == REGISTRATION:
+            self._append({**record, 'readings': [_content(reading) for reading in readings]})
+        else:
+            if split == REFERENCE:
+                record['number'] = number
+                record['readings'] = [_content(reading) for reading in readings]
+            self._append(record, self._rows(pose, split, readings, from_q, temperatures_c))
+            self.observations += len(readings)
+        self._decide(pose, solution, result)
+        return number
+
+    def note_accepted(self) -> None:
+        """Write that a person has seen to what had changed at the references."""
+        self._append({'kind': 'accepted'})
+
+    def _rows(
+        self,
+        pose: int,
+        split: str,
+        readings: Sequence[PairedReading],
+        from_q: FloatArray | None,
+        temperatures_c: Sequence[float | None],
+    ) -> list[Observation]:
+        writer = self._writer
+        if not readings or writer is None:
+            return []
+        pairs = sorted(zip(readings, temperatures_c), key=lambda pair: pair[0].stamp_s)
+        self._keep_time(pairs[0][0].stamp_s)
+        return [
+            Observation(
+                observation=writer.observations + number,
+                pose=pose,
+                configuration=writer.configurations,
+                split=_split(split),
+                stamp_s=reading.stamp_s + self._shift_s,
+                sensor=reading.sensor,
+                marker=reading.marker,
+                q=reading.q,
+                position=reading.position,
+                from_q=from_q,
+                std=reading.std,
+                samples=reading.samples,
+                temperature_c=temperature_c,
+            )
+            for number, (reading, temperature_c) in enumerate(pairs)
+        ]
+
+    def _keep_time(self, stamp_s: float) -> None:
+        """Time never runs backwards in a session, whatever the clock does between its rows."""
+        assert self._writer is not None
+        last_s = self._writer.last_stamp_s
+        if last_s is None or stamp_s + self._shift_s >= last_s:
+            return
+        shift_s = last_s + SHIFT_S - stamp_s
+        self._append({'kind': 'shift', 'shift_s': shift_s})
+        self._shift_s = shift_s
+        self.notes.append(f'the clock ran backwards: stamps are shifted by {self._shift_s:.3f} s')
+
+    def check(self) -> None:
+        """Restore what others did to the files; `DiskError` where that is not possible (yet)."""
+        if not self.closed and self._writer is not None:
+            self._writer.check()
+
+    def take_restored(self) -> list[str]:
+        """Return what was restored since the last call, a line each."""
+        lines, self._told = self._restored()[self._told :], len(self._restored())
+        return lines
+
+    def _restored(self) -> list[str]:
+        return [] if self._writer is None else self._writer.restored
+
+    @property
+    def beyond_repair(self) -> str:
+        """Why the session cannot be complete any more; '' where it can."""
+        return '' if self._writer is None else self._writer.beyond_repair
+
+    def close(self, exit_status: ExitStatus) -> None:
+        """Close the session; closing again does nothing. `DiskError` where it remains open.
+
+        `closed` is what it was closed as; see `SessionWriter.close`.
+        """
+        if not self.closed and self._writer is not None:
+            self.closed = self._writer.close(exit_status)
+
+
+def is_complete(folder: Path) -> bool:
+    """Whether a folder holds a session that is complete; `InputError` where it is none."""
+    path = folder / HEADER
+    if not path.exists():
+        return False
+    header = parse_header(read_limited(path, YAML_LIMIT, 'it was there a moment ago'), path)
+    return header.exit_status == 'complete'
+
+
+def _split(name: str) -> Split:
+    """Return the split of a row; what a planner of another version names otherwise is fitted."""
+    if name == 'validation':
+        return 'validation'
+    return 'reference' if name == REFERENCE else 'optimization'
+
+
+def _content(reading: PairedReading) -> dict[str, Any]:
+    return {
+        'sensor': reading.sensor,
+        'marker': reading.marker,
+        'stamp_s': reading.stamp_s,
+        'q': reading.q.tolist(),
+        'position': reading.position.tolist(),
+        'samples': reading.samples,
+        **({} if reading.std is None else {'std': reading.std.tolist()}),
+    }
+
+
+def _reading(content: dict[str, Any]) -> PairedReading:
+    return PairedReading(
+        sensor=content['sensor'],
+        marker=content['marker'],
+        stamp_s=content['stamp_s'],
+        q=np.array(content['q']),
+        position=np.array(content['position']),
+        std=np.array(content['std']) if 'std' in content else None,
+        samples=content['samples'],
+    )

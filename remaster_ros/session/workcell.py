@@ -1,0 +1,356 @@
+"""Cell files (config/cells/*.yaml): the arm, the markers on its tool, the sensors."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from collections.abc import Mapping
+from math import isfinite, radians
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.bodies import Body, Shape, box, cylinder, obstacle, sphere
+from remaster_ros.kinematics.collision import HALF_STEP_M, CollisionModel, arm_bodies
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import matrix_from_rpy, transform
+from remaster_ros.kinematics.urdf_geometry import MeshReader, chain_bodies
+from remaster_ros.planning.candidates import LineOfSight, PoseRanges
+from remaster_ros.session.files import decode_text, read_limited
+from remaster_ros.session.meshes import mesh_reader
+from remaster_ros.session.safe_yaml import YamlError, load_yaml
+from remaster_ros.session.workcell_units import unit_problem
+from remaster_ros.types import FloatArray
+
+YAML_LIMIT = 256 * 1024
+URDF_LIMIT = 16 * 1024**2
+
+
+class CellRobot(msgspec.Struct, forbid_unknown_fields=True):
+    """The arm of a cell; `urdf` is relative to the cell file."""
+
+    urdf: str
+    base_link: str | None = None
+    tip_link: str | None = None
+
+
+class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
+    """A sensor of a cell.
+
+    Attributes
+    ----------
+    marker
+        The marker it follows.
+    topic
+        Where its readings are published (geometry_msgs/PointStamped, sensor frame); relative to
+        the nodes' namespace, unless it begins with ``/``.
+    rough_position_m
+        Where it stands in the robot base, roughly.
+    single_shot
+        True for an instrument that measures on request.
+    measure_service
+        The service (std_srvs/Trigger) that makes it measure.
+    max_angle_deg
+        Largest angle between the tool's z axis and the line to the sensor at which the marker
+        is seen.
+    """
+
+    marker: str
+    topic: str
+    rough_position_m: tuple[float, float, float]
+    single_shot: bool = False
+    measure_service: str = ''
+    max_angle_deg: float = 60.0
+
+
+class CellBox(msgspec.Struct, forbid_unknown_fields=True):
+    """An obstacle: a box in base_link, turned by `yaw_deg` about its z axis."""
+
+    center_m: tuple[float, float, float]
+    size_m: tuple[float, float, float]
+    yaw_deg: float = 0.0
+
+    def body(self, name: str) -> Body:
+        """Return it for the collision checks."""
+        rotation = matrix_from_rpy(np.array([0.0, 0.0, radians(self.yaw_deg)]))
+        return obstacle(name, self.center_m, self.size_m, rotation)
+
+
+class CellToolBody(msgspec.Struct, forbid_unknown_fields=True):
+    """A part of the tool, its middle at `center_m` of the tool frame, turned by `rpy_deg`.
+
+    A box (`size_m`), a cylinder along its z (`radius_m`, `length_m`) or a sphere (`radius_m`).
+    """
+
+    center_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    size_m: tuple[float, float, float] | None = None
+    radius_m: float | None = None
+    length_m: float | None = None
+
+    def shape(self) -> Shape:
+        """Return its shape, about its own middle."""
+        given = (self.size_m is not None, self.radius_m is not None, self.length_m is not None)
+        if given == (True, False, False):
+            return box(np.array(self.size_m))
+        if given == (False, True, True):
+            return cylinder(self.radius_m or 0.0, self.length_m or 0.0)
+        if given == (False, True, False):
+            return sphere(self.radius_m or 0.0)
+        raise InputError(
+            'give size_m (a box), radius_m and length_m (a cylinder), or radius_m alone (a sphere)'
+        )
+
+    def body(self, name: str, chain: SerialChain) -> Body:
+        """Return it for the collision checks, on the last joint of the arm."""
+        turn = matrix_from_rpy(np.deg2rad(self.rpy_deg))
+        T = chain.T_fixed[-1] @ transform(turn, np.array(self.center_m))
+        return Body(name, len(chain), self.shape(), T, 'tool')
+
+
+class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
+    """Ranges of the Latin hypercube of poses."""
+
+    azimuth_deg: tuple[float, float] = (0.0, 360.0)
+    radius_m: tuple[float, float] = (0.2, 0.5)
+    height_m: tuple[float, float] = (0.4, 0.8)
+    roll_deg: tuple[float, float] = (0.0, 360.0)
+
+    def ranges(self) -> PoseRanges:
+        """Return the ranges in SI units."""
+        return PoseRanges(
+            azimuth_rad=(radians(self.azimuth_deg[0]), radians(self.azimuth_deg[1])),
+            radius_m=self.radius_m,
+            height_m=self.height_m,
+            roll_rad=(radians(self.roll_deg[0]), radians(self.roll_deg[1])),
+        )
+
+
+class Cell(msgspec.Struct, forbid_unknown_fields=True):
+    """A cell file; see config/cells/demo.yaml for what each key means."""
+
+    robot: CellRobot
+    markers: dict[str, tuple[float, float, float]]
+    sensors: dict[str, CellSensor]
+    aim_at: str
+    marker_std_m: float = 0.5e-3
+    held_joint: str | None = ''
+    held_values_deg: list[float] | None = []
+    poses: CellPoses = msgspec.field(default_factory=CellPoses)
+    link_radius_m: float = 0.075
+    obstacles: dict[str, CellBox] = {}
+    floor_z_m: float | None = 0.0
+    tool: dict[str, CellToolBody] = {}
+    marker_radius_m: float = 0.02
+    clearance_m: float = 0.008
+    unknown_offset_deg: float = 1.0
+    acceleration_limit_rad_s2: float | list[float] = 5.0
+    mesh_path: list[str] = []
+    urdf_text: str = ''
+    # Where it was read from; nothing a plan depends on.
+    file: str = ''
+
+    def chain(self) -> SerialChain:
+        """Build the arm's kinematic chain."""
+        return SerialChain.from_urdf(self.urdf_text, self.robot.base_link, self.robot.tip_link)
+
+    def fingerprint(self) -> str:
+        """Return a checksum of all that a plan depends on."""
+        content = msgspec.json.encode(msgspec.structs.replace(self, file=''))
+        return hashlib.sha256(content).hexdigest()
+
+    def held(self, chain: SerialChain) -> dict[int, tuple[float, ...]] | None:
+        """Return the held joint's index and values (rad), or None."""
+        if not self.held_joint:
+            return None
+        index = chain.joint_names.index(self.held_joint)
+        return {index: tuple(np.deg2rad(self.held_values_deg or []))}
+
+    def acceleration_limits(self, chain: SerialChain) -> FloatArray:
+        """Return each joint's acceleration limit, rad/s², (k,)."""
+        given = np.array(self.acceleration_limit_rad_s2, dtype=float)
+        return np.broadcast_to(given, (len(chain),)).copy()
+
+    def collision_model(
+        self,
+        chain: SerialChain,
+        unknown_offset_rad: float | None = None,
+        *,
+        without_meshes: bool = False,
+    ) -> CollisionModel:
+        """Return the arm with tool, markers and obstacles, for collision checks.
+
+        Parameters
+        ----------
+        chain
+            The arm of this cell.
+        unknown_offset_rad
+            What a joint's zero-offset may still be off by, rad; `unknown_offset_deg` where None.
+        without_meshes
+            Take capsules in place of meshes, which then need not be there: for simulated arms,
+            never for one that moves.
+
+        Raises
+        ------
+        InputError
+            A mesh of the URDF that cannot be found or read, or geometry that cannot be.
+        """
+        folder = Path(self.file).parent
+        urdf = folder / self.robot.urdf
+        read_mesh: MeshReader = mesh_reader(urdf, [folder / path for path in self.mesh_path])
+        if without_meshes:
+            read_mesh = _no_mesh
+        last = len(chain)
+        bodies = chain_bodies(self.urdf_text, chain, read_mesh)
+        bodies += [part.body(f'tool {name}', chain) for name, part in self.tool.items()]
+        bodies += [box.body(f'obstacle {name}') for name, box in self.obstacles.items()]
+        for name, position in self.markers.items():
+            T = chain.T_fixed[-1] @ transform(np.eye(3), np.array(position))
+            bodies.append(Body(f'marker {name}', last, sphere(self.marker_radius_m), T, 'tool'))
+        unknown = radians(self.unknown_offset_deg)
+        return CollisionModel(
+            chain,
+            arm_bodies(chain, bodies, self.link_radius_m),
+            floor_z=self.floor_z_m,
+            margin=self.clearance_m,
+            unknown_offset=unknown if unknown_offset_rad is None else unknown_offset_rad,
+            link_radius=self.link_radius_m,
+        )
+
+    def lines_of_sight(self, sensors_R: Mapping[str, FloatArray]) -> list[LineOfSight]:
+        """Return what every pose must keep free, for sensors at these origins in R, m, (3,)."""
+        return [
+            LineOfSight(
+                name,
+                sensors_R[name],
+                np.array(self.markers[sensor.marker]),
+                radians(sensor.max_angle_deg),
+            )
+            for name, sensor in self.sensors.items()
+            if name in sensors_R
+        ]
+
+
+def _no_mesh(name: str) -> None:
+    """Leave a mesh out."""
+
+
+def config_path(name: str) -> Path:
+    """Path of a shipped configuration file, such as ``cells/demo.yaml``.
+
+    In a source checkout config/ lies beside the package; installed, it is package data.
+    """
+    beside = Path(__file__).resolve().parents[2] / 'config'
+    if (beside / 'cells').is_dir():
+        return beside / name
+    spec = importlib.util.find_spec('remaster_ros.config')
+    if spec is None or not spec.submodule_search_locations:
+        raise InputError('the shipped configuration is missing; install the package again')
+    return Path(next(iter(spec.submodule_search_locations))) / name
+
+
+def read_cell(path: str | Path) -> Cell:
+    """Read and check a cell file.
+
+    Parameters
+    ----------
+    path
+        The file; a bare name such as ``demo`` means the shipped config/cells/demo.yaml.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the key and the remedy.
+    """
+    path = Path(path)
+    if not path.suffix and not path.exists():
+        path = config_path(f'cells/{path}.yaml')
+    try:
+        data = load_yaml(decode_text(read_limited(path, YAML_LIMIT, 'name a cell file'), path))
+        cell = msgspec.convert(data, Cell)
+    except (YamlError, msgspec.ValidationError) as error:
+        raise InputError(f'{path}: {error}') from None
+    urdf = path.parent / cell.robot.urdf
+    cell.file = str(path)
+    missing = (
+        f'robot.urdf in {path} is {cell.robot.urdf!r}, which is relative to that file; copy the '
+        'URDF there, or give its absolute path'
+    )
+    cell.urdf_text = decode_text(read_limited(urdf.resolve(), URDF_LIMIT, missing), urdf)
+    _check(path, cell)
+    return cell
+
+
+def _check(path: Path, cell: Cell) -> None:
+    """Refuse names that point nowhere and values that cannot be."""
+    _require_finite(path, '', msgspec.to_builtins(cell))
+    try:
+        chain = cell.chain()
+    except InputError as error:
+        raise InputError(f'{path.parent / cell.robot.urdf}: {error}') from None
+    names = chain.joint_names
+    if cell.held_joint and cell.held_joint not in names:
+        raise InputError(f'{path}: held_joint {cell.held_joint!r} is none of {", ".join(names)}')
+    if cell.held_joint and not cell.held_values_deg:
+        raise InputError(f'{path}: held_values_deg is empty; give at least one angle')
+    if not cell.sensors:
+        raise InputError(f'{path}: sensors is empty; name at least one')
+    for name, sensor in cell.sensors.items():
+        if sensor.marker not in cell.markers:
+            known = ', '.join(cell.markers)
+            raise InputError(
+                f'{path}: sensor {name} follows marker {sensor.marker!r}; markers has {known}'
+            )
+    if cell.aim_at not in cell.sensors:
+        raise InputError(
+            f'{path}: aim_at {cell.aim_at!r} is none of the sensors {", ".join(cell.sensors)}'
+        )
+    if problem := unit_problem(cell):
+        raise InputError(f'{path}: {problem}')
+    if not (cell.marker_std_m > 0 and cell.link_radius_m > 0):
+        raise InputError(f'{path}: marker_std_m and link_radius_m must be positive')
+    _check_collision(path, cell, chain)
+
+
+def _check_collision(path: Path, cell: Cell, chain: SerialChain) -> None:
+    """Refuse sizes and limits that cannot be; meshes are read when they are needed."""
+    if not cell.marker_radius_m > 0:
+        raise InputError(f'{path}: marker_radius_m must be positive')
+    if not HALF_STEP_M <= cell.clearance_m <= 1.0:
+        raise InputError(
+            f'{path}: clearance_m is {cell.clearance_m}; it must be from {HALF_STEP_M} (what lies '
+            'between two checks of a path) to 1'
+        )
+    if not 0.0 <= cell.unknown_offset_deg <= 10.0:
+        raise InputError(
+            f'{path}: unknown_offset_deg is {cell.unknown_offset_deg}; it must be from 0 to 10'
+        )
+    limits = np.atleast_1d(np.array(cell.acceleration_limit_rad_s2, dtype=float))
+    if isinstance(cell.acceleration_limit_rad_s2, list) and len(limits) != len(chain):
+        raise InputError(
+            f'{path}: acceleration_limit_rad_s2 has {len(limits)} values; give one number, or '
+            f'one for each of the {len(chain)} joints'
+        )
+    if not np.all(limits > 0.0):
+        raise InputError(f'{path}: acceleration_limit_rad_s2 must be positive')
+    for key, parts in (('obstacles', cell.obstacles), ('tool', cell.tool)):
+        for name, part in parts.items():
+            try:
+                part.body(name) if isinstance(part, CellBox) else part.body(name, chain)
+            except InputError as error:
+                raise InputError(f'{path}: {key}.{name}: {error}') from None
+
+
+def _require_finite(path: Path, key: str, value: Any) -> None:
+    """Refuse a number that is none, wherever it stands."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            _require_finite(path, f'{key}.{name}'.lstrip('.'), inner)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            _require_finite(path, key, inner)
+    elif isinstance(value, float) and not isfinite(value):
+        raise InputError(f'{path}: {key}: {value} is not a finite number; correct it')

@@ -1,0 +1,150 @@
+"""How the fake arm moves: a second-order servo behind a trajectory, solved in closed form.
+
+The reported joint positions x follow a reference r by x'' + 2 ζ ω x' + ω² x = ω² r. Each piece
+of the reference is a polynomial, so x lags while moving, overshoots a little and settles. The
+solution is a polynomial plus a decaying oscillation: exact at any time, without integration, and
+therefore the same in every process that knows the trajectories.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.types import FloatArray
+
+NATURAL_FREQUENCY = 14.0
+"""ω of the servo, rad/s."""
+DAMPING = 0.7
+"""ζ of the servo; below 1 the arm overshoots."""
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """A point of a trajectory: time from its start (s), position (rad) and velocity (rad/s).
+
+    Without a velocity the controller interpolates linearly towards it, as the real one does.
+    """
+
+    time_s: float
+    q: FloatArray
+    velocity: FloatArray | None = None
+
+
+def spline(
+    start: FloatArray,
+    start_velocity: FloatArray,
+    end: FloatArray,
+    end_velocity: FloatArray | None,
+    duration: float,
+) -> FloatArray:
+    """Coefficients, lowest power first, (n, k), of the piece between two waypoints.
+
+    Cubic (Hermite) where the end has a velocity, else linear.
+    """
+    T, gap = duration, end - start
+    if end_velocity is None:
+        return np.array([start, gap / T])
+    c2 = (3 * gap / T - 2 * start_velocity - end_velocity) / T
+    c3 = (start_velocity + end_velocity - 2 * gap / T) / T**2
+    return np.array([start, start_velocity, c2, c3])
+
+
+def _steady_response(reference: FloatArray) -> FloatArray:
+    """Polynomial particular solution of the servo equation for a polynomial reference."""
+    w, z = NATURAL_FREQUENCY, DAMPING
+    out = np.zeros_like(reference)
+    for power in range(len(reference) - 1, -1, -1):
+        value = np.array(reference[power])
+        if power + 1 < len(reference):
+            value = value - (2 * z / w) * (power + 1) * out[power + 1]
+        if power + 2 < len(reference):
+            value = value - (power + 2) * (power + 1) / w**2 * out[power + 2]
+        out[power] = value
+    return out
+
+
+def _derivative(coefficients: FloatArray) -> FloatArray:
+    return coefficients[1:] * np.arange(1, len(coefficients))[:, None]
+
+
+@dataclass(frozen=True)
+class _Response:
+    """x(s) = polynomial(s) + e^(-ζωs) (a cos ω_d s + b sin ω_d s) for s = t - start >= 0."""
+
+    start_s: float
+    polynomial: FloatArray
+    a: FloatArray
+    b: FloatArray
+
+    @classmethod
+    def of(cls, start_s: float, reference: FloatArray, x: FloatArray, v: FloatArray) -> _Response:
+        steady = _steady_response(reference)
+        w, z = NATURAL_FREQUENCY, DAMPING
+        wd = w * np.sqrt(1 - z * z)
+        a = x - steady[0]
+        slope = steady[1] if len(steady) > 1 else np.zeros_like(x)
+        b = (v - slope + z * w * a) / wd
+        return cls(start_s, steady, a, b)
+
+    def at(self, t: float) -> tuple[FloatArray, FloatArray]:
+        """Position and velocity at time t."""
+        s = t - self.start_s
+        w, z = NATURAL_FREQUENCY, DAMPING
+        wd = w * np.sqrt(1 - z * z)
+        decay, c, sn = np.exp(-z * w * s), np.cos(wd * s), np.sin(wd * s)
+        powers = s ** np.arange(len(self.polynomial))
+        slope = _derivative(self.polynomial)
+        x = powers @ self.polynomial + decay * (self.a * c + self.b * sn)
+        v = powers[: len(slope)] @ slope + decay * (
+            (self.b * wd - z * w * self.a) * c - (self.a * wd + z * w * self.b) * sn
+        )
+        return x, v
+
+
+class Motion:
+    """The arm's reported joint positions over time, as commanded trajectories make them.
+
+    Parameters
+    ----------
+    start_s
+        World time of the beginning, s.
+    q
+        Joint positions at rest then, rad, (k,).
+    """
+
+    def __init__(self, start_s: float, q: FloatArray) -> None:
+        q = np.asarray(q, float)
+        self._responses = [_Response.of(start_s, q[None], q, np.zeros_like(q))]
+
+    def follow(self, start_s: float, waypoints: Sequence[Waypoint]) -> None:
+        """From `start_s` on follow a trajectory; replaces what is under way.
+
+        The last waypoint is held. One piece of response is kept for each piece of the reference.
+        """
+        # A later trajectory replaces what of the former has not happened yet.
+        self._responses = [r for r in self._responses if r.start_s <= start_s] or [
+            self._responses[0]
+        ]
+        x, v = self.at(start_s)
+        reference, velocity, begin = x, v, start_s
+        for waypoint in waypoints:
+            end = start_s + waypoint.time_s
+            piece = spline(reference, velocity, waypoint.q, waypoint.velocity, end - begin)
+            response = _Response.of(begin, piece, x, v)
+            self._responses.append(response)
+            x, v = response.at(end)
+            reference, begin = waypoint.q, end
+            velocity = np.zeros_like(x) if waypoint.velocity is None else waypoint.velocity
+        self._responses.append(_Response.of(begin, reference[None], x, v))
+        # Nobody asks for times long gone; bounded memory over hours of collection.
+        del self._responses[:-16]
+
+    def at(self, t: float) -> tuple[FloatArray, FloatArray]:
+        """Joint positions (rad) and velocities (rad/s) at world time t, each (k,)."""
+        for response in reversed(self._responses):
+            if response.start_s <= t:
+                return response.at(t)
+        return self._responses[0].at(self._responses[0].start_s)

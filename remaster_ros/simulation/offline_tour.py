@@ -1,0 +1,77 @@
+"""A tour of a cell, planned and ordered as the planner node does it, all at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.planning.candidates import candidate_poses, plan_poses
+from remaster_ros.planning.tour_order import Tour
+from remaster_ros.session.workcell import Cell
+from remaster_ros.types import FloatArray
+
+# As the planner node's default: distance kept from the joint limits.
+LIMIT_MARGIN_RAD = np.deg2rad(1.0)
+
+
+def plan_tour(
+    chain: SerialChain,
+    cell: Cell,
+    places: Mapping[str, FloatArray],
+    counts: Mapping[str, int],
+    rng: np.random.Generator,
+) -> Tour:
+    """Plan poses that face one sensor and that all of them see, for every split with a count.
+
+    Parameters
+    ----------
+    chain, cell
+        The arm, and where it works.
+    places
+        T_R_N of every sensor that has to see its marker, (4, 4).
+    counts
+        Split -> number of candidate poses.
+    rng
+        Source of randomness.
+
+    Raises
+    ------
+    InputError
+        No closed form for this robot, or no pose to fit that it can take.
+    """
+    inverse = InverseKinematics(chain, cell.held(chain))
+    # Nobody stands beside a simulated arm, and its meshes may be on another machine.
+    arm = cell.collision_model(chain, without_meshes=True)
+    sights = cell.lines_of_sight({name: T_R_N[:3, 3] for name, T_R_N in places.items()})
+    aim = places[cell.aim_at][:3, 3]
+    plans = {}
+    for split, count in counts.items():
+        if count:
+            candidates = candidate_poses(count, cell.poses.ranges(), aim, rng)
+            plans[split] = plan_poses(inverse, arm, candidates, sights, LIMIT_MARGIN_RAD)
+    tour = Tour(chain, plans)
+    if not tour.poses['optimization']:
+        raise InputError(
+            f'{tour.describe()}: no pose is left to fit; give more --poses, or a --cell with '
+            'ranges of poses that suit this robot'
+        )
+    return tour
+
+
+def visit(tour: Tour, chain: SerialChain) -> dict[str, list[FloatArray]]:
+    """Return each split's joint solutions, (m, k) per pose, in the order of the visits.
+
+    A simulated session goes from one split to the other, each nearest first.
+    """
+    visits: dict[str, list[FloatArray]] = {'optimization': [], 'validation': []}
+    q = np.clip(np.zeros(len(chain)), chain.lower, chain.upper)
+    for split, plan in tour.plans.items():
+        part = Tour(chain, {split: plan})
+        while (stop := part.next(q)) is not None:
+            visits[split].append(stop.solutions)
+            q = stop.solutions[-1]
+    return visits

@@ -1,0 +1,329 @@
+"""A fake OptiTrack server: NatNet over real UDP sockets, with the world behind it.
+
+The command channel answers at once in wall time, and clients are dropped by wall time, as both
+concern the network; frames come at `rate_hz` in world time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.sensors.optitrack.diagnosis import require_group
+from remaster_ros.sensors.optitrack.protocol import natnet
+from remaster_ros.sensors.optitrack.protocol.frames import Frame
+from remaster_ros.sensors.optitrack.protocol.natnet import (
+    ClientRequest,
+    Message,
+    MessageId,
+    ProtocolError,
+    Version,
+)
+from remaster_ros.sensors.optitrack.protocol.wire import require_supported
+from remaster_ros.sensors.optitrack.sockets import open_socket
+from remaster_ros.simulation.optitrack_faults import FrameFaults
+from remaster_ros.simulation.optitrack_scene import CLOCK_HZ, OptiTrackBehaviour, OptiTrackScene
+
+if TYPE_CHECKING:
+    from remaster_ros.simulation.world import WorldView
+
+MAX_CLIENTS = 16
+_POLL_WALL_S = 0.1
+_REFUSED = natnet.Response(b'\x01\0\0\0')
+_UNRECOGNIZED = natnet.Notice(MessageId.UNRECOGNIZED_REQUEST)
+_APP_VERSIONS = {2: (1, 10, 0, 0), 3: (2, 2, 0, 0), 4: (3, 1, 0, 0)}
+"""The Motive that streams each major version of NatNet."""
+
+Address = tuple[str, int]
+
+
+@dataclass
+class _Client:
+    """A unicast client: when it was last heard (wall time), and its bitstream."""
+
+    heard_s: float
+    version: Version
+
+
+class FakeOptiTrackServer:
+    """An OptiTrack server that streams the calibration marker of a world.
+
+    Parameters
+    ----------
+    world
+        See `WorldView`.
+    sensor
+        The camera bar's name in the world.
+    rng
+        Source of all randomness.
+    version
+        Bitstream version, such as ``(2, 10)``, ``(3, 1)`` or ``(4, 1)``.
+    transport
+        ``multicast`` streams to the group; ``unicast`` to every client that says CONNECT.
+    rate_hz
+        Frames per second of world time.
+    host
+        Address of the interface to serve.
+    command_port
+        Port to listen on; 0 takes a free one, see `command_port`.
+    multicast_group, data_port
+        Where multicast frames go.
+    unicast_port
+        Send unicast frames to this port of a client instead of the one that it speaks from, and
+        never drop it: old clients such as ``natnetclient`` listen there and say nothing more.
+    client_timeout_s
+        A unicast client that is silent for so long (wall time) is dropped.
+    behaviour
+        See `OptiTrackBehaviour`.
+
+    Raises
+    ------
+    InputError
+        If a setting cannot work.
+    """
+
+    def __init__(
+        self,
+        world: WorldView,
+        sensor: str,
+        rng: np.random.Generator,
+        *,
+        version: Version = (3, 1),
+        transport: Literal['multicast', 'unicast'] = 'multicast',
+        rate_hz: float = 30.0,
+        host: str = '127.0.0.1',
+        command_port: int = natnet.DEFAULT_COMMAND_PORT,
+        multicast_group: str = natnet.DEFAULT_MULTICAST_GROUP,
+        data_port: int = natnet.DEFAULT_DATA_PORT,
+        unicast_port: int | None = None,
+        client_timeout_s: float = 5.0,
+        behaviour: OptiTrackBehaviour | None = None,
+    ) -> None:
+        try:
+            require_supported(version)
+        except ProtocolError as error:
+            raise InputError(f'version: {error}') from error
+        if transport not in ('multicast', 'unicast'):
+            raise InputError(f'transport: {transport!r} is neither multicast nor unicast')
+        if not rate_hz > 0:
+            raise InputError(f'rate_hz: {rate_hz} is not above 0')
+        require_group(multicast_group)
+        self._world = world
+        self._version = version
+        self._transport = transport
+        self._rate_hz = rate_hz
+        self._host = host
+        self._wanted_port = command_port
+        self._group = (multicast_group, data_port)
+        self._unicast_port = unicast_port
+        self._client_timeout_s = client_timeout_s
+        self._sensor, self._spoiler = sensor, FrameFaults(rng)
+        self._scene = OptiTrackScene(world, sensor, rng, behaviour or OptiTrackBehaviour())
+        self._command: socket.socket | None = None
+        self._data: socket.socket | None = None
+        self._clients: dict[Address, _Client] = {}
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._latest: Frame | None = None
+        self.frames_sent = 0
+
+    @property
+    def command_port(self) -> int:
+        """The port that answers CONNECT, once started."""
+        assert self._command is not None, 'not started'
+        return self._command.getsockname()[1]
+
+    @property
+    def clients(self) -> tuple[Address, ...]:
+        """The unicast clients."""
+        with self._lock:
+            return tuple(self._clients)
+
+    def start(self) -> None:
+        """Open the sockets and begin to stream.
+
+        Raises
+        ------
+        DeviceError
+            If the command port is in use or the host is no address of this machine.
+        """
+        self._command = open_socket(
+            self._host,
+            self._wanted_port,
+            purpose='command port of the fake OptiTrack server',
+            remedy='set command_port to a free one',
+        )
+        self._command.settimeout(_POLL_WALL_S)
+        if self._transport == 'multicast':
+            self._data = open_socket(
+                self._host, 0, purpose='fake OptiTrack data', remedy='correct host'
+            )
+            interface = socket.inet_aton(self._host)
+            self._data.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, interface)
+            self._data.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+        self._closing.clear()
+        for work in (self._serve, self._stream):
+            thread = threading.Thread(target=work, name=f'optitrack{work.__name__}', daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def stop(self) -> None:
+        """End the threads and close the sockets; may be repeated."""
+        self._closing.set()
+        for thread in self._threads:
+            thread.join()
+        self._threads.clear()
+        for opened in (self._command, self._data):
+            if opened is not None:
+                opened.close()
+        self._command = self._data = None
+        self._clients.clear()
+
+    def __enter__(self) -> FakeOptiTrackServer:
+        """Start."""
+        self.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Stop."""
+        self.stop()
+
+    def _stream(self) -> None:
+        """Send frames at the rate in world time; those that come too late are left out."""
+        start_s = self._world.now()
+        number = 0
+        while not self._closing.is_set():
+            number = max(number + 1, int((self._world.now() - start_s) * self._rate_hz))
+            self._world.sleep(max(0.0, start_s + number / self._rate_hz - self._world.now()))
+            frame = self._scene.frame(number, self._version)
+            self._latest = frame
+            for message in self._spoiler.spoil(frame, self._world.faults(self._sensor)):
+                self._distribute(message)
+            self.frames_sent += 1
+
+    def _distribute(self, frame: Frame | bytes) -> None:
+        if self._data is not None:
+            self._send(frame, self._group, self._version, self._data)
+            return
+        with self._lock:
+            receivers = [(address, c.version) for address, c in self._clients.items()]
+        for (host, port), version in receivers:
+            self._send(frame, (host, self._unicast_port or port), version)
+
+    def _serve(self) -> None:
+        """Answer the command channel."""
+        assert self._command is not None
+        while not self._closing.is_set():
+            self._forget_silent_clients()
+            try:
+                datagram, address = self._command.recvfrom(1 << 16)
+                request = natnet.decode_request(datagram)
+            except (OSError, ProtocolError):
+                continue
+            if 'off' in self._world.faults(self._sensor):
+                continue
+            with self._lock:
+                if address in self._clients:
+                    self._clients[address].heard_s = time.monotonic()
+            for answer in self._answers(request, address):
+                self._send(answer, address, self._version_of(address))
+
+    def _answers(self, request: ClientRequest, address: Address) -> list[Message]:
+        """Act on a request; most have one answer, some have none."""
+        if request.id == MessageId.CONNECT:
+            self._welcome(address, request.wanted_version)
+            return [self._server_info()]
+        if request.id == MessageId.REQUEST:
+            return [self._obey(request.text, address)]
+        if request.id == MessageId.REQUEST_MODELDEF:
+            return [self._scene.model]
+        if request.id == MessageId.REQUEST_FRAMEOFDATA:
+            return [self._latest] if self._latest is not None else [_UNRECOGNIZED]
+        if request.id == MessageId.ECHOREQUEST:
+            ticks = self._scene.ticks(self._world.now())
+            return [natnet.EchoResponse(request.clock, ticks)]
+        if request.id == MessageId.DISCONNECT:
+            with self._lock:
+                self._clients.pop(address, None)
+            return []
+        return [] if request.id == MessageId.KEEPALIVE else [_UNRECOGNIZED]
+
+    def _welcome(self, address: Address, wanted: Version | None) -> None:
+        if self._transport != 'unicast':
+            return
+        version = wanted if wanted and self._can_stream(wanted) else self._version
+        with self._lock:
+            self._clients[address] = _Client(time.monotonic(), version)
+            while len(self._clients) > MAX_CLIENTS:
+                self._clients.pop(min(self._clients, key=lambda a: self._clients[a].heard_s))
+
+    def _server_info(self) -> natnet.ServerInfo:
+        group, data_port = self._group
+        connection = natnet.Connection(CLOCK_HZ, data_port, self._data is not None, group)
+        return natnet.ServerInfo(
+            'Fake OptiTrack of remaster_ros',
+            _APP_VERSIONS[self._version[0]],
+            self._version,
+            connection if self._version >= (3, 0) else None,
+        )
+
+    def _obey(self, command: str, address: Address) -> Message:
+        """Answer a REQUEST."""
+        name, _, argument = command.partition(',')
+        if name == 'FrameRate':
+            return natnet.Response(np.float32(self._rate_hz).tobytes())
+        if name != 'Bitstream':
+            return _UNRECOGNIZED
+        if argument:
+            with contextlib.suppress(ValueError), self._lock:
+                wanted = natnet.parse_version(argument)
+                if address in self._clients and self._can_stream(wanted):
+                    self._clients[address].version = wanted
+                    argument = ''
+            if argument:
+                return _REFUSED
+        version = natnet.format_version(self._version_of(address))
+        return natnet.Response(f'Bitstream,{version}\0'.encode())
+
+    def _can_stream(self, wanted: Version) -> bool:
+        """Servers from 4.0 on speak older bitstreams to unicast clients that ask."""
+        return self._version >= (4, 0) and (3, 0) <= wanted <= self._version
+
+    def _version_of(self, address: Address) -> Version:
+        with self._lock:
+            client = self._clients.get(address)
+        return client.version if client is not None else self._version
+
+    def _forget_silent_clients(self) -> None:
+        if self._unicast_port is not None:
+            return
+        oldest = time.monotonic() - self._client_timeout_s
+        with self._lock:
+            silent = [address for address, c in self._clients.items() if c.heard_s < oldest]
+            for address in silent:
+                del self._clients[address]
+        for address in silent:
+            notice = natnet.Notice(MessageId.DISCONNECT_BY_TIMEOUT)
+            self._send(notice, address, self._version)
+
+    def _send(
+        self,
+        message: Message | bytes,
+        address: Address,
+        version: Version,
+        through: socket.socket | None = None,
+    ) -> None:
+        # A network that is down loses datagrams, as everywhere; the server goes on.
+        sender = through or self._command
+        assert sender is not None
+        raw = message if isinstance(message, bytes) else natnet.encode_message(message, version)
+        with contextlib.suppress(OSError):
+            sender.sendto(raw, address)

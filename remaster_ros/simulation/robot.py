@@ -1,0 +1,189 @@
+"""A fake arm behind ros2_control: joint_trajectory_controller and joint_state_broadcaster.
+
+It does what the real controller of Jazzy does with a trajectory: permutes by joint name, drops
+with a log line what it cannot follow, an empty trajectory too, and does not clamp to limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from remaster_ros.simulation.arm_motion import Waypoint
+from remaster_ros.simulation.faults import Numbers, is_out
+from remaster_ros.simulation.world import World
+from remaster_ros.types import FloatArray
+
+
+@dataclass(frozen=True)
+class TrajectoryPoint:
+    """A point as it comes in a trajectory_msgs/JointTrajectory; seconds, rad, rad/s."""
+
+    time_from_start_s: float
+    positions: Sequence[float]
+    velocities: Sequence[float] = ()
+
+
+class FakeArm:
+    """Follows trajectories in the hidden World and reports joint states.
+
+    Parameters
+    ----------
+    world
+        The hidden World; this is the only fake that moves it.
+    rng
+        Source of repeatability errors, encoder noise and of the order of the reported joints.
+    """
+
+    def __init__(self, world: World, rng: np.random.Generator) -> None:
+        self.world = world
+        self.names = world.chain.joint_names
+        self._rng = rng
+        # joint_state_broadcaster reports in an order of its own; everyone must permute by name.
+        self._order = rng.permutation(len(self.names))
+        self._commanded: tuple[float, FloatArray] | None = None
+        self._braked = False
+        self._last: tuple[float, list[str], FloatArray, FloatArray] | None = None
+        self._reports = 0
+        self._wrapped_once = False
+
+    def command(
+        self, names: Sequence[str], points: Sequence[TrajectoryPoint], start_s: float = 0.0
+    ) -> str | None:
+        """Take a trajectory.
+
+        Parameters
+        ----------
+        names, points
+            As in the message.
+        start_s
+            The header's stamp, s; 0 means now.
+
+        Returns
+        -------
+        str or None
+            Why the trajectory was dropped, for the log; None when it is followed.
+        """
+        now = self.world.now()
+        faults = self.world.faults('robot')
+        reason = _fault_reason(faults, now) or self._refuse(names, points, start_s, now)
+        if reason is not None:
+            return reason
+        columns = [list(names).index(name) for name in self.names]
+        # The arm does not come back to quite the same place twice.
+        stray = self._rng.normal(0.0, self.world.truth.repeatability_rad, len(columns))
+        waypoints = []
+        for point in points:
+            q = np.asarray(point.positions, float)[columns] + stray
+            velocity = np.asarray(point.velocities, float)[columns] if point.velocities else None
+            waypoints.append(Waypoint(point.time_from_start_s, q, velocity))
+        waypoints = _spoil(waypoints, faults)
+        begin = max(start_s, now)
+        self._commanded = begin + waypoints[-1].time_s, np.asarray(points[-1].positions)[columns]
+        self.world.begin_motion(begin, waypoints)
+        return None
+
+    def _refuse(
+        self, names: Sequence[str], points: Sequence[TrajectoryPoint], start_s: float, now: float
+    ) -> str | None:
+        unknown = sorted(set(names) - set(self.names))
+        missing = sorted(set(self.names) - set(names))
+        if unknown or missing or len(names) != len(self.names):
+            return f'incoming joints do not match: unknown {unknown}, missing {missing}'
+        if not points:
+            return 'the trajectory is empty'
+        times = [0.0, *(point.time_from_start_s for point in points)]
+        if any(later <= earlier for earlier, later in pairwise(times)):
+            return 'time_from_start does not increase'
+        for point in points:
+            if len(point.positions) != len(self.names):
+                return f'{len(point.positions)} positions for {len(self.names)} joints'
+            if len(point.velocities) not in (0, len(self.names)):
+                return f'{len(point.velocities)} velocities for {len(self.names)} joints'
+            if not np.all(np.isfinite([*point.positions, *point.velocities])):
+                return 'a position or velocity is not finite'
+        if np.any(np.asarray(points[-1].velocities, float) != 0.0):
+            return 'velocity of the last point is not zero'
+        if start_s > 0.0 and start_s + times[-1] <= now:
+            return 'the trajectory ends in the past'
+        return None
+
+    def joint_state(self) -> tuple[float, list[str], FloatArray, FloatArray] | None:
+        """Report now: time (s), names, positions (rad), velocities (rad/s), in its own order.
+
+        None where nothing is reported: a robot that is off, or a report that is lost.
+        """
+        now, faults = self.world.now(), self.world.faults('robot')
+        if 'estop' not in faults:
+            self._braked = False
+        elif not self._braked:
+            self._brake(now)
+        self._reports += 1
+        lost = 'lost' in faults and self._reports % int(faults['lost']) != 0
+        if lost or 'off' in faults or is_out(faults.get('intermittent'), now):
+            return None
+        if 'repeated' in faults and self._last is not None:
+            return self._last
+        now -= faults.get('late', 0.0)
+        q, velocity = self.world.reported(now)
+        q = q + self._rng.normal(0.0, self.world.truth.encoder_rad, len(q))
+        if 'copy' in faults and self._commanded is not None and now >= self._commanded[0]:
+            q = self._commanded[1]
+        if 'drift' in faults:
+            q = q + faults['drift'] * np.arcsin(np.sin(now))
+        if 'nan' in faults:
+            q = np.where(np.arange(len(q)) == 2, np.nan, q)
+        if 'reordered' in faults:
+            self._order = self._rng.permutation(len(q))
+        q = q + self._wrap(faults)
+        order = self._order
+        prefix = 'other_' if 'renamed' in faults else ''
+        names = [prefix + self.names[i] for i in order]
+        stamp, q, velocity = now + faults.get('clock', 0.0), q[order], velocity[order]
+        if 'frozen' in faults and self._last is not None:
+            _, names, q, velocity = self._last
+        self._last = stamp, names, q, velocity
+        return self._last
+
+    @property
+    def copies(self) -> int:
+        """How often each report is sent."""
+        return 2 if 'doubled' in self.world.faults('robot') else 1
+
+    def _wrap(self, faults: Numbers) -> FloatArray:
+        """Return what a joint that is a turn off adds to the positions, rad, (k,)."""
+        turn = np.zeros(len(self.names))
+        if 'wrapped' in faults:
+            turn[int(faults['wrapped']) - 1] = 2 * np.pi
+        if 'wrapped_once' in faults and not self._wrapped_once:
+            turn[int(faults['wrapped_once']) - 1] = 2 * np.pi
+        self._wrapped_once = 'wrapped_once' in faults
+        return turn
+
+    def _brake(self, now: float) -> None:
+        """Stand still at once, as an emergency stop does."""
+        self._braked = True
+        q, velocity = self.world.reported(now)
+        braking_s = 0.15
+        end = q + 0.5 * braking_s * velocity
+        self.world.begin_motion(now, [Waypoint(braking_s, end, np.zeros_like(end))])
+
+
+def _fault_reason(faults: Numbers, now: float) -> str:
+    """Why a faulty robot takes no command; '' if it does."""
+    for name in ('off', 'dropped', 'estop'):
+        if name in faults:
+            return f'fault injected: {name}'
+    return 'fault injected: intermittent' if is_out(faults.get('intermittent'), now) else ''
+
+
+def _spoil(waypoints: Sequence[Waypoint], faults: Numbers) -> list[Waypoint]:
+    """Go beside the target, or slowly."""
+    slow, beside = faults.get('slow', 1.0), faults.get('elsewhere', 0.0)
+    return [
+        Waypoint(p.time_s * slow, p.q + beside, None if p.velocity is None else p.velocity / slow)
+        for p in waypoints
+    ]

@@ -1,0 +1,181 @@
+"""Draw a hidden World around a cell, and find the one of this DDS domain."""
+
+from __future__ import annotations
+
+import os
+import stat
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.workcell import Cell, config_path
+from remaster_ros.simulation.effect_sampling import Request, hide
+from remaster_ros.simulation.hidden_arm import ChainArm
+from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.simulation.offline_tour import plan_tour, visit
+from remaster_ros.simulation.world import START_S, Truth, World
+from remaster_ros.simulation.world_model import Round, Stage
+
+PRACTICE_CANDIDATES = 14
+# About what a configuration takes, world time.
+PRACTICE_STEP_S = 10.0
+
+
+def default_folder(namespace: str = '/') -> Path:
+    """Where the fakes of this user, DDS domain and ROS namespace meet when nobody says otherwise.
+
+    Parameters
+    ----------
+    namespace
+        Such as ``/left``: every cell of a domain has its own World.
+    """
+    domain = os.environ.get('ROS_DOMAIN_ID', '0')
+    cell = namespace.rstrip('/').replace('/', '%')
+    return Path(tempfile.gettempdir()) / f'remaster_world_{os.getuid()}_{domain}{cell}'
+
+
+def make_private_folder(folder: Path) -> None:
+    """Make a folder that nobody else may look into, or take over such a one.
+
+    Its name can be foreseen and the temporary directory is open to all: another user may have
+    put a folder or a link there, through which files elsewhere would be overwritten.
+
+    Raises
+    ------
+    InputError
+        There is something else of this name; see `require_private`.
+    """
+    try:
+        folder.mkdir(mode=0o700)
+    except FileExistsError:
+        require_private(folder)
+    except OSError as error:
+        raise InputError(
+            f'{folder}: the folder of the fakes cannot be made ({error.strerror}); set TMPDIR to '
+            f'a folder you may write to'
+        ) from None
+
+
+def require_private(folder: Path) -> None:
+    """Raise `InputError` unless this is a folder, no link, of this user and for him alone."""
+    try:
+        found = folder.lstat()
+    except OSError as error:
+        raise InputError(f'{folder}: cannot be looked at ({error.strerror})') from None
+    mode = stat.S_IMODE(found.st_mode)
+    if stat.S_ISLNK(found.st_mode):
+        wrong = 'is a link, which is not followed'
+    elif not stat.S_ISDIR(found.st_mode):
+        wrong = 'is no folder'
+    elif found.st_uid != os.getuid():
+        wrong = f'belongs to the user number {found.st_uid}'
+    elif mode & 0o077:
+        wrong = f'is open to other users (mode {mode:o} instead of 700)'
+    else:
+        return
+    raise InputError(
+        f'{folder}: {wrong}; the fakes meet in a folder of their user alone: remove it, or set '
+        f'TMPDIR or the parameter world'
+    )
+
+
+def make_world(
+    folder: Path,
+    cell: Cell,
+    seed: int,
+    rate: float,
+    hidden: Sequence[Request] = (),
+    candidates: int = PRACTICE_CANDIDATES,
+) -> World:
+    """Draw a hidden World for a cell; its time begins now.
+
+    Parameters
+    ----------
+    folder
+        Where to put it; a World that is there is replaced.
+    cell
+        The arm, the markers and the names of the sensors; where the sensors really stand, and how
+        far the arm is off, comes from config/fake_world.yaml and the seed.
+    seed
+        Of everything drawn.
+    rate
+        World time over wall time.
+    hidden
+        What else is wrong with the arm or the sensors.
+    candidates
+        Candidate poses of each split that will be visited; how large a hidden effect is depends
+        on them.
+    """
+    settings = yaml.safe_load(config_path('fake_world.yaml').read_text())
+    chain = cell.chain()
+    missing = sorted(set(cell.sensors) - set(settings['sensors']))
+    if missing:
+        raise InputError(f'fake_world.yaml places no sensor {", ".join(missing)}')
+    start_q = np.deg2rad(settings['start_q_deg'])
+    truth = Truth.draw(
+        seed,
+        len(chain),
+        {name: np.array(cell.markers[s.marker]) for name, s in cell.sensors.items()},
+        cell.marker_std_m,
+        {name: settings['sensors'][name] for name in cell.sensors},
+        np.deg2rad(settings['offset_std_deg']),
+    )
+    if hidden:
+        truth = replace(truth, effects=_draw_hidden(truth, cell, chain, hidden, candidates))
+    return World.create(
+        folder,
+        truth,
+        urdf=cell.urdf_text,
+        base_link=cell.robot.base_link,
+        tip_link=cell.robot.tip_link,
+        rate=rate,
+        start_q=start_q[: len(chain)],
+        link_radius_m=cell.link_radius_m,
+    )
+
+
+def _draw_hidden(
+    truth: Truth, cell: Cell, chain: SerialChain, hidden: Sequence[Request], candidates: int
+) -> tuple[HiddenEffect, ...]:
+    """Draw effects of the sizes they have on a round like the one that will be visited."""
+    rng = np.random.default_rng([truth.seed, 2])
+    places = {name: sensor.T_R_N for name, sensor in truth.sensors.items()}
+    counts = dict.fromkeys(('optimization', 'validation'), candidates)
+    visits = visit(plan_tour(chain, cell, places, counts, rng), chain)
+    q = np.concatenate([*visits['optimization'], *visits['validation']])
+    time_s = PRACTICE_STEP_S * np.arange(len(q), dtype=float)
+    practice = Round(q, q[0], time_s, truth.warming.at(START_S + time_s))
+    stage = Stage(ChainArm(chain), practice, *truth.staged(), truth.joint_offsets)
+    return hide(stage, hidden, rng)
+
+
+def open_world(folder: str, namespace: str = '/', timeout_s: float = 20.0) -> World:
+    """Open the World in `folder` ('' for the default one), waiting until somebody has made it.
+
+    Parameters
+    ----------
+    folder, namespace
+        See `default_folder`.
+    timeout_s
+        How long to wait, wall time, s.
+
+    Raises
+    ------
+    InputError
+        If there is none after `timeout_s` of wall time.
+    """
+    path = Path(folder) if folder else default_folder(namespace)
+    deadline = time.monotonic() + timeout_s
+    while not (path / 'world.yaml').exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    # As long as it is not there, somebody else may put it there.
+    if not folder and os.path.lexists(path):
+        require_private(path)
+    return World.open(path)

@@ -1,0 +1,271 @@
+"""An arm with whatever is wrong with it, on a round of visits, before sensors: what they see.
+
+The stage of every hidden world: the fakes play on it with the package's chain, the tests with
+pinocchio's. It also knows how much of an effect is left when registration, zero-offsets and
+markers are fitted, by least squares of its own: that is the size of an effect in millimetres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from remaster_ros.simulation.hidden_effects import (
+    SLACK_RAD,
+    Circumstances,
+    Deviation,
+    HiddenEffect,
+)
+from remaster_ros.types import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ArmState:
+    """The arm at n configurations, everything in the base frame R.
+
+    Attributes
+    ----------
+    origin
+        Origin of every joint, m, (n, k, 3).
+    before, after
+        Rotation of each joint's frame before and after its own turn, (n, k, 3, 3).
+    axis
+        Unit axis of each joint, (n, k, 3).
+    tool_origin, tool
+        Of the tool frame, m, (n, 3) and (n, 3, 3).
+    """
+
+    origin: FloatArray
+    before: FloatArray
+    after: FloatArray
+    axis: FloatArray
+    tool_origin: FloatArray
+    tool: FloatArray
+
+
+class Arm(Protocol):
+    """Kinematics and gravity of an arm of k joints as drawn."""
+
+    joints: int
+
+    def state(self, q: FloatArray) -> ArmState:
+        """Where every joint is for true joint angles q, rad, (n, k)."""
+
+    def gravity_torque(self, q: FloatArray) -> FloatArray:
+        """Torque with which gravity turns each joint its own way, N m, (n, k)."""
+
+    def base_moment(self, q: FloatArray) -> FloatArray:
+        """Moment of the moving links' weight about the base's origin, N m, (n, 3)."""
+
+    def segments(self) -> FloatArray:
+        """From each joint to the next one, the last to the tool, m, (k + 1, 3).
+
+        Segment j is fixed in the frame after joint j; segment 0, before joint 1, in the base.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class StagedSensor:
+    """A sensor: rotation and origin of its frame N in R, and the marker it follows."""
+
+    rotation: FloatArray
+    origin: FloatArray
+    marker: str
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """The configurations visited, in that order.
+
+    Attributes
+    ----------
+    q
+        As the robot reported them, rad, (m, k).
+    home
+        Where it came from first, rad, (k,).
+    time_s
+        Since the beginning, (m,).
+    warming_k
+        Temperature of the arm above that of the beginning, K, (m,).
+    """
+
+    q: FloatArray
+    home: FloatArray
+    time_s: FloatArray
+    warming_k: FloatArray
+
+    @cached_property
+    def came_from(self) -> FloatArray:
+        """Configuration before each, rad, (m, k)."""
+        return np.concatenate((self.home[None], self.q[:-1]))
+
+
+def circumstances(arm: Arm, visited: Round, joint_offsets: FloatArray) -> Circumstances:
+    """Return what effects may depend on, per configuration."""
+    q = visited.q + joint_offsets
+    move = visited.q - visited.came_from
+    approach = np.zeros_like(q)
+    last = np.zeros(arm.joints)
+    for i, step in enumerate(move):
+        last = np.where(np.abs(step) > SLACK_RAD, np.sign(step), last)
+        approach[i] = last
+    state = arm.state(q)
+    return Circumstances(
+        q=visited.q,
+        move=move,
+        approach=approach,
+        time_s=visited.time_s,
+        warming_k=visited.warming_k,
+        torque=arm.gravity_torque(q),
+        base_moment=arm.base_moment(q),
+        segments=arm.segments(),
+        axes=np.einsum('kji,kj->ki', state.after[0], state.axis[0]),
+        tool=state.tool,
+    )
+
+
+def deviation(
+    effects: Sequence[HiddenEffect], c: Circumstances, sensors: tuple[str, ...]
+) -> Deviation:
+    """Return what all the effects together do."""
+    n, k = c.q.shape
+    together = Deviation.none(n, k, sensors)
+    for effect in effects:
+        effect.add_to(together, c)
+    return together
+
+
+def placed(state: ArmState, marker: FloatArray, wrong: Deviation | None) -> FloatArray:
+    """Where a marker of the tool frame (3,) or (n, 3) is in R, m, (n, 3).
+
+    Small motions within the chain are exact: T₁D₁T₂D₂p = (A₁D₁A₁⁻¹)(A₂D₂A₂⁻¹)A₂p with A₂ = T₁T₂,
+    so each moves what lies outside it, the outermost first, in the frames of the chain as drawn.
+    """
+    markers = np.broadcast_to(marker, state.tool_origin.shape)
+    point = state.tool_origin + np.einsum('nij,nj->ni', state.tool, markers)
+    if wrong is None:
+        return point
+    for j in range(state.origin.shape[1], 0, -1):
+        point = point + np.einsum('nij,nj->ni', state.after[:, j - 1], wrong.shift[:, j])
+        tilt = np.einsum('nij,nj->ni', state.before[:, j - 1], wrong.tilt[:, j - 1])
+        arm = point - state.origin[:, j - 1]
+        point = state.origin[:, j - 1] + Rotation.from_rotvec(tilt).apply(arm)
+    return Rotation.from_rotvec(wrong.base).apply(point + wrong.shift[:, 0])
+
+
+@dataclass(eq=False)
+class Stage:
+    """The true arm and sensors on one round.
+
+    Attributes
+    ----------
+    arm
+        As drawn.
+    visited
+        Where it goes.
+    sensors
+        By name.
+    markers
+        True positions in the tool frame where nothing is hidden, m, name -> (3,).
+    joint_offsets
+        True joint angle minus reported one, rad, (k,).
+    """
+
+    arm: Arm
+    visited: Round
+    sensors: Mapping[str, StagedSensor]
+    markers: Mapping[str, FloatArray]
+    joint_offsets: FloatArray
+
+    @cached_property
+    def circumstances(self) -> Circumstances:
+        """What effects may depend on, per configuration."""
+        return circumstances(self.arm, self.visited, self.joint_offsets)
+
+    def seen(self, effects: Sequence[HiddenEffect] = ()) -> FloatArray:
+        """What the sensors see without noise, each in its own frame N, m, (n, 3).
+
+        Rows as they are recorded: at every configuration one of each sensor.
+        """
+        wrong = deviation(effects, self.circumstances, tuple(self.sensors))
+        state = self.arm.state(self.visited.q + self.joint_offsets + wrong.angle)
+        points = np.empty((len(self.visited.q), len(self.sensors), 3))
+        for s, (name, sensor) in enumerate(self.sensors.items()):
+            in_base = placed(state, self.markers[sensor.marker] + wrong.marker, wrong)
+            in_sensor = (in_base - sensor.origin) @ sensor.rotation
+            points[:, s] = wrong.measured(name, in_sensor)
+        return points.reshape(-1, 3)
+
+    def response(self, effect: HiddenEffect) -> FloatArray:
+        """How far an effect moves what the sensors see, m, (n, 3)."""
+        return self.seen([effect]) - self._as_drawn
+
+    @cached_property
+    def _as_drawn(self) -> FloatArray:
+        return self.seen()
+
+    @cached_property
+    def nuisance(self) -> FloatArray:
+        """Derivatives of what is seen by offsets, registrations, markers: m, (n, 3, p).
+
+        Offsets first (k), then six per sensor, last three per marker.
+        """
+        state = self.arm.state(self.visited.q + self.joint_offsets)
+        blocks = []
+        for s, sensor in enumerate(self.sensors.values()):
+            marker = self.markers[sensor.marker]
+            point = placed(state, marker, None)
+            turns = np.cross(state.axis, point[:, None] - state.origin)
+            offsets = np.swapaxes(turns, 1, 2)
+            centered = point - point.mean(axis=0)
+            turned = np.stack([np.cross(axis, centered) for axis in np.eye(3)], axis=-1)
+            shifted = np.broadcast_to(np.eye(3), (len(point), 3, 3))
+            frames = np.zeros((len(point), 3, 6 * len(self.sensors)))
+            frames[:, :, 6 * s : 6 * s + 6] = np.concatenate((shifted, turned), axis=2)
+            places = np.zeros((len(point), 3, 3 * len(self.markers)))
+            first = 3 * list(self.markers).index(sensor.marker)
+            places[:, :, first : first + 3] = state.tool
+            block = np.concatenate((offsets, frames, places), axis=2)
+            blocks.append(np.einsum('ji,njp->nip', sensor.rotation, block))
+        return np.stack(blocks, axis=1).reshape(-1, 3, blocks[0].shape[2])
+
+    def left(self, response: FloatArray, *, fit_markers: bool = True) -> FloatArray:
+        """What of a response (n, 3) no registration, offsets and markers take up, m, (n, 3)."""
+        basis = self._basis if fit_markers else self._basis_without_markers
+        flat = response.ravel()
+        return (flat - basis @ (basis.T @ flat)).reshape(-1, 3)
+
+    @cached_property
+    def _basis(self) -> FloatArray:
+        return _span(self.nuisance.reshape(-1, self.nuisance.shape[2]))
+
+    @cached_property
+    def _basis_without_markers(self) -> FloatArray:
+        fixed = self.nuisance[:, :, : -3 * len(self.markers)]
+        return _span(fixed.reshape(-1, fixed.shape[2]))
+
+    def size_m(self, effect: HiddenEffect) -> float:
+        """What is left of an effect, RMS of the 3-D error over all rows, m.
+
+        A wrong marker is measured against a marker that is held where it should be: if it were
+        fitted, nothing would be left.
+        """
+        left = self.left(self.response(effect), fit_markers=effect.kind != 'marker_offset')
+        return float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
+
+    def of_size(self, effect: HiddenEffect, size_m: float) -> HiddenEffect:
+        """Scale an effect so that this is left of it."""
+        for _ in range(3):  # all but linear
+            effect = effect.scaled(size_m / self.size_m(effect))
+        return effect
+
+
+def _span(design: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of what the columns of a design span, (3 n, rank)."""
+    basis, singular, _ = np.linalg.svd(design, full_matrices=False)
+    return basis[:, singular > 1e-9 * singular[0]]

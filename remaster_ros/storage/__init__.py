@@ -1,1 +1,0 @@
-"""Session folders, rosbag2 (MCAP), result files, reports and figures; no ROS graph."""

@@ -1,0 +1,260 @@
+"""Frozen records that pass between collection, storage and estimation. SI units throughout."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+Split = Literal['optimization', 'validation', 'reference']
+
+FARTHEST_M = 200.0
+"""More than any tracker's range: such a number is in millimetres, or broken."""
+
+
+@dataclass(frozen=True)
+class JointSolution:
+    """One joint solution of a Cartesian pose.
+
+    Attributes
+    ----------
+    q
+        Joint positions, base to tip, rad, shape (k,).
+    position_error_m, rotation_error_rad
+        What forward kinematics leaves against the wanted pose.
+    """
+
+    q: FloatArray
+    position_error_m: float
+    rotation_error_rad: float
+
+
+@dataclass(frozen=True)
+class MarkerReading:
+    """One marker position measured by one sensor, in the sensor's own frame N.
+
+    Attributes
+    ----------
+    stamp_s
+        Time of capture, s.
+    position
+        Marker position in N, m, shape (3,).
+    """
+
+    stamp_s: float
+    position: FloatArray
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One row of ``observations.csv``: where the robot says it is, where a sensor saw a marker.
+
+    Attributes
+    ----------
+    q, from_q
+        Reported joint positions, and those it came from (None where unknown), rad, (k,).
+    position, std
+        Mean marker position in N over the dwell, and the samples' standard deviation
+        (None for a single shot), m, (3,).
+    samples
+        How many samples the mean has; None where unknown.
+    """
+
+    observation: int
+    pose: int
+    configuration: int
+    split: Split
+    stamp_s: float
+    sensor: str
+    marker: str
+    q: FloatArray
+    position: FloatArray
+    from_q: FloatArray | None = None
+    std: FloatArray | None = None
+    samples: int | None = None
+    temperature_c: float | None = None
+
+
+@dataclass(frozen=True)
+class BasePrior:
+    """A sensor's registration known beforehand: T_R_N, the sensor frame N in the robot base R.
+
+    Attributes
+    ----------
+    translation_m
+        Sensor origin in R, m, (3,).
+    rotation_xyzw
+        Unit quaternion of R_R_N, (4,).
+    std_m, std_rad
+        Standard deviation per axis.
+    """
+
+    translation_m: FloatArray
+    rotation_xyzw: FloatArray
+    std_m: float
+    std_rad: float
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What a user knows before a fit, beyond what the session says, and instead of it.
+
+    Attributes
+    ----------
+    joint_offsets
+        Joint name -> mean and standard deviation, rad.
+    markers
+        Marker name -> position in the tool frame T, m, (3,), and standard deviation per axis, m.
+    base
+        Sensor name -> registration.
+    """
+
+    joint_offsets: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    markers: Mapping[str, tuple[FloatArray, float]] = field(default_factory=dict)
+    base: Mapping[str, BasePrior] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """The observations of a session as columns; row i of every array is one observation.
+
+    Attributes
+    ----------
+    observation, pose, configuration
+        Integers as in the file, (n,).
+    is_validation
+        True where ``split`` is ``validation``, (n,).
+    stamp_s
+        Time of the measurement, s, (n,).
+    sensor, marker
+        Index into the session's ``sensors`` / ``markers`` (in their order), (n,).
+    q, from_q
+        Joint positions, rad, (n, k); ``from_q`` is NaN where unknown.
+    position, std
+        Marker in the sensor's own frame N and its dwell std, m, (n, 3); ``std`` NaN if unknown.
+    samples
+        Samples in the mean, (n,); -1 where unknown.
+    temperature_c
+        Degrees Celsius, (n,); NaN where unknown.
+    effort
+        Measured joint torques, N m, (n, k), NaN where unknown; None if the file has no column.
+    is_reference
+        True where ``split`` is ``reference``, (n,); None where none is, as in every session.
+    """
+
+    observation: IntArray
+    pose: IntArray
+    configuration: IntArray
+    is_validation: BoolArray
+    stamp_s: FloatArray
+    sensor: IntArray
+    marker: IntArray
+    q: FloatArray
+    from_q: FloatArray
+    position: FloatArray
+    std: FloatArray
+    samples: IntArray
+    temperature_c: FloatArray
+    effort: FloatArray | None = None
+    is_reference: BoolArray | None = None
+
+    def __len__(self) -> int:
+        """Return the number of observations."""
+        return len(self.observation)
+
+    @classmethod
+    def empty(cls, joints: int) -> Measurements:
+        """Return no observations of an arm with that many joints."""
+        integers, numbers = np.zeros(0, np.int64), np.zeros(0)
+        return cls(
+            observation=integers,
+            pose=integers,
+            configuration=integers,
+            is_validation=np.zeros(0, bool),
+            stamp_s=numbers,
+            sensor=integers,
+            marker=integers,
+            q=np.zeros((0, joints)),
+            from_q=np.zeros((0, joints)),
+            position=np.zeros((0, 3)),
+            std=np.zeros((0, 3)),
+            samples=integers,
+            temperature_c=numbers,
+        )
+
+    def select(self, rows: BoolArray | IntArray) -> Measurements:
+        """Return the given rows (a mask or indices), in that order."""
+        columns: dict[str, Any] = {
+            name: None if value is None else value[rows] for name, value in vars(self).items()
+        }
+        return Measurements(**columns)
+
+
+@dataclass(frozen=True)
+class Session:
+    """A session: the robot, the markers and sensors, and what was measured.
+
+    Attributes
+    ----------
+    urdf
+        Text of the nominal robot's URDF.
+    markers
+        Nominal marker positions in the tool frame T, m, name -> (3,).
+    marker_std_m
+        How well the nominal marker positions are known, per axis, m.
+    sensors
+        Sensor name -> the marker it follows while collecting.
+    measurements
+        What is fitted and what is held out: no row of them is a reference.
+    references
+        Rows of configurations that were measured again and again, to watch for changes; neither
+        fitted nor in any metric. None where there are none.
+    base_prior
+        Sensor name -> registration known beforehand.
+    exit_status
+        ``complete``, ``stopped``, ``aborted`` or '' where the file does not say.
+    extra
+        Keys of session.yaml this version does not know, kept as they are.
+    """
+
+    urdf: str
+    base_link: str
+    tip_link: str
+    markers: Mapping[str, FloatArray]
+    sensors: Mapping[str, str]
+    measurements: Measurements
+    marker_std_m: float = 0.5e-3
+    settle_s: float = 3.0
+    base_prior: Mapping[str, BasePrior] = field(default_factory=dict)
+    exit_status: str = ''
+    notes: str = ''
+    created: str = ''
+    extra: Mapping[str, Any] = field(default_factory=dict)
+    references: Measurements | None = None
+
+    @property
+    def urdf_sha256(self) -> str:
+        """SHA-256 of the URDF's text, which tells whose offsets a result holds."""
+        return hashlib.sha256(self.urdf.encode()).hexdigest()
+
+    @property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Sensor names in index order."""
+        return tuple(self.sensors)
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Marker names in index order."""
+        return tuple(self.markers)
+
+    def select(self, rows: BoolArray | IntArray) -> Session:
+        """Return this session with only the given rows."""
+        return replace(self, measurements=self.measurements.select(rows))

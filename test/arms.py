@@ -1,0 +1,23 @@
+"""Small arms for the tests of collisions: planar ones, of links that are easy to reckon with."""
+
+from __future__ import annotations
+
+from remaster_ros.kinematics.serial_chain import SerialChain
+
+
+def planar_arm(links, axis='0 1 0', limit=None):
+    """Return an arm of 0.3 m links in the X-Z plane: positive angles turn from Z towards X."""
+    kind = 'continuous' if limit is None else 'revolute'
+    bounds = '' if limit is None else f'<limit lower="{-limit}" upper="{limit}"/>'
+    parts = ['<link name="link_0"/>']
+    for i in range(1, links + 1):
+        parts.append(
+            f'<link name="link_{i}"/><joint name="joint_{i}" type="{kind}">{bounds}'
+            f'<parent link="link_{i - 1}"/><child link="link_{i}"/>'
+            f'<origin xyz="0 0 0.3"/><axis xyz="{axis}"/></joint>'
+        )
+    parts.append(
+        f'<link name="tool"/><joint name="tool_joint" type="fixed"><parent link="link_{links}"/>'
+        '<child link="tool"/><origin xyz="0 0 0.3"/></joint>'
+    )
+    return SerialChain.from_urdf('<robot name="planar">' + ''.join(parts) + '</robot>')

@@ -1,0 +1,122 @@
+"""A fit with further physical effects: the truth comes back, next to the core parameters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration_scenes import CHAIN, extension, scene
+
+from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.fit import fit_session
+from remaster_ros.errors import InputError
+
+COMPLIANCE = np.array([2e-5, 4e-5])  # rad/(N m), of joints 2 and 4
+GROWTH = 1e-3  # of all measured positions, per m of the point's place in R
+
+
+@pytest.fixture(scope='module')
+def sagging():
+    """A session whose arm sags at joints 2 and 4 and grows: the arrays of what is added."""
+    session, truth = scene(31, poses=20)
+    measured = session.measurements
+    torque = CHAIN.gravity_torque(measured.q)
+    n = len(measured)
+    joint = np.zeros((n, 7, 3))
+    joint[:, 1, 0], joint[:, 3, 1] = torque[:, 1], torque[:, 3]
+    points = CHAIN.positions(measured.q, session.markers['sir'])
+    displacement = np.zeros((n, 3, 3))
+    displacement[:, :, 2] = points
+    moved = CHAIN.positions(
+        measured.q, session.markers['sir'], joint[:, :, :2] @ COMPLIANCE
+    ) - CHAIN.positions(measured.q, session.markers['sir'])
+    moved += GROWTH * points
+    to_sensor = truth.sensors['mocap'].T_R_N[:3, :3]
+    session = replace(
+        session, measurements=replace(measured, position=measured.position + moved @ to_sensor)
+    )
+    return session, {
+        'names': ('compliance_2', 'compliance_4', 'growth'),
+        'units': ('rad/(N m)', 'rad/(N m)', '1'),
+        'joint': joint,
+        'displacement': displacement,
+        'displacement0': np.zeros((n, 3)),
+        'theta0': np.zeros(3),
+        'prior_precision': np.diag([1e4**2, 1e4**2, 0.0]),
+    }
+
+
+def test_effects_come_back_with_their_uncertainty(sagging) -> None:
+    """Within 4.5 standard deviations: wrong in 1 of 50,000 seeds."""
+    session, arrays = sagging
+    given = extension(**arrays)
+    result = fit_session(session, rng=np.random.default_rng(1), draws=400, extension=given)
+    assert result.theta_names == given.names
+    assert result.theta_draws.shape == (*result.draws.shape[:2], 3)
+    assert 'effect.growth' in result.parameter_names
+    truth = np.array([*COMPLIANCE, GROWTH])
+    assert np.all(np.abs(result.theta - truth) < 4.5 * result.theta_std)
+    assert np.all(result.theta_std < np.array([2e-5, 2e-5, 5e-4]))
+    np.testing.assert_allclose(
+        result.theta, result.theta_draws.reshape(-1, 3).mean(axis=0), rtol=1e-6
+    )
+    without = fit_session(session, rng=np.random.default_rng(1), draws=400)
+    assert without.theta.shape == (0,)
+    errors = [np.sqrt(np.mean(r.residuals_after**2)) for r in (without, result)]
+    assert errors[1] < 0.9 * errors[0]
+
+
+def test_a_prior_on_effects_pulls_them_to_zero(sagging) -> None:
+    session, arrays = sagging
+    tight = replace(extension(**arrays), prior_precision=np.diag([1e8**2, 1e8**2, 1e6**2]))
+    found = estimate(Problem.of(session), tight)
+    theta = found.model.theta(found.mode.z)
+    assert np.all(np.abs(theta) < [1e-7, 1e-7, 1e-5])
+
+
+def test_what_only_its_prior_knows_is_as_wide_as_the_prior(sagging) -> None:
+    """A spline beyond the data, beside an effect whose unit is six decades smaller."""
+    session, arrays = sagging
+    nothing = np.zeros_like(arrays['joint'][:, :, :1])
+    displacement = arrays['displacement']
+    drift = 1e6 * displacement[:, :, 2:] * session.measurements.q[:, None, 1:2]
+    beyond = extension(
+        names=(*arrays['names'], 'edge', 'drift'),
+        units=(*arrays['units'], 'rad', 'm/s'),
+        joint=np.concatenate((arrays['joint'], nothing, nothing), axis=2),
+        displacement=np.concatenate((displacement, 0.0 * drift, drift), axis=2),
+        displacement0=arrays['displacement0'],
+        theta0=np.zeros(5),
+        prior_precision=np.diag([1e4**2, 1e4**2, 0.0, 3e-4**-2, 1e-9**-2]),
+    )
+    result = fit_session(session, rng=np.random.default_rng(2), draws=800, extension=beyond)
+    # 3,000 effective draws: a std to 1.3 %, six times that.
+    assert result.theta_std[3] == pytest.approx(3e-4, rel=0.08)
+    assert not any('edge' in direction.fixed_by for direction in result.gauge)
+
+
+def test_an_effect_that_is_a_zero_offset_in_disguise_is_held_and_named(sagging) -> None:
+    session, arrays = sagging
+    joint = arrays['joint'].copy()
+    joint[:, 2, 0], joint[:, 1, 0] = 1.0, 0.0
+    twin = extension(**{**arrays, 'joint': joint, 'prior_precision': np.zeros((3, 3))})
+    gauge = estimate(Problem.of(session), twin).gauge
+    direction = next(d for d in gauge.directions if 'effect.compliance_2' in d.combination)
+    assert direction.combination['joint_3'] == pytest.approx(-1.0, abs=1e-6)
+    assert direction.fixed_by == 'effect.compliance_2 = 0'
+    assert 'effect.compliance_2' in gauge.why[2]
+    # With a prior on its size it need not be held.
+    known = replace(twin, prior_precision=np.diag([1e3**2, 0.0, 0.0]))
+    found = estimate(Problem.of(session), known)
+    assert found.gauge.held.tolist() == [0]
+    direction = next(d for d in found.gauge.directions if 'effect.compliance_2' in d.combination)
+    assert direction.fixed_by == 'the prior on the effects'
+
+
+def test_the_paper_s_model_takes_no_effects(sagging) -> None:
+    session, arrays = sagging
+    with pytest.raises(InputError, match='fast sampler'):
+        fit_session(
+            session, rng=np.random.default_rng(1), sampler='paper', extension=extension(**arrays)
+        )

@@ -1,0 +1,234 @@
+"""The log density against SciPy's, and the linear approximation against the exact density."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration_scenes import scene
+from scipy.stats import kstest, multivariate_normal
+
+from remaster_ros.calibration import laplace, sampling
+from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.laplace import find_mode
+from remaster_ros.calibration.metropolis import random_walk_sampler
+from remaster_ros.calibration.posterior import RESOLUTION_M
+from remaster_ros.calibration.priors import base_prior, marker_prior
+from remaster_ros.calibration.proposal import FactorisedProposal, LaplaceProposal
+from remaster_ros.calibration.sampling import sample_posterior
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.kinematics.transforms import quaternion_xyzw
+from remaster_ros.types import BasePrior
+
+
+@pytest.fixture(scope='module')
+def found():
+    return estimate(Problem.of(scene(11, poses=12, sensor_count=2)[0]))
+
+
+def test_density_is_that_of_correlated_normal_errors(found) -> None:
+    """The whole covariance matrix of every sensor's errors, written out."""
+    posterior, model = found.posterior, found.model
+    rng = np.random.default_rng(1)
+    points, _ = LaplaceProposal.of(found.mode).sample(6, rng)
+    expected = []
+    for point in points:
+        sigma, pose_sigma = posterior.noise(point[len(posterior.free) :])
+        z = posterior.parameters(point)
+        errors = posterior.rows.target - model.predict(z, posterior.rows)
+        value = 0.0
+        group = posterior.rows.group_of_row
+        for sensor, span in posterior.rows.spans:
+            same = group[span, None] == group[None, span]
+            covariance = sigma[sensor] ** 2 * np.eye(same.shape[0])
+            covariance += pose_sigma[sensor] ** 2 * same
+            for axis in range(3):
+                value += multivariate_normal(cov=covariance).logpdf(errors[span, axis])
+            # Flat in log sigma above the resolution; half-Cauchy ratio with d ratio / d asinh.
+            ratio = pose_sigma[sensor] / sigma[sensor]
+            value += -0.5 * (RESOLUTION_M / sigma[sensor]) ** 2
+            value += -np.log1p(ratio**2) + 0.5 * np.log1p(ratio**2)
+        x = model.natural(z)
+        for index, nominal in enumerate(found.problem.markers):
+            value += multivariate_normal(nominal, 0.25e-6 * np.eye(3)).logpdf(
+                x[model.marker(index)]
+            )
+        expected.append(value)
+    ours = posterior.log_density(points)
+    np.testing.assert_allclose(ours - ours[0], np.array(expected) - expected[0], atol=1e-6)
+
+
+def test_negative_ratios_have_no_density(found) -> None:
+    point, _ = LaplaceProposal.of(found.mode).sample(1, np.random.default_rng(1))
+    point[0, -1] *= -1.0
+    assert found.posterior.log_density(point)[0] == -np.inf
+
+
+def test_linearised_posterior_is_nearly_the_exact_one(found) -> None:
+    """Conditional times marginal equals the density but for a constant, near the mode."""
+    proposal = LaplaceProposal.of(found.mode)
+    points, _ = proposal.sample(200, np.random.default_rng(2))
+    f = len(found.posterior.free)
+    mean, factor, marginal = found.mode.linearisation.conditional(points[:, f:])
+    whitened = np.einsum('nji,nj->ni', factor, points[:, :f] - mean)
+    log_root = np.sum(np.log(np.diagonal(factor, axis1=-2, axis2=-1)), axis=-1)
+    linear = marginal - 0.5 * np.sum(whitened**2, axis=1) + log_root
+    difference = found.posterior.log_density(points) - linear
+    assert np.std(difference) < 0.05
+
+
+@pytest.mark.parametrize('kind', [LaplaceProposal, FactorisedProposal])
+def test_proposal_reports_the_density_it_samples_from(found, kind) -> None:
+    proposal = kind.of(found.mode)
+    points, density = proposal.sample(50, np.random.default_rng(3))
+    np.testing.assert_allclose(proposal.log_density(points), density)
+    assert np.all(points[:, -2:] >= 0.0)
+
+
+def test_mode_is_where_the_exact_density_peaks(found) -> None:
+    """Given the noise: every step of half a standard deviation lowers the density."""
+    posterior, mode = found.posterior, found.mode
+    top = np.concatenate((mode.z[posterior.free], mode.eta))
+    value = posterior.log_density(top[None])[0]
+    width = np.sqrt(np.diag(mode.covariance))
+    for index, std in enumerate(width):
+        for sign in (0.5, -0.5):
+            beside = top.copy()
+            beside[index] += sign * std
+            assert posterior.log_density(beside[None])[0] < value
+
+
+@pytest.mark.parametrize('seed', [60, 61])
+def test_few_poses_do_not_take_long_chains(seed) -> None:
+    """Five poses, two sensors, noise by direction: the part common to a pose reaches far up."""
+    session, _ = scene(seed, poses=5, sensor_count=2, pose_sigma_m=0.1e-3)
+    found = estimate(Problem.of(session))
+    p = found.posterior
+    mode = find_mode(type(p).of(p.model, p.rows, p.priors, p.free, found.mode.z, split=(0, 1)))
+    run, name = sample_posterior(mode, chains=4, rng=np.random.default_rng(seed))
+    assert 'factorised for every draw' in name
+    # 100,000 did not suffice in such a session.
+    assert run.draws.shape[1] < 12_000
+
+
+def test_the_draws_do_not_depend_on_the_proposal() -> None:
+    """Independent proposals and a random walk of the same target; KS at 1 in 1,000."""
+    # Few rows, noise at zero: as far from Gaussian as a session gets.
+    session, _ = scene(12, poses=5, pose_sigma_m=0.0)
+    mode = estimate(Problem.of(session)).mode
+    rng = np.random.default_rng(4)
+    independent, name = sample_posterior(mode, chains=4, draws=1500, rng=rng)
+    assert 'Laplace' in name
+    posterior = mode.linearisation.posterior
+    factor = np.linalg.cholesky(np.cov(independent.draws.reshape(-1, posterior.size).T))
+    step = 2.38 / np.sqrt(posterior.size)
+    walk = random_walk_sampler(
+        posterior.log_density,
+        lambda source: step * source.standard_normal((60, posterior.size)) @ factor.T,
+        start=independent.draws[:, :15].reshape(60, -1),
+        steps=1000,
+        burn_in=100,
+        rng=rng,
+        thin=150,
+    )
+    for index in range(posterior.size):
+        sample = independent.draws[:, ::3, index].ravel()
+        assert kstest(sample, walk.draws[..., index].ravel()).pvalue > 1e-3 / posterior.size
+
+
+def test_poor_proposals_are_adapted_and_said_so() -> None:
+    """A Laplace proposal with the noise three standard deviations off and half as wide."""
+    found = estimate(Problem.of(scene(13, poses=8)[0]))
+    width = np.sqrt(np.diag(found.mode.eta_covariance))
+    narrow = replace(
+        found.mode,
+        eta=found.mode.eta + 3.0 * width,
+        eta_covariance=0.25 * found.mode.eta_covariance,
+    )
+    run, name = sample_posterior(narrow, chains=4, draws=1000, rng=np.random.default_rng(5))
+    assert 'adapted' in name
+    right, _ = sample_posterior(found.mode, chains=4, draws=1000, rng=np.random.default_rng(6))
+    ours, theirs = (r.draws.reshape(-1, found.posterior.size) for r in (run, right))
+    shift = np.abs(ours.mean(axis=0) - theirs.mean(axis=0)) / theirs.std(axis=0)
+    # Some 500 effective draws on either side.
+    assert shift.max() < 0.25
+    np.testing.assert_allclose(ours.std(axis=0), theirs.std(axis=0), rtol=0.25)
+
+
+def test_a_random_walk_is_the_last_resort(found, monkeypatch) -> None:
+    monkeypatch.setattr(sampling, 'POOR_ACCEPTANCE', 1.1)
+    monkeypatch.setattr(sampling, 'PILOT_STEPS', 100)
+    monkeypatch.setattr(sampling, 'WALK_STEPS_PER_DRAW', 2)
+    stages: set[str] = set()
+    run, name = sample_posterior(
+        found.mode,
+        chains=4,
+        draws=50,
+        rng=np.random.default_rng(7),
+        report=lambda stage, share: stages.add(stage),
+    )
+    assert name.startswith('random-walk')
+    assert run.draws.shape == (4, 50, found.posterior.size)
+    assert 0.05 < run.acceptance_rate < 0.6
+    assert stages == {'sampling', 'adapting the sampler', 'sampling by random walk'}
+
+
+def test_a_random_walk_to_a_precision_is_as_long_as_it_takes(found, monkeypatch) -> None:
+    """Against the independent sampler of the same posterior; more chains than were asked for."""
+    monkeypatch.setattr(sampling, 'POOR_ACCEPTANCE', 1.1)
+    monkeypatch.setattr(sampling, 'FIRST_DRAWS', 40)
+    monkeypatch.setattr(sampling, 'WARM_UP', 10)
+    monkeypatch.setattr(sampling, 'R_HAT_LIMIT', 1.1)
+    ask = {'chains': 4, 'precision': 0.1}
+    run, name = sample_posterior(found.mode, rng=np.random.default_rng(7), **ask)
+    assert name.startswith('random-walk')
+    assert run.draws.shape[0] == sampling.PILOT_CHAINS
+    monkeypatch.undo()
+    right, _ = sample_posterior(found.mode, rng=np.random.default_rng(8), **ask)
+    ours, theirs = (r.draws.reshape(-1, found.posterior.size) for r in (run, right))
+    # Some 100 effective draws at least on either side: five standard errors.
+    shift = np.abs(ours.mean(axis=0) - theirs.mean(axis=0)) / theirs.std(axis=0)
+    assert shift.max() < 5 * np.sqrt(2) * 0.1
+
+
+def test_the_step_of_a_walk_suits_the_bulk_of_what_has_long_tails() -> None:
+    """A Gaussian takes its own best step; a narrow core in a wide shell a shorter one."""
+    rng, d = np.random.default_rng(9), 6
+    start = rng.standard_normal((32, d))
+    gaussian = sampling._step_scale(lambda x: -0.5 * np.sum(x**2, axis=1), np.eye(d), start, rng)
+    assert gaussian >= 0.7
+    core = sampling._step_scale(lambda x: -0.5 * np.sum(x**2, axis=1), 5.0 * np.eye(d), start, rng)
+    assert core == 0.25
+
+
+def test_priors_are_standard_normal_in_their_own_units(found) -> None:
+    model = found.model
+    x = np.zeros(model.size)
+    x[model.marker(0)] = [0.101, 0.0, 0.022]
+    residual = marker_prior(model, 0, np.array([0.1, 0.0, 0.02]), 1e-3).residual(x)
+    np.testing.assert_allclose(residual, [1.0, 0.0, 2.0])
+    T = model.reference[1]
+    known = BasePrior(T[:3, 3] - [0.002, 0.0, 0.0], quaternion_xyzw(T[:3, :3]), 1e-3, 1e-2)
+    np.testing.assert_allclose(
+        base_prior(model, 1, known).residual(x), [2, 0, 0, 0, 0, 0], atol=1e-9
+    )
+
+
+def test_a_parameter_without_information_is_an_error_not_a_crash(found) -> None:
+    bare = replace(found.posterior, priors=(), free=np.arange(found.model.size))
+    with pytest.raises(InsufficientDataError, match='hardly determine'):
+        find_mode(bare)
+
+
+def test_steps_that_settle_slowly_are_near_enough_and_none_at_all_is_refused(monkeypatch) -> None:
+    posterior = estimate(Problem.of(scene(47, poses=12)[0])).posterior
+    usual = find_mode(posterior)
+    monkeypatch.setattr(laplace, 'SETTLED', 0.0)
+    near = find_mode(posterior)
+    std = np.sqrt(np.diag(usual.covariance))
+    off = near.z[posterior.free] - usual.z[posterior.free]
+    assert np.all(np.abs(off) < 1e-2 * std[: len(off)])
+    monkeypatch.setattr(laplace, 'NEAR_ENOUGH', 0.0)
+    with pytest.raises(InsufficientDataError, match='does not settle'):
+        find_mode(posterior)

@@ -1,0 +1,153 @@
+"""Section V-C on posteriors whose distances are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration_scenes import CHAIN, extension, scene
+
+from remaster_ros.calibration import predictive_accuracy
+from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.predictive_accuracy import (
+    Predictive,
+    random_configurations,
+    theoretical_distances,
+)
+from remaster_ros.types import Measurements
+
+DRAWS = 300
+
+
+@pytest.fixture(scope='module')
+def seen() -> Measurements:
+    session, _ = scene(300, poses=12, sensor_count=2)
+    return session.measurements
+
+
+def predictive(size_of: dict[str, float], sigma_m: float = 0.0) -> Predictive:
+    """Return draws of the named parameters with these std about zero, all else fixed."""
+    model = Model(
+        CHAIN,
+        ('mocap', 'tracker'),
+        ('sir', 'smr'),
+        np.tile(np.eye(4), (2, 1, 1)),
+        np.zeros((2, 3)),
+    )
+    rng = np.random.default_rng(7)
+    after = model.vector(np.zeros(7), np.array([[0.1, 0.0, 0.02], [-0.1, 0.0, 0.02]]))
+    draws = np.tile(after, (DRAWS, 1))
+    for name, std in size_of.items():
+        draws[:, model.names.index(name)] += std * rng.standard_normal(DRAWS)
+    return Predictive(model, after.copy(), after, draws, np.full((DRAWS, 2, 2), sigma_m))
+
+
+def distances(given: Predictive, seen: Measurements, seed: int = 0):
+    everything = np.arange(len(seen))
+    return theoretical_distances(given, seen, everything, np.random.default_rng(seed))
+
+
+def test_a_shift_of_the_registration_is_the_distance(seen: Measurements) -> None:
+    """Along one axis: |N(0, std)| for the invariant version, nothing for the paper's."""
+    shifts = {'registration.mocap.x': 1e-3, 'registration.tracker.x': 1e-3}
+    invariant, paper = distances(predictive(shifts), seen)
+    # 300 draws know the mean of |x| to 4.4 %: five standard errors.
+    assert invariant.after.mean() == pytest.approx(1e-3 * np.sqrt(2 / np.pi), rel=0.22)
+    np.testing.assert_allclose(paper.after, 0.0, atol=1e-12)
+
+
+def test_an_offset_of_joint_1_counts_in_the_papers_version_alone(seen: Measurements) -> None:
+    given = predictive({'joint_1': 1e-3})
+    given = replace(given, draws=given.draws + np.eye(given.model.size)[0] * 0.01)
+    invariant, paper = distances(given, seen)
+    np.testing.assert_allclose(invariant.before, 0.0, atol=1e-12)
+    lever = np.hypot(*CHAIN.positions(seen.q, np.array([0.1, 0.0, 0.02]))[:, :2].T)
+    assert paper.before.mean() == pytest.approx(0.01 * lever.mean(), rel=0.1)
+    # After: about the mean of the draws, so only their spread of 1 mrad is left.
+    assert paper.after.mean() < 0.15 * paper.before.mean()
+
+
+def test_an_inner_offset_counts_alike_in_both(seen: Measurements) -> None:
+    invariant, paper = distances(predictive({'joint_4': 1e-3}), seen)
+    for name in ('before', 'after_offsets_only'):
+        assert getattr(invariant, name).mean() == pytest.approx(
+            getattr(paper, name).mean(), rel=0.02
+        )
+
+
+def test_noise_has_the_length_of_a_3_d_normal_error(seen: Measurements) -> None:
+    """Mean sigma sqrt(8 / pi): some 100,000 pairs know it to 0.14 %; seven standard errors."""
+    invariant, paper = distances(predictive({}, sigma_m=1e-3), seen)
+    for found in (invariant, paper):
+        assert found.after.mean() == pytest.approx(1e-3 * np.sqrt(8.0 / np.pi), rel=0.01)
+        np.testing.assert_allclose(found.after_offsets_only, 0.0, atol=1e-12)
+
+
+def test_noise_along_the_line_of_sight_alone_is_as_long_as_one_axis(seen: Measurements) -> None:
+    """Mean sigma sqrt(2 / pi): 100,000 pairs know it to 0.24 %; five standard errors."""
+    given = predictive({})
+    sensors_at = np.tile(np.eye(4), (2, 1, 1))
+    sensors_at[:, :3, 3] = [2.0, 1.0, 0.5]
+    given = replace(
+        given,
+        model=replace(given.model, reference=sensors_at),
+        sigma=np.full((DRAWS, 2, 2), 1e-3) * [1.0, 0.0],
+    )
+    invariant, _ = distances(given, seen)
+    assert invariant.after.mean() == pytest.approx(1e-3 * np.sqrt(2.0 / np.pi), rel=0.012)
+
+
+def test_all_draws_and_rows_have_their_say(seen: Measurements) -> None:
+    """One draw of 300 is a metre off; with fewer draws than rows it is still among the pairs."""
+    given = predictive({})
+    given.draws[17, given.model.names.index('registration.mocap.y')] = 1.0
+    given.draws[17, given.model.names.index('registration.tracker.y')] = 1.0
+    invariant, _ = distances(given, seen)
+    assert np.mean(invariant.after > 0.5) == pytest.approx(1 / DRAWS, rel=1e-6)
+
+
+def test_a_large_session_is_thinned(seen: Measurements, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(predictive_accuracy, 'PAIRS', 1000)
+    monkeypatch.setattr(predictive_accuracy, 'MOST_ROWS', 20)
+    invariant, paper = distances(predictive({'joint_4': 1e-3}), seen)
+    assert len(invariant.after) == len(paper.before) == 1000
+
+
+def test_random_configurations_fill_the_joint_limits(seen: Measurements) -> None:
+    model = predictive({}).model
+    rows = random_configurations(model, seen, 2000, np.random.default_rng(3))
+    assert np.all(CHAIN.within_limits(rows.q))
+    # 2000 uniform values: the outermost lie within 0.5 % of the limits but for a chance of 1e-3.
+    width = CHAIN.upper - CHAIN.lower
+    assert np.all(rows.q.min(axis=0) < CHAIN.lower + 0.005 * width)
+    assert np.all(rows.q.max(axis=0) > CHAIN.upper - 0.005 * width)
+    np.testing.assert_array_equal(np.bincount(rows.sensor), [1000, 1000])
+    followed = dict(zip(seen.sensor.tolist(), seen.marker.tolist(), strict=True))
+    assert all(followed[s] == m for s, m in zip(rows.sensor, rows.marker, strict=True))
+
+
+def test_further_effects_stay_out_of_random_configurations(seen: Measurements) -> None:
+    bare = predictive({'joint_4': 1e-3})
+    n = len(seen)
+    shifting = extension(
+        ('shift',),
+        ('m',),
+        np.zeros((n, 7, 1)),
+        np.ones((n, 3, 1)),
+        np.zeros((n, 3)),
+        np.zeros(1),
+        np.zeros((1, 1)),
+    )
+    given = replace(
+        bare,
+        model=replace(bare.model, extension=shifting),
+        before=np.append(bare.before, 0.0),
+        after=np.append(bare.after, 0.0),
+        draws=np.column_stack((bare.draws, np.full(DRAWS, 1e-3))),
+    )
+    invariant, _ = distances(given, seen)
+    alone, _ = distances(bare, seen)
+    assert invariant.after.mean() > 2 * alone.after.mean()
+    same, _ = distances(given.without_extension(), seen)
+    np.testing.assert_array_equal(same.after, alone.after)

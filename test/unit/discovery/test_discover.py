@@ -1,0 +1,293 @@
+"""The discovery on small sessions: the cause by name, or nothing; each figure of a statistic."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from calibration_scenes import CHAIN
+from discovery_scenes import at_joint, residuals_of, session_with
+
+from remaster_ros.discovery.confirmation import confirm, in_words
+from remaster_ros.discovery.cross_validation import held_out_error
+from remaster_ros.discovery.discover import Findings, discover_session, find_causes
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.evidence import Strata, _System, solve
+from remaster_ros.discovery.screening import Catalogue, screen
+from remaster_ros.errors import InputError
+from remaster_ros.types import Session
+
+ARC_MINUTE = np.radians(1.0 / 60.0)
+
+
+def findings(session: Session, seed: int = 0) -> Findings:
+    return find_causes(
+        session, rng=np.random.default_rng(seed), progress=lambda stage, share: None
+    )
+
+
+def torques(session: Session) -> np.ndarray:
+    return CHAIN.gravity_torque(session.measurements.q)
+
+
+def sagging(session: Session) -> np.ndarray:
+    """Joints 2 and 4 give way: the pair that a greedy search takes for a coupling."""
+    tau = torques(session)
+    return at_joint(2, 4e-5 * tau[:, 1]) + at_joint(4, 6e-5 * tau[:, 3])
+
+
+@cache
+def sagging_session() -> Session:
+    return session_with(21, sagging)
+
+
+def test_two_joints_that_sag_together_are_named_with_their_compliances():
+    found = findings(sagging_session())
+    assert [(e.name, e.joints) for e in found.effects] == [('joint_compliance', (2, 4))]
+    for parameter, truth in zip(found.effects[0].parameters, (4e-5, 6e-5), strict=True):
+        assert abs(parameter.value - truth) < 4.0 * parameter.std
+        assert parameter.unit == 'rad/(N m)'
+
+
+def test_backlash_and_a_sensor_scale_are_found_beside_each_other():
+    def backlash(session: Session) -> np.ndarray:
+        m = session.measurements
+        side, sides = 0.0, []
+        for move in np.nan_to_num(m.q - m.from_q)[:, 3]:
+            # A joint that stands still stays on its flank.
+            side = side if abs(move) < 1e-9 else np.sign(move)
+            sides.append(side)
+        return at_joint(4, 2.0 * ARC_MINUTE * np.array(sides))
+
+    def scale(session: Session) -> np.ndarray:
+        return 3e-3 * session.measurements.position
+
+    found = findings(session_with(22, backlash, scale))
+    assert {(e.name, e.joints) for e in found.effects} == {
+        ('backlash', (4,)),
+        ('sensor_scale', ()),
+    }
+    by_name = {e.name: e.parameters[0] for e in found.effects}
+    assert abs(by_name['backlash'].value - 2.0 * ARC_MINUTE) < 4 * by_name['backlash'].std
+    assert abs(by_name['sensor_scale'].value - 3e-3) < 4.0 * by_name['sensor_scale'].std
+
+
+def test_an_error_of_any_shape_is_a_curve_of_its_joint():
+    def curve(session: Session) -> np.ndarray:
+        q = session.measurements.q[:, 1]
+        return at_joint(2, 4 * ARC_MINUTE * (np.exp(-((q - 0.3) ** 2) / 0.02) + np.cos(7.3 * q)))
+
+    found = findings(session_with(23, curve))
+    assert ('joint_error_curve', (2,)) in {(e.name, e.joints) for e in found.effects}
+
+
+def test_an_unnamed_cause_is_located():
+    def creeping(session: Session) -> np.ndarray:
+        m = session.measurements
+        return at_joint(4, 6e-5 * CHAIN.gravity_torque(m.q)[:, 1])
+
+    found = findings(session_with(24, creeping))
+    first = found.effects[0]
+    assert (first.name, first.joints) == ('unnamed', (4, 2))
+    assert first.place == 'joint_angle'
+    assert first.driver == 'gravity_torque_of_joint_2'
+
+
+@pytest.mark.parametrize('seed', [31, 32, 33])
+def test_nothing_is_found_where_nothing_is(seed):
+    # A false claim at 1 % each: all three pass in 97 % of seeds; these are fixed.
+    found = findings(session_with(seed, sensor=None, outlier_share=0.03))
+    assert found.effects == ()
+
+
+@pytest.mark.parametrize('seed', [34, 35, 36, 37])
+def test_few_poses_are_enough_for_a_large_cause_and_show_none_where_none_is(seed):
+    # The signs of 6 poses have 32 patterns, too few for a p-value of 1 %.
+    few = {'poses': 6, 'validation': 4}
+
+    def sagging_once(session: Session) -> np.ndarray:
+        return at_joint(2, 1e-4 * torques(session)[:, 1])
+
+    found = findings(session_with(seed, sagging_once, **few))
+    assert ('joint_compliance', (2,)) in {(e.name, e.joints) for e in found.effects}
+    # A false claim at 1 % each: all four pass in 96 % of seeds; these are fixed.
+    assert findings(session_with(seed, **few)).effects == ()
+
+
+def test_what_a_marker_moved_further_than_allowed_is_said():
+    session = session_with(25)
+    markers = dict(session.markers)
+    markers['sir'] = markers['sir'] + np.array([0.0, 0.0, 6e-3])
+    found = findings(replace(session, markers=markers))
+    (effect,) = found.effects
+    assert effect.name == 'marker_offset'
+    z = effect.parameters[2]
+    # The true marker is itself 0.5 mm from where the session has it.
+    assert abs(z.value + 6e-3) < 3 * 0.5e-3
+
+
+def test_the_extended_model_is_sampled_and_gains_on_held_out_poses():
+    found = discover_session(sagging_session(), rng=np.random.default_rng(0))
+    assert found.verdict == 'effects'
+    assert found.gain.held_out_rms_after_m is not None
+    assert found.gain.held_out_rms_before_m is not None
+    assert found.gain.held_out_rms_after_m < found.gain.held_out_rms_before_m
+    assert found.gain.held_out_rms_after_m < 1.25 * found.gain.noise_floor_m
+    assert found.fit.theta_names == ('compliance_2', 'compliance_4')
+    for parameter, mean, std in zip(
+        found.effects[0].parameters, found.fit.theta, found.fit.theta_std, strict=True
+    ):
+        assert (parameter.value, parameter.std) == (mean, std)
+    assert sum(e.share for e in found.effects if e.share is not None) == pytest.approx(1.0)
+
+
+def test_causes_are_confirmed_in_another_session_of_the_arm_and_missed_when_cured():
+    # The same offsets and markers: the seed makes the arm.
+    found = discover_session(sagging_session(), rng=np.random.default_rng(0))
+    same = confirm(found, session_with(21, sagging, pose_sigma_m=0.3e-3))
+    cured = confirm(found, session_with(21, pose_sigma_m=0.3e-3))
+    assert same.confirmed
+    assert same.carried_over == pytest.approx(1.0, abs=0.4)
+    assert not cured.confirmed
+    assert cured.carried_over < 0.0
+    assert cured.rms_after_m > cured.rms_before_m
+    assert same.same_offsets
+    assert cured.same_offsets
+
+
+def test_another_arm_of_the_same_model_is_not_taken_for_this_one():
+    found = discover_session(sagging_session(), rng=np.random.default_rng(0))
+    # The seed makes the arm: other zero-offsets, and the same joints give way.
+    other = confirm(found, session_with(27, sagging))
+    assert not other.same_offsets
+    assert not other.confirmed
+    assert other.rms_after_m > 3.0 * other.rms_own_m
+    (line,) = in_words(found, other)
+    assert 'another arm, or it was mastered anew' in line
+
+
+def test_another_robot_cannot_confirm():
+    found = discover_session(sagging_session(), rng=np.random.default_rng(0))
+    session = session_with(21)
+    other = replace(session, urdf=session.urdf.replace('joint_1"', 'shoulder"'))
+    with pytest.raises(InputError, match='another robot'):
+        confirm(found, other)
+
+
+@cache
+def residuals():
+    return residuals_of(session_with(26, poses=20, sensor_count=2))
+
+
+def cells_named(name: str):
+    return list(EFFECTS[name].cells(residuals().scene))
+
+
+def test_whitening_makes_noise_of_the_model_white():
+    data = residuals()
+    seed = 3
+    print(f'seed {seed}')
+    rng = np.random.default_rng(seed)
+    rows, noise = data.rows, data.noise
+    sensor = rows.group_sensor[rows.group_of_row]
+    common = rng.standard_normal((len(rows.group_start), 3, 400))[rows.group_of_row]
+    values = noise.pose_sigma[sensor][:, None, None] * common
+    values += noise.sigma[sensor][:, None, None] * rng.standard_normal((len(rows), 3, 400))
+    white = data.whitened(values, noise).reshape(-1, 400)
+    covariance = white @ white.T / 400
+    assert np.diag(covariance).mean() == pytest.approx(1.0, abs=0.02)
+    # Correlations within a pose are gone: what is left is chance, 1 / sqrt(400).
+    off = covariance - np.diag(np.diag(covariance))
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(0.05, abs=0.005)
+
+
+@pytest.mark.parametrize('name', ['joint_compliance', 'joint_error_curve'])
+def test_restricted_likelihood_has_the_gradient_it_says(name):
+    data = residuals()
+    cells = tuple(cells_named(name)[1:3])
+    columns = data.columns(cells)
+    scale = np.sqrt(np.sum(columns**2, axis=(0, 1)))
+    scale[scale == 0.0] = scale.max()
+    strata = Strata.of(data, np.concatenate((data.base, columns / scale), axis=2))
+    p = data.base.shape[2]
+    system = _System(data, strata, cells, p, np.concatenate((np.ones(p), scale)))
+    eta, _ = system._start(None)
+    _, gradient = system.evaluate(eta)
+    for i in range(len(eta)):
+        step = np.zeros(len(eta))
+        step[i] = 1e-5
+        numeric = (system.evaluate(eta + step)[0] - system.evaluate(eta - step)[0]) / 2e-5
+        assert gradient[i] == pytest.approx(numeric, rel=1e-3, abs=1e-3)
+
+
+def test_screening_scores_agree_with_a_least_squares_fit_of_each_cell():
+    data = residuals()
+    cells = [
+        c for n in ('encoder_scale', 'encoder_eccentricity', 'backlash') for c in cells_named(n)
+    ]
+    empty = solve(data, ())
+    assert empty is not None
+    scores = screen(data, Catalogue.of(data, cells), empty).score
+    base = data.whitened(data.base, empty.noise).reshape(3 * len(data), -1)
+    errors = data.whitened(data.errors, empty.noise).ravel()
+    n = 3 * len(data) - base.shape[1]
+
+    def squares(columns: np.ndarray) -> float:
+        solution = np.linalg.lstsq(columns, errors, rcond=None)[0]
+        return float(np.sum((errors - columns @ solution) ** 2))
+
+    for cell, score in zip(cells, scores, strict=True):
+        white = data.whitened(data.columns([cell]), empty.noise)
+        white = white.reshape(3 * len(data), -1)
+        white /= np.maximum(np.linalg.norm(white, axis=0), 1e-30)
+        left = white - base @ np.linalg.lstsq(base, white, rcond=None)[0]
+        # Of joint 3, which takes three angles only, sines and cosines are partly one and the same.
+        if np.linalg.svd(left, compute_uv=False)[-1] < 2e-3:
+            continue
+        ratio = squares(base) / squares(np.concatenate((base, white), axis=1))
+        expected = 0.5 * n * np.log(ratio) - 0.5 * cell.size * np.log(n) - np.log(cell.drawn_from)
+        assert score == pytest.approx(expected, abs=0.05)
+
+
+def test_p_values_are_uniform_where_nothing_is():
+    """Kolmogorov–Smirnov at 40 draws: the limit is passed by chance once in a thousand."""
+    data = residuals()
+    cells = [c for n in ('encoder_scale', 'backlash', 'settling') for c in cells_named(n)]
+    empty = solve(data, ())
+    assert empty is not None
+    catalogue = Catalogue.of(data, cells)
+    seed = 8
+    print(f'seed {seed}')
+    rng = np.random.default_rng(seed)
+    sensor = data.rows.group_sensor[data.rows.group_of_row]
+    sigma, pose_sigma = empty.noise.sigma[sensor], empty.noise.pose_sigma[sensor]
+    values = []
+    for _ in range(40):
+        common = rng.standard_normal((len(data.rows.group_start), 3))[data.rows.group_of_row]
+        errors = pose_sigma[:, None] * common + sigma[:, None] * rng.standard_normal(
+            (len(data), 3)
+        )
+        drawn = replace(data, errors=errors)
+        screening = screen(drawn, catalogue, empty, rng=rng, draws=100)
+        values.append(screening.p_value(float(screening.score.max())))
+    below = np.sort(values) - np.arange(40) / 40
+    # One-sided: p-values may be too large, not too small.
+    assert np.max(-below) < 0.31
+
+
+def test_held_out_error_is_that_of_fits_without_the_pose():
+    data = residuals()
+    cell = cells_named('joint_compliance')[1]
+    fit = solve(data, (cell,))
+    assert fit is not None
+    folds = np.arange(data.poses)
+    by_pose = held_out_error(data, fit, fit.noise, folds)
+    pose = 4
+    columns = np.concatenate((data.base, data.columns([cell]), data.errors[:, :, None]), axis=2)
+    white = data.whitened(columns, fit.noise)
+    out = data.pose_of_row == pose
+    kept = white[~out].reshape(-1, white.shape[2])
+    beta = np.linalg.lstsq(kept[:, :-1], kept[:, -1], rcond=None)[0]
+    left = white[out].reshape(-1, white.shape[2])
+    expected = np.sum((left[:, -1] - left[:, :-1] @ beta) ** 2)
+    assert by_pose[pose] == pytest.approx(expected, rel=1e-4)

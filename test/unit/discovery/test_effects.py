@@ -1,0 +1,195 @@
+"""Every effect's columns against numerical derivatives of its own equation."""
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from calibration_scenes import CHAIN
+from discovery_scenes import residuals_of, session_with
+
+from remaster_ros.discovery.effects.base import PLACES, Cell
+from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.effects.splines import basis, centers, knot_vector, roughness
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import apply, rotation_vector_to_matrix, transform
+
+STEP = 1e-6
+
+
+@cache
+def scene_of(gravity: bool = True) -> Scene:
+    session = session_with(11, poses=8, validation=0, sensor_count=2)
+    rows = session.measurements
+    warm = 20.0 + np.linspace(0.0, 4.0, len(rows))
+    session = replace(session, measurements=replace(rows, temperature_c=warm))
+    scene = residuals_of(session).scene
+    return scene if gravity else replace(scene, chain=replace(CHAIN, has_inertials=False))
+
+
+def cells_of(name: str) -> list[Cell]:
+    return list(EFFECTS[name].cells(scene_of()))
+
+
+def moved(chain: SerialChain, scene: Scene) -> np.ndarray:
+    points = chain.forward(scene.q)
+    return apply(points, scene.markers[scene.marker])
+
+
+@pytest.mark.parametrize('name', EFFECTS)
+def test_every_cell_has_columns_of_its_size_and_a_place_of_the_table(name):
+    scene = scene_of()
+    effect = EFFECTS[name]
+    assert effect.needs(scene) == ''
+    cells = [c for c in effect.cells(scene) if c.name != 'gear_periodic'] or cells_of(name)[:20]
+    keys = [cell.key for cell in cells]
+    assert len(set(keys)) == len(keys)
+    for cell in cells:
+        columns = cell.columns(scene)
+        assert columns.displacement(scene).shape == (len(scene), 3, cell.size)
+        assert np.all(np.isfinite(columns.values))
+        assert cell.place in PLACES
+        assert cell.drawn_from >= 1
+        assert len(set(cell.parameters)) == cell.size
+        assert all(1 <= joint <= scene.joints for joint in cell.joints)
+        if cell.penalty is not None:
+            assert np.all(np.linalg.eigvalsh(cell.penalty) > 0.0)
+
+
+@pytest.mark.parametrize('name', EFFECTS)
+def test_columns_of_some_rows_are_those_they_have_among_all(name):
+    """The search of a large session works on parts of it; no column may depend on which."""
+    scene = scene_of()
+    rows = np.random.default_rng(5).permutation(len(scene))[: len(scene) // 3]
+    part = scene.at(rows)
+    for cell in cells_of(name):
+        if cell.name == 'gear_periodic' and cell.label != '7':
+            continue
+        whole, some = cell.columns(scene), cell.columns(part)
+        assert whole.at == some.at
+        np.testing.assert_allclose(
+            some.displacement(part), whole.displacement(scene)[rows], rtol=1e-9, atol=1e-12
+        )
+
+
+@pytest.mark.parametrize('name', EFFECTS)
+def test_every_effect_says_what_a_technician_and_a_scientist_need(name):
+    effect = EFFECTS[name]
+    assert effect.name == name
+    assert effect.equation
+    assert effect.source
+    assert effect.separate_by
+    assert effect.plausible[0] < effect.plausible[1]
+    assert set(re.findall(r'{(\w+)}', effect.sentence)) <= {'subject', 'other', 'driver', 'place'}
+
+
+@pytest.mark.parametrize(
+    ('name', 'feature'),
+    [
+        ('joint_compliance', lambda s, j: s.chain.gravity_torque(s.q)[:, j]),
+        ('encoder_scale', lambda s, j: s.measurements.q[:, j]),
+        ('settling', lambda s, j: -np.nan_to_num(s.measurements.q - s.measurements.from_q)[:, j]),
+    ],
+)
+def test_effects_of_an_angle_turn_the_joint_by_their_driver(name, feature):
+    scene = scene_of()
+    for cell in cells_of(name):
+        joint = cell.joints[0] - 1
+        added = np.zeros_like(scene.q)
+        added[:, joint] = STEP * feature(scene, joint)
+        points = scene.markers[scene.marker]
+        shift = CHAIN.positions(scene.q + added, points) - CHAIN.positions(scene.q, points)
+        columns = cell.columns(scene).displacement(scene)[:, :, 0]
+        np.testing.assert_allclose(columns, shift / STEP, atol=3e-5 * np.abs(columns).max() + 1e-9)
+
+
+@pytest.mark.parametrize('name', ['link_length', 'joint_axis_tilt'])
+def test_geometry_columns_are_those_of_a_chain_built_that_way(name):
+    scene = scene_of()
+    for cell in cells_of(name):
+        if cell.size > 1:
+            continue
+        T_fixed = CHAIN.T_fixed.copy()
+        if name == 'link_length':
+            link = cell.joints[0]
+            own = CHAIN.T_fixed[link][:3, 3]
+            axis = own / np.linalg.norm(own) if cell.variant == 'along' else None
+            step = STEP * (np.eye(3)['xyz'.index(cell.variant)] if axis is None else axis)
+            T_fixed[link] = transform(np.eye(3), step) @ T_fixed[link]
+        else:
+            fixed = cell.joints[0] - 1
+            turn = rotation_vector_to_matrix(STEP * np.eye(3)['xyz'.index(cell.variant)])
+            T_fixed[fixed] = T_fixed[fixed] @ transform(turn, np.zeros(3))
+        shift = moved(replace(CHAIN, T_fixed=T_fixed), scene) - moved(CHAIN, scene)
+        columns = cell.columns(scene).displacement(scene)[:, :, 0]
+        np.testing.assert_allclose(columns, shift / STEP, atol=1e-5)
+
+
+def test_thermal_growth_is_that_of_every_link():
+    scene = scene_of()
+    cell = next(
+        c for c in cells_of('thermal_growth') if c.driver == 'temperature' and not c.joints
+    )
+    columns = cell.columns(scene).displacement(scene)[:, :, 0]
+    row = len(scene) // 2
+    grown = CHAIN.T_fixed.copy()
+    grown[:, :3, 3] *= 1.0 + STEP * scene.warming[row]
+    shift = moved(replace(CHAIN, T_fixed=grown), scene) - moved(CHAIN, scene)
+    np.testing.assert_allclose(columns[row], shift[row] / STEP, atol=1e-5)
+
+
+def test_sensor_effects_act_in_the_frame_of_their_own_sensor():
+    scene = scene_of()
+    for name in ('sensor_scale', 'sensor_distortion', 'registration_drift'):
+        for cell in cells_of(name):
+            columns = cell.columns(scene).displacement(scene)
+            mine = scene.sensor == scene.sensor_names.index(cell.subject)
+            assert np.all(columns[~mine] == 0.0)
+    cell = next(c for c in cells_of('sensor_scale') if c.variant == '' and c.subject == 'mocap')
+    mine = scene.sensor == scene.sensor_names.index('mocap')
+    shift = cell.columns(scene).displacement(scene)[mine, :, 0]
+    in_sensor = np.einsum('nji,nj->ni', scene.sensor_turn[mine], shift)
+    np.testing.assert_allclose(in_sensor, scene.in_sensor[mine], atol=1e-9)
+
+
+def test_backlash_stays_on_the_flank_until_the_joint_moves_again():
+    scene = scene_of()
+    rows = scene.measurements
+    q = np.zeros((5, scene.joints))
+    came = np.zeros((5, scene.joints))
+    q[:, 1], came[:, 1] = (0.1, 0.1, 0.0, 0.0, 0.2), (np.nan, 0.1, 0.1, 0.0, 0.0)
+    few = replace(rows.select(np.arange(5)), q=q, from_q=came, stamp_s=np.arange(5.0))
+    approach = replace(scene, measurements=few).approach
+    np.testing.assert_array_equal(approach[:, 1], [0.0, 0.0, -1.0, -1.0, 1.0])
+
+
+def test_effects_that_a_session_cannot_show_say_why():
+    bare = scene_of(gravity=False)
+    assert 'link masses' in EFFECTS['joint_compliance'].needs(bare)
+    rows = bare.measurements
+    nowhere = replace(rows, from_q=np.full_like(rows.from_q, np.nan))
+    assert 'came from' in EFFECTS['backlash'].needs(replace(bare, measurements=nowhere))
+    at_once = replace(rows, stamp_s=np.zeros(len(rows)))
+    assert 'time' in EFFECTS['registration_drift'].needs(replace(bare, measurements=at_once))
+
+
+def test_gravity_moment_about_the_axis_is_the_torque():
+    scene = scene_of()
+    axes = CHAIN.axes_in_base(scene.frames)
+    along = np.sum(axes * scene.gravity_moment, axis=-1)
+    np.testing.assert_allclose(along, scene.gravity_torque, atol=1e-9)
+
+
+def test_splines_sum_to_one_and_repeat_straight_lines():
+    seed = 5
+    print(f'seed {seed}')
+    x = np.random.default_rng(seed).uniform(-1.0, 2.0, 200)
+    knots = knot_vector(-1.0, 2.0, 0.25)
+    values = basis(x, knots)
+    np.testing.assert_allclose(values.sum(axis=1), 1.0)
+    np.testing.assert_allclose(values @ centers(knots), x, atol=1e-12)
+    line = centers(knots)
+    centered = line - line.mean()
+    assert centered @ roughness(len(line)) @ centered < 0.01 * centered @ centered

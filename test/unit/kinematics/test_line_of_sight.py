@@ -1,0 +1,89 @@
+"""Capsules around the links: distances of segments and the line of sight."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.line_of_sight import LinkCapsules, segment_distance
+from remaster_ros.kinematics.serial_chain import SerialChain
+
+ROBOTS = Path(__file__).parents[3] / 'config' / 'robots'
+
+
+@pytest.fixture(scope='module')
+def lwr():
+    text = (ROBOTS / 'lwr4plus.urdf').read_text(encoding='utf-8')
+    return SerialChain.from_urdf(text)
+
+
+def planar_arm(links):
+    """Return an arm of 0.3 m links in the X-Z plane: positive angles turn from Z towards X."""
+    parts = ['<link name="link_0"/>']
+    for i in range(1, links + 1):
+        parts.append(
+            f'<link name="link_{i}"/><joint name="joint_{i}" type="continuous">'
+            f'<parent link="link_{i - 1}"/><child link="link_{i}"/>'
+            '<origin xyz="0 0 0.3"/><axis xyz="0 1 0"/></joint>'
+        )
+    parts.append(
+        f'<link name="tool"/><joint name="tool_joint" type="fixed"><parent link="link_{links}"/>'
+        '<child link="tool"/><origin xyz="0 0 0.3"/></joint>'
+    )
+    return SerialChain.from_urdf('<robot name="planar">' + ''.join(parts) + '</robot>')
+
+
+def test_segment_distance_is_the_least_over_both_segments():
+    rng = np.random.default_rng(1)
+    a, b, c, d = rng.uniform(-1, 1, (4, 60, 3))
+    b[:10] = a[:10]  # a point and a segment
+    d[5:15] = c[5:15]  # two points, then a segment and a point
+    d[20:30] = c[20:30] + 0.7 * (b[20:30] - a[20:30])  # parallel
+    c[30:40] = a[30:40] + 0.3 * (b[30:40] - a[30:40])  # touching
+    share = np.linspace(0, 1, 401)[:, None, None]
+    first, second = a + share * (b - a), c + share * (d - c)
+    sampled = np.min(np.linalg.norm(first[:, None] - second[None], axis=-1), axis=(0, 1))
+    exact = segment_distance(a, b, c, d)
+    assert np.all(exact <= sampled + 1e-12)
+    # Half a sample step on each segment is the most that sampling can miss.
+    steps = (np.linalg.norm(b - a, axis=1) + np.linalg.norm(d - c, axis=1)) / 800
+    assert np.all(exact >= sampled - steps - 1e-12)
+    np.testing.assert_allclose(exact[30:40], 0, atol=1e-12)
+
+
+def test_points_run_from_the_base_over_the_joints_to_the_tool(lwr):
+    heights = LinkCapsules(lwr).points(np.zeros(7))[:, 2]
+    np.testing.assert_allclose(
+        heights, [0, 0.102, 0.3105, 0.502, 0.7105, 0.902, 1.1005, 1.1785, 1.2285]
+    )
+
+
+def test_batches_agree_with_single_configurations(lwr):
+    arm = LinkCapsules(lwr, radius=0.09)
+    q = np.random.default_rng(2).uniform(lwr.lower, lwr.upper, (4, 50, 7))
+    marker, sensor = [0.1, 0, 0.02], [1.0, 0.2, 0.5]
+    together = arm.hides(q, marker, sensor)
+    assert together.shape == (4, 50)
+    assert 0 < together.sum() < together.size
+    single = [arm.hides(row, marker, sensor) for row in q.reshape(-1, 7)]
+    np.testing.assert_array_equal(together.ravel(), single)
+
+
+def test_line_of_sight_is_cut_by_a_link_within_the_radius():
+    # A gallows: up 0.6 m, out 0.3 m along X, down 0.3 m; the marker below, the sensor behind.
+    arm = LinkCapsules(planar_arm(3), radius=0.05)
+    q = [0, np.pi / 2, np.pi / 2]
+    marker_T, marker_height = [0, 0, 0.05], 0.25
+    assert arm.chain.positions(q, marker_T) == pytest.approx([0.3, 0, marker_height])
+    assert arm.hides(q, marker_T, [-2, 0, marker_height])
+    assert not arm.hides(q, marker_T, [2, 0, marker_height])
+    # The line passes the column, at X = 0, an eighth of the way to a sensor 2.1 m behind.
+    assert arm.hides(q, marker_T, [-1.8, 7 * 0.04, marker_height])
+    assert not arm.hides(q, marker_T, [-1.8, 7 * 0.06, marker_height])
+
+
+@pytest.mark.parametrize('radius', [0.0, -0.1, np.nan, np.inf])
+def test_wrong_radius_is_refused(lwr, radius):
+    with pytest.raises(InputError, match='link radius'):
+        LinkCapsules(lwr, radius)

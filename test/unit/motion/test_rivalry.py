@@ -1,0 +1,61 @@
+"""Of two nodes of one name exactly one goes on, whatever the order of their messages."""
+
+import pytest
+
+from remaster_ros.motion.rivalry import LISTEN_S, Rivalry
+
+
+def settle(a_started_s, b_started_s, ids=('1', '2'), delay_s=0.0, turns=3):
+    """Let two nodes exchange summaries; return which of them must end."""
+    nodes = Rivalry(ids[0]), Rivalry(ids[1])
+    begun = a_started_s, b_started_s
+    ends = [False, False]
+    for turn in range(turns):
+        sent_s = 10.0 + 0.5 * turn
+        heard_s = sent_s + delay_s
+        for me, other in ((0, 1), (1, 0)):
+            ends[me] |= nodes[me].hear(
+                ids[other], sent_s - begun[other], heard_s - begun[me], heard_s
+            )
+    return ends
+
+
+@pytest.mark.parametrize('delay_s', [0.0, 0.01, 0.2, 0.45])
+@pytest.mark.parametrize(
+    'apart_s', [0.0, 0.01, 0.3, 0.49, 0.5, 0.51, 0.9, 0.99, 1.01, 1.49, 1.6, 1.9, 9.0]
+)
+@pytest.mark.parametrize('ids', [('1', '2'), ('2', '1')])
+def test_never_both_go_on(delay_s, apart_s, ids):
+    ends = settle(0.0, apart_s, ids, delay_s)
+    assert any(ends)
+    if apart_s > 2.0 or ids == ('1', '2'):
+        # One clock, or a clear difference: the later one alone.
+        assert ends == [False, True]
+
+
+def test_the_last_words_of_a_killed_process_end_nobody():
+    """One message of a node that had run for long, after its successor was started."""
+    node = Rivalry('2')
+    node.hear_itself(0.0)
+    assert not node.hear('1', 5000.0, 0.6, 0.6)
+    # The same once more, as a late copy.
+    assert not node.hear('1', 5000.0, 0.7, 0.7)
+    assert node.hear('1', 5000.5, 1.1, 1.1)
+
+
+def test_alone_only_after_listening_and_without_a_rival():
+    node = Rivalry('1')
+    assert not node.alone(100.0)
+    node.hear_itself(100.0)
+    node.hear_itself(101.0)
+    assert not node.alone(100.0 + LISTEN_S - 0.01)
+    assert node.alone(100.0 + LISTEN_S)
+    node.hear('2', 1.0, 50.0, 110.0)
+    assert not node.alone(111.0)
+    assert node.alone(110.0 + LISTEN_S)
+
+
+def test_a_rival_before_it_has_heard_itself_does_not_count_as_listening():
+    node = Rivalry('1')
+    node.hear('2', 1.0, 50.0, 10.0)
+    assert node.alone_since_s is None

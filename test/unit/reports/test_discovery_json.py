@@ -1,0 +1,98 @@
+"""discovery.json as the contract has it, and a report that stands alone."""
+
+import json
+import re
+from xml.etree import ElementTree
+
+import msgspec
+import numpy as np
+import pytest
+from discovery_scenes import at_joint, session_with
+
+from remaster_ros.discovery.confirmation import confirm
+from remaster_ros.discovery.discover import discover_session
+from remaster_ros.errors import InputError
+from remaster_ros.reports import discovery_figures
+from remaster_ros.reports.discovery_json import read_discovery, save_discovery
+
+
+def bent(session):
+    return at_joint(2, 1.5e-3 * np.sin(2.0 * session.measurements.q[:, 1]))
+
+
+@pytest.fixture(scope='module')
+def saved(tmp_path_factory):
+    session = session_with(41, bent, poses=25, validation=15)
+    found = discover_session(session, rng=np.random.default_rng(0))
+    folder = tmp_path_factory.mktemp('discovery')
+    # Arm and poses are drawn from the seed, in turn: the same arm needs as many poses.
+    again = session_with(41, bent, poses=25, validation=15, pose_sigma_m=0.3e-3)
+    assert save_discovery(found, folder, confirm(found, again)) == folder / 'report.html'
+    return found, folder
+
+
+def test_discovery_json_has_what_the_contract_asks(saved):
+    found, folder = saved
+    content = json.loads((folder / 'discovery.json').read_text())
+    assert content['format'] == 'remaster-discovery/1'
+    assert content['verdict'] == found.verdict == 'effects'
+    (effect,) = content['effects']
+    assert (effect['name'], effect['joints']) == ('encoder_eccentricity', [2])
+    assert (effect['place'], effect['form']) == ('joint_angle', 'sin/cos')
+    assert effect['parameters'][0].keys() == {'name', 'value', 'std', 'unit'}
+    for other in effect['confusable_with']:
+        assert other.keys() == {'name', 'joints', 'log_evidence_gain', 'separate_by'}
+        assert other['separate_by']
+    assert content['gain']['held_out_rms_after_m'] < content['gain']['held_out_rms_before_m']
+    assert content['joint_offsets_after'][1].keys() >= {'joint', 'mean_deg', 'std_deg'}
+    assert content['confirmation']['confirmed'] is True
+    assert read_discovery(folder / 'discovery.json') == content
+
+
+def test_the_report_needs_nothing_else_and_says_the_cause(saved):
+    found, folder = saved
+    page = (folder / 'report.html').read_text()
+    assert not re.findall(r'(?:src|href)="(?!#)[^"]', page)
+    assert found.effects[0].cause in page
+    assert 'sin2_2' in page
+    for name in ('gain', 'drivers', 'causes'):
+        ElementTree.parse(folder / 'figures' / f'{name}.svg')
+
+
+def test_curves_of_a_large_session_are_drawn_at_the_rows_that_were_searched(saved, monkeypatch):
+    """Through 100,000 rows they took 15 MB of SVG; in the rows searched they are the same."""
+    found, _ = saved
+
+    def curve():
+        # Points of what is left, then the curve.
+        _, line = discovery_figures.causes(found).axes[0].lines
+        return line.get_xdata(), line.get_ydata()
+
+    x, y = curve()
+    assert len(x) == len(found.residuals.scene)
+    monkeypatch.setattr(discovery_figures, 'MOST_DRAWN', 0)
+    few_x, few_y = curve()
+    assert len(few_x) == len(found.residuals) < len(x)
+    np.testing.assert_allclose(few_y, np.interp(few_x, x, y), atol=1e-9)
+
+
+def test_without_figures_there_is_no_report(saved, tmp_path):
+    found, _ = saved
+    (tmp_path / 'report.html').write_text('of an earlier run')
+    assert save_discovery(found, tmp_path, figures=False) == tmp_path / 'discovery.json'
+    assert [path.name for path in tmp_path.iterdir()] == ['discovery.json']
+
+
+def test_what_is_no_discovery_is_refused_in_one_line(saved, tmp_path):
+    _, folder = saved
+    content = json.loads((folder / 'discovery.json').read_text())
+    for change, words in (
+        ({'verdict': 'perhaps'}, 'perhaps'),
+        ({'format': 'remaster-discovery/9'}, 'remaster-discovery/9'),
+        ({'effects': None}, 'effects'),
+    ):
+        path = tmp_path / 'discovery.json'
+        path.write_bytes(msgspec.json.encode({**content, **change}))
+        with pytest.raises(InputError, match=words) as error:
+            read_discovery(path)
+        assert '\n' not in str(error.value)

@@ -1,0 +1,109 @@
+"""Every verdict of a discovery, with and without causes, has figures, a report and its JSON."""
+
+import re
+from dataclasses import replace
+from typing import get_args
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from discovery_scenes import at_joint, session_with
+
+from remaster_ros.cli.discover import summary
+from remaster_ros.discovery.discover import Verdict, discover_session
+from remaster_ros.reports.discovery_json import read_discovery, save_discovery
+from remaster_ros.types import Measurements
+
+
+def bent(session):
+    return at_joint(2, 1.5e-3 * np.sin(2.0 * session.measurements.q[:, 1]))
+
+
+def too_long(session):
+    return 2e-3 * session.measurements.position
+
+
+def discovered(seed, **options):
+    session = session_with(seed, poses=25, validation=options.pop('validation', 15), **options)
+    return discover_session(session, rng=np.random.default_rng(0))
+
+
+def unmeasured(measurements: Measurements) -> Measurements:
+    """Return the same as a table without approach, time and temperature has them."""
+    return replace(
+        measurements,
+        from_q=np.full_like(measurements.from_q, np.nan),
+        temperature_c=np.full(len(measurements), np.nan),
+        stamp_s=np.zeros(len(measurements)),
+    )
+
+
+@pytest.fixture(scope='module')
+def found():
+    """Return a healthy arm, one with a bent encoder, and a sensor of the wrong scale."""
+    return {
+        'healthy': discovered(41),
+        'bent': discovered(41, angles=bent),
+        'scale': discovered(41, sensor=too_long),
+        'unproven': discovered(41, angles=bent, validation=0),
+    }
+
+
+def saved(discovery, folder):
+    """Save with figures; return the page, its verdict's mood, and the names of its figures."""
+    assert save_discovery(discovery, folder) == folder / 'report.html'
+    page = (folder / 'report.html').read_text(encoding='utf-8')
+    assert not re.findall(r'(?:src|href)="(?!#)[^"]', page)
+    names = {path.stem for path in (folder / 'figures').glob('*.svg')}
+    for name in names:
+        ElementTree.parse(folder / 'figures' / f'{name}.svg')
+        assert f'id="{name}-' in page, name
+    assert read_discovery(folder / 'discovery.json')['verdict'] == discovery.verdict
+    assert f'verdict: {discovery.verdict}' in summary(discovery)
+    mood = re.search(r'class="verdict (\w+)"', page)
+    return page, mood and mood.group(1), names
+
+
+def test_the_scenes_give_what_they_are_made_for(found):
+    assert found['healthy'].verdict == 'none'
+    assert not found['healthy'].effects
+    assert [effect.name for effect in found['bent'].effects] == ['encoder_eccentricity']
+    assert 'sensor_scale' in [effect.name for effect in found['scale'].effects]
+
+
+def test_nothing_found_is_a_page_without_a_figure_of_causes(found, tmp_path):
+    page, mood, names = saved(found['healthy'], tmp_path)
+    assert names == {'gain', 'drivers'}
+    assert mood == 'good'
+    assert 'Nothing is there beyond the zero-offsets' in page
+    assert 'None. Every combination' in page
+
+
+@pytest.mark.parametrize('scene', ['bent', 'scale', 'unproven'])
+def test_causes_are_drawn(found, scene, tmp_path):
+    page, mood, names = saved(found[scene], tmp_path)
+    assert names == {'gain', 'drivers', 'causes'}
+    assert mood in ('good', 'caution')
+    for effect in found[scene].effects:
+        assert effect.cause in page
+    assert ('No validation poses' in page) == (scene == 'unproven')
+
+
+@pytest.mark.parametrize('verdict', get_args(Verdict))
+@pytest.mark.parametrize('scene', ['healthy', 'bent'])
+def test_every_verdict_has_its_page(found, verdict, scene, tmp_path):
+    page, mood, names = saved(replace(found[scene], verdict=verdict), tmp_path)
+    assert ('causes' in names) == (scene == 'bent')
+    # Effects that the held-out poses do not bear out are no good news.
+    good = verdict == 'none' or (verdict == 'effects' and scene == 'bent')
+    assert mood == ('good' if good else 'caution')
+    assert 'id="gain"' in page
+
+
+def test_a_table_without_the_optional_columns_has_its_page(tmp_path):
+    session = session_with(41, bent, poses=25, validation=15)
+    session = replace(session, measurements=unmeasured(session.measurements))
+    discovery = discover_session(session, rng=np.random.default_rng(0))
+    page, _, names = saved(discovery, tmp_path)
+    assert names >= {'gain', 'drivers'}
+    assert 'What this session cannot test' in page

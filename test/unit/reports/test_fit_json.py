@@ -1,0 +1,203 @@
+"""fit.json keeps its contract, and the three ways to apply offsets do the same."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+import yaml
+
+from remaster_ros.compensation.export import (
+    _rpy,
+    calibrated_urdf,
+    exports,
+    layer_text,
+    remaster_text,
+)
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, matrix_from_rpy
+from remaster_ros.reports.fit_json import (
+    fit_to_dict,
+    joint_offsets_rad,
+    prepare_folder,
+    read_fit,
+    write_fit,
+)
+
+
+def test_fit_json_is_the_fit(fit_result, tmp_path):
+    write_fit(fit_result, tmp_path / 'new' / 'fit.json')
+    fit = read_fit(tmp_path / 'new' / 'fit.json')
+    assert fit == msgspec.json.decode(msgspec.json.encode(fit_to_dict(fit_result)))
+    assert fit['format'] == 'remaster-fit/1'
+    assert [row['joint'] for row in fit['joint_offsets']] == list(fit_result.joint_names)
+    offsets, std = joint_offsets_rad(fit, fit_result.joint_names)
+    np.testing.assert_allclose(offsets, fit_result.joint_offsets, atol=1e-14)
+    known = np.where(fit_result.identifiable, fit_result.joint_offsets_std, 0.0)
+    np.testing.assert_allclose(std, known, atol=1e-14)
+    for i, row in enumerate(fit['joint_offsets']):
+        assert row['identifiable'] == (row['why'] == '') == bool(fit_result.identifiable[i])
+        assert row['interval95_deg'][0] <= row['mean_deg'] <= row['interval95_deg'][1]
+    assert set(fit['registration']) == set(fit['noise']) == set(fit_result.session.sensors)
+    for sensor, frame in fit['registration'].items():
+        T_R_N = fit_result.T_R_N[sensor]
+        np.testing.assert_allclose(frame['translation_m'], T_R_N[:3, 3])
+        rotation = matrix_from_quaternion_xyzw(frame['rotation_xyzw'])
+        np.testing.assert_allclose(rotation, T_R_N[:3, :3], atol=1e-12)
+    assert set(fit['markers']) == {'sir', 'smr'}
+    assert fit['sampler']['chains'] == 4
+    assert fit['sampler']['seconds'] is None  # no clock was given
+    assert set(fit['accuracy']) == {'optimization', 'validation'}
+    assert fit['gauge'][0]['fixed_by'] == f'{fit_result.joint_names[0]} = 0'
+    assert [row['observation'] for row in fit['left_out']] == [o for o, _ in fit_result.left_out]
+    assert fit['left_out']
+    assert len(fit['robot']['urdf_sha256']) == 64
+
+
+def test_offsets_of_another_robot_are_refused(fit_result):
+    fit = fit_to_dict(fit_result)
+    with pytest.raises(InputError, match='use the fit of this robot'):
+        joint_offsets_rad(fit, ['joint_1', 'joint_2'])
+
+
+@pytest.mark.parametrize(
+    ('key', 'value'), [('std_deg', -0.01), ('std_deg', 1e30), ('mean_deg', -1e300)]
+)
+def test_offsets_that_are_no_angles_are_refused(fit_result, key, value):
+    fit = fit_to_dict(fit_result)
+    fit['joint_offsets'][2][key] = value
+    with pytest.raises(InputError, match=f'joint_3: {key} is {value:g}, not '.replace('+', r'\+')):
+        joint_offsets_rad(fit, fit_result.joint_names)
+
+
+@pytest.mark.parametrize(
+    ('change', 'problem'),
+    [
+        (lambda fit: fit.pop('joint_offsets'), 'joint_offsets'),
+        (lambda fit: fit.update(format='remaster-fit/9'), 'remaster-fit/9'),
+        (lambda fit: fit['joint_offsets'][1].update(mean_deg='x'), r'joint_offsets\[1\]'),
+        (lambda fit: fit['noise']['mocap'].pop('sigma_m'), 'sigma_m'),
+    ],
+)
+def test_a_wrong_fit_json_is_refused(fit_result, tmp_path, change, problem):
+    path = tmp_path / 'fit.json'
+    fit = write_fit(fit_result, path)
+    change(fit)
+    path.write_text(json.dumps(fit))
+    with pytest.raises(InputError, match=problem) as caught:
+        read_fit(path)
+    assert str(path) in str(caught.value)
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('data', [b'', b'{', b'[]', b'\xff\xfe', b'[' * 100_000])
+def test_what_is_no_fit_json_is_refused(data, tmp_path):
+    (tmp_path / 'fit.json').write_bytes(data)
+    with pytest.raises(InputError, match=r'fit\.json'):
+        read_fit(tmp_path / 'fit.json')
+
+
+def test_an_output_folder_is_tried_before_the_work(tmp_path):
+    prepare_folder(tmp_path / 'out')
+    prepare_folder(tmp_path / 'out')
+    assert list((tmp_path / 'out').iterdir()) == []
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(InputError, match='cannot be written'):
+        prepare_folder(tmp_path / 'file')
+
+
+def test_the_calibrated_urdf_is_the_robot_with_offsets(fit_result):
+    rng = np.random.default_rng(2)
+    chain = fit_result.chain
+    offsets = rng.normal(0, 0.02, len(chain))
+    text = calibrated_urdf(fit_result.session.urdf, chain, offsets)
+    calibrated = SerialChain.from_urdf(text, chain.base_link, chain.tip_link)
+    q = rng.uniform(chain.lower, chain.upper, (50, len(chain)))
+    np.testing.assert_allclose(
+        calibrated.forward(q), chain.forward(q, offsets), rtol=0, atol=1e-12
+    )
+    # The arm stops in the same places: reported limit + offset = nominal limit.
+    np.testing.assert_allclose(calibrated.lower + offsets, chain.lower, atol=1e-12)
+    np.testing.assert_allclose(calibrated.upper + offsets, chain.upper, atol=1e-12)
+    np.testing.assert_allclose(calibrated.masses, chain.masses)
+    assert 'Geometry, limits and velocities' in text  # comments stay
+
+
+def test_joints_without_origin_or_limits_are_calibrated_too():
+    text = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
+      <joint name="j1" type="continuous"><parent link="a"/><child link="b"/>
+        <axis xyz="0 1 0"/></joint>
+      <joint name="j2" type="revolute"><parent link="b"/><child link="c"/>
+        <origin xyz="1 0 0"/><axis xyz="0 0 2"/><limit lower="-1" upper="1" velocity="1"/>
+        <safety_controller soft_lower_limit="-0.9" soft_upper_limit="0.9"/></joint></robot>"""
+    chain = SerialChain.from_urdf(text)
+    offsets = np.array([0.1, -0.2])
+    shifted = calibrated_urdf(text, chain, offsets)
+    calibrated = SerialChain.from_urdf(shifted)
+    q = np.array([0.3, 0.4])
+    np.testing.assert_allclose(calibrated.forward(q), chain.forward(q, offsets), atol=1e-15)
+    assert 'soft_upper_limit="1.1' in shifted
+
+
+def test_roll_pitch_yaw_are_exact_at_and_near_the_singularity():
+    rng = np.random.default_rng(4)
+    for away in (0.0, 1e-16, 1e-12, 1e-9, 1e-7, 1e-4, 1.0):
+        for sign in (-1, 1):
+            rpy = rng.uniform(-3, 3, 3)
+            rpy[1] = sign * (np.pi / 2 - away)
+            rotation = matrix_from_rpy(rpy)
+            np.testing.assert_allclose(matrix_from_rpy(_rpy(rotation)), rotation, atol=1e-14)
+
+
+def test_the_offset_layer_is_a_ros_parameter_file(fit_result):
+    known = fit_result.identifiable
+    assert 0 < known.sum() < len(known)
+    parameters = yaml.safe_load(layer_text(fit_result))['/**']['ros__parameters']
+    names = np.array(fit_result.joint_names)
+    assert parameters['joint_names'] == names[known].tolist()
+    assert parameters['joint_offsets'] == fit_result.joint_offsets[known].tolist()
+    assert parameters['joint_offsets_std'] == fit_result.joint_offsets_std[known].tolist()
+    assert parameters['left_out'] == names[~known].tolist()
+
+
+def test_the_instructions_say_minus_the_offset(fit_result):
+    text = remaster_text(fit_result)
+    table, _, notes = text.partition('Left out of all three')
+    for i, joint in enumerate(fit_result.joint_names):
+        lines = [line for line in table.splitlines() if line.split()[:1] == [joint]]
+        assert len(lines) == fit_result.identifiable[i]
+        if not fit_result.identifiable[i]:
+            assert f'{joint}: {fit_result.why[i]}' in notes
+            continue
+        offset, _, drive_to = map(float, lines[0].split()[1:4])
+        assert (
+            offset == -drive_to == pytest.approx(np.degrees(fit_result.joint_offsets[i]), abs=6e-5)
+        )
+
+
+@pytest.mark.parametrize('known', [True, False])
+def test_all_joints_or_none_may_be_applied(fit_result, known):
+    """No list that ROS cannot read, no table without rows, and hyphens that end no comment."""
+    count = len(fit_result.joint_names)
+    result = replace(
+        fit_result,
+        identifiable=np.full(count, known),
+        why=('' if known else 'joint_1 -- a <name> --->',) * count,
+    )
+    texts = exports(result)
+    layer = yaml.safe_load(texts['offset_layer.yaml'])
+    parameters = layer['/**']['ros__parameters']
+    assert ('joint_names' in parameters) == ('joint_offsets' in parameters) == known
+    assert ('left_out' in parameters) != known
+    text = texts['remaster.txt']
+    assert ('drive to, deg' in text) == known
+    assert ('these data tell no offset' in text) != known
+    assert ('Left out' in text) != known
+    urdf = texts['robot_calibrated.urdf']
+    chain = SerialChain.from_urdf(urdf, result.chain.base_link, result.chain.tip_link)
+    assert np.array_equal(chain.lower, result.chain.lower) != known
+    assert ('left out' in urdf) != known

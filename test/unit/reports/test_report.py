@@ -1,0 +1,330 @@
+"""The report is one page that needs nothing else, says the verdict, and stays of bounded size."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from html.parser import HTMLParser
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from remaster_ros.calibration.noise_check import NoiseCheck
+from remaster_ros.calibration.result import NoiseEstimate
+from remaster_ros.kinematics import transforms
+from remaster_ros.kinematics.transforms import apply
+from remaster_ros.reports.fit_json import save_fit
+from remaster_ros.reports.report import report_html, verdict
+from remaster_ros.reports.scene import _round_factor, draw_scene
+
+VOID = {'meta', 'br', 'img', 'link', 'hr', 'input'}
+
+
+class Page(HTMLParser):
+    """Checks that elements nest, and collects identifiers, addresses and text."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.ids, self.addresses, self.text = [], [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in VOID:
+            self.open.append(tag)
+        attributes = dict(attrs)
+        if 'id' in attributes:
+            self.ids.append(attributes['id'])
+        for key in ('src', 'href', 'xlink:href'):
+            if key in attributes:
+                self.addresses.append(attributes[key])
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] not in ('script', 'style'):
+            self.text.append(data)
+
+
+@pytest.fixture(scope='module')
+def folder(fit_result, tmp_path_factory):
+    folder = tmp_path_factory.mktemp('fit')
+    assert save_fit(fit_result, folder) == folder / 'report.html'
+    return folder
+
+
+@pytest.fixture(scope='module')
+def html(folder):
+    return (folder / 'report.html').read_text(encoding='utf-8')
+
+
+@pytest.fixture(scope='module')
+def page(html):
+    page = Page()
+    page.feed(html)
+    page.close()
+    return page
+
+
+def test_all_files_are_there(folder):
+    names = sorted(str(p.relative_to(folder)) for p in folder.rglob('*') if p.is_file())
+    assert names == [
+        'apply/offset_layer.yaml',
+        'apply/remaster.txt',
+        'apply/robot_calibrated.urdf',
+        'figures/errors.svg',
+        'figures/posteriors.svg',
+        'figures/residuals.svg',
+        'figures/traces.svg',
+        'fit.json',
+        'report.html',
+    ]
+
+
+def test_the_page_is_whole_and_needs_nothing_else(page, html):
+    assert page.open == []
+    assert len(page.ids) == len(set(page.ids))
+    assert page.addresses
+    for address in page.addresses:
+        assert address.startswith('#')
+        assert address[1:] in page.ids
+    for reference in re.findall(r'url\(#([^)]+)\)', html):
+        assert reference in page.ids
+
+
+def test_the_page_says_what_was_found(fit_result, page):
+    text = ' '.join(' '.join(page.text).split())
+    metrics = fit_result.accuracy['validation']['post_registration']
+    before, after = (f'{metrics[side]["mean_mm"]:.3f} mm' for side in ('before', 'after'))
+    assert f'falls from {before} to {after} on poses it never fitted' in text
+    for i, joint in enumerate(fit_result.joint_names):
+        if fit_result.identifiable[i]:
+            degrees = f'{np.degrees(fit_result.joint_offsets[i]):+.4f}'.replace('-', '−')
+            assert f'{joint} {degrees}' in text
+        else:
+            assert fit_result.why[i] in text
+    for direction in fit_result.gauge:
+        assert direction.why in text
+    for observation, why in fit_result.left_out:
+        assert f'{observation} {why}' in text
+    for name in fit_result.session.sensors:
+        assert name in text  # also the one that looks like markup
+    assert fit_result.sampler.message[1:] in text
+
+
+def test_names_cannot_become_markup(fit_result, html):
+    hostile = [name for name in fit_result.session.sensors if '<' in name]
+    assert hostile
+    assert hostile[0] not in html
+
+
+def test_the_size_is_bounded(folder):
+    assert (folder / 'report.html').stat().st_size < 8e6
+
+
+@pytest.mark.parametrize('name', ['posteriors', 'traces', 'errors', 'residuals'])
+def test_figures_are_svg_with_nothing_cut_off(folder, name):
+    root = ElementTree.parse(folder / 'figures' / f'{name}.svg').getroot()
+    width, height = map(float, root.get('viewBox').split()[2:])
+    texts = [e for e in root.iter('{http://www.w3.org/2000/svg}text')]
+    assert texts
+    for text in texts:
+        place = re.search(r'(?:translate|rotate)\(([^)]*)\)', text.get('transform', ''))
+        if place and place.group(0).startswith('translate'):
+            x, y = map(float, place.group(1).split()[:2] if ' ' in place.group(1) else [0, 0])
+        else:
+            x, y = float(text.get('x', 0)), float(text.get('y', 0))
+        assert -1 <= x <= width + 1
+        assert -1 <= y <= height + 1
+
+
+def test_figures_name_units_and_joints(fit_result, folder):
+    figures = {p.stem: p.read_text(encoding='utf-8') for p in (folder / 'figures').iterdir()}
+    for joint in fit_result.joint_names:
+        assert joint in figures['posteriors']
+        assert joint in figures['traces']
+    assert 'degrees' in figures['posteriors']
+    assert 'chain 4' in figures['traces']
+    for name in ('errors', 'residuals'):
+        assert '(mm)' in figures[name]
+    for word in ('mocap', 'before', 'after'):
+        assert word in figures['errors']
+
+
+def test_the_same_fit_gives_the_same_page(fit_result, folder, tmp_path):
+    save_fit(fit_result, tmp_path)
+    for path in folder.rglob('*'):
+        if path.is_file():
+            assert path.read_bytes() == (tmp_path / path.relative_to(folder)).read_bytes()
+
+
+def test_without_figures_there_is_no_report_and_none_of_an_earlier_fit(fit_result, tmp_path):
+    (tmp_path / 'report.html').write_text('of an earlier fit')
+    assert save_fit(fit_result, tmp_path, figures=False) == tmp_path / 'fit.json'
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['apply', 'fit.json']
+
+
+def test_drawing_libraries_are_imported_only_for_a_report():
+    script = (
+        'import sys, remaster_ros.reports.fit_json, remaster_ros.session.reader\n'
+        "print([m for m in ('matplotlib', 'plotly', 'jinja2', 'mcap') if m in sys.modules])"
+    )
+    out = subprocess.run(
+        [sys.executable, '-c', script], capture_output=True, text=True, check=True
+    )
+    assert out.stdout.strip() == '[]'
+
+
+def with_accuracy(result, split, before, after):
+    metric = {'before': {'mean_mm': before}, 'after': {'mean_mm': after}}
+    accuracy = {'optimization': None, 'validation': None, split: {'post_registration': metric}}
+    return replace(result, accuracy=accuracy)
+
+
+@pytest.mark.parametrize(
+    ('split', 'before', 'after', 'converged', 'mood', 'words'),
+    [
+        ('validation', 4.0, 0.5, True, 'good', '8.0 times smaller'),
+        ('validation', 1.0, 0.97, True, 'caution', 'hardly matter'),
+        ('validation', 1.0, 1.5, True, 'bad', 'make it worse'),
+        ('optimization', 4.0, 0.5, True, 'caution', 'on the fitted poses'),
+        ('validation', 4.0, 0.5, False, 'bad', 'have not converged'),
+    ],
+)
+def test_the_verdict_is_honest(fit_result, split, before, after, converged, mood, words):
+    sampler = replace(fit_result.sampler, converged=converged)
+    result = replace(with_accuracy(fit_result, split, before, after), sampler=sampler)
+    judged = verdict(result)
+    assert judged.mood == mood
+    assert words in judged.headline
+    told = ' '.join(judged.points)
+    assert ('fit again with more draws' in told) != converged
+    assert ('no validation poses' in told) == (split == 'optimization')
+
+
+MOVED = NoiseCheck('tracker', 2.337e-3, None, 0.11e-3, poses=12)
+UNTOLD = NoiseCheck('tracker', 0.3e-3, None, None, poses=12)
+
+
+@pytest.mark.parametrize('after', [2.337, 4.3])
+@pytest.mark.parametrize('check', [MOVED, UNTOLD], ids=['moved', 'untold'])
+def test_an_error_that_noise_does_not_explain_is_never_green(fit_result, check, after):
+    result = replace(with_accuracy(fit_result, 'validation', 4.395, after), noise_checks=(check,))
+    judged = verdict(result)
+    assert judged.mood == 'caution'
+    told = f'{judged.headline} {judged.points[0]}'
+    if check is MOVED:
+        assert 'other errors dominate; run "remaster discover"' in judged.headline
+        assert '0.110 mm per axis within a pose' in told
+        assert 'makes 0.176 mm' in told
+    else:
+        assert 'this session cannot tell' in judged.headline
+        assert 'measure poses in all their joint solutions' in told
+    assert judged.points[0].startswith('tracker: ')
+    html = report_html(replace(fit_result, noise_checks=(check,)), {})
+    assert 'verdict caution' in html
+
+
+def test_offsets_that_hardly_matter_where_noise_explains_the_rest(fit_result):
+    assert all(check.explained for check in fit_result.noise_checks)
+    judged = verdict(with_accuracy(fit_result, 'validation', 0.4, 0.39))
+    assert judged.mood == 'caution'
+    assert 'That is what noise explains' in judged.headline
+    assert 'discover' not in judged.headline
+
+
+def test_a_session_without_validation_has_a_report(fit_result):
+    optimization = ~fit_result.session.measurements.is_validation
+    result = replace(
+        fit_result,
+        session=fit_result.session.select(optimization),
+        residuals_before=fit_result.residuals_before[optimization],
+        residuals_after=fit_result.residuals_after[optimization],
+        accuracy={**fit_result.accuracy, 'validation': None},
+        left_out=(),
+    )
+    html = report_html(result, {})
+    assert 'not proven' in html
+    assert 'No observation was left out' in html
+
+
+def test_noise_along_the_line_of_sight_has_rows_of_its_own(fit_result):
+    name = next(iter(fit_result.noise))
+    part = NoiseEstimate(0.0123e-3, 1e-6, None, None)
+    noise = replace(fit_result.noise[name], directions={'along': part, 'across': part})
+    plain = report_html(fit_result, {})
+    assert 'line of sight' not in plain
+    html = report_html(replace(fit_result, noise={**fit_result.noise, name: noise}), {})
+    assert 'along the line of sight' in html
+    assert html.count('0.0123') == 2
+
+
+def test_error_vectors_lead_from_the_measured_to_the_modelled_marker(fit_result):
+    """After, magnified once, every vector ends where the calibrated arm has the marker."""
+    scene = draw_scene(fit_result)
+    m = fit_result.session.measurements
+    by_name = {trace['name'].split(',')[0]: trace for trace in scene.data}
+    json.dumps(scene.data, allow_nan=False)
+    assert scene.rows_shown == scene.rows == len(m)
+    after = by_name['error after']
+    lines = np.array([after['x'], after['y'], after['z']], dtype=float).T.reshape(-1, 3, 3)
+    starts, ends = lines[:, 0], lines[:, 1]
+    markers = np.array([fit_result.marker_positions[n] for n in fit_result.session.markers])
+    modelled = fit_result.chain.positions(m.q, markers[m.marker], fit_result.joint_offsets)
+    T_R_N = np.array([fit_result.T_R_N[n] for n in fit_result.session.sensors])[m.sensor]
+    np.testing.assert_allclose(starts, apply(T_R_N, m.position), atol=1e-5)
+    np.testing.assert_allclose(starts + (ends - starts) / scene.magnification, modelled, atol=3e-5)
+
+
+@pytest.mark.parametrize(
+    ('factor', 'rounded'), [(0.3, 1), (1.9, 1), (2.0, 2), (49.0, 20), (50.0, 50), (999.0, 500)]
+)
+def test_magnifications_are_round(factor, rounded):
+    assert _round_factor(factor) == rounded
+
+
+def with_references(fit_result, shift_m):
+    """The session with four rounds of five references, the sensor moved before the last one."""
+    session, chain = fit_result.session, fit_result.chain
+    m = session.measurements
+    rng = np.random.default_rng(12)
+    print('seed 12')
+    pick = np.flatnonzero(m.sensor == 0)[np.linspace(0, 40, 5).astype(int)]
+    rows = m.select(np.tile(pick, 4))
+    name = session.sensor_names[0]
+    seen = chain.positions(rows.q, session.markers[session.sensors[name]])
+    seen[-5:] += [0.0, shift_m, 0.0]
+    T = fit_result.T_R_N[name]
+    number = np.arange(len(rows)) + 10_000
+    references = replace(
+        rows,
+        observation=number,
+        configuration=number,
+        position=transforms.apply(transforms.inverse(T), seen) + rng.normal(0, 2e-5, seen.shape),
+        std=np.full((len(rows), 3), np.nan),
+        stamp_s=number * 5.0,
+    )
+    return replace(fit_result, session=replace(session, references=references)), name
+
+
+def test_what_changed_in_the_session_is_said_first(fit_result):
+    assert 'id="references"' not in report_html(fit_result, {})
+    result, _ = with_references(fit_result, 0.0)
+    html = report_html(result, {})
+    assert '4 rounds of the same few configurations' in html
+    assert 'Nothing did' in html
+    result, name = with_references(fit_result, 3e-3)
+    judged = verdict(result)
+    assert any(f'{name} or the base was moved between' in point for point in judged.points)
+    assert judged.mood != 'good'
+    html = report_html(result, {})
+    assert html.count('was moved between configurations') == 2
+    assert 'off by up to 3.0' in html

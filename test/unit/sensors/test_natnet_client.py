@@ -1,0 +1,466 @@
+"""The OptiTrack client on real sockets: against the fake server, and against misbehaving ones."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import threading
+import time
+
+import numpy as np
+import pytest
+from fuzzing import DatagramSource, full_frame
+from optitrack_world import RATE, SENSOR, MarkerWorld, eventually, free_port, open_descriptors
+
+from remaster_ros.errors import DeviceError
+from remaster_ros.sensors.optitrack import client as natnet_client
+from remaster_ros.sensors.optitrack.client import NatNetClient, NatNetSettings
+from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
+from remaster_ros.sensors.optitrack.protocol import natnet
+from remaster_ros.sensors.optitrack.protocol.frames import (
+    BITSTREAM_CHANGED,
+    MODEL_LIST_CHANGED,
+    Frame,
+    LabeledMarker,
+)
+from remaster_ros.sensors.optitrack.protocol.models import ModelDefinition, RigidBodyDescription
+from remaster_ros.simulation.optitrack import FakeOptiTrackServer
+from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour
+
+LOCAL = '127.0.0.1'
+NOISELESS = OptiTrackBehaviour(noise_across_m=0.0, noise_along_m=0.0)
+
+
+@pytest.fixture
+def data_port():
+    return free_port()
+
+
+@contextlib.contextmanager
+def fake_server(data_port, command_port=0, world=None, **options):
+    server = FakeOptiTrackServer(
+        world or MarkerWorld(),
+        SENSOR,
+        np.random.default_rng(1),
+        command_port=command_port,
+        data_port=data_port,
+        **options,
+    )
+    with server:
+        yield server
+
+
+@contextlib.contextmanager
+def client_of(port, data_port, on_sample=lambda sample: None, wait_s=20.0, clock=None, **settings):
+    client = NatNetClient(
+        NatNetSettings(
+            **({'command_port': port, 'data_port': data_port, 'silence_s': 0.4} | settings)
+        ),
+        on_sample,
+        *([clock] if clock else []),
+    )
+    client.start(wait_s)
+    try:
+        yield client
+    finally:
+        client.stop()
+
+
+@pytest.mark.parametrize('transport', ['unicast', 'multicast'])
+@pytest.mark.parametrize('version', [(2, 6), (2, 10), (3, 1), (4, 1), (4, 3)])
+def test_readings_are_where_the_marker_was(version, transport, data_port):
+    samples = []
+    world = MarkerWorld()
+    start = world.now()
+    options = {'version': version, 'transport': transport, 'behaviour': NOISELESS, 'world': world}
+    with (
+        fake_server(data_port, **options) as server,
+        client_of(
+            server.command_port, data_port, samples.append, transport=transport, clock=world.now
+        ) as client,
+    ):
+        assert eventually(lambda: len(samples) >= 20)
+        assert client.diagnosis().fault == 'none', client.diagnosis()
+        status = client.status()
+    assert (status.version, status.marker_id) == (version, 65537)
+    # The scene began between `start` and the first frame: find its zero from the first reading.
+    times = np.array([sample.timestamp_s for sample in samples])
+    positions = np.array([sample.position for sample in samples])
+    angles = np.unwrap(np.arctan2(positions[:, 1], positions[:, 0]))
+    np.testing.assert_allclose(np.diff(angles), np.diff(times), atol=1e-4)
+    np.testing.assert_allclose(np.hypot(positions[:, 0], positions[:, 1]), 0.3, atol=1e-6)
+    np.testing.assert_allclose(positions[:, 2], 2.0, atol=1e-6)
+    assert (np.diff([sample.frame_number for sample in samples]) >= 1).all()
+    received = np.array([sample.received_s for sample in samples])
+    assert (received >= start + times).all(), 'no reading arrives before it was taken'
+
+
+def test_hidden_markers_never_become_readings(data_port):
+    """Model-filled positions are 0.5 m off here: a single one that passed would show."""
+    seen = []
+    hides = OptiTrackBehaviour(occlusions_per_s=2.0, occlusion_s=0.3, guess_error_m=0.5)
+    with (
+        fake_server(data_port, behaviour=hides, rate_hz=100.0) as server,
+        client_of(server.command_port, data_port, seen.append) as client,
+    ):
+        hidden = (Dropped.OCCLUDED, Dropped.MODEL_FILLED)
+        assert eventually(lambda: all(client.status().dropped[r] > 10 for r in hidden))
+        assert eventually(lambda: len(seen) > 100)
+    radii = [np.hypot(*sample.position[:2]) for sample in seen]
+    np.testing.assert_allclose(radii, 0.3, atol=6 * 25e-6)
+
+
+def test_a_blocked_line_of_sight_is_named(data_port):
+    world = MarkerWorld()
+    with (
+        fake_server(data_port, world=world) as server,
+        client_of(server.command_port, data_port) as client,
+    ):
+        assert eventually(lambda: client.diagnosis().fault == 'none')
+        world.visible = False
+        assert eventually(lambda: client.diagnosis().fault == 'marker')
+        assert 'hidden' in client.diagnosis().message
+        world.visible = True
+        assert eventually(lambda: client.diagnosis().fault == 'none')
+
+
+def test_the_wanted_bitstream_is_negotiated(data_port):
+    options = {'version': (4, 1), 'transport': 'unicast'}
+    for wanted, agreed in (('3.1', (3, 1)), ('4.1', (4, 1)), ('4.3', (4, 1)), ('2.10', (4, 1))):
+        samples = []
+        with (
+            fake_server(data_port, **options) as server,
+            client_of(
+                server.command_port, data_port, samples.append, transport='unicast',
+                bitstream=wanted,
+            ) as client,
+        ):  # fmt: skip
+            assert eventually(lambda: samples)  # noqa: B023
+            assert client.status().version == agreed
+
+
+def test_a_server_that_does_not_negotiate_is_read_in_its_own_version(data_port):
+    with (
+        fake_server(data_port, version=(3, 1), transport='unicast') as server,
+        client_of(server.command_port, data_port, transport='unicast', bitstream='4.1') as client,
+    ):
+        assert client.status().version == (3, 1)
+
+
+@pytest.mark.parametrize('transport', ['unicast', 'multicast'])
+def test_a_restarted_server_of_another_version_is_followed(transport, data_port):
+    samples = []
+    port = free_port()
+    with client_of(port, data_port, samples.append, wait_s=0, transport=transport) as client:
+        for version in ((3, 1), (4, 1), (2, 10)):
+            before = len(samples)
+            with fake_server(data_port, port, version=version, transport=transport):
+                assert eventually(lambda: len(samples) > before + 5), version  # noqa: B023
+                assert client.status().version == version
+        assert eventually(lambda: client.diagnosis().fault == 'silence')
+
+
+def test_the_server_forgets_a_client_that_says_goodbye_or_nothing(data_port):
+    with fake_server(data_port, transport='unicast', client_timeout_s=0.5) as server:
+        with client_of(server.command_port, data_port, transport='unicast'):
+            assert len(server.clients) == 1
+        assert eventually(lambda: not server.clients), 'DISCONNECT'
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mute:
+            mute.settimeout(20.0)
+            mute.sendto(struct.pack('<2H', 0, 0), (LOCAL, server.command_port))
+            while natnet.split_datagram(mute.recv(65536))[0] != 11:
+                pass
+            assert not server.clients
+
+
+def test_a_client_keeps_itself_alive(data_port):
+    with (
+        fake_server(data_port, transport='unicast', client_timeout_s=2.5) as server,
+        client_of(server.command_port, data_port, transport='unicast') as client,
+    ):
+        frames = client.status().frames
+        assert eventually(lambda: client.status().frames > frames + 6 * 30 * RATE / 2)
+        assert server.clients
+
+
+@pytest.mark.parametrize(
+    ('settings', 'server_options', 'text'),
+    [
+        ({'transport': 'unicast'}, {}, 'set transport to multicast'),
+        ({'multicast_group': '239.1.2.3'}, {}, 'set multicast_group'),
+        ({'marker': MarkerChoice(rigid_body='tol')}, {}, 'the server streams: tool'),
+        ({}, {'version': (2, 10), 'multicast_group': '239.4.5.6'}, 'local_interface the card'),
+    ],
+)
+def test_a_wrong_setting_is_named_at_start(settings, server_options, text, data_port):
+    with (
+        fake_server(data_port, **server_options) as server,
+        pytest.raises(DeviceError, match=text),
+        client_of(server.command_port, data_port, wait_s=1.5, **settings),
+    ):
+        pass
+
+
+def test_a_unicast_server_is_followed_even_by_a_client_set_to_multicast(data_port):
+    """Its frames come to the command socket, as long as the client keeps itself alive."""
+    options = {'transport': 'unicast', 'client_timeout_s': 1.5}
+    with (
+        fake_server(data_port, **options) as server,
+        client_of(server.command_port, data_port, transport='multicast') as client,
+    ):
+        frames = client.status().frames
+        assert eventually(lambda: client.status().frames > frames + 4 * 30 * RATE / 2)
+        assert client.status().restarts == 0
+        assert server.clients
+
+
+def test_a_wrong_data_port_is_named(data_port):
+    with (
+        fake_server(data_port) as server,
+        pytest.raises(DeviceError, match=f'streams to UDP port {data_port}'),
+        client_of(server.command_port, free_port(), wait_s=1.5),
+    ):
+        pass
+
+
+def test_a_server_that_never_answers_is_named_in_time():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
+        deaf.bind((LOCAL, 0))
+        port = deaf.getsockname()[1]
+        before = threading.active_count(), open_descriptors()
+        with pytest.raises(DeviceError, match=f'no answer from 127.0.0.1:{port}'):
+            NatNetClient(NatNetSettings(command_port=port, data_port=free_port()), print).start(
+                1.0
+            )
+        assert (threading.active_count(), open_descriptors()) == before
+    with pytest.raises(DeviceError, match=f'nothing listens on UDP port {port}'):
+        NatNetClient(NatNetSettings(command_port=port, data_port=free_port()), print).start(1.0)
+
+
+@pytest.mark.parametrize(
+    ('settings', 'text'),
+    [
+        ({'server': 'no-such-host.invalid'}, 'server: .* is not known'),
+        ({'local_interface': '192.0.2.123'}, 'no address of this machine'),
+    ],
+)
+def test_an_address_that_cannot_be_used_is_named(settings, text, data_port):
+    with pytest.raises(DeviceError, match=text):
+        NatNetClient(NatNetSettings(data_port=data_port, **settings), print).start()
+
+
+def test_ports_in_use_are_named(data_port):
+    group = natnet.DEFAULT_MULTICAST_GROUP
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as selfish:
+        selfish.bind((group, data_port))
+        before = open_descriptors()
+        with pytest.raises(DeviceError, match=f'UDP port {data_port} .* is in use'):
+            NatNetClient(NatNetSettings(data_port=data_port), print).start()
+        assert open_descriptors() == before
+    with (
+        fake_server(data_port) as server,
+        pytest.raises(DeviceError, match=f'UDP port {server.command_port} .* set command_port'),
+        fake_server(data_port, server.command_port),
+    ):
+        pass
+
+
+class Peer:
+    """A hand-made server: sends exactly what a test wants sent."""
+
+    version = (3, 1)
+    connection = natnet.Connection(10_000_000, 1511, False, '0.0.0.0')
+
+    def __init__(self):
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind((LOCAL, 0))
+        self.socket.settimeout(20.0)
+        self.port = self.socket.getsockname()[1]
+        self.number = 0
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        self.socket.close()
+
+    def wait_for(self, message_id):
+        while True:
+            datagram, self.client = self.socket.recvfrom(65536)
+            if natnet.decode_request(datagram).id == message_id:
+                return
+
+    def welcome(self):
+        """Answer CONNECT and MODELDEF."""
+        self.wait_for(natnet.MessageId.CONNECT)
+        self.send(natnet.ServerInfo('peer', (3, 0, 0, 0), self.version, self.connection))
+        self.wait_for(natnet.MessageId.REQUEST_MODELDEF)
+        self.name_body('tool', 1)
+
+    def name_body(self, name, body_id):
+        self.send(ModelDefinition((RigidBodyDescription(name, body_id),)))
+
+    def send(self, message):
+        self.send_bytes(natnet.encode_message(message, self.version))
+
+    def send_bytes(self, datagram, sender=None):
+        (sender or self.socket).sendto(datagram, self.client)
+
+    def frame(self, **fields):
+        self.number += 1
+        position = (0.5 + 1e-6 * self.number, 0.25, 2.0)
+        marker = LabeledMarker(1 << 16 | 1, position, 0.01, 0x0A, 1e-4)
+        return Frame(self.number, self.number / 100, (marker,), **fields)
+
+
+@pytest.fixture
+def peer_and_client():
+    """A hand-made server with a client that knows its marker."""
+    samples = []
+    with (
+        Peer() as peer,
+        client_of(peer.port, 1511, samples.append, wait_s=0, transport='unicast') as client,
+    ):
+        peer.welcome()
+        client.samples = samples
+        send_until_believed(peer, samples)
+        del samples[:]
+        yield peer, client
+
+
+def send_until_believed(peer, samples):
+    """Send frames until the peer has been the only source for long enough."""
+
+    def believed():
+        peer.send(peer.frame())
+        return samples
+
+    assert eventually(believed)
+    # What is still on its way comes before the test begins.
+    assert eventually(lambda: samples[-1].frame_number == peer.number)
+
+
+def test_no_datagram_ends_the_thread(peer_and_client):
+    peer, client = peer_and_client
+    rng = np.random.default_rng(5)
+    good = natnet.encode_message(peer.frame(), peer.version)
+    for length in range(len(good)):
+        peer.send_bytes(good[:length])
+    for _ in range(300):
+        bad = bytearray(good[: rng.integers(4, len(good))])
+        bad[rng.integers(len(bad))] ^= 1 << int(rng.integers(8))
+        peer.send_bytes(bytes(bad))
+        peer.send_bytes(rng.bytes(int(rng.integers(0, 200))))
+    for message_id in (1, 3, 5, 8, 13, 100, 200):
+        peer.send_bytes(natnet.join_datagram(message_id, rng.bytes(50)))
+    assert eventually(lambda: client.status().dropped[Dropped.MALFORMED] > len(good))
+
+    def takes_good_ones():
+        peer.send(peer.frame())
+        return len(client.samples) > 20
+
+    assert eventually(takes_good_ones)
+    for sample in client.samples:
+        np.testing.assert_allclose(sample.position, [0.5, 0.25, 2.0], atol=0.01)
+
+
+def test_another_address_is_counted_and_never_believed(peer_and_client):
+    peer, client = peer_and_client
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.bind(('127.0.0.2', 0))
+        for _ in range(5):
+            peer.send_bytes(natnet.encode_message(peer.frame(), (3, 1)), stranger)
+        assert eventually(lambda: client.status().dropped[Dropped.FOREIGN] == 5)
+    assert client.status().foreign == ('127.0.0.2',)
+    assert not client.samples
+    assert eventually(lambda: client.diagnosis().fault == 'address')
+    assert '127.0.0.2' in client.diagnosis().message
+
+
+def received(frames, on_sample):
+    """Return a client without sockets that has received frames and digested none."""
+    client = NatNetClient(NatNetSettings(marker=MarkerChoice(marker_id=1 << 16 | 1)), on_sample)
+    client._server_ip, client._version = LOCAL, (3, 1)
+    client._lock.source = (LOCAL, 1511)
+    client._data = source = DatagramSource()
+    for number in range(1, frames + 1):
+        datagram = natnet.encode_message(full_frame((3, 1), number), (3, 1))
+        source.waiting.append((datagram, (LOCAL, 1511)))
+    while source.waiting:
+        client._receive(source)
+    return client
+
+
+def test_a_slow_listener_keeps_no_datagram_in_the_socket():
+    """The socket is emptied between any two hand-overs that take long; nothing is lost."""
+    numbers = []
+
+    def listen(sample):
+        numbers.append(sample.frame_number)
+        time.sleep(0.006)
+
+    client = received(2000, listen)
+    client._digest_backlog()
+    assert numbers == [1], 'one turn takes no longer than its time'
+    client._on_sample = lambda sample: numbers.append(sample.frame_number)
+    while client._backlog:
+        client._digest_backlog()
+    assert numbers == list(range(1, 2001))
+    assert client.status().lost == 0
+
+
+def test_what_waits_is_bounded_and_the_rest_counted(monkeypatch):
+    one = len(natnet.encode_message(full_frame((3, 1)), (3, 1)))
+    monkeypatch.setattr(natnet_client, 'MAX_BACKLOG_BYTES', 100 * one)
+    client = received(130, print)
+    assert len(client._backlog) == 100
+    assert client.status().dropped[Dropped.OVERRUN] == 30
+
+
+def test_a_changed_model_list_is_asked_for(peer_and_client):
+    peer, client = peer_and_client
+    peer.send(peer.frame(params=MODEL_LIST_CHANGED))
+    peer.wait_for(natnet.MessageId.REQUEST_MODELDEF)
+    peer.name_body('tool', 2)
+    assert eventually(lambda: client.status().marker_id == 2 << 16 | 1)
+
+
+def test_a_changed_bitstream_is_asked_for(peer_and_client):
+    peer, client = peer_and_client
+    peer.send(peer.frame(params=BITSTREAM_CHANGED))
+    peer.version = (4, 1)
+    peer.welcome()
+    assert eventually(lambda: client.status().version == (4, 1))
+
+
+def test_an_unknown_version_is_named():
+    with (
+        Peer() as peer,
+        client_of(peer.port, 1511, wait_s=0, transport='unicast') as client,
+    ):
+        peer.wait_for(natnet.MessageId.CONNECT)
+        peer.send(natnet.ServerInfo('new', (9, 0, 0, 0), (5, 0), peer.connection))
+        assert eventually(lambda: client.diagnosis().fault == 'version')
+
+
+def test_a_listener_that_fails_is_logged_and_called_again(peer_and_client, caplog):
+    peer, client = peer_and_client
+    accepted = client.status().accepted
+    client._on_sample = lambda sample: 1 / 0
+    for _ in range(2):
+        peer.send(peer.frame())
+    assert eventually(lambda: len(caplog.records) == 2)
+    assert client.status().accepted == accepted + 2
+
+
+def test_stopping_leaves_nothing_behind(data_port):
+    before = threading.active_count(), open_descriptors()
+    for _ in range(3):
+        with (
+            fake_server(data_port) as server,
+            client_of(server.command_port, data_port) as client,
+        ):
+            pass
+        client.stop()  # a second time
+    assert (threading.active_count(), open_descriptors()) == before

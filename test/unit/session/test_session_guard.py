@@ -1,0 +1,183 @@
+"""What others do to the files of a session while it is written: restored, said, never sealed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from test_session_writer import observations
+
+from remaster_ros.cli.main import main
+from remaster_ros.errors import InputError, MovedError
+from remaster_ros.session.reader import read_session
+from remaster_ros.session.session_writer import SessionWriter
+
+FILES = ('observations.csv', 'journal.jsonl', 'session.yaml', 'robot.urdf')
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / 'runs' / 's'
+
+
+@pytest.fixture
+def begun(session, folder):
+    """Return a writer with half of the observations, and the rest."""
+    writer = SessionWriter(folder, session)
+    rows = list(observations(session))
+    for row in rows[:10]:
+        writer.append(row)
+    yield writer, rows[10:]
+    writer.release()
+
+
+@pytest.fixture
+def whole(session, tmp_path):
+    """Return the bytes of the same session when nobody touches it."""
+    with SessionWriter(tmp_path / 'whole', session) as writer:
+        for row in observations(session):
+            writer.append(row)
+    return {name: (tmp_path / 'whole' / name).read_bytes() for name in FILES}
+
+
+def finish(writer, rest, status='complete'):
+    for row in rest:
+        writer.append(row)
+    return writer.close(status)
+
+
+def check_is_whole(folder, whole):
+    for name in FILES:
+        if name != 'journal.jsonl':
+            assert (folder / name).read_bytes() == whole[name], name
+    sealed = subprocess.run(
+        ['sha256sum', '--check', '--strict', 'SHA256SUMS'], cwd=folder, capture_output=True
+    )
+    assert sealed.returncode == 0
+    read = read_session(folder)
+    assert read.exit_status == 'complete'
+    kept = [line for line in whole['journal.jsonl'].splitlines()]
+    journal = (folder / 'journal.jsonl').read_bytes().splitlines()
+    assert [line for line in journal if b'"kind":"restored"' not in line] == kept
+
+
+def sed(path, script):
+    subprocess.run(['sed', '-i', script, str(path)], check=True)
+
+
+def test_a_file_that_an_editor_saved_is_restored(begun, folder, whole):
+    """`sed -i` left 20 of 94 rows, sealed as complete."""
+    writer, rest = begun
+    sed(folder / 'observations.csv', '4,$d')
+    short = (folder / 'observations.csv').read_bytes()
+    assert finish(writer, rest) == 'complete'
+    check_is_whole(folder, whole)
+    (line,) = writer.restored
+    assert 'observations.csv: was replaced by another file' in line
+    assert 'what was found there is observations.csv.changed' in line
+    assert (folder / 'observations.csv.changed').read_bytes() == short
+    told = [json.loads(line) for line in (folder / 'journal.jsonl').read_bytes().splitlines()]
+    assert [r['file'] for r in told if r['kind'] == 'restored'] == ['observations.csv']
+
+
+@pytest.mark.parametrize('name', FILES)
+@pytest.mark.parametrize('when', ['in the run', 'before the end'])
+@pytest.mark.parametrize(
+    'change', ['saved', 'flipped', 'flipped, dated back', 'cut', 'longer', 'removed', 'folder']
+)
+def test_whatever_is_done_to_a_file_is_undone(begun, folder, whole, name, when, change):
+    writer, rest = begun
+    path = folder / name
+    if when == 'before the end':
+        for row in rest:
+            writer.append(row)
+        rest = []
+    data, dated = path.read_bytes(), path.stat()
+    place = len(data) // 2
+    flipped = data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
+    if change == 'saved':
+        sed(path, '1s/e/f/')
+        assert path.stat().st_ino != dated.st_ino
+    elif change == 'removed':
+        path.unlink()
+    elif change == 'folder':
+        path.unlink()
+        path.mkdir()
+    else:
+        with path.open('r+b') as file:
+            file.write(flipped if change.startswith('flipped') else data + b'x\n')
+            file.truncate({'cut': place, 'longer': len(data) + 2}.get(change, len(data)))
+    if change == 'flipped, dated back':
+        os.utime(path, ns=(dated.st_atime_ns, dated.st_mtime_ns))
+    assert finish(writer, rest) == 'complete'
+    check_is_whole(folder, whole)
+    assert len(writer.restored) == 1
+    assert str(path) in writer.restored[0]
+
+
+def test_a_file_that_was_only_touched_is_no_news(begun, folder, whole):
+    writer, rest = begun
+    for name in FILES:
+        os.utime(folder / name)
+    writer.check()
+    assert finish(writer, rest) == 'complete'
+    assert not writer.restored
+    check_is_whole(folder, whole)
+
+
+def test_a_removed_folder_is_noticed_and_its_observations_come_back(begun, folder, session):
+    writer, rest = begun
+    shutil.rmtree(folder.parent)
+    writer.check()
+    assert len(read_session(folder).measurements) == 10
+    assert len(writer.restored) == 4
+    assert finish(writer, rest) == 'aborted', 'the bag and the plan are lost'
+    assert 'the bag and the plan' in writer.beyond_repair
+    assert len(read_session(folder).measurements) == len(session.measurements)
+    assert read_session(folder).exit_status == 'aborted'
+
+
+def test_a_renamed_folder_is_noticed_and_gone_on_with_when_it_is_back(begun, folder, whole):
+    writer, rest = begun
+    folder.rename(folder.parent / 'elsewhere')
+    for attempt in (writer.check, lambda: writer.append(rest[0]), writer.close):
+        with pytest.raises(MovedError, match='put it back under its name'):
+            attempt()
+    folder.mkdir()
+    with pytest.raises(MovedError):
+        writer.append(rest[0])
+    folder.rmdir()
+    (folder.parent / 'elsewhere').rename(folder)
+    assert finish(writer, rest) == 'complete'
+    assert not writer.restored
+    check_is_whole(folder, whole)
+
+
+def test_a_restored_journal_is_still_written_by_one_process(begun, folder, session):
+    writer, rest = begun
+    sed(folder / 'journal.jsonl', '3d')
+    writer.check()
+    with pytest.raises(InputError, match='another process is writing'):
+        SessionWriter(folder, session, resume=True)
+    assert finish(writer, rest) == 'complete'
+
+
+def test_a_killed_session_whose_rows_were_changed_is_recovered(begun, folder, session, capsys):
+    """What the journal has is restored, and what was found is kept beside it."""
+    writer, _rest = begun
+    good = (folder / 'observations.csv').read_bytes()
+    writer.release()
+    sed(folder / 'observations.csv', '3s/$/0/')
+    with pytest.raises(InputError, match='let `remaster recover` restore it'):
+        SessionWriter(folder, session, resume=True)
+    assert main(['recover', str(folder)]) == 3
+    assert 'observations.csv.changed' in capsys.readouterr().out
+    assert (folder / 'observations.csv').read_bytes() == good
+    assert main(['recover', str(folder)]) == 0
+    read = read_session(folder)
+    assert read.exit_status == 'aborted'
+    np.testing.assert_array_equal(read.measurements.observation, range(10))

@@ -1,0 +1,125 @@
+"""The recorder's memory: numbering, results, registration and time across restarts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from remaster_ros.collection.pairing import PairedReading
+from remaster_ros.errors import InputError
+from remaster_ros.session.reader import read_session
+from remaster_ros.session.session_journal import Logbook
+
+
+def reading(sensor, stamp_s):
+    return PairedReading(
+        sensor=sensor,
+        marker={'mocap': 'sir', 'tracker': 'smr'}[sensor],
+        stamp_s=stamp_s,
+        q=np.array([0.1, 0.2]) + 1e-3 * stamp_s,
+        position=np.array([1.0, 2.0, 3.0]),
+        std=np.full(3, 1e-5) if sensor == 'mocap' else None,
+        samples=7,
+    )
+
+
+def write(book, pose, solution, readings, split='optimization', result='recorded', **options):
+    options.setdefault('temperatures_c', [21.5] * len(readings))
+    book.write(
+        pose=pose, solution=solution, split=split, result=result, reason='', readings=readings,
+        from_q=None, **options,
+    )  # fmt: skip
+
+
+def test_a_recorder_started_again_knows_what_it_decided(session, tmp_path):
+    book = Logbook(tmp_path, session)
+    assert not book.notes
+    assert book.follow('plan a')
+    points = [reading('mocap', 1.0), reading('tracker', 2.0)]
+    write(book, -1, 0, points, split='registration')
+    write(book, 0, 3, [reading('mocap', 9.0), reading('tracker', 8.0)])
+    write(book, 0, 1, [], result='rejected', temperatures_c=[])
+    write(book, 0, 2, [reading('mocap', 11.0)], result='partial', temperatures_c=[None])
+    book._writer.release()  # killed
+
+    book = Logbook(tmp_path, session)
+    assert 'after 3 observations' in book.notes[0]
+    assert book.plan_id == 'plan a'
+    results = [book.result(0, solution) for solution in range(4)]
+    assert results == ['', '', 'partial', 'recorded']
+    assert book.decided() == '0: 3 2'
+    assert [r.sensor for r in book.registration] == ['mocap', 'tracker']
+    np.testing.assert_array_equal(book.registration[0].q, points[0].q)
+    write(book, 0, 1, [reading('tracker', 12.0)])
+    book.close('complete')
+    m = read_session(tmp_path).measurements
+    assert m.observation.tolist() == [0, 1, 2, 3]
+    assert m.configuration.tolist() == [0, 0, 1, 2]
+    assert m.stamp_s.tolist() == [8.0, 9.0, 11.0, 12.0]
+    np.testing.assert_array_equal(m.temperature_c, [21.5, 21.5, np.nan, 21.5])
+
+    book = Logbook(tmp_path, session)
+    assert book.closed == 'complete'
+    assert book.observations == 4
+    assert 'is complete' in book.notes[0]
+
+
+def test_another_plan_is_not_followed_once_there_are_observations(session, tmp_path):
+    book = Logbook(tmp_path, session)
+    assert book.follow('a')
+    write(book, -1, 0, [reading('mocap', 1.0)], split='registration')
+    assert book.follow('b')
+    assert not book.result(-1, 0)
+    write(book, 0, 0, [reading('mocap', 2.0)])
+    assert not book.follow('c')
+    assert book.follow('b')
+    book.close('stopped')
+
+
+def test_time_goes_on_though_the_clock_began_anew(session, tmp_path):
+    book = Logbook(tmp_path, session)
+    write(book, 0, 0, [reading('mocap', 500.0)])
+    book.close('stopped')
+    for solution in (1, 2):
+        book.reopen()
+        write(book, 0, solution, [reading('mocap', 100.0 + solution)])
+        assert 'ran backwards' in ' '.join(book.notes) or solution == 2
+        book.close('stopped')
+    book.reopen()
+    write(book, 1, 0, [reading('mocap', 50.0)])
+    book.close('complete')
+    stamps = read_session(tmp_path).measurements.stamp_s.tolist()
+    assert stamps == pytest.approx([500.0, 501.0, 502.0, 503.0])
+
+
+def test_a_folder_of_something_else_is_refused(session, tmp_path):
+    (tmp_path / 'observations.csv').write_text('mine\n')
+    with pytest.raises(InputError, match='already holds files'):
+        Logbook(tmp_path, session)
+
+
+def test_references_are_rows_of_their_own_and_are_remembered(session, tmp_path):
+    book = Logbook(tmp_path, session)
+    book.follow('a')
+    places = [[reading('mocap', 1.0), reading('tracker', 1.5)], [reading('mocap', 2.0)]]
+    write(book, 0, 0, places[0], split='reference')
+    write(book, 1, 0, [reading('mocap', 3.0)], split='validation')
+    book.note_accepted()
+    write(book, 2, 0, places[1], split='reference')
+    book._writer.release()  # killed
+    book = Logbook(tmp_path, session)
+    assert [kind for kind, _, _ in book.watched] == ['reference', 'other', 'accepted', 'reference']
+    assert [number for kind, number, _ in book.watched if kind == 'reference'] == [0, 2]
+    for readings, (_, _, found) in zip(places, (book.watched[0], book.watched[3])):
+        for one, other in zip(readings, found, strict=True):
+            assert (one.sensor, one.stamp_s) == (other.sensor, other.stamp_s)
+            np.testing.assert_array_equal(one.position, other.position)
+            assert (one.std is None) == (other.std is None)
+    assert not book.registration
+    write(book, 3, 0, [reading('mocap', 4.0)])
+    book.close('complete')
+    found = read_session(tmp_path)
+    assert found.measurements.observation.tolist() == [2, 4]
+    assert found.measurements.is_validation.tolist() == [True, False]
+    assert found.references.observation.tolist() == [0, 1, 3]
+    assert found.references.configuration.tolist() == [0, 0, 2]

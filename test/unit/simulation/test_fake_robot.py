@@ -1,0 +1,168 @@
+"""The fake arm takes and drops trajectories as joint_trajectory_controller does."""
+
+import numpy as np
+import pytest
+
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.workcell import config_path
+from remaster_ros.simulation.faults import inject
+from remaster_ros.simulation.robot import FakeArm, TrajectoryPoint
+from remaster_ros.simulation.world import SensorTruth, Truth, World
+
+
+class SteppedWorld(World):
+    """A World whose time the test sets."""
+
+    time_s = 100.0
+
+    def now(self):
+        return self.time_s
+
+
+@pytest.fixture
+def world(tmp_path):
+    urdf = config_path('robots/lwr4plus.urdf').read_text()
+    chain = SerialChain.from_urdf(urdf)
+    rng = np.random.default_rng(5)
+    T = np.eye(4)
+    T[:3, 3] = [2.0, 0.0, 1.0]
+    truth = Truth(
+        5, rng.normal(0, 0.005, 7), {'mocap': SensorTruth(T, np.array([0.1, 0, 0]), np.pi)}
+    )
+    world = SteppedWorld.create(
+        tmp_path / 'world',
+        truth,
+        urdf=urdf,
+        base_link=chain.base_link,
+        tip_link=chain.tip_link,
+        rate=10.0,
+        start_q=np.array([0, 0.3, 0, -1.2, 0, 1.0, 0]),
+        link_radius_m=0.06,
+    )
+    yield world
+    world.close()
+
+
+@pytest.fixture
+def arm(world):
+    return FakeArm(world, np.random.default_rng(7))
+
+
+def go(arm, target, seconds=2.0, names=None, **kwargs):
+    return arm.command(names or arm.names, [TrajectoryPoint(seconds, target, **kwargs)])
+
+
+def test_it_follows_permuted_names(world, arm):
+    target = np.linspace(-0.3, 0.3, 7)
+    order = [3, 1, 0, 2, 6, 5, 4]
+    assert go(arm, target[order], names=[arm.names[i] for i in order]) is None
+    world.time_s += 10.0
+    stamp, names, q, velocity = arm.joint_state()
+    assert stamp == world.time_s
+    assert names != list(arm.names), 'joint_states must come in an order of their own'
+    np.testing.assert_allclose([dict(zip(names, q))[n] for n in arm.names], target, atol=2e-4)
+    np.testing.assert_allclose(velocity, 0, atol=1e-9)
+
+
+def test_it_does_not_clamp_to_limits(world, arm):
+    assert go(arm, np.full(7, 3.5)) is None
+    world.time_s += 10.0
+    np.testing.assert_allclose(arm.joint_state()[2], 3.5, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ('change', 'reason'),
+    [
+        ({'names': [f'joint_{i}' for i in range(7)]}, 'do not match'),
+        ({'names': [f'joint_{i + 1}' for i in range(6)]}, 'do not match'),
+        ({'velocities': [0.1] * 7}, 'velocity'),
+        ({'target': [np.nan] * 7}, 'finite'),
+        ({'target': [0.0] * 6}, '6 positions'),
+    ],
+)
+def test_what_it_cannot_follow_is_dropped_with_a_reason(world, arm, change, reason):
+    before = world.reported(world.now())[0]
+    change = dict(change)
+    assert reason in go(arm, change.pop('target', [0.0] * 7), **change)
+    world.time_s += 10.0
+    np.testing.assert_array_equal(world.reported(world.now())[0], before)
+
+
+def test_times_must_increase_and_not_end_in_the_past(arm):
+    points = [TrajectoryPoint(1.0, [0.0] * 7), TrajectoryPoint(1.0, [0.1] * 7)]
+    assert 'increase' in arm.command(arm.names, points)
+    assert 'past' in arm.command(arm.names, points[:1], start_s=50.0)
+
+
+def test_an_empty_trajectory_is_no_way_to_stop_it(world, arm):
+    """As with the controllers that refuse one: who wants the arm to stand must say where."""
+    go(arm, np.zeros(7), seconds=4.0)
+    world.time_s += 2.0
+    assert 'empty' in arm.command(arm.names, [])
+    assert np.max(np.abs(world.reported(world.now())[1])) > 0.1
+    world.time_s += 5.0
+    np.testing.assert_allclose(world.reported(world.now())[0], 0.0, atol=2e-4)
+
+
+def test_another_process_sees_the_same_arm(world, arm):
+    """A second World on the same folder computes the same marker at the same time."""
+    go(arm, np.linspace(-0.4, 0.4, 7))
+    other = World.open(world.folder)
+    go(arm, np.linspace(0.2, -0.2, 7))
+    for t in (100.5, 101.0, 103.0):
+        np.testing.assert_array_equal(
+            other.marker_in_sensor('mocap', t), world.marker_in_sensor('mocap', t)
+        )
+    other.close()
+
+
+def test_the_marker_is_where_offsets_put_it(world):
+    """True angle = reported one + zero-offset."""
+    truth = world.truth
+    T = world.chain.forward(world.start_q + truth.joint_offsets)
+    expected = T @ [*truth.sensors['mocap'].marker, 1.0]
+    seen = truth.sensors['mocap'].T_R_N @ [*world.marker_in_sensor('mocap', 100.0), 1.0]
+    np.testing.assert_allclose(seen, expected, atol=1e-12)
+
+
+def reports(world, arm, count, step_s=0.05):
+    """Return that many reports, each by joint name."""
+    found = []
+    for _ in range(count):
+        world.time_s += step_s
+        state = arm.joint_state()
+        if state is not None:
+            stamp, names, q, _ = state
+            found.append((stamp, np.array([dict(zip(names, q))[name] for name in arm.names])))
+    return found
+
+
+def spoiled(world, arm, count=6, **faults):
+    """Return reports of a moving arm: before a fault, and with it."""
+    inject(world.folder, {})
+    go(arm, np.full(7, 0.5), seconds=20.0)
+    before = reports(world, arm, 10)
+    inject(world.folder, {'robot': faults})
+    return before, reports(world, arm, count)
+
+
+def test_a_joint_that_is_a_turn_off(world, arm):
+    before, after = spoiled(world, arm, wrapped=3)
+    turn = np.array([0, 0, 2 * np.pi, 0, 0, 0, 0])
+    assert all(np.allclose(q - turn, before[-1][1], atol=0.1) for _, q in after)
+    before, after = spoiled(world, arm, wrapped_once=3)
+    assert np.allclose(after[0][1] - turn, before[-1][1], atol=0.1)
+    assert all(np.allclose(q, before[-1][1], atol=0.1) for _, q in after[1:])
+
+
+def test_reports_that_are_lost_doubled_repeated_or_frozen(world, arm):
+    assert len(spoiled(world, arm, lost=3)[1]) == 2
+    before, after = spoiled(world, arm, repeated=1)
+    assert all(stamp == before[-1][0] for stamp, _ in after)
+    before, after = spoiled(world, arm, frozen=1)
+    assert np.all(np.diff([stamp for stamp, _ in after]) > 0)
+    assert all(np.array_equal(q, before[-1][1]) for _, q in after)
+    assert not np.array_equal(before[-1][1], before[-2][1])
+    assert arm.copies == 1
+    spoiled(world, arm, doubled=1)
+    assert arm.copies == 2
