@@ -50,7 +50,7 @@ from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.sampling import sample_posterior
 from remaster_ros.kinematics.transforms import inverse
-from remaster_ros.simulation.session_simulator import Truth
+from remaster_ros.simulation.session_simulator import SessionTruth
 from remaster_ros.types import FloatArray
 
 SENSORS = (('mocap',), ('tracker',), ('mocap', 'tracker'))
@@ -150,7 +150,7 @@ def visible_names(model: Model) -> list[str]:
     return names
 
 
-def visible_truth(model: Model, truth: Truth) -> dict[str, float]:
+def visible_truth(model: Model, truth: SessionTruth) -> dict[str, float]:
     """Return the truth in the same coordinates."""
     noise = [truth.sensors[name].sigma_m for name in model.sensor_names]
     noise += [truth.sensors[name].pose_sigma_m for name in model.sensor_names]
@@ -158,7 +158,7 @@ def visible_truth(model: Model, truth: Truth) -> dict[str, float]:
     return dict(zip(visible_names(model), values.tolist()))
 
 
-def pinned_truth(model: Model, truth: Truth) -> FloatArray:
+def pinned_truth(model: Model, truth: SessionTruth) -> FloatArray:
     """Return the true parameters in the model's pinned coordinates, (size,)."""
     markers = np.array([truth.markers[name] for name in model.marker_names])
     T_R_N = np.array([truth.sensors[name].T_R_N for name in model.sensor_names])
@@ -166,7 +166,7 @@ def pinned_truth(model: Model, truth: Truth) -> FloatArray:
     return model.pinned(model.with_corrections(x, model.reference @ inverse(T_R_N)))
 
 
-def cramer_rao_std(found: Estimate, truth: Truth) -> FloatArray:
+def cramer_rao_std(found: Estimate, truth: SessionTruth) -> FloatArray:
     """Return the bound of the model's pinned parameters, (size,); NaN where nothing tells."""
     model = found.model
     rows = Rows.of(found.problem.measurements, found.problem.fitted, model.reference)

@@ -24,7 +24,7 @@ from path_judges import collides
 
 from remaster_ros.kinematics.collision import FLOOR, OBSTACLE, SELF_COLLISION
 from remaster_ros.nodes.tour_planner import TourPlanner
-from remaster_ros.session.workcell import Cell
+from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import FloatArray
 
 
@@ -47,7 +47,7 @@ class Tally(NamedTuple):
 
 
 def tours(
-    cell: Cell, seeds: range, candidates: int = 60
+    cell: Workcell, seeds: range, candidates: int = 60
 ) -> tuple[list[FloatArray], Counter[str], int, list[float], list[float], float]:
     """Return every move (n, k) of tours of a cell, what was dropped, and the times."""
     chain = cell.chain()

@@ -19,7 +19,11 @@ from remaster_ros.kinematics.transforms import looking_at, transform
 from remaster_ros.planning.candidates import candidate_poses, plan_poses
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.offline_tour import LIMIT_MARGIN_RAD
-from remaster_ros.simulation.session_simulator import SimulatedSensor, Truth, simulate_session
+from remaster_ros.simulation.session_simulator import (
+    SessionTruth,
+    SimulatedSensor,
+    simulate_session,
+)
 from remaster_ros.types import FloatArray, Session
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -95,7 +99,7 @@ def experiment(
     joint_offsets: FloatArray | None = None,
     marker_std_m: float = CELL.marker_std_m,
     sizes: Sequence[tuple[int, int]] = (OPTIMIZATION, VALIDATION),
-) -> tuple[Session, Truth]:
+) -> tuple[Session, SessionTruth]:
     """Simulate an experiment of the paper's size.
 
     Parameters

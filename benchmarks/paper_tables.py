@@ -26,7 +26,7 @@ from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import FitResult, fit_session
 from remaster_ros.calibration.sampling import sample_posterior
 from remaster_ros.kinematics.transforms import inverse, rotation_vector_to_matrix, transform
-from remaster_ros.simulation.session_simulator import Truth
+from remaster_ros.simulation.session_simulator import SessionTruth
 from remaster_ros.types import FloatArray, Session
 
 SENSORS = {'mocap': 'Motion Capture', 'tracker': 'Laser Tracker'}
@@ -96,7 +96,7 @@ class Case(NamedTuple):
     """
 
     session: Session
-    truth: Truth
+    truth: SessionTruth
     fit: FitResult
     corrections: FloatArray
 
@@ -116,7 +116,7 @@ def simulated(sensor: str, noise: str, seed: int) -> Case:
 
 
 def corrections(
-    session: Session, truth: Truth, sensor: str, rng: np.random.Generator
+    session: Session, truth: SessionTruth, sensor: str, rng: np.random.Generator
 ) -> FloatArray:
     """Return draws of Table II's parameters, the initial registration being off by its means."""
     found = estimate(Problem.of(session))

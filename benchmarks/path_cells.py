@@ -15,7 +15,7 @@ import yaml
 from path_judges import BulletJudge, FclJudge, Judge, Part
 
 from remaster_ros.kinematics.transforms import matrix_from_rpy, transform
-from remaster_ros.session.workcell import Cell, config_path, read_cell
+from remaster_ros.session.workcell import Workcell, config_path, read_cell
 from remaster_ros.types import FloatArray
 
 # Where each arm's wrist reaches with the tool level.
@@ -162,7 +162,7 @@ def _bullet_urdf(text: str, spec: CellSpec, marker_radius: float, link_radius: f
     )
 
 
-def _lwr_parts(cell: Cell) -> list[Part]:
+def _lwr_parts(cell: Workcell) -> list[Part]:
     """Return cylinders of 60 mm along the links: the arm as it may be, in capsules of 75 mm.
 
     The forearm ends before the wrist and the flange is slender, as on the arm itself, whose wrist
@@ -203,7 +203,7 @@ def _box_parts(spec: CellSpec) -> list[Part]:
     return parts
 
 
-def make_cell(spec: CellSpec, folder: Path) -> tuple[Cell, Judge]:
+def make_cell(spec: CellSpec, folder: Path) -> tuple[Workcell, Judge]:
     """Write a cell into a folder, read it as the planner does, and return it with its judge."""
     folder.mkdir(parents=True, exist_ok=True)
     robot = {'urdf': 'robot.urdf', 'base_link': 'base_link', 'tip_link': 'tool'}

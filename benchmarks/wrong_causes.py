@@ -61,9 +61,9 @@ def greedy(data: Residuals) -> str:
     left = errors - base @ (base.T @ errors)
     best, name, tried, freedom = 0.0, '', 0, len(left) - base.shape[1]
     for effect in EFFECTS.values():
-        if effect.name in ('marker_offset', 'joint_error_curve') or effect.needs(data.scene):
+        if effect.name in ('marker_offset', 'joint_error_curve') or effect.needs(data.context):
             continue
-        for cell in effect.cells(data.scene):
+        for cell in effect.cells(data.context):
             if cell.size > 2:
                 continue
             columns = _columns(data, cell, base)
@@ -89,7 +89,7 @@ def full_dh(data: Residuals) -> str:
     cells = [
         cell
         for name in ('link_length', 'joint_axis_tilt')
-        for cell in EFFECTS[name].cells(data.scene)
+        for cell in EFFECTS[name].cells(data.context)
         if cell.size == 1
     ]
     kept: list[Cell] = []
@@ -133,7 +133,7 @@ def draw(kind: str, found: Findings, path: Path) -> None:
     from matplotlib.figure import Figure
 
     data = found.residuals
-    scene, rows = data.scene, data.rows.source
+    scene, rows = data.context, data.rows.source
     figure = Figure(figsize=(8.4, 2.6), layout='constrained')
     axes = figure.subplots(1, 2, sharey=True)
     left = data.unexplained(found.selection.empty)[rows]

@@ -10,7 +10,11 @@ from remaster_ros.calibration.extension import Extension, Term
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix, transform
-from remaster_ros.simulation.session_simulator import SimulatedSensor, Truth, simulate_session
+from remaster_ros.simulation.session_simulator import (
+    SessionTruth,
+    SimulatedSensor,
+    simulate_session,
+)
 from remaster_ros.types import Session
 
 ROOT = Path(__file__).parent.parent
@@ -65,7 +69,7 @@ def scene(
     sigma_m: float = 0.23e-3,
     pose_sigma_m: float = 0.5e-3,
     **options: object,
-) -> tuple[Session, Truth]:
+) -> tuple[Session, SessionTruth]:
     """Simulate a session; the seed is printed, so that a failure can be repeated."""
     print(f'scene seed {seed}')
     rng = np.random.default_rng(seed)

@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from remaster_ros.simulation.arm_motion import Motion, Waypoint, spline
+from remaster_ros.simulation.arm_motion import Motion, ServoPoint, spline
 from remaster_ros.simulation.world import START_S
 
 TOUCHED_RAD = 1e-4
@@ -143,7 +143,7 @@ class Observer:
                 nearest_s, begun = since_s, motion.at(line['start_s'])
             motion.follow(
                 line['start_s'],
-                [Waypoint(t, np.array(q), v and np.array(v)) for t, q, v in line['points']],
+                [ServoPoint(t, np.array(q), v and np.array(v)) for t, q, v in line['points']],
             )
         # One that the arm has dropped began when it came.
         return begun or motion.at(came_s)

@@ -18,7 +18,7 @@ import numpy as np
 from hidden_arm import PinocchioArm
 
 from remaster_ros.simulation.hidden_effects import HiddenEffect
-from remaster_ros.simulation.world_model import Round, Stage, StagedSensor
+from remaster_ros.simulation.world_model import Round, StagedSensor, WorldModel
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements, Session
 
 MARKER_STD_M = 0.5e-3
@@ -104,7 +104,7 @@ class HiddenTruth:
     outliers: IntArray
 
 
-class HiddenWorld(Stage):
+class HiddenWorld(WorldModel):
     """An arm with true offsets and markers in front of true sensors, on one round of visits.
 
     Parameters

@@ -64,7 +64,7 @@ class Channel:
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
+class ErrorGroup:
     """Errors of one channel that have one variance.
 
     Attributes
@@ -121,7 +121,7 @@ class Posterior:
     reference: FloatArray
     channels: tuple[Channel, ...]
     separable: tuple[int, ...]
-    cells: tuple[Cell, ...]
+    cells: tuple[ErrorGroup, ...]
     frames: FloatArray | None
 
     @classmethod
@@ -329,7 +329,7 @@ class Posterior:
         return result
 
 
-def _cells(channels: Sequence[Channel], rows: Rows) -> tuple[Cell, ...]:
+def _cells(channels: Sequence[Channel], rows: Rows) -> tuple[ErrorGroup, ...]:
     """Sort the groups of each channel by size; groups of one row have no deviations."""
     cells = []
     for index, channel in enumerate(channels):
@@ -337,10 +337,10 @@ def _cells(channels: Sequence[Channel], rows: Rows) -> tuple[Cell, ...]:
         size = rows.group_size[mine]
         spare = int(np.sum(size - 1))
         if spare > 0:
-            cells.append(Cell(index, 0, mine, channel.dimension * spare))
+            cells.append(ErrorGroup(index, 0, mine, channel.dimension * spare))
         for value in np.unique(size):
             groups = mine[size == value]
-            cells.append(Cell(index, int(value), groups, channel.dimension * len(groups)))
+            cells.append(ErrorGroup(index, int(value), groups, channel.dimension * len(groups)))
     return tuple(cells)
 
 

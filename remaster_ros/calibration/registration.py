@@ -71,7 +71,7 @@ def register_points(points_R: ArrayLike, points_N: ArrayLike) -> tuple[FloatArra
     return T_R_N, float(np.sqrt(np.mean(distances**2)))
 
 
-def register_agreeing(
+def register_ransac(
     points_R: ArrayLike, points_N: ArrayLike, allowed_m: float
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Register by the points that agree: one may be that of a stray taken for the marker.

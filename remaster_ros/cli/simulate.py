@@ -17,13 +17,17 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import looking_at, quaternion_xyzw, transform
 from remaster_ros.session.files import decode_text, read_limited, write_atomically
 from remaster_ros.session.reader import URDF_LIMIT, write_session
-from remaster_ros.session.workcell import Cell, CellRobot, config_path, read_cell
-from remaster_ros.simulation.effect_sampling import Request, hide
+from remaster_ros.session.workcell import CellRobot, Workcell, config_path, read_cell
+from remaster_ros.simulation.effect_sampling import EffectSpec, hide
 from remaster_ros.simulation.hidden_arm import ChainArm
 from remaster_ros.simulation.hidden_effects import HiddenEffect
 from remaster_ros.simulation.offline_tour import plan_tour, visit
-from remaster_ros.simulation.session_simulator import SimulatedSensor, Truth, simulate_session
-from remaster_ros.simulation.world_model import Round, Stage, StagedSensor
+from remaster_ros.simulation.session_simulator import (
+    SessionTruth,
+    SimulatedSensor,
+    simulate_session,
+)
+from remaster_ros.simulation.world_model import Round, StagedSensor, WorldModel
 from remaster_ros.simulation.wrong_arm import Warming
 from remaster_ros.types import FloatArray
 
@@ -96,7 +100,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--effect',
-        type=Request.parse,
+        type=EffectSpec.parse,
         action='append',
         default=[],
         metavar='NAME[@JOINT][:MM]',
@@ -160,7 +164,7 @@ class _Hidden:
         chain: SerialChain,
         sensors: dict[str, SimulatedSensor],
         visits: dict[str, list[FloatArray]],
-        requests: list[Request],
+        requests: list[EffectSpec],
         rng: np.random.Generator,
     ) -> None:
         self._chain, self._sensors, self._requests, self._rng = chain, sensors, requests, rng
@@ -175,14 +179,14 @@ class _Hidden:
             name: StagedSensor(sensor.T_R_N[:3, :3], sensor.T_R_N[:3, 3], sensor.marker)
             for name, sensor in self._sensors.items()
         }
-        stage = Stage(ChainArm(self._chain), self.round, staged, markers, joint_offsets)
+        stage = WorldModel(ChainArm(self._chain), self.round, staged, markers, joint_offsets)
         effects = hide(stage, self._requests, self._rng)
         self.found = [(effect, stage.size_m(effect)) for effect in effects]
         return stage.seen(effects).reshape(len(self.round.q), len(staged), 3)
 
 
 def choose_robot(
-    cell: Cell, robot: str | None, base_link: str | None, tip_link: str | None
+    cell: Workcell, robot: str | None, base_link: str | None, tip_link: str | None
 ) -> SerialChain:
     """Put another robot into the cell where one is named; return the chain.
 
@@ -212,7 +216,7 @@ def choose_robot(
     return chain
 
 
-def choose_sensors(cell: Cell, chosen: tuple[str, ...] | None) -> None:
+def choose_sensors(cell: Workcell, chosen: tuple[str, ...] | None) -> None:
     """Leave the chosen sensors in the cell; aim at the first of them if need be.
 
     Raises
@@ -232,7 +236,7 @@ def choose_sensors(cell: Cell, chosen: tuple[str, ...] | None) -> None:
         cell.aim_at = chosen[0]
 
 
-def place_sensor(cell: Cell, rough: FloatArray, rng: np.random.Generator) -> FloatArray:
+def place_sensor(cell: Workcell, rough: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return T_R_N of a sensor near its rough place that looks at the middle of the workspace."""
     position = rough + rng.normal(0.0, PLACEMENT_STD_M, 3)
     middle = (0.0, 0.0, sum(cell.poses.height_m) / 2)
@@ -240,7 +244,7 @@ def place_sensor(cell: Cell, rough: FloatArray, rng: np.random.Generator) -> Flo
 
 
 def truth_to_dict(
-    truth: Truth, chain: SerialChain, seed: int, hidden: list[tuple[HiddenEffect, float]]
+    truth: SessionTruth, chain: SerialChain, seed: int, hidden: list[tuple[HiddenEffect, float]]
 ) -> dict[str, Any]:
     """Return everything that an estimate of the session is to find."""
     return {

@@ -6,14 +6,18 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from remaster_ros.collection.reference_watch import Change, ReferenceReading, ReferenceWatch
+from remaster_ros.collection.reference_watch import (
+    ReferenceReading,
+    ReferenceWatch,
+    SetupChange,
+)
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray, Session
 
 
 def changes(
     session: Session, chain: SerialChain, T_R_N: Mapping[str, FloatArray]
-) -> tuple[int, list[Change]]:
+) -> tuple[int, list[SetupChange]]:
     """Return how many rounds of the references there are, and what they tell has changed.
 
     Each change is told once, as the last round that shows it has it.
@@ -45,7 +49,7 @@ def replay(
     readings: Sequence[ReferenceReading],
     others: Sequence[int],
     T_R_N: Mapping[str, FloatArray],
-) -> list[Change]:
+) -> list[SetupChange]:
     """Judge the references of a recorded session; return what was found, round by round.
 
     Parameters
@@ -56,7 +60,7 @@ def replay(
         Numbers of the configurations that are no references, in any order.
     """
     other = np.sort(np.asarray(others, dtype=int))
-    found: list[Change] = []
+    found: list[SetupChange] = []
     for i, reading in enumerate(readings):
         if i:
             between = (readings[i - 1].configuration, reading.configuration)

@@ -59,7 +59,7 @@ class ReferenceReading:
 
 
 @dataclass(frozen=True)
-class Change:
+class SetupChange:
     """What has changed.
 
     Attributes
@@ -158,7 +158,7 @@ class ReferenceWatch:
         self._begin = 0
         self._begins: set[int] = set()
         self._tests = 0
-        self.change: Change | None = None
+        self.change: SetupChange | None = None
 
     @property
     def rounds(self) -> int:
@@ -197,7 +197,7 @@ class ReferenceWatch:
         self._begin, self._open, self.change = len(self._rounds), False, None
         self._begins.add(self._begin)
 
-    def judge(self, T_R_N: Mapping[str, FloatArray]) -> Change | None:
+    def judge(self, T_R_N: Mapping[str, FloatArray]) -> SetupChange | None:
         """Judge the last round, once; return what has changed, None where nothing has.
 
         Parameters
@@ -265,14 +265,14 @@ class ReferenceWatch:
             found[sensor] = float(np.sqrt(variance)), freedoms
         return found
 
-    def _unsteady(self, noise: Mapping[str, tuple[float, int]]) -> Change | None:
+    def _unsteady(self, noise: Mapping[str, tuple[float, int]]) -> SetupChange | None:
         """Return that the first two rounds lie so far apart that nothing is seen by them."""
         if not noise:
             return None
         sensor, (std, _) = max(noise.items(), key=lambda item: item[1][0])
         if np.sqrt(6.0) * std < self._stop_m:
             return None
-        self.change = Change(
+        self.change = SetupChange(
             'unsteady',
             f'{sensor} and the arm do not repeat: something is loose, or was moved,',
             False,
@@ -340,7 +340,7 @@ class ReferenceWatch:
         noise: Mapping[str, tuple[float, int]],
         T_R_N: Mapping[str, FloatArray],
         p_value: float,
-    ) -> Change:
+    ) -> SetupChange:
         """Find the cause, and when it came, that explain the rounds best (by BIC)."""
         rounds = range(self._begin, number + 1)
         keys = [
@@ -397,7 +397,7 @@ class ReferenceWatch:
             first = {g: off[j] for j, (i, g) in reversed(list(enumerate(rows)))}
             size = max(float(np.linalg.norm(last[g] - first[g])) for g in last)
             subject = 'something changed that no single cause explains'
-            return Change('unexplained', subject, False, size, None, after, before, p_value)
+            return SetupChange('unexplained', subject, False, size, None, after, before, p_value)
         alike = {
             other.subject
             for value, _, _, other, when in fits
@@ -405,7 +405,7 @@ class ReferenceWatch:
         }
         size = float(np.max(np.linalg.norm(cause.jacobian @ theta, axis=-1)))
         turned = theta[cause.shifts :]
-        return Change(
+        return SetupChange(
             cause.kind,
             cause.subject,
             step is None,

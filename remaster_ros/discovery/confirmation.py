@@ -93,7 +93,7 @@ def confirm(discovery: Discovery, session: Session) -> Confirmation:
 def _own_gain(discovery: Discovery) -> float:
     """Return by how much the causes lower the mean square in their own session, m²."""
     data = discovery.residuals
-    rows = data.scene.measurements.is_validation
+    rows = data.context.measurements.is_validation
     if not rows.any():
         rows = np.isin(np.arange(len(rows)), data.rows.source)
     return (
@@ -115,7 +115,7 @@ def _alone(
     without = solve(data, rest, solution)
     if without is None:
         return float('nan')
-    own_rows = data.scene.measurements.is_validation
+    own_rows = data.context.measurements.is_validation
     if not own_rows.any():
         own_rows = np.isin(np.arange(len(own_rows)), data.rows.source)
     own = (

@@ -185,13 +185,13 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
     if thinned:
         residuals = residuals.only(np.intersect1d(pool, found.kept), found.model.reference)
     untestable = {
-        name: why for name, effect in EFFECTS.items() if (why := effect.needs(residuals.scene))
+        name: why for name, effect in EFFECTS.items() if (why := effect.needs(residuals.context))
     }
     cells = [
         cell
         for name, effect in EFFECTS.items()
         if name not in untestable and name != 'marker_offset'
-        for cell in effect.cells(residuals.scene)
+        for cell in effect.cells(residuals.context)
     ]
     search = Search(
         residuals,

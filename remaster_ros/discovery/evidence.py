@@ -133,7 +133,7 @@ class Solution:
         return precision
 
 
-def log_prior(cells: Sequence[Cell]) -> float:
+def log_prior_one_by_one(cells: Sequence[Cell]) -> float:
     """Return the log prior probability of cells among all that are tried."""
     return -float(sum(np.log(cell.drawn_from) for cell in cells))
 
@@ -177,7 +177,7 @@ def solve(
     if not system.visible():
         return None
     try:
-        return system.solution(start, log_prior(cells) if prior is None else prior)
+        return system.solution(start, log_prior_one_by_one(cells) if prior is None else prior)
     except np.linalg.LinAlgError:
         # So nearly alike that rounding decides: they cannot be told apart.
         return None

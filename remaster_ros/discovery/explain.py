@@ -9,10 +9,10 @@ import numpy as np
 
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.effects.base import Cell
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import Solution, solve
-from remaster_ros.discovery.families import grouped, log_prior
+from remaster_ros.discovery.families import family_log_prior, grouped
 from remaster_ros.discovery.gain import shares
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, screen
@@ -148,7 +148,7 @@ def _described(
         )
     )
     rest = tuple(cell for cell in solution.cells if cell not in group)
-    without = solve(data, rest, solution, prior=log_prior(rest, catalogue.cells))
+    without = solve(data, rest, solution, prior=family_log_prior(rest, catalogue.cells))
     gain = sum(step.log_evidence_gain for step in selection.steps)
     if without is not None:
         gain = solution.log_evidence - without.log_evidence
@@ -169,7 +169,7 @@ def _described(
         p_value=float(min(p_values)),
         log_evidence_gain=float(gain),
         confusable_with=alike,
-        cause=in_words(group, data.scene) + _also_called(alike),
+        cause=in_words(group, data.context) + _also_called(alike),
         size_m=_size(data, solution, group),
         share=share,
         tied=any(not other.same and other.log_evidence_gain > gain - TIED for other in alike),
@@ -219,7 +219,7 @@ def _look_alikes(
         if (other.name, other.joints) == (cell.name, cell.joints):
             continue
         cells = (*without.cells, other)
-        fit = solve(data, cells, solution, prior=log_prior(cells, catalogue.cells))
+        fit = solve(data, cells, solution, prior=family_log_prior(cells, catalogue.cells))
         if fit is None or fit.log_evidence < solution.log_evidence - CONFUSABLE:
             continue
         gain = fit.log_evidence - without.log_evidence
@@ -276,7 +276,7 @@ def separate_by(cell: Cell, other: Cell, same: bool) -> str:
     return '; and '.join(dict.fromkeys(texts))
 
 
-def in_words(group: Sequence[Cell], scene: Scene) -> str:
+def in_words(group: Sequence[Cell], context: Context) -> str:
     """Return the sentence for a technician, with what the session cannot tell."""
     first = group[0]
     joints = _joints(group)
@@ -291,7 +291,7 @@ def in_words(group: Sequence[Cell], scene: Scene) -> str:
         subject=subject, other=other, driver=first.driver.replace('_', ' '), place=place
     )
     sentence = sentence[:1].upper() + sentence[1:]
-    if not scene.has_gravity and first.place == 'joint_angle' and 'angle' in first.driver:
+    if not context.has_gravity and first.place == 'joint_angle' and 'angle' in first.driver:
         sentence += (
             ' It may be gravity that bends the arm: without link masses in the URDF '
             'nobody can tell the two apart.'

@@ -26,7 +26,7 @@ def relatives(cells: Sequence[Cell], cell: Cell) -> int:
     return max(1, sum(other.name in family for other in cells))
 
 
-def log_prior(cells: Sequence[Cell], catalogue: Sequence[Cell]) -> float:
+def family_log_prior(cells: Sequence[Cell], catalogue: Sequence[Cell]) -> float:
     """Return the log prior probability of a set: cell by cell, or by whole families.
 
     Cells of a family come together more often than each by its own chance: given the family, each

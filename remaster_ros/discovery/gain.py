@@ -73,7 +73,7 @@ def shares(data: Residuals, groups: Sequence[tuple[Cell, ...]], solution: Soluti
 
     On held-out rows where there are any. All are refitted at each step; together they make 1.
     """
-    rows = data.scene.measurements.is_validation
+    rows = data.context.measurements.is_validation
     if not rows.any():
         rows = np.isin(np.arange(len(rows)), data.rows.source)
     left: list[float] = []
@@ -114,7 +114,7 @@ def noise_by_range(data: Residuals, solution: Solution) -> dict[str, dict[str, f
         low, high = np.quantile(distance, (0.25, 0.75))
         near, far = length[span][distance <= low], length[span][distance >= high]
         p_value = 1.0 if np.ptp(distance) == 0.0 else spearmanr(distance, length[span])[1]
-        found[data.scene.sensor_names[sensor]] = {
+        found[data.context.sensor_names[sensor]] = {
             'near_m': float(low),
             'far_m': float(high),
             'far_over_near': float(np.sqrt(np.mean(far**2) / np.mean(near**2))),

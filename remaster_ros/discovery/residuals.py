@@ -20,7 +20,7 @@ from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.outliers import robust_noise
 from remaster_ros.discovery.effects.base import Cell
-from remaster_ros.discovery.effects.context import BLOCK_ROWS, Scene
+from remaster_ros.discovery.effects.context import BLOCK_ROWS, Context
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 # Directions of the offsets model below this share of the largest are its gauge.
@@ -59,10 +59,10 @@ class Residuals:
 
     Attributes
     ----------
-    scene
+    context
         All rows of the session at the solution of the offsets model.
     rows
-        The rows worked on; ``source`` are their indices in the scene.
+        The rows worked on; ``source`` are their indices in the context.
     errors
         Measured minus modelled, in base coordinates, m, (n, 3).
     base
@@ -77,7 +77,7 @@ class Residuals:
         A robust first estimate.
     """
 
-    scene: Scene
+    context: Context
     rows: Rows
     errors: FloatArray
     base: FloatArray
@@ -96,7 +96,7 @@ class Residuals:
         """Take over the rows a fit kept, with the residuals of another mode of its model."""
         problem, model = found.problem, found.model
         x = model.natural(mode.z)
-        scene = Scene(
+        context = Context(
             problem.chain,
             problem.measurements,
             problem.sensor_names,
@@ -105,7 +105,7 @@ class Residuals:
             model.markers(x),
             model.T_R_N(x),
         )
-        count = len(scene)
+        count = len(context)
         every = Rows.of(problem.measurements, np.arange(count), model.reference)
         full_errors = np.empty((count, 3))
         full_jacobian = np.empty((count, 3, model.size))
@@ -123,7 +123,7 @@ class Residuals:
         full_base = full_jacobian @ ((vectors[seen] / scale).T / singular[seen])
         sigma, pose_sigma = robust_noise(rows, full_errors[rows.source], np.ones(len(rows), bool))
         return cls(
-            scene,
+            context,
             rows,
             full_errors[rows.source],
             full_base[rows.source],
@@ -135,7 +135,7 @@ class Residuals:
 
     def only(self, source: IntArray, reference: FloatArray) -> Residuals:
         """Return the same on other rows of the session."""
-        rows = Rows.of(self.scene.measurements, np.sort(source), reference)
+        rows = Rows.of(self.context.measurements, np.sort(source), reference)
         return replace(
             self, rows=rows, errors=self.full_errors[rows.source], base=self.full_base[rows.source]
         )
@@ -147,15 +147,15 @@ class Residuals:
     @property
     def sensors(self) -> int:
         """Number of sensors."""
-        return len(self.scene.sensor_names)
+        return len(self.context.sensor_names)
 
     @cached_property
-    def part(self) -> Scene:
-        """The scene of the rows worked on, in their order.
+    def part(self) -> Context:
+        """The context of the rows worked on, in their order.
 
         What the search needs of hundreds of causes is computed on these rows alone.
         """
-        return self.scene.at(self.rows.source)
+        return self.context.at(self.rows.source)
 
     @cached_property
     def _displacements(self) -> dict[Cell, FloatArray]:
@@ -171,7 +171,7 @@ class Residuals:
     @cached_property
     def pose_of_row(self) -> IntArray:
         """Number of each row's pose, counted from 0 over all sensors, (n,)."""
-        poses = self.scene.measurements.pose[self.rows.source]
+        poses = self.context.measurements.pose[self.rows.source]
         return np.unique(poses, return_inverse=True)[1]
 
     @property
@@ -193,11 +193,11 @@ class Residuals:
 
     def displaced(self, cells: Sequence[Cell], parameters: FloatArray) -> FloatArray:
         """Return what cells with these parameters displace in every row, m, (all rows, 3)."""
-        shift = np.zeros((len(self.scene), 3))
-        for where, scene in self.scene.blocks():
+        shift = np.zeros((len(self.context), 3))
+        for where, context in self.context.blocks():
             start = 0
             for cell in cells:
-                columns = cell.columns(scene).displacement(scene)
+                columns = cell.columns(context).displacement(context)
                 shift[where] += columns @ parameters[start : start + cell.size]
                 start += cell.size
         return shift

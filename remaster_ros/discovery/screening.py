@@ -69,10 +69,10 @@ class Catalogue:
     @classmethod
     def of(cls, data: Residuals, cells: Sequence[Cell]) -> Catalogue:
         """Compute all columns on the rows of the residuals, in single precision."""
-        scene = data.part
+        context = data.part
         at, features, shifts = [], [], []
         for cell in cells:
-            columns = cell.columns(scene)
+            columns = cell.columns(context)
             values = columns.values.astype(np.float32)
             if columns.at is None:
                 at += [-1] * cell.size
@@ -90,7 +90,7 @@ class Catalogue:
             np.concatenate([np.zeros((n, 0), np.float32), *features], axis=1),
             np.concatenate([np.zeros((n, 3, 0), np.float32), *shifts], axis=2),
             position,
-            scene.jacobian.astype(np.float32),
+            context.jacobian.astype(np.float32),
         )
 
     def block(self, columns: IntArray) -> NDArray[np.float32]:

@@ -19,7 +19,7 @@ import numpy as np
 from remaster_ros.discovery.cross_validation import held_out_error, worth_of
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.evidence import Solution, solve
-from remaster_ros.discovery.families import FAMILIES, grouped, log_prior, relatives
+from remaster_ros.discovery.families import FAMILIES, family_log_prior, grouped, relatives
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, Screening, screen
 from remaster_ros.types import FloatArray
@@ -126,7 +126,7 @@ class Search:
             proposal = self.propose(solution, screening)
             if proposal is None or proposal[0].log_evidence <= solution.log_evidence:
                 break
-            candidate, p_value = self.earned(proposal[0]), proposal[1]
+            candidate, p_value = self.backward_elimination(proposal[0]), proposal[1]
             if candidate.log_evidence <= solution.log_evidence:
                 break
             share = self.held_out_share(solution, candidate)
@@ -136,8 +136,8 @@ class Search:
                 rejected = step
                 break
             steps.append(step)
-            solution = self.exchange(self.prune(candidate))
-            solution = self._judged(self.earned(self.keep_what_pays(solution)))
+            solution = self.swap(self.prune(candidate))
+            solution = self._judged(self.backward_elimination(self.drop_unpredictive(solution)))
         empty = self.fit(())
         assert empty is not None
         return Selection(empty, solution, tuple(steps), rejected)
@@ -153,7 +153,7 @@ class Search:
 
     def fit(self, cells: Sequence[Cell], start: Solution | None = None) -> Solution | None:
         """Fit a set with its prior probability."""
-        return solve(self.data, cells, start, prior=log_prior(cells, self.catalogue.cells))
+        return solve(self.data, cells, start, prior=family_log_prior(cells, self.catalogue.cells))
 
     def propose(self, solution: Solution, screening: Screening) -> tuple[Solution, float] | None:
         """Return the set of the highest evidence one step on, with the p-value of the step."""
@@ -242,7 +242,7 @@ class Search:
                 return solution
         return solution
 
-    def exchange(self, solution: Solution) -> Solution:
+    def swap(self, solution: Solution) -> Solution:
         """Replace cells, one at a time, by what explains more in their place."""
         if len(solution.cells) > MOST_EXCHANGED:
             return solution
@@ -270,7 +270,7 @@ class Search:
             return None
         return best
 
-    def keep_what_pays(self, solution: Solution) -> Solution:
+    def drop_unpredictive(self, solution: Solution) -> Solution:
         """Drop the causes without which poses left out are predicted better."""
         for group in grouped(solution.cells):
             if len(group) == len(solution.cells):
@@ -281,7 +281,7 @@ class Search:
                 solution = without
         return solution
 
-    def earned(self, solution: Solution) -> Solution:
+    def backward_elimination(self, solution: Solution) -> Solution:
         """Drop, the weakest first, the members of families that do not pay by themselves.
 
         A family passes its tests as a whole. Each member has still to raise the evidence, to

@@ -6,7 +6,7 @@ import numpy as np
 
 from remaster_ros.calibration.extension import Extension, Term
 from remaster_ros.discovery.effects.base import Cell
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.evidence import Solution
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.types import FloatArray
@@ -15,9 +15,9 @@ from remaster_ros.types import FloatArray
 def extension_of(residuals: Residuals, solution: Solution) -> Extension:
     """Return the cells of a solution as further parameters, linearised where it has them."""
     terms = []
-    displacement0 = np.zeros((len(residuals.scene), 3))
+    displacement0 = np.zeros((len(residuals.context), 3))
     for cell, where in zip(solution.cells, solution.slices(), strict=True):
-        term = Term(where, *_columns(cell, residuals.scene))
+        term = Term(where, *_columns(cell, residuals.context))
         if term.at is None:
             displacement0 += term.values @ solution.parameters[where]
         terms.append(term)
@@ -33,7 +33,7 @@ def extension_of(residuals: Residuals, solution: Solution) -> Extension:
     )
 
 
-def _columns(cell: Cell, scene: Scene) -> tuple[int | None, FloatArray]:
+def _columns(cell: Cell, context: Context) -> tuple[int | None, FloatArray]:
     """Return joint and values of a cell's columns in every row of a session."""
-    blocks = [cell.columns(block) for _, block in scene.blocks()]
+    blocks = [cell.columns(block) for _, block in context.blocks()]
     return blocks[0].at, np.concatenate([block.values for block in blocks])

@@ -10,7 +10,7 @@ BACK_S = 1.0
 """What a node that was started again publishes may find its way so much later than its word, s."""
 
 
-class Presence:
+class Liveness:
     """Follow the signs of life of sensors.
 
     Parameters

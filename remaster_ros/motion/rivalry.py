@@ -16,7 +16,7 @@ SAME_S = 1.5
 by up to half a second may make the two sides see different differences, and one still ends."""
 
 
-class Rivalry:
+class DuplicateNodeCheck:
     """Whether a node has a rival, and whether it must give way.
 
     Parameters

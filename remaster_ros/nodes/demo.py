@@ -44,7 +44,7 @@ from remaster_ros.reports.fit_json import read_fit
 from remaster_ros.session.session_journal import is_complete
 from remaster_ros.session.session_writer import JOURNAL
 from remaster_ros.session.workcell import config_path, read_cell
-from remaster_ros.simulation.effect_sampling import Request
+from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.setup import make_world
 
 FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
@@ -124,7 +124,7 @@ class Demo:
         self.out = output_folder(Path(self.p.out))
         self.session, self.fit = self.out / 'session', self.out / 'fit'
         self.discovery = self.out / 'discovery'
-        self.requests = [Request.parse(text) for text in self.p.hide.split(',') if text]
+        self.requests = [EffectSpec.parse(text) for text in self.p.hide.split(',') if text]
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self.hidden = Path(tempfile.mkdtemp(prefix='remaster_world_'))

@@ -24,7 +24,7 @@ from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.messages import stamp_of, temperature_topic, transform_array
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import LATCHED, RELIABLE, Status
+from remaster_ros.nodes.status import LATCHED, RELIABLE, NodeStatus
 from remaster_ros.sensors.laser_tracker.client import (
     LaserTrackerClient,
     LaserTrackerError,
@@ -127,7 +127,7 @@ class LaserTrackerMarkers(RemasterNode):
             self._on_measure,
             callback_group=MutuallyExclusiveCallbackGroup(),
         )
-        self.status = Status(self, self._summary)
+        self.status = NodeStatus(self, self._summary)
         self._thread = threading.Thread(target=self._keep_locked, daemon=True)
         self._thread.start()
 

@@ -2,7 +2,7 @@
 
 The lock (flock) goes with the process, however that ends: a node that was killed can be started
 again at once. What runs on another computer, or for another user, is told apart by
-/remaster/status (see `remaster_ros.nodes.status.Status`).
+/remaster/status (see `remaster_ros.nodes.status.NodeStatus`).
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from remaster_ros.calibration.fit import (
 from remaster_ros.errors import RemasterError
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import LATCHED, Status
+from remaster_ros.nodes.status import LATCHED, NodeStatus
 from remaster_ros.reports.fit_json import FIT_FILE, prepare_folder, read_fit, save_fit
 from remaster_ros.session.priors import read_priors
 from remaster_ros.session.reader import read_session
@@ -78,7 +78,7 @@ class Optimizer(RemasterNode):
             serve = partial(self._serve, work)
             group = MutuallyExclusiveCallbackGroup()
             self.create_service(Trigger, service, serve, callback_group=group)
-        self.status = Status(self, self._summary)
+        self.status = NodeStatus(self, self._summary)
         self._publish_last()
 
     def _serve(

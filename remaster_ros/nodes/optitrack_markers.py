@@ -16,7 +16,7 @@ from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import RELIABLE, Status
+from remaster_ros.nodes.status import RELIABLE, NodeStatus
 from remaster_ros.sensors.clock_offset import ClockMapping
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.diagnosis import NatNetSettings, warning
@@ -76,7 +76,7 @@ class OptiTrackMarkers(RemasterNode):
         self.published = 0
         self.client = self._make_client()
         self.client.start()
-        self.status = Status(self, self._summary)
+        self.status = NodeStatus(self, self._summary)
         self._started_s = time.monotonic()
         self._timer = self.create_timer(0.5, self._check_start, clock=self.status.steady)
 

@@ -31,14 +31,14 @@ from std_srvs.srv import Trigger
 from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
 from remaster_ros.nodes.messages import JointOrder, transform_array
 from remaster_ros.nodes.parameters import declare, parameter
-from remaster_ros.nodes.pose_publisher import PEERS, Announcer
-from remaster_ros.nodes.preflight_monitor import Clearance
+from remaster_ros.nodes.pose_publisher import PEERS, PosePublisher
+from remaster_ros.nodes.preflight_monitor import PreflightMonitor
 from remaster_ros.nodes.run_token import LivingRun, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, Event, Status, listen
+from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, Event, NodeStatus, listen
 from remaster_ros.nodes.tour_planner import PlanningThread, TourPlanner
-from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, Stop
-from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanBook
+from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, PoseVisit
+from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanJournal
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 
@@ -113,10 +113,10 @@ class PosePlanner(RemasterNode):
         )
         self._planning = PlanningThread()
         model = self._tours.model
-        self.book = PlanBook(Path(self.p.session), self._settings(), self.chain, model)
+        self.journal = PlanJournal(Path(self.p.session), self._settings(), self.chain, model)
         self._tried_wall = 0.0
         self._resume()
-        self._announcer = Announcer(self, self.chain)
+        self._poses = PosePublisher(self, self.chain)
         self._joint_states: Subscription | None = self._listen_to_the_arm()
         self.create_subscription(JointState, 'remaster/settled', self._on_settled, RELIABLE)
         self.create_subscription(
@@ -126,8 +126,8 @@ class PosePlanner(RemasterNode):
         self.create_service(Trigger, 'remaster/collect', self._on_collect)
         self.create_service(Trigger, 'remaster/pause', self._on_pause, callback_group=at_once)
         self.create_service(Trigger, 'remaster/stop', self._on_stop, callback_group=at_once)
-        self.status = Status(self, self._summary)
-        self._clearance, self._cleared = Clearance(self, self.cell), False
+        self.status = NodeStatus(self, self._summary)
+        self._preflight, self._cleared = PreflightMonitor(self, self.cell), False
         listen(self, self._on_event, self._on_summary)
         self.create_timer(0.05, self._step, clock=self.status.steady)
 
@@ -146,20 +146,22 @@ class PosePlanner(RemasterNode):
 
     def _resume(self) -> None:
         """Take up what a planner before this one has left."""
-        book = self.book
-        if book.tour is None:
+        journal = self.journal
+        if journal.tour is None:
             return
-        self._resumed = book.tour.visited > 0
-        if REGISTRATION not in book.tour.plans:
+        self._resumed = journal.tour.visited > 0
+        if REGISTRATION not in journal.tour.plans:
             self.phase = 'collection'
-        if book.lost:
-            self.get_logger().warning(book.lost)
-        if book.state == 'complete':
+        if journal.lost:
+            self.get_logger().warning(journal.lost)
+        if journal.state == 'complete':
             self.state = 'complete'
         else:
-            self._left = book.run if book.state == 'running' else ''
-            self._why = self._unwanted('' if book.state == 'running' else f'it was {book.state}')
-        self.get_logger().warning(f'{book.path}: going on; {self._progress()}')
+            self._left = journal.run if journal.state == 'running' else ''
+            self._why = self._unwanted(
+                '' if journal.state == 'running' else f'it was {journal.state}'
+            )
+        self.get_logger().warning(f'{journal.path}: going on; {self._progress()}')
 
     def _unwanted(self, why: str) -> str:
         """Return that, and why, this planner does not go on by itself."""
@@ -177,11 +179,11 @@ class PosePlanner(RemasterNode):
             why = 'its run was in another boot of this computer, or was ended'
         elif passed_s > self.p.resume_within_s:
             why = f'its run has been without a planner for {passed_s:.0f} s'
-        elif not all(self._announcer.says(name, 'started') for name in PEERS):
+        elif not all(self._poses.says(name, 'started') for name in PEERS):
             self._why = 'waiting for robot_bridge and recorder to confirm the run'
             return
         else:
-            says = self._announcer.says
+            says = self._poses.says
             other = [name for name in PEERS if says(name, 'run') != self._left]
             if other:
                 why = f'{" and ".join(other)} did not take part in its run'
@@ -200,11 +202,10 @@ class PosePlanner(RemasterNode):
             self.status.publish()
 
     def _progress(self) -> str:
-        tour = self.book.tour
+        tour = self.journal.tour
         poses = f'{tour.poses_begun} of {sum(tour.poses.values())}' if tour else 'none'
-        return (
-            f'{poses} {self.phase} poses begun, {self.book.outcomes.total()} configurations done'
-        )
+        done = self.journal.outcomes.total()
+        return f'{poses} {self.phase} poses begun, {done} configurations done'
 
     # Services
 
@@ -215,21 +216,21 @@ class PosePlanner(RemasterNode):
         if self.state in ('complete', 'failed'):
             response.message = f'the collection is {self.state}: {self._why or "start anew"}'
             return response
-        if halted := self._announcer.says('robot_bridge', 'halted'):
+        if halted := self._poses.says('robot_bridge', 'halted'):
             response.message = f'the arm is halted: {halted}; /remaster/clear_halt, then collect'
             return response
-        if self._announcer.says('recorder', 'exit_status') == 'complete':
+        if self._poses.says('recorder', 'exit_status') == 'complete':
             response.message = "the recorder's session is complete; give it a new folder"
             return response
-        if self._announcer.says('recorder', 'changed_run') == 'unknown':
+        if self._poses.says('recorder', 'changed_run') == 'unknown':
             response.message = 'the recorder was started just now; try again in a second'
             return response
-        if self.state != 'running' and self._announcer.says('recorder', 'changed_run') not in (
+        if self.state != 'running' and self._poses.says('recorder', 'changed_run') not in (
             '',
             'none',
         ):
             # A person has looked: how things are from now on is measured first.
-            self.book.ask_round()
+            self.journal.ask_round()
         if self.state != 'running' and self._joint_states is None:
             # The arm may have been stopped, or moved by hand, since it last settled.
             self._joint_states = self._listen_to_the_arm()
@@ -256,7 +257,7 @@ class PosePlanner(RemasterNode):
         with self._lock:
             self._left = ''
             # The command first: nothing that fails behind it may keep the arm moving.
-            self._announcer.stop()
+            self._poses.stop()
             self._set_state('stopped')
         response.success, response.message = True, 'stopped'
         return response
@@ -309,40 +310,40 @@ class PosePlanner(RemasterNode):
             ('recorder', 'configuration'),
             ('robot_bridge', 'failed'),
         )
-        ids = self._announcer.ids(event.values.get('stamp', '')) if final else None
+        ids = self._poses.ids(event.values.get('stamp', '')) if final else None
         number = event.values.get('solution', '')
-        if ids is None or self.book.stop is None or number not in map(str, range(len(ids))):
+        if ids is None or self.journal.stop is None or number not in map(str, range(len(ids))):
             return
         solution = ids[int(number)]
         result = event.values.get('result', 'failed')
-        outdated = event.values['stamp'] != self._announcer.stamp
+        outdated = event.values['stamp'] != self._poses.stamp
         if outdated and result not in ('recorded', 'partial'):
             # It was announced again meanwhile, and will be visited again.
             return
-        if solution in self.book.stop.ids:
+        if solution in self.journal.stop.ids:
             self._registered = event.values.get('registered') == 'yes'
-            self.book.outcome(solution, result)
+            self.journal.outcome(solution, result)
             self._step()
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
-        self._clearance.on_summary(node, message, values)
-        self._announcer.hear(node, values)
+        self._preflight.on_summary(node, message, values)
+        self._poses.hear(node, values)
         if node == 'robot_bridge' and values.get('halted'):
             self._set_state('paused', values['halted'], only_from='running')
         run = self._run
         if node == 'recorder' and run is not None and values.get('changed_run') == run.token:
             # Said while this planner was not there; collect begins another run.
             self._set_state('paused', values.get('changed', ''), only_from='running')
-        stop = self.book.stop
+        stop = self.journal.stop
         if node != 'recorder' or stop is None or self.state in ('complete', 'failed'):
             return
-        if values.get('plan') == self.book.id:
+        if values.get('plan') == self.journal.id:
             # What became of a configuration may have been said while this planner was not there.
             pose, _, solutions = values.get('decided', '').partition(': ')
             for solution in map(int, solutions.split()):
                 if pose == str(stop.pose) and solution in stop.ids:
-                    self.book.outcome(solution, 'recorded')
-                    self._announcer.stamp = ''
+                    self.journal.outcome(solution, 'recorded')
+                    self._poses.stamp = ''
 
     # The tour
 
@@ -354,7 +355,7 @@ class PosePlanner(RemasterNode):
         if self._left:
             self._take_up_run()
         self._write_state()
-        if self.book.trouble and not self._is_written():
+        if self.journal.trouble and not self._is_written():
             return
         if self.state != 'running' or self._q is None or not self._heard():
             return
@@ -362,9 +363,9 @@ class PosePlanner(RemasterNode):
             return
         try:
             self._check_session()
-            stop = self.book.stop
+            stop = self.journal.stop
             if stop is not None and stop.ids:
-                if self._announcer.is_lost():
+                if self._poses.is_lost():
                     self._announce_rest(stop, self._q)
                 return
             stop = self._next_stop(self._q)
@@ -373,25 +374,25 @@ class PosePlanner(RemasterNode):
             self.get_logger().error(str(error))
             return
         if stop is not None:
-            self._announcer.close()
-            self.book.open_stop(stop)
-            if stop.ids and not self.book.trouble:
+            self._poses.close()
+            self.journal.open_stop(stop)
+            if stop.ids and not self.journal.trouble:
                 self._publish(stop)
 
-    def _announce_rest(self, stop: Stop, q: FloatArray) -> None:
+    def _announce_rest(self, stop: PoseVisit, q: FloatArray) -> None:
         """Announce what is left of a stop, by ways that begin where the arm stands now."""
-        tour = self.book.tour
+        tour = self.journal.tour
         assert tour is not None
         what = (tour, stop.split, stop.pose, stop.ids)
         found = self._planning.ask(what, q, lambda: tour.reroute(stop, q))
         if found is not None:
-            self.book.reroute(found[0])
-            if found[0].ids and not self.book.trouble:
+            self.journal.reroute(found[0])
+            if found[0].ids and not self.journal.trouble:
                 self._publish(found[0])
 
-    def _propose(self, q: FloatArray) -> tuple[Stop | None] | None:
+    def _propose(self, q: FloatArray) -> tuple[PoseVisit | None] | None:
         """Return the next stop in a tuple, None in it at the end; None while it is planned."""
-        tour = self.book.tour
+        tour = self.journal.tour
         assert tour is not None
         self._why = ''
         standing = self._tours.model.trouble(q)
@@ -410,7 +411,7 @@ class PosePlanner(RemasterNode):
         """Write down what was said; a stop or pause came in a thread that must not wait for it."""
         with self._lock:
             state, run = self.state, '' if self._run is None else self._run.token
-        self.book.say_state(state, run)
+        self.journal.say_state(state, run)
 
     def _is_written(self) -> bool:
         """Whether the disk takes what it did not take before; looked at once a second."""
@@ -418,20 +419,20 @@ class PosePlanner(RemasterNode):
         if now - self._tried_wall < RETRY_WALL_S:
             return False
         self._tried_wall = now
-        self.book.write_out()
+        self.journal.write_out()
         self.status.publish()
-        return not self.book.trouble
+        return not self.journal.trouble
 
     def _check_session(self) -> None:
         """Refuse to add another plan's poses to a session."""
-        theirs = self._announcer.says('recorder', 'plan')
-        observations = self._announcer.says('recorder', 'observations')
-        if theirs not in ('', self.book.id) and observations != '0':
-            session = self._announcer.says('recorder', 'session')
+        theirs = self._poses.says('recorder', 'plan')
+        observations = self._poses.says('recorder', 'observations')
+        if theirs not in ('', self.journal.id) and observations != '0':
+            session = self._poses.says('recorder', 'session')
             raise InputError(
                 f'the session {session} holds observations of another plan than '
-                f'{self.book.path}; give the planner the same session folder as the recorder, or '
-                'begin a new session'
+                f'{self.journal.path}; give the planner the same session folder as the recorder, '
+                'or begin a new session'
             )
 
     def _heard(self) -> bool:
@@ -442,7 +443,7 @@ class PosePlanner(RemasterNode):
         if not self.status.alone(time.monotonic()):
             self._why = 'listening whether there is another pose_planner'
             return False
-        matched = self._announcer.matched()
+        matched = self._poses.matched()
         self._why = '' if matched else 'waiting for robot_bridge and recorder'
         return matched
 
@@ -451,51 +452,51 @@ class PosePlanner(RemasterNode):
         if not self._cleared:
             # No pose was begun before a preflight was passed.
             seen_before = self._resumed or bool(self.T_R_N)
-            findings = self._clearance.findings(seen_before=seen_before)
+            findings = self._preflight.findings(seen_before=seen_before)
             self._cleared = not findings
             self._why = f'preflight: {"; ".join(findings)}' if findings else ''
         return self._cleared
 
-    def _next_stop(self, q: FloatArray) -> Stop | None:
+    def _next_stop(self, q: FloatArray) -> PoseVisit | None:
         if self.phase == REGISTRATION:
             return self._next_registration(q)
-        if self.book.tour is None or REGISTRATION in self.book.tour.plans:
+        if self.journal.tour is None or REGISTRATION in self.journal.tour.plans:
             T_R_N = dict(self.T_R_N)
             planned = self._planning.ask('plan', q, lambda: self._tours.collection(T_R_N))
             if planned is None:
                 return None
-            self.book.begin(planned[0])
+            self.journal.begin(planned[0])
         proposed = self._propose(q)
         if proposed == (None,):
             self._set_state('complete', only_from='running')
         return None if proposed is None else proposed[0]
 
-    def _next_registration(self, q: FloatArray) -> Stop | None:
+    def _next_registration(self, q: FloatArray) -> PoseVisit | None:
         """Visit poses until the recorder has registered every sensor."""
-        missing = [name for name in self._clearance.required() if name not in self.T_R_N]
-        if not missing or (self.T_R_N and self._clearance.any_sensor):
+        missing = [name for name in self._preflight.required() if name not in self.T_R_N]
+        if not missing or (self.T_R_N and self._preflight.any_sensor):
             self.phase, self._why = 'collection', ''
             return self._next_stop(q)
         if self._registered:
             # The recorder said so; its transforms are on their way.
             return None
-        if self.book.tour is None:
+        if self.journal.tour is None:
             planned = self._planning.ask('register', q, self._tours.registration)
             if planned is None:
                 return None
-            self.book.begin(planned[0])
+            self.journal.begin(planned[0])
         proposed = self._propose(q)
         if proposed == (None,):
-            assert self.book.tour is not None
+            assert self.journal.tour is not None
             raise InsufficientDataError(
-                f'no registration of {", ".join(missing)} after {self.book.tour.visited} poses '
-                f'({self._announcer.says("recorder", "registration")}); the recorder counts why '
+                f'no registration of {", ".join(missing)} after {self.journal.tour.visited} poses '
+                f'({self._poses.says("recorder", "registration")}); the recorder counts why '
                 'readings were rejected'
             )
         return None if proposed is None else proposed[0]
 
-    def _publish(self, stop: Stop) -> None:
-        tour = self.book.tour
+    def _publish(self, stop: PoseVisit) -> None:
+        tour = self.journal.tour
         if tour is not None and self.phase != REGISTRATION and not self._described:
             self._described = True
             self.status.event('planned', tour.describe())
@@ -507,11 +508,13 @@ class PosePlanner(RemasterNode):
                     and stop.split == REFERENCE
                     and stop.index == tour.references - 1
                 )
-                self._announcer.announce(stop, self.book.id, self.status, last)
+                self._poses.announce(stop, self.journal.id, self.status, last)
 
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
-        tour, outcomes, run = self.book.tour, dict(self.book.outcomes), self._run
-        full = f'waiting for room on the disk: {self.book.trouble}' if self.book.trouble else ''
+        tour, outcomes, run = self.journal.tour, dict(self.journal.outcomes), self._run
+        full = (
+            f'waiting for room on the disk: {self.journal.trouble}' if self.journal.trouble else ''
+        )
         dropped = tour.dropped if tour and self.phase != REGISTRATION else {}
         collecting = tour is not None and self.phase != REGISTRATION
         solutions = Counter(tour.dropped_solutions if tour and collecting else {})
@@ -525,8 +528,8 @@ class PosePlanner(RemasterNode):
             'configurations_done': sum(outcomes.values()),
             'configurations': sum(tour.configurations.values()) if tour else 0,
             'references': tour.references if tour else 0,
-            'references_done': self.book.references.total(),
-            'plan': self.book.id,
+            'references_done': self.journal.references.total(),
+            'plan': self.journal.id,
             'run': '' if run is None else run.token,
             # Whether it may still go on by itself.
             'resuming': 'yes' if self._left else 'no',
@@ -542,7 +545,7 @@ class PosePlanner(RemasterNode):
         """Tell the bridge to stop: nobody plans any more."""
         self._set_state('stopped', only_from='running')
         self._write_state()
-        self.book.close()
+        self.journal.close()
 
 
 def main(args: list[str] | None = None) -> int:

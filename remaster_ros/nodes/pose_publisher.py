@@ -13,8 +13,8 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.messages import duration_of, stamp_key
 from remaster_ros.nodes.pose_tracker import waypoints_message
 from remaster_ros.nodes.running import RemasterNode
-from remaster_ros.nodes.status import LEASED, Status
-from remaster_ros.planning.tour_order import Stop
+from remaster_ros.nodes.status import LEASED, NodeStatus
+from remaster_ros.planning.tour_order import PoseVisit
 
 PEERS = ('robot_bridge', 'recorder')
 ANNOUNCE_WALL_S = 5.0
@@ -31,7 +31,7 @@ class _Peer:
     values: dict[str, str]
 
 
-class Announcer:
+class PosePublisher:
     """Publishes poses with their joint solutions, and follows who knows them.
 
     Attributes
@@ -103,7 +103,7 @@ class Announcer:
             for node, peer in self._peers.items()
         )
 
-    def announce(self, stop: Stop, plan: str, status: Status, last: bool = False) -> None:
+    def announce(self, stop: PoseVisit, plan: str, status: NodeStatus, last: bool = False) -> None:
         """Publish a pose with what is left of its solutions.
 
         Parameters

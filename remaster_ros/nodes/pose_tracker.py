@@ -11,12 +11,12 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.errors import InputError
 from remaster_ros.nodes.messages import duration_of, stamp_key
-from remaster_ros.planning.tour_order import Stop, nearest_solution
+from remaster_ros.planning.tour_order import PoseVisit, nearest_solution
 from remaster_ros.types import FloatArray
 
 
 @dataclass(frozen=True)
-class Announced:
+class PublishedPose:
     """A pose under way.
 
     Attributes
@@ -41,7 +41,9 @@ class Announced:
     last: bool = False
 
 
-def waypoints_message(stop: Stop, joint_names: Sequence[str], header: Header) -> JointTrajectory:
+def waypoints_message(
+    stop: PoseVisit, joint_names: Sequence[str], header: Header
+) -> JointTrajectory:
     """Return remaster/joint_waypoints of a stop.
 
     The configurations to go through before each solution, in order; ``time_from_start.sec`` is 1
@@ -102,7 +104,7 @@ def waypoints_by_solution(
     return {index: np.array(points) for index, points in found.items()}
 
 
-class Announcements:
+class PoseTracker:
     """Bring the two together; the last announcement counts.
 
     Parameters
@@ -113,7 +115,7 @@ class Announcements:
 
     def __init__(self, joint_names: Sequence[str]) -> None:
         self._joint_names = tuple(joint_names)
-        self._said: Announced | None = None
+        self._said: PublishedPose | None = None
         self._solutions: FloatArray | None = None
         self._stamp = ''
 
@@ -121,7 +123,7 @@ class Announcements:
         """Take the values of the planner's event ``pose``."""
         # Bags of the first version have neither ids nor plan.
         ids = values.get('ids', ' '.join(map(str, range(int(values['solutions'])))))
-        self._said = Announced(
+        self._said = PublishedPose(
             int(values['pose']),
             values['split'],
             tuple(map(int, ids.split())),
@@ -140,7 +142,7 @@ class Announcements:
             self._stamp, self._solutions = stamp_key(message.header.stamp), points[:, columns]
 
     @property
-    def now(self) -> Announced | None:
+    def now(self) -> PublishedPose | None:
         """The pose under way; None where either topic has not said it."""
         said = self._said
         return said if said is not None and said.stamp == self._stamp else None

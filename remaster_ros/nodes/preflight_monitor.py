@@ -9,12 +9,12 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from remaster_ros.motion.preflight import Facts, SensorFacts, preflight
-from remaster_ros.session.workcell import Cell
+from remaster_ros.session.workcell import Workcell
 
 MEASURE_EVERY_WALL_S = 5.0
 
 
-class Clearance:
+class PreflightMonitor:
     """Whether the arm may move for the first time.
 
     Parameters
@@ -25,7 +25,7 @@ class Clearance:
         Its sensors.
     """
 
-    def __init__(self, node: Node, cell: Cell) -> None:
+    def __init__(self, node: Node, cell: Workcell) -> None:
         self._cell = cell
         self._said: dict[str, tuple[float, str, dict[str, str]]] = {}
         self._clients: dict[str, Client] = {

@@ -28,21 +28,21 @@ from trajectory_msgs.msg import JointTrajectory
 from remaster_ros.collection.pairing import PairedReading, Pairing, Rejection
 from remaster_ros.collection.plausibility import Plausibility
 from remaster_ros.errors import DiskError, InputError
-from remaster_ros.motion.liveness import Presence
+from remaster_ros.motion.liveness import Liveness
 from remaster_ros.nodes.bagging import BEGAN, BagRecorder
 from remaster_ros.nodes.messages import JointOrder, seconds, temperature_topic
 from remaster_ros.nodes.parameters import declare
-from remaster_ros.nodes.pose_tracker import Announced, Announcements
+from remaster_ros.nodes.pose_tracker import PoseTracker, PublishedPose
 from remaster_ros.nodes.recorder_parameters import Parameters, sensor_rules
 from remaster_ros.nodes.registering import Registrar
-from remaster_ros.nodes.retrying_writer import Patience
+from remaster_ros.nodes.retrying_writer import RetryingWriter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import JOINT_STATES, Event, Status, receiver, run_after
+from remaster_ros.nodes.status import JOINT_STATES, Event, NodeStatus, receiver, run_after
 from remaster_ros.nodes.status import TOPIC as STATUS
-from remaster_ros.nodes.triggered_sensors import Shots
+from remaster_ros.nodes.triggered_sensors import TriggeredSensors
 from remaster_ros.nodes.watching import Watching
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
-from remaster_ros.session.session_journal import Logbook
+from remaster_ros.session.session_journal import SessionJournal
 from remaster_ros.session.session_writer import ExitStatus
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray, MarkerReading, Measurements, Session
@@ -65,7 +65,7 @@ class _Taking:
 
     pairing: Pairing
     solution: int
-    pose: Announced
+    pose: PublishedPose
     from_q: FloatArray | None
     future: Future | None = None
 
@@ -85,7 +85,7 @@ class Recorder(RemasterNode):
                 f'of {", ".join(self.cell.sensors)}'
             )
         streams = [name for name, sensor in self.cell.sensors.items() if not sensor.single_shot]
-        self._presence = Presence(
+        self._liveness = Liveness(
             self.cell.sensors, self.p.heartbeat_s, streams, since_s=time.monotonic()
         )
         self._waited_s = dict.fromkeys(self.cell.sensors, 0.0)
@@ -102,12 +102,12 @@ class Recorder(RemasterNode):
             settle_s=self.p.settle_s,
             created=datetime.now(UTC).isoformat(timespec='seconds'),
         )
-        self.logbook = Logbook(folder, header)
+        self.journal = SessionJournal(folder, header)
         self.counts: Counter[str] = Counter()
         self._trouble = self._restored = ''
-        self._announcements = Announcements(self.chain.joint_names)
+        self._pose_tracker = PoseTracker(self.chain.joint_names)
         self._taking: _Taking | None = None
-        self._due: deque[tuple[FloatArray, float, int, Announced]] = deque(maxlen=100)
+        self._due: deque[tuple[FloatArray, float, int, PublishedPose]] = deque(maxlen=100)
         # Topics come in no common order: what belongs to a dwell may be here before /settled is.
         self._recent_joints: deque[tuple[float, FloatArray]] = deque(maxlen=4000)
         self._recent_readings: deque[tuple[str, MarkerReading]] = deque(maxlen=4000)
@@ -121,12 +121,12 @@ class Recorder(RemasterNode):
         # Settled where no announced pose has a solution (yet): joints, rad, and when.
         self._unknown: tuple[FloatArray, float] | None = None
         self._checked_wall = time.monotonic()
-        self._disk = Patience(lambda why: self.get_logger().error(f'the arm is held: {why}'))
+        self._disk = RetryingWriter(lambda why: self.get_logger().error(f'the arm is held: {why}'))
         self.registrar = Registrar(self, self.cell, self.chain, self.p.max_deviation_m / 2)
         markers = {name: np.array(position) for name, position in self.cell.markers.items()}
         self._plausibility = Plausibility(self.chain, markers, self.p.max_deviation_m)
         self._watching = Watching(self.chain, markers, self.p.reference_stop_m)
-        recording = self.p.bag and not self.logbook.closed
+        recording = self.p.bag and not self.journal.closed
         self._bag = BagRecorder(self, folder / 'bag' if recording else None)
         self._subscribe()
         # A group of its own: while it waits for the reading, what makes the reading goes on.
@@ -136,11 +136,11 @@ class Recorder(RemasterNode):
             self._on_register,
             callback_group=ReentrantCallbackGroup(),
         )
-        self.status = Status(self, self._summary)
-        for note in (*self.logbook.notes, *self._bag.notes):
+        self.status = NodeStatus(self, self._summary)
+        for note in (*self.journal.notes, *self._bag.notes):
             self.get_logger().warning(note)
-        self.registrar.add(self.logbook.registration)
-        self._watching.take_back(self.logbook.watched, self.registrar.T_R_N)
+        self.registrar.add(self.journal.registration)
+        self._watching.take_back(self.journal.watched, self.registrar.T_R_N)
         self.create_timer(0.05, self._look, clock=self.status.steady)
 
     def _subscribe(self) -> None:
@@ -148,8 +148,8 @@ class Recorder(RemasterNode):
         bag = self._bag
         bag.subscribe(JointState, 'joint_states', self._on_joint_state, JOINT_STATES)
         bag.subscribe(JointState, 'remaster/settled', self._on_settled)
-        announcements = self._announcements
-        bag.subscribe(JointTrajectory, 'remaster/joint_solutions', announcements.hear_solutions)
+        poses = self._pose_tracker
+        bag.subscribe(JointTrajectory, 'remaster/joint_solutions', poses.hear_solutions)
         bag.subscribe(JointTrajectory, 'joint_trajectory_controller/joint_trajectory')
         clients = {}
         for name, sensor in self.cell.sensors.items():
@@ -157,7 +157,7 @@ class Recorder(RemasterNode):
             bag.subscribe(Temperature, temperature_topic(sensor.topic), self._on_temperature)
             if sensor.single_shot and sensor.measure_service and self.p.call_measure:
                 clients[name] = self.create_client(Trigger, sensor.measure_service)
-        self._shots = Shots(clients)
+        self._shots = TriggeredSensors(clients)
         bag.subscribe(DiagnosticArray, STATUS, receiver(self._on_event, self._on_summary))
         bag.subscribe_rest()
 
@@ -170,7 +170,7 @@ class Recorder(RemasterNode):
             if not np.all(np.isfinite(position)):
                 self.counts[f'{sensor}_not_finite'] += 1
                 return
-            self._presence.reads(sensor, time.monotonic())
+            self._liveness.reads(sensor, time.monotonic())
             reading = MarkerReading(seconds(message.header.stamp), position)
             self._recent_readings.append((sensor, reading))
             if self._taking is not None:
@@ -207,12 +207,12 @@ class Recorder(RemasterNode):
 
     def _on_event(self, event: Event) -> None:
         if (event.node, event.event) == ('pose_planner', 'pose'):
-            self._announcements.hear_pose(event.values)
+            self._pose_tracker.hear_pose(event.values)
             if event.values['split'] not in (REFERENCE, REGISTRATION):
                 self._say_change(self._watching.leave(self.registrar.T_R_N))
-            if not self._disk.full and not self.logbook.closed:
+            if not self._disk.full and not self.journal.closed:
                 # Before the arm gets there: it is held where there is no room.
-                self._disk.write(partial(self.logbook.follow, event.values.get('plan', '')))
+                self._disk.write(partial(self.journal.follow, event.values.get('plan', '')))
         elif (event.node, event.event) == ('recorder', BEGAN):
             # From a bag: that recorder was started anew here, and knew of no reading under way.
             self._taking = None
@@ -223,7 +223,7 @@ class Recorder(RemasterNode):
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
         if 'sensor' in values:
-            self._presence.says(
+            self._liveness.says(
                 values['sensor'],
                 values.get('ready') == 'yes',
                 message,
@@ -238,9 +238,9 @@ class Recorder(RemasterNode):
             state = values.get('state')
             if state == 'complete':
                 self._disk.write(partial(self._close, 'complete'))
-            elif state == 'stopped' and self.logbook.observations:
+            elif state == 'stopped' and self.journal.observations:
                 self._disk.write(partial(self._close, 'stopped'))
-            elif state == 'running' and self.logbook.closed == 'stopped':
+            elif state == 'running' and self.journal.closed == 'stopped':
                 self._disk.write(self._reopen)
 
     # A configuration
@@ -251,7 +251,7 @@ class Recorder(RemasterNode):
         except InputError as error:
             self._trouble = str(error)
             return
-        pose, solution = self._announcements.now, self._announcements.which(q)
+        pose, solution = self._pose_tracker.now, self._pose_tracker.which(q)
         if pose is None or solution is None:
             # The planner sees by the summary what is not known here, and announces it again. Or it
             # is on its way: topics overtake each other.
@@ -267,13 +267,13 @@ class Recorder(RemasterNode):
 
     def _look_again(self) -> None:
         """Take up a settled configuration that was not known, if the arm still stands there."""
-        pose = self._announcements.now
+        pose = self._pose_tracker.now
         if self._unknown is None or pose is None:
             return
         q, settled_s = self._unknown
         since = [joints for stamp_s, joints in self._recent_joints if stamp_s > settled_s]
         stands = all(np.max(np.abs(joints - q)) <= self.p.motion_tolerance for joints in since)
-        solution = self._announcements.which(q) if stands else None
+        solution = self._pose_tracker.which(q) if stands else None
         if solution is not None:
             self._due.append((q, settled_s, solution, pose))
         if solution is not None or not stands:
@@ -283,12 +283,12 @@ class Recorder(RemasterNode):
         """Begin the reading that is due, unless one is under way."""
         while self._due and not self._busy():
             q, settled_s, solution, pose = self._due.popleft()
-            if self.logbook.closed or not self.logbook.follow(pose.plan):
+            if self.journal.closed or not self.journal.follow(pose.plan):
                 self._trouble = (
                     'settled, but the session is closed, or was begun with another plan'
                 )
                 continue
-            known = self.logbook.result(pose.pose, pose.ids[solution])
+            known = self.journal.result(pose.pose, pose.ids[solution])
             if known:
                 self._report(
                     pose.stamp, solution, known, 'recorded before', registered=self._registered()
@@ -307,15 +307,15 @@ class Recorder(RemasterNode):
         return [name for name in self.cell.sensors if self.p.require in ('all', 'any', name)]
 
     def _absent(self) -> dict[str, str]:
-        """Return why, for each sensor that is not there (`Presence.absent`)."""
-        return self._presence.absent(time.monotonic(), self._wanted())
+        """Return why, for each sensor that is not there (`Liveness.absent`)."""
+        return self._liveness.absent(time.monotonic(), self._wanted())
 
     def _take(
         self,
         q: FloatArray,
         settled_s: float,
         solution: int,
-        pose: Announced,
+        pose: PublishedPose,
         future: Future | None = None,
     ) -> None:
         pairing = Pairing(settled_s, q, self.rules, self.p.motion_tolerance, self.p.require)
@@ -335,7 +335,7 @@ class Recorder(RemasterNode):
         self._check_files()
         if self._taking is not None:
             self._shots.look(self._taking.pairing, absent)
-            self._taking.pairing.give_up(self._now, absent, self._presence.words)
+            self._taking.pairing.give_up(self._now, absent, self._liveness.words)
             self._finish_if_complete()
         self._look_again()
         self._take_next()
@@ -416,7 +416,7 @@ class Recorder(RemasterNode):
 
     def _write(self, good: list[PairedReading], taking: _Taking, result: str, reason: str) -> int:
         """Write what became of one configuration; on disk when this returns."""
-        return self.logbook.write(
+        return self.journal.write(
             pose=taking.pose.pose,
             solution=taking.pose.ids[taking.solution],
             split=taking.pose.split,
@@ -478,12 +478,12 @@ class Recorder(RemasterNode):
             watching.stopped_run not in (None, self._run)
             and self._run
             and not self._disk.full
-            and not self.logbook.closed
+            and not self.journal.closed
         ):
             self._disk.write(self._accept_change)
 
     def _accept_change(self) -> None:
-        self.logbook.note_accepted()
+        self.journal.note_accepted()
         self._watching.accept()
         self.status.publish()
 
@@ -497,11 +497,11 @@ class Recorder(RemasterNode):
         if self._q is None:
             response.message = 'no joint_states yet: is the robot running?'
             return response
-        if self.logbook.closed:
-            response.message = f'the session is closed ({self.logbook.closed})'
+        if self.journal.closed:
+            response.message = f'the session is closed ({self.journal.closed})'
             return response
         future: Future = Future()
-        pose = Announced(BY_HAND, REGISTRATION, (0,), '')
+        pose = PublishedPose(BY_HAND, REGISTRATION, (0,), '')
         self._take(self._q, self._now, 0, pose, future)
         good, why = await future
         response.success = bool(good)
@@ -511,28 +511,28 @@ class Recorder(RemasterNode):
     # State
 
     def _summary(self) -> tuple[str, str, dict[str, Any]]:
-        state = 'closed' if self.logbook.closed else 'measuring' if self._busy() else 'waiting'
+        state = 'closed' if self.journal.closed else 'measuring' if self._busy() else 'waiting'
         now, sensors = time.monotonic(), self.cell.sensors
         waiting_for = self._waiting_for(self._absent())
         trouble = self._trouble or (f'waiting for {waiting_for}' if waiting_for else '')
-        trouble = trouble or self.logbook.beyond_repair or self._restored
+        trouble = trouble or self.journal.beyond_repair or self._restored
         trouble = trouble or self._watching.describe()
-        pose, stopped = self._announcements.now, self._watching.stopped_run
+        pose, stopped = self._pose_tracker.now, self._watching.stopped_run
         values = {
             'state': state,
-            'exit_status': self.logbook.closed,
+            'exit_status': self.journal.closed,
             'session': self.p.session,
-            'observations': self.logbook.observations,
+            'observations': self.journal.observations,
             # By these the planner, or one that was started again, takes up where this one is.
             'pose': '' if pose is None else pose.stamp,
-            'plan': self.logbook.plan_id,
+            'plan': self.journal.plan_id,
             'run': self._run,
-            'decided': self.logbook.decided(),
+            'decided': self.journal.decided(),
             'registration': self.registrar.describe(),
             'require': self.p.require,
             'waiting_for': waiting_for,
             **{f'waited_s_{name}': f'{s:.1f}' for name, s in self._waited_s.items()},
-            **{f'read_age_s_{n}': f'{self._presence.read_age_s(n, now):.1f}' for n in sensors},
+            **{f'read_age_s_{n}': f'{self._liveness.read_age_s(n, now):.1f}' for n in sensors},
             'bag_dropped': self._bag.dropped,
             'restored': self._restored,
             'changed': self._watching.describe(),
@@ -554,28 +554,28 @@ class Recorder(RemasterNode):
             return
         self._checked_wall = time.monotonic()
         if not self._disk.full:
-            self._disk.write(self.logbook.check)
+            self._disk.write(self.journal.check)
         self._say_restored()
 
     def _say_restored(self) -> None:
-        for line in self.logbook.take_restored():
+        for line in self.journal.take_restored():
             self.get_logger().error(line)
             self._restored = line
             self.status.publish()
 
     def _reopen(self) -> None:
-        self.logbook.reopen()
+        self.journal.reopen()
         self._bag.reopen()
 
     def _close(self, exit_status: ExitStatus) -> None:
-        if not self.logbook.closed:
+        if not self.journal.closed:
             self._say_change(self._watching.judge(self.registrar.T_R_N))
-            self.logbook.close(exit_status)
+            self.journal.close(exit_status)
             self._say_restored()
-            if self.logbook.closed != exit_status:
+            if self.journal.closed != exit_status:
                 self.get_logger().error(
-                    f'the session is closed as {self.logbook.closed}, not as {exit_status}: '
-                    f'{self.logbook.beyond_repair}; its observations are all there'
+                    f'the session is closed as {self.journal.closed}, not as {exit_status}: '
+                    f'{self.journal.beyond_repair}; its observations are all there'
                 )
             self._bag.close()
             waited = ', '.join(f'{name} {s:.1f} s' for name, s in self._waited_s.items())

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from remaster_ros.collection.pairing import SensorRules
 from remaster_ros.nodes.parameters import parameter
-from remaster_ros.session.workcell import Cell
+from remaster_ros.session.workcell import Workcell
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Parameters:
     )
 
 
-def sensor_rules(cell: Cell, p: Parameters) -> tuple[SensorRules, ...]:
+def sensor_rules(cell: Workcell, p: Parameters) -> tuple[SensorRules, ...]:
     """Return how each sensor of the cell is read."""
     return tuple(
         SensorRules(

@@ -6,13 +6,13 @@ import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 
-from remaster_ros.calibration.registration import register_agreeing
+from remaster_ros.calibration.registration import register_ransac
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.messages import transform_message
 from remaster_ros.nodes.status import LATCHED
-from remaster_ros.session.workcell import Cell
+from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import FloatArray
 
 POINTS = 3
@@ -31,7 +31,7 @@ class Registrar:
         A point that is off by more is not used, m.
     """
 
-    def __init__(self, node: Node, cell: Cell, chain: SerialChain, allowed_m: float) -> None:
+    def __init__(self, node: Node, cell: Workcell, chain: SerialChain, allowed_m: float) -> None:
         self._node, self._cell, self._chain = node, cell, chain
         self._allowed_m = allowed_m
         self._points: dict[str, list[tuple[FloatArray, FloatArray]]] = {
@@ -57,7 +57,7 @@ class Registrar:
                 continue
             robot, measured = (np.array(side) for side in zip(*points))
             try:
-                T_R_N, agree = register_agreeing(robot, measured, self._allowed_m)
+                T_R_N, agree = register_ransac(robot, measured, self._allowed_m)
             except InsufficientDataError as error:
                 self._notes[reading.sensor] = f'{reading.sensor}: {error}'
                 self._node.get_logger().warning(self._notes[reading.sensor])

@@ -11,7 +11,7 @@ RETRY_S = 1.0
 """How often a full disk is tried again, s of wall time."""
 
 
-class Patience:
+class RetryingWriter:
     """One thing at a time that is to be written.
 
     Parameters

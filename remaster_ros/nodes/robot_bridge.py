@@ -45,7 +45,7 @@ from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.pose_tracker import waypoints_by_solution
 from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import LEASED, RELIABLE, Event, Status, listen
+from remaster_ros.nodes.status import LEASED, RELIABLE, Event, NodeStatus, listen
 from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
 from remaster_ros.session.halt_file import HaltFile
 from remaster_ros.session.workcell import read_cell
@@ -114,7 +114,7 @@ class RobotBridge(RemasterNode):
         # Since when a controller listens; a command before that would be lost.
         self._listened_wall: float | None = None
         self._settled = self.create_publisher(JointState, 'remaster/settled', RELIABLE)
-        self.status = Status(self, self._summary)
+        self.status = NodeStatus(self, self._summary)
         self.create_subscription(JointState, JOINTS, self._on_joint_state, NEWEST_STATES)
         self.create_subscription(JointTrajectory, WAYPOINTS, self._on_waypoints, RELIABLE)
         self.create_subscription(JointTrajectory, SOLUTIONS, self._on_solutions, RELIABLE)

@@ -22,7 +22,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
 from remaster_ros.errors import InputError
-from remaster_ros.motion.rivalry import Rivalry
+from remaster_ros.motion.rivalry import DuplicateNodeCheck
 from remaster_ros.nodes.qos_mismatch import mismatches
 from remaster_ros.session.bag_metadata import LATCHED_DEPTH
 
@@ -63,7 +63,7 @@ class Event:
     values: dict[str, str]
 
 
-class Status:
+class NodeStatus:
     """Publish a node's summary and events; end the node where another of its name is longer there.
 
     Parameters
@@ -79,7 +79,7 @@ class Status:
         self._summary = summary
         # Tells a node that was started again from the one before it.
         self._started, self._started_wall = str(time.time_ns()), time.monotonic()
-        self._rivalry = Rivalry(self._started)
+        self._duplicates = DuplicateNodeCheck(self._started)
         self._publisher = node.create_publisher(DiagnosticArray, TOPIC, RELIABLE)
         # Where the executor has threads, heartbeats go on while a callback plans or writes.
         group = MutuallyExclusiveCallbackGroup()
@@ -98,7 +98,7 @@ class Status:
     @property
     def alone_since(self) -> float | None:
         """Since when no other of this name was heard, `time.monotonic`; None where not yet."""
-        return self._rivalry.alone_since_s
+        return self._duplicates.alone_since_s
 
     def alone(self, now: float) -> bool:
         """Whether this node has listened for 1.5 s and heard of no other of its name.
@@ -108,7 +108,7 @@ class Status:
         now
             `time.monotonic`, s.
         """
-        return self._rivalry.alone(now)
+        return self._duplicates.alone(now)
 
     def _look_at_qos(self) -> None:
         self._qos_trouble = mismatches(self._node)
@@ -120,7 +120,7 @@ class Status:
             return
         now = time.monotonic()
         if started == self._started:
-            self._rivalry.hear_itself(now)
+            self._duplicates.hear_itself(now)
             return
         try:
             uptime_s = float(values['uptime_s'])
@@ -129,7 +129,7 @@ class Status:
         # A replay publishes what a node of this name once said, and is another node.
         if self._namesakes() < 2:
             return
-        if self._rivalry.hear(started, uptime_s, now - self._started_wall, now):
+        if self._duplicates.hear(started, uptime_s, now - self._started_wall, now):
             self._node.failure = InputError(  # type: ignore[attr-defined]
                 f'{own} is running already in this ROS domain, for {uptime_s:.0f} s, on another '
                 'computer or for another user; end that one, or give this one a namespace '

@@ -26,7 +26,7 @@ from remaster_ros.planning.tour_order import (
     free_way,
     registration_tour,
 )
-from remaster_ros.session.workcell import Cell
+from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import FloatArray
 
 MOST_TRIES = 5
@@ -66,7 +66,7 @@ class TourPlanner:
 
     def __init__(
         self,
-        cell: Cell,
+        cell: Workcell,
         chain: SerialChain,
         counts: Mapping[str, int],
         seed: int,

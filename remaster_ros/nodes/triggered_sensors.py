@@ -28,7 +28,7 @@ class _Shot:
     answered_wall: float | None = None
 
 
-class Shots:
+class TriggeredSensors:
     """The measurements that one configuration after the other needs.
 
     Parameters

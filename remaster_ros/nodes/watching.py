@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from remaster_ros.collection.pairing import PairedReading
-from remaster_ros.collection.reference_watch import Change, ReferenceReading, ReferenceWatch
+from remaster_ros.collection.reference_watch import (
+    ReferenceReading,
+    ReferenceWatch,
+    SetupChange,
+)
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray
 
@@ -37,8 +41,8 @@ class Watching:
     ) -> None:
         self._stop_m = stop_m
         self._watch = ReferenceWatch(chain, markers, **({'stop_m': stop_m} if stop_m else {}))
-        self._said: Change | None = None
-        self.change: Change | None = None
+        self._said: SetupChange | None = None
+        self.change: SetupChange | None = None
         self.stopped_run: str | None = None
 
     @property
@@ -70,7 +74,7 @@ class Watching:
         log: Iterable[tuple[str, int, Sequence[PairedReading]]],
         T_R_N: Mapping[str, FloatArray],
     ) -> None:
-        """Take up what a recorder before this one has logged (`Logbook.watched`)."""
+        """Take up what a recorder before this one has logged (`SessionJournal.watched`)."""
         for kind, configuration, readings in log:
             if kind == 'reference':
                 self.read(configuration, readings, T_R_N)

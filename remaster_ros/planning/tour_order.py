@@ -23,7 +23,7 @@ FIRST_ROUNDS = 2
 
 
 @dataclass(frozen=True)
-class Stop:
+class PoseVisit:
     """A pose to visit now.
 
     Attributes
@@ -61,7 +61,7 @@ class Stop:
             straight = np.empty((0, self.solutions.shape[1]))
             object.__setattr__(self, 'paths', (straight,) * len(self.solutions))
 
-    def only(self, ids: Collection[int]) -> Stop:
+    def only(self, ids: Collection[int]) -> PoseVisit:
         """Return the stop with only these solutions, in the same order.
 
         The ways stay as they were: they hold for an arm that has visited the others. From
@@ -138,12 +138,12 @@ class Tour:
             self.dropped_solutions.update(plan.dropped_solutions)
         self.visited = 0
 
-    def next(self, q: FloatArray) -> Stop | None:
+    def next(self, q: FloatArray) -> PoseVisit | None:
         """Return the next stop for an arm at joint positions `q` (rad, (k,)); None at the end."""
         proposed = self.propose(q)
         return None if proposed is None else self.take(proposed)
 
-    def propose(self, q: FloatArray) -> Stop | None:
+    def propose(self, q: FloatArray) -> PoseVisit | None:
         """Return what `next` would, and leave the tour as it is: a thread may do this."""
         if self._rounds_due:
             return self._propose_reference(q)
@@ -170,7 +170,7 @@ class Tour:
         if self.references:
             self._reference, self._rounds_due = 0, max(self._rounds_due, 1)
 
-    def _propose_reference(self, q: FloatArray) -> Stop:
+    def _propose_reference(self, q: FloatArray) -> PoseVisit:
         index = self._reference
         ids, paths, unreached = self._route(REFERENCE, index, [0], q)
         return self._stop(REFERENCE, index, ids, paths, unreached)
@@ -191,13 +191,13 @@ class Tour:
                 return np.concatenate((first, before[None], last))
         return free_way(self._model, q, goal, self._chain.velocity_limits, index)
 
-    def take(self, proposed: Stop) -> Stop:
+    def take(self, proposed: PoseVisit) -> PoseVisit:
         """Count a proposed stop visited and return it with its number."""
         return self.go_to(
             proposed.split, proposed.index, proposed.ids, proposed.paths, proposed.unreached
         )
 
-    def reroute(self, stop: Stop, q: FloatArray) -> Stop:
+    def reroute(self, stop: PoseVisit, q: FloatArray) -> PoseVisit:
         """Return a stop with the ways to its solutions, and their order, found anew from `q`."""
         ids, paths, unreached = self._route(stop.split, stop.index, stop.ids, q)
         solutions = self.plans[stop.split].poses[stop.index].solutions[list(ids)]
@@ -212,7 +212,7 @@ class Tour:
         ids: Sequence[int],
         paths: Sequence[FloatArray] = (),
         unreached: Sequence[int] = (),
-    ) -> Stop:
+    ) -> PoseVisit:
         """Return the stop at one planned pose with these of its solutions, and count it visited.
 
         This is how a tour that was begun before takes up where it was: the stops so far, in order.
@@ -242,11 +242,11 @@ class Tour:
         ids: Sequence[int],
         paths: Sequence[FloatArray],
         unreached: Sequence[int],
-    ) -> Stop:
+    ) -> PoseVisit:
         pose = self.plans[split].poses[index]
         number = self.visited if split != REGISTRATION else -1 - self.visited
         solutions = pose.solutions[list(ids)]
-        return Stop(
+        return PoseVisit(
             number, split, pose.T_R_T, solutions, index, tuple(ids), tuple(paths), tuple(unreached)
         )
 

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.base import Cell
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.reports.figures import AFTER, BEFORE, INK, STYLE, WIDTH_IN, log_axis
 from remaster_ros.types import FloatArray
 
@@ -49,7 +49,7 @@ def gain(discovery: Discovery) -> Figure:
     figure = Figure(figsize=(WIDTH_IN, 2.6), layout='constrained')
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     data, selection = discovery.residuals, discovery.selection
-    held_out = data.scene.measurements.is_validation
+    held_out = data.context.measurements.is_validation
     rows = held_out if held_out.any() else np.isin(np.arange(len(held_out)), data.rows.source)
     errors = [data.unexplained(fit) for fit in (selection.empty, selection.solution)]
     lengths = [np.maximum(1e3 * np.linalg.norm(e[rows], axis=1), 1e-4) for e in errors]
@@ -68,7 +68,7 @@ def gain(discovery: Discovery) -> Figure:
     left.legend(loc='upper left')
 
     parts, names = [], []
-    for sensor, name in enumerate(data.scene.sensor_names):
+    for sensor, name in enumerate(data.context.sensor_names):
         names.append(name)
         parts.append(
             [
@@ -102,17 +102,23 @@ def gain(discovery: Discovery) -> Figure:
 def drivers(discovery: Discovery) -> Figure:
     """Draw, joint by joint, the errors along the joint's motion against every driver."""
     data, selection = discovery.residuals, discovery.selection
-    scene = data.part
+    context = data.part
     by_joint: list[tuple[str, Callable[[int], FloatArray] | None]] = [
-        ('own angle (°)', lambda j: np.degrees(scene.measurements.q[:, j])),
-        ('gravity torque (N m)', lambda j: scene.gravity_torque[:, j]),
-        ('last move (°)', lambda j: np.degrees(scene.last_move[:, j])),
-        ('time (h)', lambda j: scene.elapsed_s / 3600.0),
-        ('temperature (K)', lambda j: scene.warming),
+        ('own angle (°)', lambda j: np.degrees(context.measurements.q[:, j])),
+        ('gravity torque (N m)', lambda j: context.gravity_torque[:, j]),
+        ('last move (°)', lambda j: np.degrees(context.last_move[:, j])),
+        ('time (h)', lambda j: context.elapsed_s / 3600.0),
+        ('temperature (K)', lambda j: context.warming),
     ]
-    shown = [True, scene.has_gravity, scene.has_approach, scene.has_time, scene.has_temperature]
+    shown = [
+        True,
+        context.has_gravity,
+        context.has_approach,
+        context.has_time,
+        context.has_temperature,
+    ]
     kept = [pair for pair, show in zip(by_joint, shown, strict=True) if show]
-    joints = scene.joints
+    joints = context.joints
     height = 1.05 * len(kept) + 0.6
     figure = Figure(figsize=(WIDTH_IN, height))
     # Fixed margins: to find them for so many panels takes longer than to draw them.
@@ -125,7 +131,7 @@ def drivers(discovery: Discovery) -> Figure:
         hspace=0.7,
         wspace=0.1,
     )
-    motion = scene.jacobian
+    motion = context.jacobian
     length = np.maximum(np.linalg.norm(motion, axis=1), 1e-6)
     fits = [(selection.empty, BEFORE, 'before')]
     if discovery.groups:
@@ -195,34 +201,34 @@ def causes(discovery: Discovery) -> Figure:
     return figure
 
 
-def _driver(scene: Scene, cell: Cell) -> tuple[str, FloatArray]:
+def _driver(context: Context, cell: Cell) -> tuple[str, FloatArray]:
     """Return label and value of what drives a cause at a joint's angle, (n,)."""
     joint = cell.joints[-1] - 1
     if cell.driver == 'own_angle' or cell.driver.startswith('angle_of'):
-        return f'angle of joint {joint + 1} (°)', np.degrees(scene.measurements.q[:, joint])
+        return f'angle of joint {joint + 1} (°)', np.degrees(context.measurements.q[:, joint])
     if cell.driver.startswith('gravity_torque'):
-        return f'gravity torque on joint {joint + 1} (N m)', scene.gravity_torque[:, joint]
+        return f'gravity torque on joint {joint + 1} (N m)', context.gravity_torque[:, joint]
     if cell.driver.startswith('approach'):
-        return f'approach of joint {joint + 1}', scene.approach[:, joint]
+        return f'approach of joint {joint + 1}', context.approach[:, joint]
     if cell.driver.startswith('last_move'):
-        return f'last move of joint {joint + 1} (°)', np.degrees(scene.last_move[:, joint])
+        return f'last move of joint {joint + 1} (°)', np.degrees(context.last_move[:, joint])
     if cell.driver == 'temperature':
-        return 'temperature above the first (K)', scene.warming
-    return 'time (h)', scene.elapsed_s / 3600.0
+        return 'temperature above the first (K)', context.warming
+    return 'time (h)', context.elapsed_s / 3600.0
 
 
 def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     """Draw one cause at a joint's angle, in arc minutes."""
     data, solution = discovery.residuals, discovery.selection.solution
-    whole = len(data.scene) <= MOST_DRAWN
-    scene = data.scene if whole else data.part
+    whole = len(data.context) <= MOST_DRAWN
+    context = data.context if whole else data.part
     left = data.unexplained(solution) if whole else data.left(solution)
-    fitted = np.ones(len(scene), dtype=bool)
+    fitted = np.ones(len(context), dtype=bool)
     if whole:
-        fitted = np.isin(np.arange(len(scene)), data.rows.source)
-    label, x = _driver(scene, cell)
+        fitted = np.isin(np.arange(len(context)), data.rows.source)
+    label, x = _driver(context, cell)
     where = dict(zip(solution.cells, solution.slices(), strict=True))[cell]
-    columns = cell.columns(scene)
+    columns = cell.columns(context)
     assert columns.at is not None
     index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
     chosen = [index[name] for name in cell.parameters]
@@ -234,7 +240,7 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
         values = values - values[fitted].mean(axis=0)
     effect = values @ solution.parameters[where] / ARC_MINUTE
     spread = (values @ draws.T / ARC_MINUTE).std(axis=1)
-    motion = scene.jacobian[:, :, columns.at]
+    motion = context.jacobian[:, :, columns.at]
     # What is left, as an angle of this joint: only where the marker is far from its axis.
     square = np.sum(motion**2, axis=1)
     far = fitted & (square > 0.1 * np.median(square))

@@ -23,13 +23,13 @@ from remaster_ros.session.files import make_folder, write_atomically
 
 if TYPE_CHECKING:
     from remaster_ros.calibration.result import FitResult
-    from remaster_ros.reports.scene import Scene
+    from remaster_ros.reports.view_3d import View3D
 
 # Less than this is no gain a user would notice.
 NOTICEABLE_GAIN = 1.1
 
 
-class Verdict(NamedTuple):
+class Headline(NamedTuple):
     """The result in plain words.
 
     Attributes
@@ -74,11 +74,11 @@ def write_report(result: FitResult, folder: str | os.PathLike[str]) -> Path:
 
 def report_html(result: FitResult, drawings: dict[str, str]) -> str:
     """Return the page; with drawings (of `draw_figures`) it also has the 3-D view."""
-    scene: Scene | None = None
+    scene: View3D | None = None
     if drawings:
-        from remaster_ros.reports.scene import draw_scene
+        from remaster_ros.reports.view_3d import draw_view
 
-        scene = draw_scene(result)
+        scene = draw_view(result)
     return page(
         'report.html.jinja',
         fit=fit_to_dict(result),
@@ -100,7 +100,7 @@ def _references(result: FitResult) -> tuple[int, list[str]]:
     return rounds, [f'While it was measured, {change.describe()}.' for change in found]
 
 
-def verdict(result: FitResult) -> Verdict:
+def verdict(result: FitResult) -> Headline:
     """Judge a fit in words: what was gained, whether the chains agree, what stays unknown."""
     validated = result.accuracy['validation'] is not None
     split = 'validation' if validated else 'optimization'
@@ -173,7 +173,7 @@ def verdict(result: FitResult) -> Verdict:
             f'{len(result.left_out)} observation{plural} left out as gross errors; '
             'they are listed below.'
         )
-    return Verdict(mood, headline, points)
+    return Headline(mood, headline, points)
 
 
 def _dominated(unexplained: Sequence[NoiseCheck]) -> str:

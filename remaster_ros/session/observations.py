@@ -31,7 +31,7 @@ LIMIT_TOLERANCE_RAD = math.radians(1.0)
 
 
 @dataclass(frozen=True)
-class Columns:
+class ColumnNames:
     """The column names of a session with k joints, in the order this package writes them."""
 
     joints: int
@@ -104,7 +104,7 @@ def parse_observations(
         raise InputError(f'{path}: no header line; the first line names the columns')
     _refuse_other_separators(lines[0], path)
     names = split_line(lines[0], path, 1)
-    columns = Columns(len(chain))
+    columns = ColumnNames(len(chain))
     with_effort = _check_names(names, columns, path)
     if len(lines) < 2:
         raise InputError(f'{path}: no observations below the header; measure before fitting')
@@ -158,7 +158,7 @@ def check_row(
     InputError
         As `parse_observations`.
     """
-    columns = Columns(len(chain))
+    columns = ColumnNames(len(chain))
     table = Table(path, columns.names(), [text.rstrip('\n')], first_line=line)
     measurements = _columns(table, columns, chain, sensors, markers, with_effort=False)
     row = next(row_keys(measurements, first_line=line))
@@ -169,7 +169,7 @@ def check_row(
 
 def format_header(joints: int, with_effort: bool = False) -> str:
     """Return the header line of observations.csv."""
-    return ','.join(Columns(joints).names(with_effort)) + '\n'
+    return ','.join(ColumnNames(joints).names(with_effort)) + '\n'
 
 
 def format_observation(observation: Observation) -> str:
@@ -213,7 +213,7 @@ def format_measurements(m: Measurements, sensors: Sequence[str], markers: Sequen
     return format_header(m.q.shape[1], m.effort is not None) + ''.join(f'{row}\n' for row in lines)
 
 
-def _check_names(names: list[str], columns: Columns, path: Path) -> bool:
+def _check_names(names: list[str], columns: ColumnNames, path: Path) -> bool:
     """Hold the header against the format; return whether the file has effort columns."""
     where = f'{path}, line 1'
     for name in names:
@@ -247,7 +247,7 @@ def _check_names(names: list[str], columns: Columns, path: Path) -> bool:
 
 def _columns(
     table: Table,
-    columns: Columns,
+    columns: ColumnNames,
     chain: SerialChain,
     sensors: Sequence[str],
     markers: Sequence[str],

@@ -20,7 +20,7 @@ from remaster_ros.errors import DiskError, InputError
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import Plan, PlannedPose
-from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, Stop, Tour
+from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, PoseVisit, Tour
 from remaster_ros.session.files import make_folder
 from remaster_ros.session.journal import Journal, Record
 from remaster_ros.session.session_writer import PLAN
@@ -30,7 +30,7 @@ NO_FREE_PATH = 'no_free_path'
 """Outcome of a configuration that the arm cannot get to without hitting something."""
 
 
-class PlanBook:
+class PlanJournal:
     """Keep what a planner must not forget; what a method returned from is on the disk.
 
     Unless `trouble` says that the disk is full: then it is kept until `write_out` succeeds.
@@ -87,7 +87,7 @@ class PlanBook:
         self.id = self.state = self.run = self.lost = self.trouble = ''
         self._unwritten: deque[Record] = deque()
         self.tour: Tour | None = None
-        self.stop: Stop | None = None
+        self.stop: PoseVisit | None = None
         self.outcomes: Counter[str] = Counter()
         self.references: Counter[str] = Counter()
         if self.path.exists():
@@ -158,7 +158,7 @@ class PlanBook:
         elif kind == 'state':
             self.state, self.run = record['state'], record.get('run', '')
 
-    def _take(self, stop: Stop) -> None:
+    def _take(self, stop: PoseVisit) -> None:
         """Go to a stop; the solutions that nothing leads to have their outcome with it."""
         if stop.unreached:
             self._count(stop.split, NO_FREE_PATH, len(stop.unreached))
@@ -212,12 +212,12 @@ class PlanBook:
             self._append({'kind': 'round'})
             self.tour.ask_round()
 
-    def open_stop(self, stop: Stop) -> None:
+    def open_stop(self, stop: PoseVisit) -> None:
         """Remember the next stop, before the arm is sent there."""
         self._append({'kind': 'stop', 'split': stop.split, 'index': stop.index, **_ways(stop)})
         self._take(stop)
 
-    def reroute(self, stop: Stop) -> None:
+    def reroute(self, stop: PoseVisit) -> None:
         """Remember other ways to what is left of the open stop, before the arm is sent there."""
         self._append({'kind': 'route', **_ways(stop)})
         self._take(stop)
@@ -261,7 +261,7 @@ def _content(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _ways(stop: Stop) -> dict[str, Any]:
+def _ways(stop: PoseVisit) -> dict[str, Any]:
     """Return a stop's solutions and the ways to them, as they are written."""
     return {
         'ids': list(stop.ids),

@@ -27,7 +27,7 @@ SHIFT_S = 1.0
 _FINAL = ('recorded', 'partial')
 
 
-class Logbook:
+class SessionJournal:
     """Write a session, new or unfinished, and remember what was decided.
 
     Parameters

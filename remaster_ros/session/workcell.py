@@ -1,4 +1,4 @@
-"""Cell files (config/cells/*.yaml): the arm, the markers on its tool, the sensors."""
+"""Workcell files (config/cells/*.yaml): the arm, the markers on its tool, the sensors."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
         )
 
 
-class Cell(msgspec.Struct, forbid_unknown_fields=True):
+class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     """A cell file; see config/cells/demo.yaml for what each key means."""
 
     robot: CellRobot
@@ -252,7 +252,7 @@ def config_path(name: str) -> Path:
     return Path(next(iter(spec.submodule_search_locations))) / name
 
 
-def read_cell(path: str | Path) -> Cell:
+def read_cell(path: str | Path) -> Workcell:
     """Read and check a cell file.
 
     Parameters
@@ -270,7 +270,7 @@ def read_cell(path: str | Path) -> Cell:
         path = config_path(f'cells/{path}.yaml')
     try:
         data = load_yaml(decode_text(read_limited(path, YAML_LIMIT, 'name a cell file'), path))
-        cell = msgspec.convert(data, Cell)
+        cell = msgspec.convert(data, Workcell)
     except (YamlError, msgspec.ValidationError) as error:
         raise InputError(f'{path}: {error}') from None
     urdf = path.parent / cell.robot.urdf
@@ -284,7 +284,7 @@ def read_cell(path: str | Path) -> Cell:
     return cell
 
 
-def _check(path: Path, cell: Cell) -> None:
+def _check(path: Path, cell: Workcell) -> None:
     """Refuse names that point nowhere and values that cannot be."""
     _require_finite(path, '', msgspec.to_builtins(cell))
     try:
@@ -315,7 +315,7 @@ def _check(path: Path, cell: Cell) -> None:
     _check_collision(path, cell, chain)
 
 
-def _check_collision(path: Path, cell: Cell, chain: SerialChain) -> None:
+def _check_collision(path: Path, cell: Workcell, chain: SerialChain) -> None:
     """Refuse sizes and limits that cannot be; meshes are read when they are needed."""
     if not cell.marker_radius_m > 0:
         raise InputError(f'{path}: marker_radius_m must be positive')

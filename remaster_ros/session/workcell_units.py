@@ -7,7 +7,7 @@ from math import degrees, pi
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from remaster_ros.session.workcell import Cell
+    from remaster_ros.session.workcell import Workcell
 
 # Nobody places a marker worse than this; a session whose nominal places say nothing may say so.
 LARGEST_MARKER_STD_M = 0.02
@@ -20,7 +20,7 @@ LARGEST_LINK_RADIUS_M = 1.0
 SMALLEST_VIEW_DEG = 3.5
 
 
-def unit_problem(cell: Cell) -> str:
+def unit_problem(cell: Workcell) -> str:
     """Return what is wrong with the first number that cannot be in its unit; '' where none is."""
     if cell.marker_std_m > LARGEST_MARKER_STD_M:
         return (
@@ -57,7 +57,7 @@ def unit_problem(cell: Cell) -> str:
     return ''
 
 
-def _lengths(cell: Cell) -> Iterator[tuple[str, float, float]]:
+def _lengths(cell: Workcell) -> Iterator[tuple[str, float, float]]:
     """Return key, value and largest value, m, of every length."""
     for name, position in cell.markers.items():
         for value in position:

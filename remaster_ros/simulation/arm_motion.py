@@ -22,7 +22,7 @@ DAMPING = 0.7
 
 
 @dataclass(frozen=True)
-class Waypoint:
+class ServoPoint:
     """A point of a trajectory: time from its start (s), position (rad) and velocity (rad/s).
 
     Without a velocity the controller interpolates linearly towards it, as the real one does.
@@ -119,7 +119,7 @@ class Motion:
         q = np.asarray(q, float)
         self._responses = [_Response.of(start_s, q[None], q, np.zeros_like(q))]
 
-    def follow(self, start_s: float, waypoints: Sequence[Waypoint]) -> None:
+    def follow(self, start_s: float, waypoints: Sequence[ServoPoint]) -> None:
         """From `start_s` on follow a trajectory; replaces what is under way.
 
         The last waypoint is held. One piece of response is kept for each piece of the reference.

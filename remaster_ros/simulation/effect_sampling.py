@@ -1,7 +1,7 @@
 """Draws effects to hide: which joint, which way, which sign.
 
 Signs are drawn too, but for what can only give way to a load or grow when it warms. Every draw is
-of about the largest size that is plausible; `Stage.of_size` makes it smaller.
+of about the largest size that is plausible; `WorldModel.of_size` makes it smaller.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.simulation.hidden_effects import ARC_MINUTE, NAMED, Circumstances, HiddenEffect
-from remaster_ros.simulation.world_model import Stage
+from remaster_ros.simulation.world_model import WorldModel
 from remaster_ros.types import FloatArray
 
 RANDOM = 'random'
@@ -194,7 +194,7 @@ DRAWS: dict[str, Draw] = {
 
 
 @dataclass(frozen=True)
-class Request:
+class EffectSpec:
     """What somebody wants hidden.
 
     Attributes
@@ -204,7 +204,7 @@ class Request:
     joint
         The joint that errs, 1-based; any where None.
     size_m
-        What it leaves, see `Stage.size_m`; drawn where None.
+        What it leaves, see `WorldModel.size_m`; drawn where None.
     """
 
     kind: str
@@ -212,7 +212,7 @@ class Request:
     size_m: float | None = None
 
     @classmethod
-    def parse(cls, text: str) -> Request:
+    def parse(cls, text: str) -> EffectSpec:
         """Read ``NAME[@JOINT][:SIZE_MM]``, such as ``backlash``, ``backlash@4:0.3``, ``random``.
 
         Raises
@@ -234,7 +234,7 @@ class Request:
 
 
 def hide(
-    stage: Stage, requests: Sequence[Request], rng: np.random.Generator
+    stage: WorldModel, requests: Sequence[EffectSpec], rng: np.random.Generator
 ) -> tuple[HiddenEffect, ...]:
     """Draw what was asked for.
 
@@ -258,9 +258,9 @@ def hide(
 
 
 def draw_effect(
-    stage: Stage, kind: str, rng: np.random.Generator, size_m: float, joint: int | None = None
+    stage: WorldModel, kind: str, rng: np.random.Generator, size_m: float, joint: int | None = None
 ) -> HiddenEffect:
-    """Draw an effect of that kind of which so much is left (see `Stage.size_m`).
+    """Draw an effect of that kind of which so much is left (see `WorldModel.size_m`).
 
     Drawn again as long as it would have to be larger than is plausible: a joint that hardly moves
     shows no eccentricity. Where no draw gets there, the most visible of them is taken.
@@ -288,7 +288,7 @@ def draw_effect(
     return stage.of_size(best, size_m)
 
 
-def _balanced(stage: Stage, effect: HiddenEffect) -> HiddenEffect:
+def _balanced(stage: WorldModel, effect: HiddenEffect) -> HiddenEffect:
     """Let every joint that shares in an effect leave as much as the drawn values are large.
 
     Else one of two joints that give way could be there in name only.

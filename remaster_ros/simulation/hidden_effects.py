@@ -305,7 +305,7 @@ def _after(e: HiddenEffect, c: Circumstances) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Cell:
+class HiddenKind:
     """Where an effect enters, what drives it, its form, and its rule."""
 
     place: str
@@ -315,29 +315,29 @@ class Cell:
 
 
 NAMED = {
-    'joint_compliance': Cell('joint_angle', 'gravity_torque', 'linear', _compliance),
-    'encoder_eccentricity': Cell('joint_angle', 'joint_angle', 'sin/cos', _eccentricity),
-    'encoder_scale': Cell('joint_angle', 'joint_angle', 'linear', _scale),
-    'gear_periodic': Cell('joint_angle', 'joint_angle', 'sin/cos', _eccentricity),
-    'joint_error_curve': Cell('joint_angle', 'joint_angle', 'free', _curve),
-    'backlash': Cell('joint_angle', 'approach', 'step', _backlash),
-    'settling': Cell('joint_angle', 'last_move', 'linear', _settling),
-    'joint_coupling': Cell('joint_angle', 'other_joint', 'linear or sin/cos', _coupling),
-    'link_length': Cell('link_translation', 'constant', 'constant', _link_length),
-    'joint_axis_tilt': Cell('link_rotation', 'constant', 'constant', _tilt),
-    'marker_offset': Cell('marker', 'constant', 'constant', _marker),
-    'thermal_growth': Cell('link_translation', 'temperature', 'linear', _thermal),
-    'base_compliance': Cell('base_rotation', 'gravity_moment', 'linear', _base),
-    'registration_drift': Cell('sensor_frame', 'time', 'linear', _drift),
-    'sensor_scale': Cell('sensor_frame', 'position', 'linear', _sensor_scale),
-    'sensor_distortion': Cell('sensor_frame', 'position', 'quadratic, radial', _distortion),
+    'joint_compliance': HiddenKind('joint_angle', 'gravity_torque', 'linear', _compliance),
+    'encoder_eccentricity': HiddenKind('joint_angle', 'joint_angle', 'sin/cos', _eccentricity),
+    'encoder_scale': HiddenKind('joint_angle', 'joint_angle', 'linear', _scale),
+    'gear_periodic': HiddenKind('joint_angle', 'joint_angle', 'sin/cos', _eccentricity),
+    'joint_error_curve': HiddenKind('joint_angle', 'joint_angle', 'free', _curve),
+    'backlash': HiddenKind('joint_angle', 'approach', 'step', _backlash),
+    'settling': HiddenKind('joint_angle', 'last_move', 'linear', _settling),
+    'joint_coupling': HiddenKind('joint_angle', 'other_joint', 'linear or sin/cos', _coupling),
+    'link_length': HiddenKind('link_translation', 'constant', 'constant', _link_length),
+    'joint_axis_tilt': HiddenKind('link_rotation', 'constant', 'constant', _tilt),
+    'marker_offset': HiddenKind('marker', 'constant', 'constant', _marker),
+    'thermal_growth': HiddenKind('link_translation', 'temperature', 'linear', _thermal),
+    'base_compliance': HiddenKind('base_rotation', 'gravity_moment', 'linear', _base),
+    'registration_drift': HiddenKind('sensor_frame', 'time', 'linear', _drift),
+    'sensor_scale': HiddenKind('sensor_frame', 'position', 'linear', _sensor_scale),
+    'sensor_distortion': HiddenKind('sensor_frame', 'position', 'quadratic, radial', _distortion),
 }
 UNNAMED = {
-    'foreign_torque': Cell('joint_angle', 'gravity_torque', 'linear', _foreign_torque),
-    'creeping_joint': Cell('joint_angle', 'time', 'linear', _creep),
-    'slipped_joint': Cell('joint_angle', 'time', 'step', _slip),
-    'warm_joint': Cell('joint_angle', 'temperature', 'linear', _warm_joint),
-    'bent_coupling': Cell('joint_angle', 'angle', 'quadratic', _bent_coupling),
-    'sagging_tool': Cell('marker', 'gravity', 'linear', _sagging_tool),
-    'bumped_sensor': Cell('sensor_frame', 'time', 'step', _bumped_sensor),
+    'foreign_torque': HiddenKind('joint_angle', 'gravity_torque', 'linear', _foreign_torque),
+    'creeping_joint': HiddenKind('joint_angle', 'time', 'linear', _creep),
+    'slipped_joint': HiddenKind('joint_angle', 'time', 'step', _slip),
+    'warm_joint': HiddenKind('joint_angle', 'temperature', 'linear', _warm_joint),
+    'bent_coupling': HiddenKind('joint_angle', 'angle', 'quadratic', _bent_coupling),
+    'sagging_tool': HiddenKind('marker', 'gravity', 'linear', _sagging_tool),
+    'bumped_sensor': HiddenKind('sensor_frame', 'time', 'step', _bumped_sensor),
 }

@@ -11,7 +11,7 @@ from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import candidate_poses, plan_poses
 from remaster_ros.planning.tour_order import Tour
-from remaster_ros.session.workcell import Cell
+from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import FloatArray
 
 # As the planner node's default: distance kept from the joint limits.
@@ -20,7 +20,7 @@ LIMIT_MARGIN_RAD = np.deg2rad(1.0)
 
 def plan_tour(
     chain: SerialChain,
-    cell: Cell,
+    cell: Workcell,
     places: Mapping[str, FloatArray],
     counts: Mapping[str, int],
     rng: np.random.Generator,

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from remaster_ros.simulation.arm_motion import Waypoint
+from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.faults import Numbers, is_out
 from remaster_ros.simulation.world import World
 from remaster_ros.types import FloatArray
@@ -79,7 +79,7 @@ class FakeArm:
         for point in points:
             q = np.asarray(point.positions, float)[columns] + stray
             velocity = np.asarray(point.velocities, float)[columns] if point.velocities else None
-            waypoints.append(Waypoint(point.time_from_start_s, q, velocity))
+            waypoints.append(ServoPoint(point.time_from_start_s, q, velocity))
         waypoints = _spoil(waypoints, faults)
         begin = max(start_s, now)
         self._commanded = begin + waypoints[-1].time_s, np.asarray(points[-1].positions)[columns]
@@ -169,7 +169,7 @@ class FakeArm:
         q, velocity = self.world.reported(now)
         braking_s = 0.15
         end = q + 0.5 * braking_s * velocity
-        self.world.begin_motion(now, [Waypoint(braking_s, end, np.zeros_like(end))])
+        self.world.begin_motion(now, [ServoPoint(braking_s, end, np.zeros_like(end))])
 
 
 def _fault_reason(faults: Numbers, now: float) -> str:
@@ -180,10 +180,12 @@ def _fault_reason(faults: Numbers, now: float) -> str:
     return 'fault injected: intermittent' if is_out(faults.get('intermittent'), now) else ''
 
 
-def _spoil(waypoints: Sequence[Waypoint], faults: Numbers) -> list[Waypoint]:
+def _spoil(waypoints: Sequence[ServoPoint], faults: Numbers) -> list[ServoPoint]:
     """Go beside the target, or slowly."""
     slow, beside = faults.get('slow', 1.0), faults.get('elsewhere', 0.0)
     return [
-        Waypoint(p.time_s * slow, p.q + beside, None if p.velocity is None else p.velocity / slow)
+        ServoPoint(
+            p.time_s * slow, p.q + beside, None if p.velocity is None else p.velocity / slow
+        )
         for p in waypoints
     ]

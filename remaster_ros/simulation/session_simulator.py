@@ -42,7 +42,7 @@ class SimulatedSensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class SessionTruth:
     """What a simulated session was made from.
 
     Attributes
@@ -80,7 +80,7 @@ def simulate_session(
     seconds_per_configuration: float = 10.0,
     temperature_c: FloatArray | None = None,
     seen: Callable[[FloatArray, dict[str, FloatArray]], FloatArray] | None = None,
-) -> tuple[Session, Truth]:
+) -> tuple[Session, SessionTruth]:
     """Visit the poses with a robot whose truth is drawn, and measure with noise.
 
     Parameters
@@ -175,7 +175,7 @@ def simulate_session(
         exit_status='complete',
         notes='simulated',
     )
-    truth = Truth(
+    truth = SessionTruth(
         offsets,
         true_markers,
         dict(sensors),

@@ -15,13 +15,13 @@ import yaml
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.workcell import Cell, config_path
-from remaster_ros.simulation.effect_sampling import Request, hide
+from remaster_ros.session.workcell import Workcell, config_path
+from remaster_ros.simulation.effect_sampling import EffectSpec, hide
 from remaster_ros.simulation.hidden_arm import ChainArm
 from remaster_ros.simulation.hidden_effects import HiddenEffect
 from remaster_ros.simulation.offline_tour import plan_tour, visit
-from remaster_ros.simulation.world import START_S, Truth, World
-from remaster_ros.simulation.world_model import Round, Stage
+from remaster_ros.simulation.world import START_S, World, WorldTruth
+from remaster_ros.simulation.world_model import Round, WorldModel
 
 PRACTICE_CANDIDATES = 14
 # About what a configuration takes, world time.
@@ -88,10 +88,10 @@ def require_private(folder: Path) -> None:
 
 def make_world(
     folder: Path,
-    cell: Cell,
+    cell: Workcell,
     seed: int,
     rate: float,
-    hidden: Sequence[Request] = (),
+    hidden: Sequence[EffectSpec] = (),
     candidates: int = PRACTICE_CANDIDATES,
 ) -> World:
     """Draw a hidden World for a cell; its time begins now.
@@ -119,7 +119,7 @@ def make_world(
     if missing:
         raise InputError(f'fake_world.yaml places no sensor {", ".join(missing)}')
     start_q = np.deg2rad(settings['start_q_deg'])
-    truth = Truth.draw(
+    truth = WorldTruth.draw(
         seed,
         len(chain),
         {name: np.array(cell.markers[s.marker]) for name, s in cell.sensors.items()},
@@ -142,7 +142,11 @@ def make_world(
 
 
 def _draw_hidden(
-    truth: Truth, cell: Cell, chain: SerialChain, hidden: Sequence[Request], candidates: int
+    truth: WorldTruth,
+    cell: Workcell,
+    chain: SerialChain,
+    hidden: Sequence[EffectSpec],
+    candidates: int,
 ) -> tuple[HiddenEffect, ...]:
     """Draw effects of the sizes they have on a round like the one that will be visited."""
     rng = np.random.default_rng([truth.seed, 2])
@@ -152,7 +156,7 @@ def _draw_hidden(
     q = np.concatenate([*visits['optimization'], *visits['validation']])
     time_s = PRACTICE_STEP_S * np.arange(len(q), dtype=float)
     practice = Round(q, q[0], time_s, truth.warming.at(START_S + time_s))
-    stage = Stage(ChainArm(chain), practice, *truth.staged(), truth.joint_offsets)
+    stage = WorldModel(ChainArm(chain), practice, *truth.staged(), truth.joint_offsets)
     return hide(stage, hidden, rng)
 
 

@@ -27,7 +27,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.line_of_sight import LinkCapsules
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.simulation.arm_motion import Motion, Waypoint
+from remaster_ros.simulation.arm_motion import Motion, ServoPoint
 from remaster_ros.simulation.faults import Faults, Numbers, is_out
 from remaster_ros.simulation.hidden_effects import HiddenEffect
 from remaster_ros.simulation.world_model import StagedSensor
@@ -88,7 +88,7 @@ class SensorTruth:
 
 
 @dataclass(frozen=True)
-class Truth:
+class WorldTruth:
     """Everything an estimate is to find, and the seed it came from.
 
     Attributes
@@ -124,7 +124,7 @@ class Truth:
         marker_std_m: float,
         placements: dict[str, dict[str, Any]],
         offset_std_rad: float = np.deg2rad(0.3),
-    ) -> Truth:
+    ) -> WorldTruth:
         """Draw a truth.
 
         Parameters
@@ -174,7 +174,7 @@ class Truth:
         }
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Truth:
+    def from_dict(cls, data: dict[str, Any]) -> WorldTruth:
         """Undo `to_dict`."""
         sensors = {
             name: SensorTruth(np.array(s['T_R_N']), np.array(s['marker_m']), s['acceptance_rad'])
@@ -207,7 +207,7 @@ class World:
 
     def __init__(self, folder: Path, data: dict[str, Any]) -> None:
         self.folder = folder
-        self.truth = Truth.from_dict(data['truth'])
+        self.truth = WorldTruth.from_dict(data['truth'])
         self.rate = float(data['rate'])
         self._started = float(data['started_monotonic_s'])
         self.chain = SerialChain.from_urdf(data['urdf'], data['base_link'], data['tip_link'])
@@ -234,7 +234,7 @@ class World:
     def create(
         cls,
         folder: Path,
-        truth: Truth,
+        truth: WorldTruth,
         *,
         urdf: str,
         base_link: str | None,
@@ -298,7 +298,7 @@ class World:
 
     # Motion
 
-    def begin_motion(self, start_s: float, waypoints: Sequence[Waypoint]) -> None:
+    def begin_motion(self, start_s: float, waypoints: Sequence[ServoPoint]) -> None:
         """Send the arm along waypoints (reported joint positions); every process learns of it."""
         points = [
             [p.time_s, p.q.tolist(), None if p.velocity is None else p.velocity.tolist()]
@@ -318,7 +318,7 @@ class World:
             if self._torn.endswith('\n'):
                 trajectory, self._torn = json.loads(self._torn), ''
                 waypoints = [
-                    Waypoint(time_s, np.array(q), None if v is None else np.array(v))
+                    ServoPoint(time_s, np.array(q), None if v is None else np.array(v))
                     for time_s, q, v in trajectory['points']
                 ]
                 start_s = trajectory['start_s']

@@ -159,7 +159,7 @@ def placed(state: ArmState, marker: FloatArray, wrong: Deviation | None) -> Floa
 
 
 @dataclass(eq=False)
-class Stage:
+class WorldModel:
     """The true arm and sensors on one round.
 
     Attributes

@@ -17,7 +17,7 @@ import optitrack_world
 import pytest
 import tracker_world
 
-from remaster_ros.calibration.registration import register_agreeing
+from remaster_ros.calibration.registration import register_ransac
 from remaster_ros.errors import DeviceError, InsufficientDataError
 from remaster_ros.kinematics import transforms
 from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient, LaserTrackerSettings
@@ -346,8 +346,8 @@ def test_a_stray_during_the_registration(tmp_path):
     seen = seen + rng.normal(0, 3e-5, seen.shape)
     seen[1] = seen[0] + [0.1, 0.0, 0.0]
     with pytest.raises(InsufficientDataError) as refusal:
-        register_agreeing(model_R[:3], seen[:3], 0.025)
-    T_R_N, agree = register_agreeing(model_R, seen, 0.025)
+        register_ransac(model_R[:3], seen[:3], 0.025)
+    T_R_N, agree = register_ransac(model_R, seen, 0.025)
     assert agree.tolist() == [True, False, True, True]
     assert np.linalg.norm(T_R_N[:3, 3] - sensor.T_R_N[:3, 3]) < 0.05
     text = f'{refusal.value}; the next point decides, and the stray is left out'

@@ -17,7 +17,7 @@ from remaster_ros.calibration.fit import FitResult, fit_session
 from remaster_ros.calibration.model import predict_in_sensor
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
-from remaster_ros.simulation.session_simulator import Truth
+from remaster_ros.simulation.session_simulator import SessionTruth
 from remaster_ros.types import BasePrior, Session
 
 SEEDS = range(100, 112)
@@ -27,12 +27,12 @@ def fit(session: Session, seed: int = 1, **options: object) -> FitResult:
     return fit_session(session, rng=np.random.default_rng(seed), **options)  # type: ignore[arg-type]
 
 
-def deviations(result: FitResult, truth: Truth) -> np.ndarray:
+def deviations(result: FitResult, truth: SessionTruth) -> np.ndarray:
     return (result.joint_offsets - truth.joint_offsets) / result.joint_offsets_std
 
 
 @pytest.fixture(scope='module')
-def fits() -> list[tuple[FitResult, Truth]]:
+def fits() -> list[tuple[FitResult, SessionTruth]]:
     found = []
     for seed in SEEDS:
         session, truth = scene(seed, poses=20, sensor_count=1 + seed % 2)

@@ -200,7 +200,7 @@ def test_a_settled_arm_is_read_though_its_pose_is_heard_of_later(start, client, 
     from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
     from remaster_ros.nodes.messages import stamp_key
-    from remaster_ros.nodes.status import RELIABLE, Status, listen
+    from remaster_ros.nodes.status import RELIABLE, NodeStatus, listen
 
     cell = read_cell('demo')
     names, rng = cell.chain().joint_names, np.random.default_rng(SEED)
@@ -245,7 +245,7 @@ def test_a_settled_arm_is_read_though_its_pose_is_heard_of_later(start, client, 
     solutions.header.stamp = client.get_clock().now().to_msg()
     solutions.points = [JointTrajectoryPoint(positions=q.tolist())]
     publishers['/remaster/joint_solutions'].publish(solutions)
-    status = Status(client, lambda: ('ok', '', {}))
+    status = NodeStatus(client, lambda: ('ok', '', {}))
     until(lambda: client.count_subscribers('/remaster/status') > 1, 'the status')
     stamp = stamp_key(solutions.header.stamp)
     values = {'pose': 0, 'split': 'optimization', 'solutions': 1, 'ids': '0', 'plan': 'p'}

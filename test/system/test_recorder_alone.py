@@ -55,7 +55,7 @@ class Rig:
         from sensor_msgs.msg import JointState
         from trajectory_msgs.msg import JointTrajectory
 
-        from remaster_ros.nodes.status import RELIABLE, Status, listen
+        from remaster_ros.nodes.status import RELIABLE, NodeStatus, listen
 
         self.client, self.sensor, self.session = client, sensor, folder / 'session'
         cell = folder / 'cell.yaml'
@@ -76,7 +76,7 @@ class Rig:
         )
         self.points = client.create_publisher(PointStamped, TOPICS[sensor], 100)
         self.says = client.create_publisher(DiagnosticArray, '/remaster/status', RELIABLE)
-        self.Status = Status
+        self.Status = NodeStatus
         self.t = 1000.0
         self.pose = itertools.count()
         publishers = (self.joints, self.settled, self.solutions, self.points)

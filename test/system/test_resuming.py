@@ -99,12 +99,12 @@ def test_a_halted_arm_is_not_collected_with(start, client, tmp_path):
     import rclpy
     from sensor_msgs.msg import JointState
 
-    from remaster_ros.nodes.status import RELIABLE, Status, listen
+    from remaster_ros.nodes.status import RELIABLE, NodeStatus, listen
     from remaster_ros.session.workcell import read_cell
 
     halted = {'halted': 'the robot does not follow'}
     bridge = rclpy.create_node('robot_bridge', context=client.context)
-    status = Status(bridge, lambda: ('ok', '', dict(halted)))
+    status = NodeStatus(bridge, lambda: ('ok', '', dict(halted)))
     said = {}
     listen(
         client, lambda event: None, lambda node, text, values: said.update({node: (text, values)})

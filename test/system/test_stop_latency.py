@@ -42,7 +42,7 @@ class Around:
         from sensor_msgs.msg import JointState
         from trajectory_msgs.msg import JointTrajectory
 
-        from remaster_ros.nodes.status import RELIABLE, Status, listen
+        from remaster_ros.nodes.status import RELIABLE, NodeStatus, listen
 
         self.client, self.said = client, said
         self.names = list(read_cell('demo').chain().joint_names)
@@ -59,7 +59,7 @@ class Around:
         }
         self.nodes = [rclpy.create_node(name, context=client.context) for name in facts]
         self.statuses = [
-            Status(node, lambda values=values: ('ok', '', values))
+            NodeStatus(node, lambda values=values: ('ok', '', values))
             for node, values in zip(self.nodes, facts.values())
         ]
         listen(client, lambda event: None, self._summary)

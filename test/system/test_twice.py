@@ -143,9 +143,9 @@ def test_two_started_at_once_on_two_computers(start_elsewhere, client, said):
 
 def test_alone(client):
     """True after 1.5 s of listening, without a rival; what was recorded of one is none."""
-    from remaster_ros.nodes.status import Status
+    from remaster_ros.nodes.status import NodeStatus
 
-    status = Status(client, lambda: ('ok', '', {}))
+    status = NodeStatus(client, lambda: ('ok', '', {}))
     until(client, lambda: status.alone_since is not None, 10, 'its own summary')
     assert not status.alone(time.monotonic())
     until(client, lambda: status.alone(time.monotonic()), 10, 'to be alone')

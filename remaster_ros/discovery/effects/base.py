@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.types import FloatArray
 
 Place = Literal[
@@ -29,7 +29,7 @@ PLACES: tuple[Place, ...] = (
 
 
 @dataclass(frozen=True, eq=False)
-class Columns:
+class Design:
     """What one unit of each of m parameters does to each of n rows.
 
     Attributes
@@ -48,11 +48,11 @@ class Columns:
         """Number of parameters m."""
         return self.values.shape[-1]
 
-    def displacement(self, scene: Scene) -> FloatArray:
+    def displacement(self, context: Context) -> FloatArray:
         """Return the displacement of the marker in R to first order, m per unit, (n, 3, m)."""
         if self.at is None:
             return self.values
-        return scene.jacobian[:, :, self.at, None] * self.values[:, None, :]
+        return context.jacobian[:, :, self.at, None] * self.values[:, None, :]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ class Cell:
     form: str
     parameters: tuple[str, ...]
     unit: str
-    columns: Callable[[Scene], Columns]
+    columns: Callable[[Context], Design]
     drawn_from: int = 1
     penalty: FloatArray | None = None
     variant: str = ''
@@ -132,9 +132,9 @@ class Effect:
     separate_by
         Which measurements tell it from others.
     cells
-        All of its cells for a scene.
+        All of its cells for a context.
     needs
-        Tells why a scene cannot show it; '' where it can.
+        Tells why a context cannot show it; '' where it can.
     """
 
     name: str
@@ -147,35 +147,35 @@ class Effect:
     plausible: tuple[float, float]
     sentence: str
     separate_by: str
-    cells: Callable[[Scene], Iterable[Cell]]
-    needs: Callable[[Scene], str] = field(default=lambda scene: '')
+    cells: Callable[[Context], Iterable[Cell]]
+    needs: Callable[[Context], str] = field(default=lambda context: '')
 
 
-def at_joint(joint: int, *features: FloatArray) -> Columns:
+def at_joint(joint: int, *features: FloatArray) -> Design:
     """Return columns that add features (n,) to the angle of a joint (1-based)."""
-    return Columns(joint - 1, np.stack(features, axis=-1))
+    return Design(joint - 1, np.stack(features, axis=-1))
 
 
-def displaced(*shifts: FloatArray) -> Columns:
+def displaced(*shifts: FloatArray) -> Design:
     """Return columns that displace the marker by shifts (n, 3) in R, m per unit."""
-    return Columns(None, np.stack(shifts, axis=-1))
+    return Design(None, np.stack(shifts, axis=-1))
 
 
-def turned(scene: Scene, axes: Sequence[FloatArray], about: FloatArray) -> Columns:
+def turned(context: Context, axes: Sequence[FloatArray], about: FloatArray) -> Design:
     """Return columns that turn the marker about points (n, 3), m, by axes (n, 3), rad per unit."""
-    return displaced(*(np.cross(axis, scene.points - about) for axis in axes))
+    return displaced(*(np.cross(axis, context.points - about) for axis in axes))
 
 
-def needs_gravity(scene: Scene) -> str:
+def needs_gravity(context: Context) -> str:
     """Say why gravity's effects cannot be tested; '' where they can."""
-    return '' if scene.has_gravity else 'the URDF has no link masses, so gravity is unknown'
+    return '' if context.has_gravity else 'the URDF has no link masses, so gravity is unknown'
 
 
-def needs_approach(scene: Scene) -> str:
+def needs_approach(context: Context) -> str:
     """Say why approach and last move cannot be tested; '' where they can."""
-    return '' if scene.has_approach else 'where the arm came from (from_q) is not recorded'
+    return '' if context.has_approach else 'where the arm came from (from_q) is not recorded'
 
 
-def needs_time(scene: Scene) -> str:
+def needs_time(context: Context) -> str:
     """Say why drift cannot be tested; '' where it can."""
-    return '' if scene.has_time else 'all rows have the same time'
+    return '' if context.has_time else 'all rows have the same time'

@@ -6,19 +6,19 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Columns, Effect, needs_gravity, turned
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, needs_gravity, turned
+from remaster_ros.discovery.effects.context import Context
 
 
-def cells(scene: Scene) -> Iterator[Cell]:
+def cells(context: Context) -> Iterator[Cell]:
     """One compliance for all directions, or one about each horizontal axis."""
 
-    def isotropic(scene: Scene) -> Columns:
-        return turned(scene, [scene.base_moment], np.zeros(3))
+    def isotropic(context: Context) -> Design:
+        return turned(context, [context.base_moment], np.zeros(3))
 
-    def by_axis(scene: Scene) -> Columns:
-        axes = [scene.base_moment * unit for unit in np.eye(3)[:2]]
-        return turned(scene, axes, np.zeros(3))
+    def by_axis(context: Context) -> Design:
+        axes = [context.base_moment * unit for unit in np.eye(3)[:2]]
+        return turned(context, axes, np.zeros(3))
 
     for variant, columns, parameters in (
         ('isotropic', isotropic, ('base_compliance',)),

@@ -26,7 +26,7 @@ BLOCK_ROWS = 10_000
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class Context:
     """The rows of a session as effects see them: n rows, k joints.
 
     Attributes
@@ -200,8 +200,8 @@ class Scene:
         """Distance from the row's sensor, m, (n,)."""
         return np.linalg.norm(self.in_sensor, axis=1)
 
-    def at(self, rows: IntArray) -> Scene:
-        """Return the scene of some rows, by their indices in this one and in that order.
+    def at(self, rows: IntArray) -> Context:
+        """Return the context of some rows, by their indices in this one and in that order.
 
         Every value is that which the row has here, also where it depends on other rows: time
         since the first row, the move before, a sensor's centre.
@@ -218,8 +218,8 @@ class Scene:
             rows,
         )
 
-    def blocks(self, rows: int = BLOCK_ROWS) -> Iterator[tuple[slice, Scene]]:
-        """Give the scene in runs of so many rows, each with its place; a small one as it is.
+    def blocks(self, rows: int = BLOCK_ROWS) -> Iterator[tuple[slice, Context]]:
+        """Give the context in runs of so many rows, each with its place; a small one as it is.
 
         What a block computes goes with it, so memory does not grow with the rows.
         """
@@ -257,16 +257,16 @@ class Scene:
 
 
 @dataclass(frozen=True, eq=False)
-class PartOfScene(Scene):
-    """Some rows of a scene; what depends on more than a row itself is that of the whole.
+class PartOfScene(Context):
+    """Some rows of a context; what depends on more than a row itself is that of the whole.
 
     Attributes
     ----------
     whole, rows
-        The scene, and which of its rows these are, (n,).
+        The context, and which of its rows these are, (n,).
     """
 
-    whole: Scene
+    whole: Context
     rows: IntArray
 
     @cached_property

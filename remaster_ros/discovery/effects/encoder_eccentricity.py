@@ -6,22 +6,22 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Columns, Effect, at_joint
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, at_joint
+from remaster_ros.discovery.effects.context import Context
 
 # Orders tried together: the disc off centre, the disc or its bearing oval, both.
 ORDERS = ((1,), (2,), (1, 2))
 
 
-def cells(scene: Scene) -> Iterator[Cell]:
+def cells(context: Context) -> Iterator[Cell]:
     """Sine and cosine of the joint's own angle."""
-    for joint in scene.moving:
+    for joint in context.moving:
         for orders in ORDERS:
 
             def columns(
-                scene: Scene, joint: int = joint, orders: tuple[int, ...] = orders
-            ) -> Columns:
-                angle = scene.measurements.q[:, joint - 1]
+                context: Context, joint: int = joint, orders: tuple[int, ...] = orders
+            ) -> Design:
+                angle = context.measurements.q[:, joint - 1]
                 waves = [wave(order * angle) for order in orders for wave in (np.sin, np.cos)]
                 return at_joint(joint, *waves)
 
@@ -36,7 +36,7 @@ def cells(scene: Scene) -> Iterator[Cell]:
                 ),
                 unit=EFFECT.unit,
                 columns=columns,
-                drawn_from=scene.joints * len(ORDERS),
+                drawn_from=context.joints * len(ORDERS),
                 variant='+'.join(map(str, orders)),
             )
 

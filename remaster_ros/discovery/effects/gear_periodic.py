@@ -6,23 +6,23 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Columns, Effect, at_joint
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, at_joint
+from remaster_ros.discovery.effects.context import Context
 
 # Lower orders are the encoder's. Twice the ratio of a 200:1 harmonic drive is the highest known.
 LOWEST_ORDER = 3
 HIGHEST_ORDER = 400
 
 
-def cells(scene: Scene) -> Iterator[Cell]:
+def cells(context: Context) -> Iterator[Cell]:
     """Sine and cosine at every whole order that the rows are enough to tell."""
-    highest = int(min(HIGHEST_ORDER, 4 * len(scene)))
+    highest = int(min(HIGHEST_ORDER, 4 * len(context)))
     orders = range(LOWEST_ORDER, highest + 1)
-    for joint in scene.moving:
+    for joint in context.moving:
         for order in orders:
 
-            def columns(scene: Scene, joint: int = joint, order: int = order) -> Columns:
-                phase = order * scene.measurements.q[:, joint - 1]
+            def columns(context: Context, joint: int = joint, order: int = order) -> Design:
+                phase = order * context.measurements.q[:, joint - 1]
                 return at_joint(joint, np.sin(phase), np.cos(phase))
 
             yield Cell(
@@ -34,7 +34,7 @@ def cells(scene: Scene) -> Iterator[Cell]:
                 parameters=(f'sin{order}_{joint}', f'cos{order}_{joint}'),
                 unit=EFFECT.unit,
                 columns=columns,
-                drawn_from=scene.joints * len(orders),
+                drawn_from=context.joints * len(orders),
                 variant=str(order),
             )
 

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Columns, Effect, turned
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, turned
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.types import FloatArray
 
 # A tilt along the axis before is, with that joint's zero-offset, another name for a shift of the
@@ -15,21 +15,23 @@ from remaster_ros.types import FloatArray
 RARITY = 3
 
 
-def cells(scene: Scene) -> Iterator[Cell]:
+def cells(context: Context) -> Iterator[Cell]:
     """Each joint after the first, about the axes of its frame that are not its own axis."""
-    for joint in range(2, scene.joints + 1):
-        directions = tilt_directions(scene, joint)
+    for joint in range(2, context.joints + 1):
+        directions = tilt_directions(context, joint)
         # A tilt has any direction; on a whole arm some of them are other names for a link's.
         for axes in (''.join(directions), *directions):
 
             def columns(
-                scene: Scene,
+                context: Context,
                 joint: int = joint,
                 chosen: tuple[FloatArray, ...] = tuple(directions[axis] for axis in axes),
-            ) -> Columns:
-                fixed = scene.chain.T_fixed[joint - 1][:3, :3]
-                turn = scene.link_rotation(joint - 1) @ fixed
-                return turned(scene, [turn @ axis for axis in chosen], scene.joint_origin(joint))
+            ) -> Design:
+                fixed = context.chain.T_fixed[joint - 1][:3, :3]
+                turn = context.link_rotation(joint - 1) @ fixed
+                return turned(
+                    context, [turn @ axis for axis in chosen], context.joint_origin(joint)
+                )
 
             yield Cell(
                 name=EFFECT.name,
@@ -40,14 +42,15 @@ def cells(scene: Scene) -> Iterator[Cell]:
                 parameters=tuple(f'tilt_{axis}_{joint}' for axis in axes),
                 unit=EFFECT.unit,
                 columns=columns,
-                drawn_from=(scene.joints - 1) * (1 if len(axes) > 1 else RARITY * len(directions)),
+                drawn_from=(context.joints - 1)
+                * (1 if len(axes) > 1 else RARITY * len(directions)),
                 variant=axes,
             )
 
 
-def tilt_directions(scene: Scene, joint: int) -> dict[str, FloatArray]:
+def tilt_directions(context: Context, joint: int) -> dict[str, FloatArray]:
     """Return the axes of a joint's frame (at angle zero) that are not along its own axis."""
-    own = scene.chain.axes[joint - 1]
+    own = context.chain.axes[joint - 1]
     return {
         name: axis for name, axis in zip('xyz', np.eye(3), strict=True) if abs(axis @ own) < 0.9
     }

@@ -6,23 +6,23 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Columns, Effect, at_joint
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, at_joint
+from remaster_ros.discovery.effects.context import Context
 
 
-def cells(scene: Scene) -> Iterator[Cell]:
+def cells(context: Context) -> Iterator[Cell]:
     """Joint j by every other joint l: linear, or sine and cosine."""
-    count = 2 * scene.joints * max(1, len(scene.moving) - 1)
-    for joint in range(1, scene.joints + 1):
-        for other in scene.moving:
+    count = 2 * context.joints * max(1, len(context.moving) - 1)
+    for joint in range(1, context.joints + 1):
+        for other in context.moving:
             if other == joint:
                 continue
 
-            def linear(scene: Scene, joint: int = joint, other: int = other) -> Columns:
-                return at_joint(joint, scene.measurements.q[:, other - 1])
+            def linear(context: Context, joint: int = joint, other: int = other) -> Design:
+                return at_joint(joint, context.measurements.q[:, other - 1])
 
-            def waves(scene: Scene, joint: int = joint, other: int = other) -> Columns:
-                angle = scene.measurements.q[:, other - 1]
+            def waves(context: Context, joint: int = joint, other: int = other) -> Design:
+                angle = context.measurements.q[:, other - 1]
                 return at_joint(joint, np.sin(angle), np.cos(angle))
 
             pair = f'{joint}_by_{other}'

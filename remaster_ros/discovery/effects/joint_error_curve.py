@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Columns, Effect
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.base import Cell, Design, Effect
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.splines import basis, centers, knot_vector, roughness
 from remaster_ros.types import FloatArray
 
@@ -19,24 +19,24 @@ RARITY = 10
 ROWS_PER_KNOT = 6.0
 
 
-def knots_of(scene: Scene, joint: int) -> FloatArray:
+def knots_of(context: Context, joint: int) -> FloatArray:
     """Return the knots of a joint's curve: over its angles, as fine as the rows allow, rad."""
-    angle = scene.measurements.q[:, joint - 1]
+    angle = context.measurements.q[:, joint - 1]
     low, high = float(angle.min()), float(angle.max())
-    configurations = len(np.unique(scene.measurements.configuration))
+    configurations = len(np.unique(context.measurements.configuration))
     spacing = max(FINEST_KNOTS, (high - low) * ROWS_PER_KNOT / configurations)
     return knot_vector(low, max(high, low + 3.0 * spacing), spacing)
 
 
-def cells(scene: Scene) -> Iterator[Cell]:
+def cells(context: Context) -> Iterator[Cell]:
     """One curve per joint."""
-    for joint in scene.moving:
-        knots = knots_of(scene, joint)
+    for joint in context.moving:
+        knots = knots_of(context, joint)
         angles = np.degrees(centers(knots))
 
-        def columns(scene: Scene, joint: int = joint, knots: FloatArray = knots) -> Columns:
-            values = basis(scene.measurements.q[:, joint - 1], knots)
-            return Columns(joint - 1, values)
+        def columns(context: Context, joint: int = joint, knots: FloatArray = knots) -> Design:
+            values = basis(context.measurements.q[:, joint - 1], knots)
+            return Design(joint - 1, values)
 
         yield Cell(
             name=EFFECT.name,
@@ -47,7 +47,7 @@ def cells(scene: Scene) -> Iterator[Cell]:
             parameters=tuple(f'curve_{joint}_at_{angle:+.1f}deg' for angle in angles),
             unit=EFFECT.unit,
             columns=columns,
-            drawn_from=RARITY * scene.joints,
+            drawn_from=RARITY * context.joints,
             penalty=roughness(len(angles)),
         )
 

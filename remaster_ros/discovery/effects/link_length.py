@@ -6,21 +6,21 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Columns, Effect, displaced
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.types import FloatArray
 
 
-def cells(scene: Scene) -> Iterator[Cell]:
+def cells(context: Context) -> Iterator[Cell]:
     """Each link from joint j to joint j + 1, along its length and across it."""
-    for link in scene.links():
-        directions = link_directions(scene, link)
+    for link in context.links():
+        directions = link_directions(context, link)
         for axis, direction in directions.items():
 
             def columns(
-                scene: Scene, link: int = link, direction: FloatArray = direction
-            ) -> Columns:
-                return displaced(scene.link_rotation(link) @ direction)
+                context: Context, link: int = link, direction: FloatArray = direction
+            ) -> Design:
+                return displaced(context.link_rotation(link) @ direction)
 
             yield Cell(
                 name=EFFECT.name,
@@ -31,14 +31,14 @@ def cells(scene: Scene) -> Iterator[Cell]:
                 parameters=(f'length_{link}' if axis == 'along' else f'offset_{axis}_{link}',),
                 unit=EFFECT.unit,
                 columns=columns,
-                drawn_from=len(scene.links()) * len(directions),
+                drawn_from=len(context.links()) * len(directions),
                 variant=axis,
             )
 
 
-def link_directions(scene: Scene, link: int) -> dict[str, FloatArray]:
+def link_directions(context: Context, link: int) -> dict[str, FloatArray]:
     """Return the axes of the frame of a link, and its own direction where it is none of them."""
-    shift = scene.chain.T_fixed[link][:3, 3]
+    shift = context.chain.T_fixed[link][:3, 3]
     length = np.linalg.norm(shift)
     axes = dict(zip('xyz', np.eye(3), strict=True))
     if length < 1e-3:

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from remaster_ros.discovery.effects.base import Cell, Columns, Effect, displaced
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.context import Context
 
 
-def cells(scene: Scene) -> Iterator[Cell]:
+def cells(context: Context) -> Iterator[Cell]:
     """Each marker, along the axes of the tool frame.
 
     The offsets model fits the markers already: this cell is judged by how far the fit moved them,
     against how well the session claims to know them.
     """
-    for index, name in enumerate(scene.marker_names):
+    for index, name in enumerate(context.marker_names):
 
-        def columns(scene: Scene, index: int = index) -> Columns:
-            mine = (scene.marker == index)[:, None]
-            turn = scene.tool[:, :3, :3]
+        def columns(context: Context, index: int = index) -> Design:
+            mine = (context.marker == index)[:, None]
+            turn = context.tool[:, :3, :3]
             return displaced(*(turn[:, :, axis] * mine for axis in range(3)))
 
         yield Cell(
@@ -30,7 +30,7 @@ def cells(scene: Scene) -> Iterator[Cell]:
             parameters=tuple(f'{axis}_{name}' for axis in 'xyz'),
             unit=EFFECT.unit,
             columns=columns,
-            drawn_from=len(scene.marker_names),
+            drawn_from=len(context.marker_names),
             subject=name,
         )
 

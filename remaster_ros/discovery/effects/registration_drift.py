@@ -6,23 +6,23 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Columns, Effect, displaced, needs_time
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced, needs_time
+from remaster_ros.discovery.effects.context import Context
 
 
-def cells(scene: Scene) -> Iterator[Cell]:
+def cells(context: Context) -> Iterator[Cell]:
     """Each sensor's frame shifts steadily, or shifts and turns."""
-    for index, name in enumerate(scene.sensor_names):
+    for index, name in enumerate(context.sensor_names):
 
-        def shift(scene: Scene, index: int = index) -> Columns:
-            amount = (scene.elapsed_s * scene.seen_by(index))[:, None]
-            return displaced(*(amount * scene.sensor_turn[:, :, axis] for axis in range(3)))
+        def shift(context: Context, index: int = index) -> Design:
+            amount = (context.elapsed_s * context.seen_by(index))[:, None]
+            return displaced(*(amount * context.sensor_turn[:, :, axis] for axis in range(3)))
 
-        def motion(scene: Scene, index: int = index) -> Columns:
-            mine = scene.seen_by(index)
-            amount = (scene.elapsed_s * mine)[:, None]
-            arms = scene.points - scene.centers[index]
-            axes = [scene.sensor_turn[:, :, axis] for axis in range(3)]
+        def motion(context: Context, index: int = index) -> Design:
+            mine = context.seen_by(index)
+            amount = (context.elapsed_s * mine)[:, None]
+            arms = context.points - context.centers[index]
+            axes = [context.sensor_turn[:, :, axis] for axis in range(3)]
             shifts = [amount * axis for axis in axes]
             # A turn seen at one metre, which has the unit of the shifts.
             turns = [amount * np.cross(axis, arms) for axis in axes]
@@ -43,7 +43,7 @@ def cells(scene: Scene) -> Iterator[Cell]:
                 parameters=parameters,
                 unit=EFFECT.unit,
                 columns=columns,
-                drawn_from=2 * len(scene.sensor_names),
+                drawn_from=2 * len(context.sensor_names),
                 variant=variant,
                 subject=name,
             )

@@ -6,24 +6,24 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Columns, Effect, displaced
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.types import FloatArray
 
 # No lens bends lengths about the sensor's origin, and over most rooms it looks like a plain scale.
 SPHERE_RARITY = 20
 
 
-def cells(scene: Scene) -> Iterator[Cell]:
+def cells(context: Context) -> Iterator[Cell]:
     """Each sensor: radial about its z axis, in metres or in field angle, or about its origin."""
-    for index, name in enumerate(scene.sensor_names):
+    for index, name in enumerate(context.sensor_names):
         for variant in ('radial', 'radial angle', 'radial sphere', 'quadratic'):
 
-            def columns(scene: Scene, index: int = index, variant: str = variant) -> Columns:
-                mine = scene.seen_by(index)[:, None]
+            def columns(context: Context, index: int = index, variant: str = variant) -> Design:
+                mine = context.seen_by(index)[:, None]
                 shifts = [
-                    np.einsum('nij,nj->ni', scene.sensor_turn, shift * mine)
-                    for shift in distortions(scene.in_sensor, variant)
+                    np.einsum('nij,nj->ni', context.sensor_turn, shift * mine)
+                    for shift in distortions(context.in_sensor, variant)
                 ]
                 return displaced(*shifts)
 
@@ -39,7 +39,7 @@ def cells(scene: Scene) -> Iterator[Cell]:
                 unit='1/m' if axes else ('m/m' if 'angle' in variant else '1/m^2'),
                 columns=columns,
                 drawn_from=4
-                * len(scene.sensor_names)
+                * len(context.sensor_names)
                 * (SPHERE_RARITY if variant == 'radial sphere' else 1),
                 variant=variant,
                 subject=name,

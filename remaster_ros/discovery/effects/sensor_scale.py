@@ -6,27 +6,27 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Columns, Effect, displaced
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.types import FloatArray
 
 
-def cells(scene: Scene) -> Iterator[Cell]:
+def cells(context: Context) -> Iterator[Cell]:
     """Each sensor: one scale, one along its z axis (depth), or one per axis."""
-    for index, name in enumerate(scene.sensor_names):
+    for index, name in enumerate(context.sensor_names):
 
-        def stretch(scene: Scene, along: FloatArray, index: int = index) -> FloatArray:
-            stretched = (scene.in_sensor * along) * scene.seen_by(index)[:, None]
-            return np.einsum('nij,nj->ni', scene.sensor_turn, stretched)
+        def stretch(context: Context, along: FloatArray, index: int = index) -> FloatArray:
+            stretched = (context.in_sensor * along) * context.seen_by(index)[:, None]
+            return np.einsum('nij,nj->ni', context.sensor_turn, stretched)
 
-        def isotropic(scene: Scene, stretch=stretch) -> Columns:  # type: ignore[no-untyped-def]
-            return displaced(stretch(scene, np.ones(3)))
+        def isotropic(context: Context, stretch=stretch) -> Design:  # type: ignore[no-untyped-def]
+            return displaced(stretch(context, np.ones(3)))
 
-        def depth(scene: Scene, stretch=stretch) -> Columns:  # type: ignore[no-untyped-def]
-            return displaced(stretch(scene, np.eye(3)[2]))
+        def depth(context: Context, stretch=stretch) -> Design:  # type: ignore[no-untyped-def]
+            return displaced(stretch(context, np.eye(3)[2]))
 
-        def by_axis(scene: Scene, stretch=stretch) -> Columns:  # type: ignore[no-untyped-def]
-            return displaced(*(stretch(scene, axis) for axis in np.eye(3)))
+        def by_axis(context: Context, stretch=stretch) -> Design:  # type: ignore[no-untyped-def]
+            return displaced(*(stretch(context, axis) for axis in np.eye(3)))
 
         for variant, columns, parameters in (
             ('', isotropic, (f'scale_{name}',)),
@@ -42,7 +42,7 @@ def cells(scene: Scene) -> Iterator[Cell]:
                 parameters=parameters,
                 unit=EFFECT.unit,
                 columns=columns,
-                drawn_from=3 * len(scene.sensor_names),
+                drawn_from=3 * len(context.sensor_names),
                 variant=variant,
                 subject=name,
             )

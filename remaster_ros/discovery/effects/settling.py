@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from remaster_ros.discovery.effects.base import Cell, Columns, Effect, at_joint, needs_approach
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.base import (
+    Cell,
+    Design,
+    Effect,
+    at_joint,
+    needs_approach,
+)
+from remaster_ros.discovery.effects.context import Context
 
 
-def cells(scene: Scene) -> Iterator[Cell]:
+def cells(context: Context) -> Iterator[Cell]:
     """One cell per joint: δq_j = -s_j (q_j - from_q_j)."""
-    for joint in scene.moving:
+    for joint in context.moving:
 
-        def columns(scene: Scene, joint: int = joint) -> Columns:
-            return at_joint(joint, -scene.last_move[:, joint - 1])
+        def columns(context: Context, joint: int = joint) -> Design:
+            return at_joint(joint, -context.last_move[:, joint - 1])
 
         yield Cell(
             name=EFFECT.name,
@@ -24,7 +30,7 @@ def cells(scene: Scene) -> Iterator[Cell]:
             parameters=(f'settling_{joint}',),
             unit=EFFECT.unit,
             columns=columns,
-            drawn_from=scene.joints,
+            drawn_from=context.joints,
         )
 
 

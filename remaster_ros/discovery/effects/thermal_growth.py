@@ -6,32 +6,32 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Columns, Effect, displaced
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.types import FloatArray
 
 # Growth with time is rarer by so much where the temperature is recorded.
 BESIDE_TEMPERATURE = 50
 
 
-def cells(scene: Scene) -> Iterator[Cell]:
+def cells(context: Context) -> Iterator[Cell]:
     """The whole arm, and each link, in proportion to warming and to time."""
     drivers = {}
-    if scene.has_temperature:
+    if context.has_temperature:
         drivers['temperature'] = '1/K'
-    if scene.has_time:
+    if context.has_time:
         drivers['time'] = '1/s'
     arm: tuple[int, ...] = ()
-    parts = [arm, *((link,) for link in scene.links() if _has_length(scene, link))]
+    parts = [arm, *((link,) for link in context.links() if _has_length(context, link))]
     for driver, unit in drivers.items():
         for joints in parts:
 
             def columns(
-                scene: Scene, driver: str = driver, joints: tuple[int, ...] = joints
-            ) -> Columns:
-                amount = scene.warming if driver == 'temperature' else scene.elapsed_s
-                links = joints or tuple(range(scene.joints + 1))
-                return displaced(amount[:, None] * sum(link_vector(scene, j) for j in links))
+                context: Context, driver: str = driver, joints: tuple[int, ...] = joints
+            ) -> Design:
+                amount = context.warming if driver == 'temperature' else context.elapsed_s
+                links = joints or tuple(range(context.joints + 1))
+                return displaced(amount[:, None] * sum(link_vector(context, j) for j in links))
 
             yield Cell(
                 name=EFFECT.name,
@@ -49,21 +49,21 @@ def cells(scene: Scene) -> Iterator[Cell]:
             )
 
 
-def link_vector(scene: Scene, link: int) -> FloatArray:
+def link_vector(context: Context, link: int) -> FloatArray:
     """Return a link's vector in R, from joint ``link`` to the next, m, (n, 3)."""
-    shift = scene.chain.T_fixed[link][:3, 3]
+    shift = context.chain.T_fixed[link][:3, 3]
     if link == 0:
-        return np.broadcast_to(shift, (len(scene), 3))
-    return scene.link_rotation(link) @ shift
+        return np.broadcast_to(shift, (len(context), 3))
+    return context.link_rotation(link) @ shift
 
 
-def _has_length(scene: Scene, link: int) -> bool:
-    return bool(np.linalg.norm(scene.chain.T_fixed[link][:3, 3]) > 1e-3)
+def _has_length(context: Context, link: int) -> bool:
+    return bool(np.linalg.norm(context.chain.T_fixed[link][:3, 3]) > 1e-3)
 
 
-def needs_warming(scene: Scene) -> str:
+def needs_warming(context: Context) -> str:
     """Say why growth cannot be tested; '' where it can."""
-    if scene.has_temperature or scene.has_time:
+    if context.has_temperature or context.has_time:
         return ''
     return 'neither temperature nor time varies'
 

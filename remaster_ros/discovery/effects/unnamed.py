@@ -8,8 +8,15 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Columns, Effect, Place, displaced, turned
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.base import (
+    Cell,
+    Design,
+    Effect,
+    Place,
+    displaced,
+    turned,
+)
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.splines import basis, knot_vector, roughness
 from remaster_ros.types import FloatArray
 
@@ -19,7 +26,7 @@ FREE_KNOTS = 10
 # Something may have slipped or been bumped at any time: so many moments are tried.
 MOMENTS = 24
 
-Feature = Callable[[Scene], FloatArray]
+Feature = Callable[[Context], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,57 +38,57 @@ class Driver:
     value: Feature
 
 
-def cells(scene: Scene) -> Iterator[Cell]:
+def cells(context: Context) -> Iterator[Cell]:
     """All cells that no named effect has."""
-    found = [*_joint_angles(scene), *_links(scene), *_frames(scene)]
+    found = [*_joint_angles(context), *_links(context), *_frames(context)]
     for cell in found:
         yield replace(cell, drawn_from=RARITY * len(found))
 
 
-def _elapsed(scene: Scene) -> FloatArray:
-    return scene.elapsed_s
+def _elapsed(context: Context) -> FloatArray:
+    return context.elapsed_s
 
 
-def _warming(scene: Scene) -> FloatArray:
-    return scene.warming
+def _warming(context: Context) -> FloatArray:
+    return context.warming
 
 
-def _angle(scene: Scene, joint: int) -> FloatArray:
-    return scene.measurements.q[:, joint - 1]
+def _angle(context: Context, joint: int) -> FloatArray:
+    return context.measurements.q[:, joint - 1]
 
 
-def _torque(scene: Scene, joint: int) -> FloatArray:
-    return scene.gravity_torque[:, joint - 1]
+def _torque(context: Context, joint: int) -> FloatArray:
+    return context.gravity_torque[:, joint - 1]
 
 
-def _approach(scene: Scene, joint: int) -> FloatArray:
-    return scene.approach[:, joint - 1]
+def _approach(context: Context, joint: int) -> FloatArray:
+    return context.approach[:, joint - 1]
 
 
-def _move(scene: Scene, joint: int) -> FloatArray:
-    return scene.last_move[:, joint - 1]
+def _move(context: Context, joint: int) -> FloatArray:
+    return context.last_move[:, joint - 1]
 
 
-def _power(scene: Scene, value: Feature, power: int) -> FloatArray:
-    return value(scene)[:, None] ** power
+def _power(context: Context, value: Feature, power: int) -> FloatArray:
+    return value(context)[:, None] ** power
 
 
-def _sine_cosine(scene: Scene, value: Feature) -> FloatArray:
-    return np.stack((np.sin(value(scene)), np.cos(value(scene))), axis=-1)
+def _sine_cosine(context: Context, value: Feature) -> FloatArray:
+    return np.stack((np.sin(value(context)), np.cos(value(context))), axis=-1)
 
 
-def _after(scene: Scene, moment: float) -> FloatArray:
-    return (scene.elapsed_s > moment).astype(float)[:, None]
+def _after(context: Context, moment: float) -> FloatArray:
+    return (context.elapsed_s > moment).astype(float)[:, None]
 
 
-def _spline(scene: Scene, value: Feature, knots: FloatArray) -> FloatArray:
-    return basis(value(scene), knots)
+def _spline(context: Context, value: Feature, knots: FloatArray) -> FloatArray:
+    return basis(value(context), knots)
 
 
-def slow_drivers(scene: Scene) -> list[Driver]:
+def slow_drivers(context: Context) -> list[Driver]:
     """Return the drivers that change over the session."""
-    found = [Driver('time', 's', _elapsed)] if scene.has_time else []
-    return found + ([Driver('temperature', 'K', _warming)] if scene.has_temperature else [])
+    found = [Driver('time', 's', _elapsed)] if context.has_time else []
+    return found + ([Driver('temperature', 'K', _warming)] if context.has_temperature else [])
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +103,9 @@ class _Form:
     variant: str = ''
 
 
-def _form(scene: Scene, driver: Driver, name: str) -> _Form | None:
+def _form(context: Context, driver: Driver, name: str) -> _Form | None:
     """Return a driver's form; None where the driver hardly varies."""
-    values = driver.value(scene)
+    values = driver.value(context)
     low, high = float(values.min()), float(values.max())
     if high - low < 1e-9:
         return None
@@ -115,11 +122,11 @@ def _form(scene: Scene, driver: Driver, name: str) -> _Form | None:
     return _Form(name, partial(_power, value=driver.value, power=power), ('',), unit)
 
 
-def _steps(scene: Scene) -> list[_Form]:
+def _steps(context: Context) -> list[_Form]:
     """Return steps at moments spread over the session, between rows."""
-    if not scene.has_time:
+    if not context.has_time:
         return []
-    times = np.unique(scene.elapsed_s)
+    times = np.unique(context.elapsed_s)
     chosen = np.unique(np.linspace(0, len(times) - 1, MOMENTS + 2).astype(int)[1:-1])
     return [
         _Form(
@@ -129,45 +136,45 @@ def _steps(scene: Scene) -> list[_Form]:
     ]
 
 
-def _joint_drivers(scene: Scene, joint: int) -> Iterator[tuple[Driver, tuple[int, ...], str]]:
+def _joint_drivers(context: Context, joint: int) -> Iterator[tuple[Driver, tuple[int, ...], str]]:
     """Give each driver of a joint's angle with the joints it concerns and the forms tried."""
-    if joint in scene.moving:
+    if joint in context.moving:
         yield Driver('own_angle', 'rad', partial(_angle, joint=joint)), (joint,), 'quadratic'
-    for driver in slow_drivers(scene):
+    for driver in slow_drivers(context):
         yield driver, (joint,), 'linear quadratic free'
-    if scene.has_gravity:
+    if context.has_gravity:
         own = Driver('gravity_torque', '(N m)', partial(_torque, joint=joint))
         yield own, (joint,), 'quadratic free'
-    for other in range(1, scene.joints + 1):
+    for other in range(1, context.joints + 1):
         if other == joint:
             continue
         pair = (joint, other)
-        if other in scene.moving:
+        if other in context.moving:
             angle = Driver(f'angle_of_joint_{other}', 'rad', partial(_angle, joint=other))
             yield angle, pair, 'quadratic free'
-        if scene.has_gravity:
+        if context.has_gravity:
             name = f'gravity_torque_of_joint_{other}'
             yield Driver(name, '(N m)', partial(_torque, joint=other)), pair, 'linear'
-        if scene.has_approach and other in scene.moving:
+        if context.has_approach and other in context.moving:
             name = f'approach_of_joint_{other}'
             yield Driver(name, '1', partial(_approach, joint=other)), pair, 'linear'
             name = f'last_move_of_joint_{other}'
             yield Driver(name, 'rad', partial(_move, joint=other)), pair, 'linear'
 
 
-def _at(scene: Scene, joint: int, form: _Form) -> Columns:
-    return Columns(joint - 1, form.features(scene))
+def _at(context: Context, joint: int, form: _Form) -> Design:
+    return Design(joint - 1, form.features(context))
 
 
-def _joint_angles(scene: Scene) -> Iterator[Cell]:
+def _joint_angles(context: Context) -> Iterator[Cell]:
     """Angles: by own angle squared, by other joints, by torques, over time and temperature."""
-    for joint in range(1, scene.joints + 1):
+    for joint in range(1, context.joints + 1):
         forms = [
-            (driver.name, joints, _form(scene, driver, name))
-            for driver, joints, names in _joint_drivers(scene, joint)
+            (driver.name, joints, _form(context, driver, name))
+            for driver, joints, names in _joint_drivers(context, joint)
             for name in names.split()
         ]
-        forms += [('time', (joint,), step) for step in _steps(scene)]
+        forms += [('time', (joint,), step) for step in _steps(context)]
         for driver_name, joints, form in forms:
             if form is not None:
                 yield _cell(
@@ -188,7 +195,7 @@ def _cell(
     form: _Form,
     stems: tuple[str, ...],
     unit: str,
-    columns: Callable[[Scene], Columns],
+    columns: Callable[[Context], Design],
     subject: str = '',
 ) -> Cell:
     return Cell(
@@ -206,46 +213,46 @@ def _cell(
     )
 
 
-def _shifted(scene: Scene, turn: Feature, form: _Form) -> Columns:
+def _shifted(context: Context, turn: Feature, form: _Form) -> Design:
     """Shift along the axes of a rotation (n, 3, 3), for each feature."""
-    features = form.features(scene)
-    axes = turn(scene)
+    features = form.features(context)
+    axes = turn(context)
     count = features.shape[1]
     return displaced(*(features[:, [i]] * axes[:, :, a] for i in range(count) for a in range(3)))
 
 
-def _rotated(scene: Scene, turn: Feature, about: Feature, form: _Form) -> Columns:
+def _rotated(context: Context, turn: Feature, about: Feature, form: _Form) -> Design:
     """Turn about the axes of a rotation (n, 3, 3) through points (n, 3), for each feature."""
-    features = form.features(scene)
-    frame = turn(scene)
+    features = form.features(context)
+    frame = turn(context)
     axes = [features[:, [i]] * frame[:, :, a] for i in range(features.shape[1]) for a in range(3)]
-    return turned(scene, axes, about(scene))
+    return turned(context, axes, about(context))
 
 
-def _link_turn(scene: Scene, link: int) -> FloatArray:
-    return scene.link_rotation(link)
+def _link_turn(context: Context, link: int) -> FloatArray:
+    return context.link_rotation(link)
 
 
-def _joint_origin(scene: Scene, joint: int) -> FloatArray:
-    return scene.joint_origin(joint)
+def _joint_origin(context: Context, joint: int) -> FloatArray:
+    return context.joint_origin(joint)
 
 
-def _bending(scene: Scene, link: int) -> Columns:
+def _bending(context: Context, link: int) -> Design:
     """Bearings give way to gravity's moment across the joint's own axis."""
-    moment = scene.gravity_moment[:, link - 1]
-    own = scene.link_rotation(link) @ scene.chain.axes[link - 1]
+    moment = context.gravity_moment[:, link - 1]
+    own = context.link_rotation(link) @ context.chain.axes[link - 1]
     lateral = moment - np.sum(moment * own, axis=1)[:, None] * own
-    return turned(scene, [lateral], scene.joint_origin(link))
+    return turned(context, [lateral], context.joint_origin(link))
 
 
-def _links(scene: Scene) -> Iterator[Cell]:
+def _links(context: Context) -> Iterator[Cell]:
     """Links that shift or turn: by gravity's moment, over time, by temperature."""
-    for link in scene.links():
+    for link in context.links():
         turn = partial(_link_turn, link=link)
         axes = tuple(f'link_{link}_{axis}' for axis in 'xyz')
         turns = tuple(f'link_{link}_r{axis}' for axis in 'xyz')
-        for driver in slow_drivers(scene):
-            form = _form(scene, driver, 'linear')
+        for driver in slow_drivers(context):
+            form = _form(context, driver, 'linear')
             if form is None:
                 continue
             shift = partial(_shifted, turn=turn, form=form)
@@ -253,7 +260,7 @@ def _links(scene: Scene) -> Iterator[Cell]:
             about = partial(_joint_origin, joint=link + 1)
             rotation = partial(_rotated, turn=turn, about=about, form=form)
             yield _cell('link_rotation', (link,), driver.name, form, turns, 'rad', rotation)
-        if scene.has_gravity:
+        if context.has_gravity:
             yield Cell(
                 name='unnamed',
                 joints=(link,),
@@ -266,49 +273,49 @@ def _links(scene: Scene) -> Iterator[Cell]:
             )
 
 
-def _base_turn(scene: Scene) -> FloatArray:
-    return np.broadcast_to(np.eye(3), (len(scene), 3, 3))
+def _base_turn(context: Context) -> FloatArray:
+    return np.broadcast_to(np.eye(3), (len(context), 3, 3))
 
 
-def _base_origin(scene: Scene) -> FloatArray:
-    return np.zeros((len(scene), 3))
+def _base_origin(context: Context) -> FloatArray:
+    return np.zeros((len(context), 3))
 
 
-def _tool_turn(scene: Scene, marker: int) -> FloatArray:
-    return scene.tool[:, :3, :3] * (scene.marker == marker)[:, None, None]
+def _tool_turn(context: Context, marker: int) -> FloatArray:
+    return context.tool[:, :3, :3] * (context.marker == marker)[:, None, None]
 
 
-def _sensor_turn(scene: Scene, sensor: int) -> FloatArray:
-    return scene.sensor_turn * scene.seen_by(sensor)[:, None, None]
+def _sensor_turn(context: Context, sensor: int) -> FloatArray:
+    return context.sensor_turn * context.seen_by(sensor)[:, None, None]
 
 
-def _sagging(scene: Scene, marker: int) -> Columns:
+def _sagging(context: Context, marker: int) -> Design:
     """The marker's stem bends under its own weight, across the tool's z axis."""
-    axis = scene.tool[:, :3, 2]
+    axis = context.tool[:, :3, 2]
     across = np.array((0.0, 0.0, -1.0)) + axis * axis[:, 2:]
-    return displaced((scene.marker == marker)[:, None] * across)
+    return displaced((context.marker == marker)[:, None] * across)
 
 
-def _line_of_sight(scene: Scene, sensor: int, power: int) -> Columns:
-    distance = np.maximum(scene.range_m, 1e-3)
-    along = np.einsum('nij,nj->ni', scene.sensor_turn, scene.in_sensor)
-    return displaced((scene.seen_by(sensor) * distance ** (power - 1.0))[:, None] * along)
+def _line_of_sight(context: Context, sensor: int, power: int) -> Design:
+    distance = np.maximum(context.range_m, 1e-3)
+    along = np.einsum('nij,nj->ni', context.sensor_turn, context.in_sensor)
+    return displaced((context.seen_by(sensor) * distance ** (power - 1.0))[:, None] * along)
 
 
-def _frames(scene: Scene) -> Iterator[Cell]:
+def _frames(context: Context) -> Iterator[Cell]:
     """Base, markers and sensors: over time, by temperature, gravity, joint 1, range."""
     slow = [
         (driver.name, form)
-        for driver in slow_drivers(scene)
-        if (form := _form(scene, driver, 'linear')) is not None
+        for driver in slow_drivers(context)
+        if (form := _form(context, driver, 'linear')) is not None
     ]
     turns = tuple(f'base_r{axis}' for axis in 'xyz')
     first = Driver('angle_of_joint_1', 'rad', partial(_angle, joint=1))
-    for name, form in (*slow, (first.name, _form(scene, first, 'sin/cos'))):
+    for name, form in (*slow, (first.name, _form(context, first, 'sin/cos'))):
         if form is not None:
             columns = partial(_rotated, turn=_base_turn, about=_base_origin, form=form)
             yield _cell('base_rotation', (), name, form, turns, 'rad', columns)
-    for index, marker in enumerate(scene.marker_names):
+    for index, marker in enumerate(context.marker_names):
         turn = partial(_tool_turn, marker=index)
         axes = tuple(f'marker_{marker}_{axis}' for axis in 'xyz')
         for name, form in slow:
@@ -325,14 +332,14 @@ def _frames(scene: Scene) -> Iterator[Cell]:
             columns=partial(_sagging, marker=index),
             subject=marker,
         )
-    for index, sensor in enumerate(scene.sensor_names):
+    for index, sensor in enumerate(context.sensor_names):
         turn = partial(_sensor_turn, sensor=index)
         axes = tuple(f'{sensor}_{axis}' for axis in 'xyz')
-        forms = [('time', step) for step in _steps(scene)]
+        forms = [('time', step) for step in _steps(context)]
         forms += [
             (driver.name, form)
-            for driver in slow_drivers(scene)
-            for form in (_form(scene, driver, name) for name in ('linear', 'free'))
+            for driver in slow_drivers(context)
+            for form in (_form(context, driver, name) for name in ('linear', 'free'))
             if form is not None and (driver.name, form.name) != ('time', 'linear')
         ]
         for name, form in forms:

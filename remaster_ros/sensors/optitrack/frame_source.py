@@ -29,7 +29,7 @@ REMEMBERED = 64
 """Sources; a forger with a new port for every frame must not fill the memory."""
 
 
-class Verdict(Enum):
+class SourceVerdict(Enum):
     """What to do with a frame."""
 
     BELIEVED = 'believed'
@@ -101,29 +101,29 @@ class SourceLock:
         other.last_s = now_s
         return True
 
-    def judge(self, source: Source, now_s: float) -> Verdict:
+    def judge(self, source: Source, now_s: float) -> SourceVerdict:
         """Decide on a whole frame, and give the lock where it is due."""
         if self.is_refused(source, now_s):
-            return Verdict.FOREIGN
+            return SourceVerdict.FOREIGN
         if source == self.source:
             self._heard_s = now_s
             for other in self._others.values():
                 other.beside = other.beside or now_s - other.first_s > PROBATION_S
-            return Verdict.BELIEVED
+            return SourceVerdict.BELIEVED
         if source == self._last:
             self.source, self._heard_s = source, now_s
-            return Verdict.BELIEVED
+            return SourceVerdict.BELIEVED
         if not self._answered:
-            return Verdict.PROBATION
+            return SourceVerdict.PROBATION
         known = self._note(source, now_s)
         alone = len(self._candidates(now_s)) == 1
         if not alone or known.frames < PROBATION_FRAMES or now_s - known.first_s < PROBATION_S:
-            return Verdict.PROBATION
+            return SourceVerdict.PROBATION
         del self._others[source]
         self.source = self._last = source
         self._heard_s = now_s
         self.taken += 1
-        return Verdict.BELIEVED
+        return SourceVerdict.BELIEVED
 
     def rivals(self, now_s: float) -> tuple[Source, ...]:
         """Return who is refused and was heard lately, while or after another had the lock."""

@@ -16,7 +16,7 @@ from remaster_ros.sensors.optitrack.diagnosis import (
     diagnose,
 )
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerGate, MarkerSample
-from remaster_ros.sensors.optitrack.frame_source import Source, SourceLock, Verdict, describe
+from remaster_ros.sensors.optitrack.frame_source import Source, SourceLock, SourceVerdict, describe
 from remaster_ros.sensors.optitrack.protocol.frames import Frame
 from remaster_ros.sensors.optitrack.protocol.natnet import ServerInfo, Version
 from remaster_ros.sensors.optitrack.sockets import interface_towards, resolve
@@ -198,10 +198,10 @@ class MarkerFollower(ABC):
         now = time.monotonic()
         before = self._lock.source
         verdict = self._lock.judge(source, now)
-        if verdict is Verdict.FOREIGN:
+        if verdict is SourceVerdict.FOREIGN:
             self._gate.drop(Dropped.FOREIGN)
             return None
-        if verdict is Verdict.PROBATION:
+        if verdict is SourceVerdict.PROBATION:
             self._gate.pass_over(Dropped.PROBATION)
             return None
         if before is None:

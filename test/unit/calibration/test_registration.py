@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from remaster_ros.calibration.registration import register_agreeing, register_points
+from remaster_ros.calibration.registration import register_points, register_ransac
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.kinematics.transforms import (
     apply,
@@ -102,9 +102,9 @@ def test_a_stray_at_one_point_is_found_by_the_next(seed, moved):
     # A stray so near that the triangle is as it should be could not be told.
     points_N[1] = points_N[0] + (points_N[1] - points_N[0]) * (1.6 if moved else 0.3)
     with pytest.raises(InsufficientDataError, match='of 3 points too few agree'):
-        register_agreeing(points_R[:3], points_N[:3], 0.025)
+        register_ransac(points_R[:3], points_N[:3], 0.025)
     for count in (4, 5):
-        found, agree = register_agreeing(points_R[:count], points_N[:count], 0.025)
+        found, agree = register_ransac(points_R[:count], points_N[:count], 0.025)
         assert agree.tolist() == [True, False, True, True, True][:count]
         np.testing.assert_allclose(apply(found, points_N[:1]), points_R[:1], atol=0.01)
         assert np.linalg.norm(found[:3, 3] - T_R_N[:3, 3]) < 0.1
@@ -114,4 +114,4 @@ def test_a_stray_that_stands_still_at_every_point_is_no_frame():
     _, _, points_R, points_N = random_case(3, 6)
     points_N[1:] = points_N[0] + np.random.default_rng(3).normal(0, 1e-4, (5, 3))
     with pytest.raises(InsufficientDataError, match='too few agree'):
-        register_agreeing(points_R, points_N, 0.025)
+        register_ransac(points_R, points_N, 0.025)

@@ -180,7 +180,7 @@ def residuals():
 
 
 def cells_named(name: str):
-    return list(EFFECTS[name].cells(residuals().scene))
+    return list(EFFECTS[name].cells(residuals().context))
 
 
 def test_whitening_makes_noise_of_the_model_white():

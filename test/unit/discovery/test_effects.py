@@ -10,7 +10,7 @@ from calibration_scenes import CHAIN
 from discovery_scenes import residuals_of, session_with
 
 from remaster_ros.discovery.effects.base import PLACES, Cell
-from remaster_ros.discovery.effects.context import Scene
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.splines import basis, centers, knot_vector, roughness
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -20,12 +20,12 @@ STEP = 1e-6
 
 
 @cache
-def scene_of(gravity: bool = True) -> Scene:
+def scene_of(gravity: bool = True) -> Context:
     session = session_with(11, poses=8, validation=0, sensor_count=2)
     rows = session.measurements
     warm = 20.0 + np.linspace(0.0, 4.0, len(rows))
     session = replace(session, measurements=replace(rows, temperature_c=warm))
-    scene = residuals_of(session).scene
+    scene = residuals_of(session).context
     return scene if gravity else replace(scene, chain=replace(CHAIN, has_inertials=False))
 
 
@@ -33,7 +33,7 @@ def cells_of(name: str) -> list[Cell]:
     return list(EFFECTS[name].cells(scene_of()))
 
 
-def moved(chain: SerialChain, scene: Scene) -> np.ndarray:
+def moved(chain: SerialChain, scene: Context) -> np.ndarray:
     points = chain.forward(scene.q)
     return apply(points, scene.markers[scene.marker])
 

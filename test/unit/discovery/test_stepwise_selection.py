@@ -41,8 +41,8 @@ def test_curves_that_stand_in_for_a_weak_cause_give_way_to_it():
     cells = tuple(
         cell
         for name, effect in EFFECTS.items()
-        if name not in ('marker_offset', 'gear_periodic') and not effect.needs(data.scene)
-        for cell in effect.cells(data.scene)
+        if name not in ('marker_offset', 'gear_periodic') and not effect.needs(data.context)
+        for cell in effect.cells(data.context)
     )
     search = Search(
         data, cells, np.random.default_rng(7), lambda data, solution: data, lambda share: None

@@ -137,7 +137,9 @@ def test_columns_and_errors_of_a_part_are_those_of_the_whole():
     found = findings(session_with(21, sagging))
     data, solution = found.residuals, found.selection.solution
     rows = data.rows.source
-    wanted = [cell.columns(data.scene).displacement(data.scene)[rows] for cell in solution.cells]
+    wanted = [
+        cell.columns(data.context).displacement(data.context)[rows] for cell in solution.cells
+    ]
     np.testing.assert_allclose(
         data.columns(solution.cells), np.concatenate(wanted, axis=2), atol=1e-12
     )
@@ -150,6 +152,6 @@ def test_what_a_fit_leaves_does_not_depend_on_blocks(monkeypatch):
     found = findings(session_with(21, sagging))
     data, solution = found.residuals, found.selection.solution
     whole = data.unexplained(solution)
-    blocks = type(data.scene).blocks
-    monkeypatch.setattr(type(data.scene), 'blocks', lambda scene: blocks(scene, 7))
+    blocks = type(data.context).blocks
+    monkeypatch.setattr(type(data.context), 'blocks', lambda scene: blocks(scene, 7))
     np.testing.assert_allclose(data.unexplained(solution), whole, rtol=0.0, atol=1e-12)

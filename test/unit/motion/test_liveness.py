@@ -1,12 +1,12 @@
-"""Presence of sensors: silent, not ready, back again."""
+"""Liveness of sensors: silent, not ready, back again."""
 
 import math
 
-from remaster_ros.motion.liveness import Presence
+from remaster_ros.motion.liveness import Liveness
 
 
 def test_silent_or_not_ready_is_absent_and_says_why():
-    presence = Presence(['mocap', 'tracker'], 3.0)
+    presence = Liveness(['mocap', 'tracker'], 3.0)
     assert presence.absent(100.0) == {}, 'a bag without status has no absent sensor'
     presence.says('mocap', True, '', 10.0)
     presence.says('tracker', False, 'warming up', 10.0)
@@ -22,7 +22,7 @@ def test_silent_or_not_ready_is_absent_and_says_why():
 
 
 def test_readings_are_counted_and_dated():
-    presence = Presence(['mocap'], 3.0)
+    presence = Liveness(['mocap'], 3.0)
     assert presence.read_age_s('mocap', 5.0) == math.inf
     presence.reads('mocap', 5.0)
     presence.reads('mocap', 6.0)
@@ -31,7 +31,7 @@ def test_readings_are_counted_and_dated():
 
 
 def test_a_stream_whose_node_was_started_again_is_there_with_its_first_reading():
-    presence = Presence(['mocap', 'tracker'], 3.0, ['mocap'])
+    presence = Liveness(['mocap', 'tracker'], 3.0, ['mocap'])
     why = {'mocap': 'no reading since its node was started'}
     for started in ('first', 'second'):
         for sensor in ('mocap', 'tracker'):
@@ -49,7 +49,7 @@ def test_a_stream_whose_node_was_started_again_is_there_with_its_first_reading()
 
 
 def test_what_has_not_been_heard_yet_is_absent_for_a_while_where_it_is_required():
-    presence = Presence(['mocap', 'tracker'], 3.0, since_s=10.0)
+    presence = Liveness(['mocap', 'tracker'], 3.0, since_s=10.0)
     presence.reads('tracker', 10.1)
     assert presence.absent(19.9) == {}, 'one that is not required is not given up for that'
     unheard = {'mocap': 'its node has not been heard yet'}
@@ -60,7 +60,7 @@ def test_what_has_not_been_heard_yet_is_absent_for_a_while_where_it_is_required(
 
 
 def test_an_instrument_whose_node_was_started_again_needs_a_moment_where_it_is_required():
-    presence = Presence(['tracker'], 3.0)
+    presence = Liveness(['tracker'], 3.0)
     presence.says('tracker', True, '', 10.0, 'first')
     assert presence.absent(10.0, ['tracker']) == {}
     presence.says('tracker', True, '', 11.0, 'second')

@@ -2,12 +2,12 @@
 
 import pytest
 
-from remaster_ros.motion.rivalry import LISTEN_S, Rivalry
+from remaster_ros.motion.rivalry import LISTEN_S, DuplicateNodeCheck
 
 
 def settle(a_started_s, b_started_s, ids=('1', '2'), delay_s=0.0, turns=3):
     """Let two nodes exchange summaries; return which of them must end."""
-    nodes = Rivalry(ids[0]), Rivalry(ids[1])
+    nodes = DuplicateNodeCheck(ids[0]), DuplicateNodeCheck(ids[1])
     begun = a_started_s, b_started_s
     ends = [False, False]
     for turn in range(turns):
@@ -35,7 +35,7 @@ def test_never_both_go_on(delay_s, apart_s, ids):
 
 def test_the_last_words_of_a_killed_process_end_nobody():
     """One message of a node that had run for long, after its successor was started."""
-    node = Rivalry('2')
+    node = DuplicateNodeCheck('2')
     node.hear_itself(0.0)
     assert not node.hear('1', 5000.0, 0.6, 0.6)
     # The same once more, as a late copy.
@@ -44,7 +44,7 @@ def test_the_last_words_of_a_killed_process_end_nobody():
 
 
 def test_alone_only_after_listening_and_without_a_rival():
-    node = Rivalry('1')
+    node = DuplicateNodeCheck('1')
     assert not node.alone(100.0)
     node.hear_itself(100.0)
     node.hear_itself(101.0)
@@ -56,6 +56,6 @@ def test_alone_only_after_listening_and_without_a_rival():
 
 
 def test_a_rival_before_it_has_heard_itself_does_not_count_as_listening():
-    node = Rivalry('1')
+    node = DuplicateNodeCheck('1')
     node.hear('2', 1.0, 50.0, 10.0)
     assert node.alone_since_s is None

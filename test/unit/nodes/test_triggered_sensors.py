@@ -46,7 +46,7 @@ def scene(monkeypatch):
     client = Client()
     rules = SensorRules('tracker', 'smr', single_shot=True, timeout_s=60.0)
     pairing = Pairing(10.0, Q, (rules,))
-    asking = triggered_sensors.Shots({'tracker': client})
+    asking = triggered_sensors.TriggeredSensors({'tracker': client})
 
     def look(at, absent=()):
         clock.now = at

@@ -12,7 +12,7 @@ from trajectory_msgs.msg import JointTrajectory
 from remaster_ros.errors import InputError
 from remaster_ros.nodes.pose_tracker import waypoints_by_solution, waypoints_message
 from remaster_ros.nodes.tour_planner import PlanningThread
-from remaster_ros.planning.tour_order import Stop
+from remaster_ros.planning.tour_order import PoseVisit
 
 NAMES = ('a', 'b', 'c')
 
@@ -21,7 +21,7 @@ def stop_with(*lengths):
     rng = np.random.default_rng(1)
     paths = tuple(rng.standard_normal((n, 3)) for n in lengths)
     solutions = rng.standard_normal((len(lengths), 3))
-    return Stop(0, 'optimization', np.eye(4), solutions, 0, tuple(range(len(lengths))), paths)
+    return PoseVisit(0, 'optimization', np.eye(4), solutions, 0, tuple(range(len(lengths))), paths)
 
 
 def test_what_was_sent_is_what_is_grouped():

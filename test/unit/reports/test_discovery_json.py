@@ -69,7 +69,7 @@ def test_curves_of_a_large_session_are_drawn_at_the_rows_that_were_searched(save
         return line.get_xdata(), line.get_ydata()
 
     x, y = curve()
-    assert len(x) == len(found.residuals.scene)
+    assert len(x) == len(found.residuals.context)
     monkeypatch.setattr(discovery_figures, 'MOST_DRAWN', 0)
     few_x, few_y = curve()
     assert len(few_x) == len(found.residuals) < len(x)

@@ -19,7 +19,7 @@ from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.reports.fit_json import save_fit
 from remaster_ros.reports.report import report_html, verdict
-from remaster_ros.reports.scene import _round_factor, draw_scene
+from remaster_ros.reports.view_3d import _round_factor, draw_view
 
 VOID = {'meta', 'br', 'img', 'link', 'hr', 'input'}
 
@@ -269,7 +269,7 @@ def test_noise_along_the_line_of_sight_has_rows_of_its_own(fit_result):
 
 def test_error_vectors_lead_from_the_measured_to_the_modelled_marker(fit_result):
     """After, magnified once, every vector ends where the calibrated arm has the marker."""
-    scene = draw_scene(fit_result)
+    scene = draw_view(fit_result)
     m = fit_result.session.measurements
     by_name = {trace['name'].split(',')[0]: trace for trace in scene.data}
     json.dumps(scene.data, allow_nan=False)

@@ -11,7 +11,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import Plan, PlannedPose
 from remaster_ros.planning.tour_order import REGISTRATION, Tour, registration_tour
-from remaster_ros.session.plan_journal import PlanBook
+from remaster_ros.session.plan_journal import PlanJournal
 from remaster_ros.session.workcell import read_cell
 
 SETTINGS = {'cell': 'abc', 'seed': 3}
@@ -47,7 +47,7 @@ def test_any_number_of_restarts_visits_what_one_run_visits(chain, tmp_path):
     rng = np.random.default_rng(seed)
     plans = {'optimization': plan_of(chain, 1, 7, 4), 'validation': plan_of(chain, 2, 5, 3)}
     one_run = Tour(chain, plans)
-    book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+    book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
     assert not book.path.exists()
     book.begin(Tour(chain, plans))
     plan_id, outcomes, q = book.id, {}, np.zeros(len(chain))
@@ -56,7 +56,7 @@ def test_any_number_of_restarts_visits_what_one_run_visits(chain, tmp_path):
         assert (stop.pose, stop.split, stop.ids) == (wanted.pose, wanted.split, wanted.ids)
         open_ids = book.stop.ids
         book.close()
-        book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+        book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
         assert book.id == plan_id
         assert book.stop.ids == open_ids
         assert book.stop.pose == stop.pose
@@ -71,7 +71,7 @@ def test_any_number_of_restarts_visits_what_one_run_visits(chain, tmp_path):
 
 def test_a_registration_tour_keeps_its_order_and_its_numbers(chain, tmp_path):
     tour = registration_tour(chain, plan_of(chain, 3, 6, 2), [np.array([0.1, 0.0, 0.02])])
-    book = PlanBook(tmp_path, SETTINGS, chain)
+    book = PlanJournal(tmp_path, SETTINGS, chain)
     book.begin(tour)
     q = np.zeros(len(chain))
     numbers = []
@@ -83,25 +83,25 @@ def test_a_registration_tour_keeps_its_order_and_its_numbers(chain, tmp_path):
         assert stop.split == REGISTRATION
         assert len(stop.ids) == 1
         book.close()
-        book = PlanBook(tmp_path, SETTINGS, chain)
+        book = PlanJournal(tmp_path, SETTINGS, chain)
     assert numbers == [-1, -2, -3, -4, -5, -6]
     assert not book.outcomes
     book.close()
 
 
 def test_the_state_and_its_run_are_known(chain, tmp_path):
-    book = PlanBook(tmp_path, SETTINGS, chain)
+    book = PlanJournal(tmp_path, SETTINGS, chain)
     book.say_state('running', 'abc')
     assert not book.path.exists()
     book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
     with pytest.raises(InputError, match='another process'):
-        PlanBook(tmp_path, SETTINGS, chain)
+        PlanJournal(tmp_path, SETTINGS, chain)
     book.close()
     for state, run in (('running', 'abc'), ('running', 'def'), ('paused', '')):
-        book = PlanBook(tmp_path, SETTINGS, chain)
+        book = PlanJournal(tmp_path, SETTINGS, chain)
         book.say_state(state, run)
         book.close()
-        book = PlanBook(tmp_path, SETTINGS, chain)
+        book = PlanJournal(tmp_path, SETTINGS, chain)
         assert (book.state, book.run) == (state, run)
         book.close()
 
@@ -114,17 +114,17 @@ def test_the_state_and_its_run_are_known(chain, tmp_path):
     ],
 )
 def test_another_plan_is_refused(chain, tmp_path, settings, problem):
-    book = PlanBook(tmp_path, SETTINGS, chain)
+    book = PlanJournal(tmp_path, SETTINGS, chain)
     book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
     book.close()
     with pytest.raises(InputError, match=problem):
-        PlanBook(tmp_path, settings, chain)
+        PlanJournal(tmp_path, settings, chain)
     # And it is not held any longer.
-    PlanBook(tmp_path, SETTINGS, chain).close()
+    PlanJournal(tmp_path, SETTINGS, chain).close()
 
 
 def test_a_torn_line_is_dropped_and_a_damaged_one_refused(chain, tmp_path):
-    book = PlanBook(tmp_path, SETTINGS, chain)
+    book = PlanJournal(tmp_path, SETTINGS, chain)
     book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
     stop = book.tour.next(np.zeros(len(chain)))
     book.open_stop(stop)
@@ -132,17 +132,17 @@ def test_a_torn_line_is_dropped_and_a_damaged_one_refused(chain, tmp_path):
     book.close()
     whole = book.path.read_bytes()
     book.path.write_bytes(whole[:-5])
-    book = PlanBook(tmp_path, SETTINGS, chain)
+    book = PlanJournal(tmp_path, SETTINGS, chain)
     assert 'cut off' in book.lost
     assert book.stop.ids == stop.ids
     book.close()
     book.path.write_bytes(whole.replace(b'"stop"', b'"step"', 1))
     with pytest.raises(InputError, match='line 4: damaged'):
-        PlanBook(tmp_path, SETTINGS, chain)
+        PlanJournal(tmp_path, SETTINGS, chain)
 
 
 def test_what_a_full_disk_does_not_take_is_kept(chain, tmp_path, full_disk):
-    book = PlanBook(tmp_path, SETTINGS, chain)
+    book = PlanJournal(tmp_path, SETTINGS, chain)
     book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 2)}))
     stop = book.tour.next(np.zeros(len(chain)))
     with full_disk():
@@ -155,7 +155,7 @@ def test_what_a_full_disk_does_not_take_is_kept(chain, tmp_path, full_disk):
     assert not book.trouble
     left = book.stop.ids
     book.close()
-    book = PlanBook(tmp_path, SETTINGS, chain)
+    book = PlanJournal(tmp_path, SETTINGS, chain)
     assert book.stop.ids == left == stop.ids[1:]
     assert book.outcomes['recorded'] == 1
     book.close()
@@ -163,7 +163,7 @@ def test_what_a_full_disk_does_not_take_is_kept(chain, tmp_path, full_disk):
 
 def test_ways_and_what_has_none_survive_a_restart(chain, tmp_path):
     rng = np.random.default_rng(5)
-    book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+    book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
     book.begin(Tour(chain, {'optimization': plan_of(chain, 1, 2, 4)}))
     way = rng.uniform(-1, 1, (2, len(chain)))
     straight = np.empty((0, len(chain)))
@@ -173,20 +173,20 @@ def test_ways_and_what_has_none_survive_a_restart(chain, tmp_path):
     book.outcome(2, 'recorded')
     book.close()
 
-    book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+    book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
     assert dict(book.outcomes) == {'no_free_path': 2, 'recorded': 1}
     assert book.stop.ids == (0,)
     other = rng.uniform(-1, 1, (1, len(chain)))
     book.reroute(replace(book.stop, paths=(other,)))
     book.close()
 
-    book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+    book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
     np.testing.assert_array_equal(book.stop.paths[0], other)
     assert (book.stop.ids, book.stop.pose) == ((0,), stop.pose)
     # From where the arm stands now nothing leads there: its outcome, and the totals add up.
     book.reroute(replace(book.stop.only([]), unreached=(0,)))
     book.close()
-    book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+    book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
     assert book.stop.ids == ()
     assert book.outcomes.total() == 4
     assert book.tour.plans['optimization'].dropped_solutions == {}
@@ -194,10 +194,10 @@ def test_ways_and_what_has_none_survive_a_restart(chain, tmp_path):
 
 def test_the_counts_of_dropped_solutions_survive_a_restart(chain, tmp_path):
     plan = replace(plan_of(chain, 1, 2, 2), dropped_solutions={'self-collision': 3})
-    book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+    book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
     book.begin(Tour(chain, {'optimization': plan}))
     book.close()
-    book = PlanBook(tmp_path / 'session', SETTINGS, chain)
+    book = PlanJournal(tmp_path / 'session', SETTINGS, chain)
     assert book.tour.dropped_solutions == {'self-collision': 3}
 
 
@@ -212,7 +212,7 @@ def test_references_are_visited_as_in_one_run_whatever_is_killed(chain, tmp_path
     }
     settings = {**SETTINGS, 'reference_every': 7}
     one_run = Tour(chain, plans, reference_every=7)
-    book = PlanBook(tmp_path / 'session', settings, chain)
+    book = PlanJournal(tmp_path / 'session', settings, chain)
     book.begin(Tour(chain, plans, reference_every=7))
     q, number = np.zeros(len(chain)), 0
     while (wanted := one_run.next(q)) is not None:
@@ -226,21 +226,21 @@ def test_references_are_visited_as_in_one_run_whatever_is_killed(chain, tmp_path
         for solution in book.stop.ids:
             book.outcome(solution, 'recorded')
         book.close()
-        book = PlanBook(tmp_path / 'session', settings, chain)
+        book = PlanJournal(tmp_path / 'session', settings, chain)
         q = rng.uniform(-1, 1, len(chain))
     assert book.tour.next(q) is None
     assert book.outcomes.total() == sum(book.tour.configurations.values()) == 18
     assert book.references.total() == book.tour.reference_stops == number - 6
     book.close()
     with pytest.raises(InputError, match='another reference_every'):
-        PlanBook(tmp_path / 'session', {**settings, 'reference_every': 8}, chain)
+        PlanJournal(tmp_path / 'session', {**settings, 'reference_every': 8}, chain)
 
 
 def test_a_plan_of_a_version_without_references_goes_on_without(chain, tmp_path):
-    book = PlanBook(tmp_path, SETTINGS, chain)
+    book = PlanJournal(tmp_path, SETTINGS, chain)
     book.begin(Tour(chain, {'optimization': plan_of(chain, 7, 2, 2)}))
     book.close()
-    again = PlanBook(tmp_path, {**SETTINGS, 'reference_every': 25}, chain)
+    again = PlanJournal(tmp_path, {**SETTINGS, 'reference_every': 25}, chain)
     again.ask_round()
     assert again.tour.next(np.zeros(len(chain))).split == 'optimization'
     again.close()

@@ -8,7 +8,7 @@ import pytest
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.errors import InputError
 from remaster_ros.session.reader import read_session
-from remaster_ros.session.session_journal import Logbook
+from remaster_ros.session.session_journal import SessionJournal
 
 
 def reading(sensor, stamp_s):
@@ -32,7 +32,7 @@ def write(book, pose, solution, readings, split='optimization', result='recorded
 
 
 def test_a_recorder_started_again_knows_what_it_decided(session, tmp_path):
-    book = Logbook(tmp_path, session)
+    book = SessionJournal(tmp_path, session)
     assert not book.notes
     assert book.follow('plan a')
     points = [reading('mocap', 1.0), reading('tracker', 2.0)]
@@ -42,7 +42,7 @@ def test_a_recorder_started_again_knows_what_it_decided(session, tmp_path):
     write(book, 0, 2, [reading('mocap', 11.0)], result='partial', temperatures_c=[None])
     book._writer.release()  # killed
 
-    book = Logbook(tmp_path, session)
+    book = SessionJournal(tmp_path, session)
     assert 'after 3 observations' in book.notes[0]
     assert book.plan_id == 'plan a'
     results = [book.result(0, solution) for solution in range(4)]
@@ -58,14 +58,14 @@ def test_a_recorder_started_again_knows_what_it_decided(session, tmp_path):
     assert m.stamp_s.tolist() == [8.0, 9.0, 11.0, 12.0]
     np.testing.assert_array_equal(m.temperature_c, [21.5, 21.5, np.nan, 21.5])
 
-    book = Logbook(tmp_path, session)
+    book = SessionJournal(tmp_path, session)
     assert book.closed == 'complete'
     assert book.observations == 4
     assert 'is complete' in book.notes[0]
 
 
 def test_another_plan_is_not_followed_once_there_are_observations(session, tmp_path):
-    book = Logbook(tmp_path, session)
+    book = SessionJournal(tmp_path, session)
     assert book.follow('a')
     write(book, -1, 0, [reading('mocap', 1.0)], split='registration')
     assert book.follow('b')
@@ -77,7 +77,7 @@ def test_another_plan_is_not_followed_once_there_are_observations(session, tmp_p
 
 
 def test_time_goes_on_though_the_clock_began_anew(session, tmp_path):
-    book = Logbook(tmp_path, session)
+    book = SessionJournal(tmp_path, session)
     write(book, 0, 0, [reading('mocap', 500.0)])
     book.close('stopped')
     for solution in (1, 2):
@@ -95,11 +95,11 @@ def test_time_goes_on_though_the_clock_began_anew(session, tmp_path):
 def test_a_folder_of_something_else_is_refused(session, tmp_path):
     (tmp_path / 'observations.csv').write_text('mine\n')
     with pytest.raises(InputError, match='already holds files'):
-        Logbook(tmp_path, session)
+        SessionJournal(tmp_path, session)
 
 
 def test_references_are_rows_of_their_own_and_are_remembered(session, tmp_path):
-    book = Logbook(tmp_path, session)
+    book = SessionJournal(tmp_path, session)
     book.follow('a')
     places = [[reading('mocap', 1.0), reading('tracker', 1.5)], [reading('mocap', 2.0)]]
     write(book, 0, 0, places[0], split='reference')
@@ -107,7 +107,7 @@ def test_references_are_rows_of_their_own_and_are_remembered(session, tmp_path):
     book.note_accepted()
     write(book, 2, 0, places[1], split='reference')
     book._writer.release()  # killed
-    book = Logbook(tmp_path, session)
+    book = SessionJournal(tmp_path, session)
     assert [kind for kind, _, _ in book.watched] == ['reference', 'other', 'accepted', 'reference']
     assert [number for kind, number, _ in book.watched if kind == 'reference'] == [0, 2]
     for readings, (_, _, found) in zip(places, (book.watched[0], book.watched[3])):

@@ -5,13 +5,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
-from remaster_ros.simulation.arm_motion import DAMPING, NATURAL_FREQUENCY, Motion, Waypoint
+from remaster_ros.simulation.arm_motion import DAMPING, NATURAL_FREQUENCY, Motion, ServoPoint
 
 
 def go(motion, start, end, duration):
     """Send it to `end` at rest."""
     end = np.asarray(end, float)
-    motion.follow(start, [Waypoint(duration, end, np.zeros_like(end))])
+    motion.follow(start, [ServoPoint(duration, end, np.zeros_like(end))])
 
 
 @pytest.mark.parametrize('with_velocities', [True, False])
@@ -20,9 +20,9 @@ def test_the_response_solves_the_servo_equation(with_velocities):
     times, q, v = [0.5, 1.1, 1.7], [0.0, -0.8, -1.1], [-0.9, -1.2, 0.0]
     if with_velocities:
         curve = CubicHermiteSpline([0, *times], [start, *q], [0, *v])
-        points = [Waypoint(t, np.array([a]), np.array([b])) for t, a, b in zip(times, q, v)]
+        points = [ServoPoint(t, np.array([a]), np.array([b])) for t, a, b in zip(times, q, v)]
     else:
-        points = [Waypoint(t, np.array([a])) for t, a in zip(times, q)]
+        points = [ServoPoint(t, np.array([a])) for t, a in zip(times, q)]
 
         def curve(s):
             return np.interp(s, [0, *times], [start, *q])

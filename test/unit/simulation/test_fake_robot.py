@@ -7,7 +7,7 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.workcell import config_path
 from remaster_ros.simulation.faults import inject
 from remaster_ros.simulation.robot import FakeArm, TrajectoryPoint
-from remaster_ros.simulation.world import SensorTruth, Truth, World
+from remaster_ros.simulation.world import SensorTruth, World, WorldTruth
 
 
 class SteppedWorld(World):
@@ -26,7 +26,7 @@ def world(tmp_path):
     rng = np.random.default_rng(5)
     T = np.eye(4)
     T[:3, 3] = [2.0, 0.0, 1.0]
-    truth = Truth(
+    truth = WorldTruth(
         5, rng.normal(0, 0.005, 7), {'mocap': SensorTruth(T, np.array([0.1, 0, 0]), np.pi)}
     )
     world = SteppedWorld.create(

@@ -6,13 +6,13 @@ from calibration_scenes import CHAIN, random_poses
 
 from remaster_ros.errors import InputError
 from remaster_ros.session.workcell import read_cell
-from remaster_ros.simulation.arm_motion import Waypoint
-from remaster_ros.simulation.effect_sampling import RANDOM, Request, hide
+from remaster_ros.simulation.arm_motion import ServoPoint
+from remaster_ros.simulation.effect_sampling import RANDOM, EffectSpec, hide
 from remaster_ros.simulation.hidden_arm import ChainArm
 from remaster_ros.simulation.hidden_effects import NAMED, UNNAMED, HiddenEffect
 from remaster_ros.simulation.setup import make_world
 from remaster_ros.simulation.world import World
-from remaster_ros.simulation.world_model import Round, Stage, StagedSensor
+from remaster_ros.simulation.world_model import Round, StagedSensor, WorldModel
 from remaster_ros.simulation.wrong_arm import Warming, WrongArm
 
 SEED = 5
@@ -26,7 +26,7 @@ def stage():
     q = np.concatenate(random_poses(40, rng))
     time_s = 12.0 * np.arange(1, len(q) + 1)
     sensor = StagedSensor(np.eye(3), np.array([0.1, 0.2, -2.0]), 'sir')
-    return Stage(
+    return WorldModel(
         ChainArm(CHAIN),
         Round(q, np.full(7, 0.1), time_s, WARMING.at(time_s)),
         {'mocap': sensor},
@@ -39,7 +39,7 @@ def stage():
 def test_over_time_the_arm_errs_as_on_the_stage(stage, kind):
     """Where each motion has ended, the sensor sees what it sees on a stage."""
     print(f'seed {SEED}')
-    effects = hide(stage, [Request(kind, size_m=0.5e-3)], np.random.default_rng(SEED))
+    effects = hide(stage, [EffectSpec(kind, size_m=0.5e-3)], np.random.default_rng(SEED))
     arm = WrongArm(
         CHAIN,
         stage.joint_offsets,
@@ -74,20 +74,20 @@ def test_while_it_moves_the_error_passes_over(stage):
 
 def test_an_effect_survives_its_file(stage):
     for kind in (*NAMED, *UNNAMED):
-        (effect,) = hide(stage, [Request(kind)], np.random.default_rng(SEED))
+        (effect,) = hide(stage, [EffectSpec(kind)], np.random.default_rng(SEED))
         again = HiddenEffect.from_dict(effect.to_dict())
         np.testing.assert_array_equal(stage.seen([again]), stage.seen([effect]))
 
 
 def test_it_has_the_joint_and_the_size_asked_for(stage):
-    (effect,) = hide(stage, [Request.parse('backlash@4:0.3')], np.random.default_rng(SEED))
+    (effect,) = hide(stage, [EffectSpec.parse('backlash@4:0.3')], np.random.default_rng(SEED))
     assert (effect.kind, effect.joints) == ('backlash', (4,))
     assert stage.size_m(effect) == pytest.approx(0.3e-3)
 
 
 def test_random_draws_all_of_those_with_a_name(stage):
     rng = np.random.default_rng(SEED)
-    drawn = {hide(stage, [Request(RANDOM)], rng)[0].kind for _ in range(120)}
+    drawn = {hide(stage, [EffectSpec(RANDOM)], rng)[0].kind for _ in range(120)}
     # Each of the sixteen is missed in 120 draws with a probability of 4e-4.
     assert drawn == set(NAMED)
 
@@ -97,17 +97,17 @@ def test_random_draws_all_of_those_with_a_name(stage):
 )
 def test_what_cannot_be_hidden_is_refused(text):
     with pytest.raises(InputError, match=r'NAME|joints count'):
-        Request.parse(text)
+        EffectSpec.parse(text)
 
 
 def test_a_joint_that_cannot_show_it_is_refused(stage):
     with pytest.raises(InputError, match='backlash at joint 9 cannot be seen'):
-        hide(stage, [Request.parse('backlash@9')], np.random.default_rng(SEED))
+        hide(stage, [EffectSpec.parse('backlash@9')], np.random.default_rng(SEED))
 
 
 def test_a_world_keeps_what_is_hidden_in_it(tmp_path):
     """Another process that opens the World sees the same, and the reported angles are right."""
-    requests = [Request.parse('joint_compliance:0.4'), Request.parse('sensor_scale')]
+    requests = [EffectSpec.parse('joint_compliance:0.4'), EffectSpec.parse('sensor_scale')]
     cell = read_cell('demo')
     made = make_world(tmp_path, cell, SEED, 20.0, requests)
     plain = make_world(tmp_path / 'plain', cell, SEED, 20.0)
@@ -115,7 +115,7 @@ def test_a_world_keeps_what_is_hidden_in_it(tmp_path):
     assert [effect.kind for effect in opened.truth.effects] == [r.kind for r in requests]
     end = made.start_q + 0.2
     for world in (made, plain):
-        world.begin_motion(101.0, [Waypoint(2.0, end, np.zeros(7))])
+        world.begin_motion(101.0, [ServoPoint(2.0, end, np.zeros(7))])
     for sensor in made.truth.sensors:
         seen = made.marker_in_sensor(sensor, 110.0)
         np.testing.assert_array_equal(opened.marker_in_sensor(sensor, 110.0), seen)

@@ -20,7 +20,7 @@ ARMS_SHOWN = 5
 ROWS_SHOWN = 600
 
 
-class Scene(NamedTuple):
+class View3D(NamedTuple):
     """A plotly figure as plain data, and what its caption must say.
 
     Attributes
@@ -43,7 +43,7 @@ class Scene(NamedTuple):
     far_sensors: list[str]
 
 
-def draw_scene(result: FitResult) -> Scene:
+def draw_view(result: FitResult) -> View3D:
     """Return the 3-D view, everything in the robot base R, metres."""
     m = result.session.measurements
     shown = _evenly(len(m), ROWS_SHOWN)
@@ -79,7 +79,7 @@ def draw_scene(result: FitResult) -> Scene:
         if is_far:
             far.append(sensor)
         data.append(_sensor(sensor, T, is_far))
-    return Scene(data, _layout(), magnification, len(shown), len(m), far)
+    return View3D(data, _layout(), magnification, len(shown), len(m), far)
 
 
 def _arms(result: FitResult) -> dict[str, Any]:
