@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from remaster_ros import __version__
 from remaster_ros.calibration.evaluate_offsets import OffsetsJudgement, accuracy_with_offsets
 from remaster_ros.cli.console import progress_bar, say
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -18,6 +17,7 @@ from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
 from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.session.reader import read_session
 from remaster_ros.types import Session
+from remaster_ros.version import __version__
 
 FORMAT = 'remaster-accuracy/1'
 DESCRIPTION = (

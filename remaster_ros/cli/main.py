@@ -11,9 +11,9 @@ import traceback
 import warnings
 from collections.abc import Sequence
 
-from remaster_ros import __version__
 from remaster_ros.cli.options import Parser, integer
 from remaster_ros.errors import InsufficientDataError, RemasterError
+from remaster_ros.version import __version__
 
 # Each verb is the module of that name beside this one, imported only when it is used: SciPy and
 # the rest take more than a second to load, and `remaster --help` needs none of it.

@@ -10,13 +10,13 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from remaster_ros import __version__
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.errors import InputError
 from remaster_ros.reports.fit_json import FIT_LIMIT, REPORT_FILE, fit_to_dict
 from remaster_ros.session.files import cannot_write, make_folder, read_limited, write_atomically
+from remaster_ros.version import __version__
 
 FORMAT = 'remaster-discovery/1'
 DISCOVERY_FILE = 'discovery.json'

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from remaster_ros import __version__
 from remaster_ros.compensation.export import exports
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.session.files import cannot_write, make_folder, read_limited, write_atomically
 from remaster_ros.types import FloatArray, Session
+from remaster_ros.version import __version__
 
 if TYPE_CHECKING:
     from remaster_ros.calibration.result import FitResult

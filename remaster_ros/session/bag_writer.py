@@ -15,7 +15,6 @@ from types import TracebackType
 
 from mcap.writer import CompressionType, Writer
 
-from remaster_ros import __version__
 from remaster_ros.errors import DiskError, InputError
 from remaster_ros.session.bag import LATCHED_TOPICS, BagReader
 from remaster_ros.session.bag_metadata import (
@@ -35,6 +34,7 @@ from remaster_ros.session.files import (
 )
 from remaster_ros.session.manifest import add_to_manifest, read_manifest
 from remaster_ros.session.message_definitions import definition_of
+from remaster_ros.version import __version__
 
 WAITING_LIMIT = 64 * 1024**2
 """So many bytes that a full disk does not take are kept in memory; later messages are refused."""

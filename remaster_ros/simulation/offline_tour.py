@@ -24,6 +24,8 @@ def plan_tour(
     places: Mapping[str, FloatArray],
     counts: Mapping[str, int],
     rng: np.random.Generator,
+    *,
+    without_meshes: bool = True,
 ) -> Tour:
     """Plan poses that face one sensor and that all of them see, for every split with a count.
 
@@ -37,6 +39,9 @@ def plan_tour(
         Split -> number of candidate poses.
     rng
         Source of randomness.
+    without_meshes
+        Take capsules in place of meshes: nobody stands beside a simulated arm, and its meshes may
+        be on another machine.
 
     Raises
     ------
@@ -44,8 +49,7 @@ def plan_tour(
         No closed form for this robot, or no pose to fit that it can take.
     """
     inverse = InverseKinematics(chain, cell.held(chain))
-    # Nobody stands beside a simulated arm, and its meshes may be on another machine.
-    arm = cell.collision_model(chain, without_meshes=True)
+    arm = cell.collision_model(chain, without_meshes=without_meshes)
     sights = cell.lines_of_sight({name: T_R_N[:3, 3] for name, T_R_N in places.items()})
     aim = places[cell.aim_at][:3, 3]
     plans = {}

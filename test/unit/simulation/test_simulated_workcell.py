@@ -1,4 +1,4 @@
-"""The parts of `remaster simulate`: robot, sensors, placement, order of the visits."""
+"""The parts of a simulated workcell: robot, sensors, placement, order of the visits."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from remaster_ros.cli import simulate
 from remaster_ros.errors import InputError
 from remaster_ros.planning.candidates import order_solutions
 from remaster_ros.session.workcell import read_cell
+from remaster_ros.simulation import simulated_workcell
 from remaster_ros.simulation.session_simulator import SimulatedSensor
 
 ROOT = Path(__file__).parents[3]
@@ -25,14 +25,15 @@ def place_all(cell, seed):
     rng = np.random.default_rng(seed)
     return {
         name: SimulatedSensor(
-            sensor.marker, simulate.place_sensor(cell, np.array(sensor.rough_position_m), rng)
+            sensor.marker,
+            simulated_workcell.place_sensor(cell, np.array(sensor.rough_position_m), rng),
         )
         for name, sensor in cell.sensors.items()
     }
 
 
 def test_a_shipped_robot_goes_by_its_name_and_keeps_the_held_joint(cell):
-    chain = simulate.choose_robot(cell, 'iiwa14', None, None)
+    chain = simulated_workcell.choose_robot(cell, 'iiwa14', None, None)
     assert chain.name == 'iiwa14'
     assert 'iiwa14' in cell.urdf_text
     assert list(cell.held(chain)) == [2]
@@ -40,7 +41,7 @@ def test_a_shipped_robot_goes_by_its_name_and_keeps_the_held_joint(cell):
 
 def test_any_urdf_goes_by_its_path_with_the_links_asked_for(cell):
     path = ROOT / 'config/robots/iiwa7.urdf'
-    chain = simulate.choose_robot(cell, str(path), 'base_link', 'link_6')
+    chain = simulated_workcell.choose_robot(cell, str(path), 'base_link', 'link_6')
     assert len(chain) == 6
     assert chain.tip_link == 'link_6'
     # Six joints leave none to hold.
@@ -49,29 +50,29 @@ def test_any_urdf_goes_by_its_path_with_the_links_asked_for(cell):
 
 def test_an_unknown_robot_is_refused_with_the_names_there_are(cell):
     with pytest.raises(InputError, match='one of iiwa14, iiwa7, lwr4plus'):
-        simulate.choose_robot(cell, 'nix', None, None)
+        simulated_workcell.choose_robot(cell, 'nix', None, None)
 
 
 def test_a_urdf_that_is_none_is_named(cell, tmp_path):
     path = tmp_path / 'robot.urdf'
     path.write_text('<robot name="x">')
     with pytest.raises(InputError, match=r'robot\.urdf: '):
-        simulate.choose_robot(cell, str(path), None, None)
+        simulated_workcell.choose_robot(cell, str(path), None, None)
 
 
 def test_the_tool_faces_a_sensor_that_is_there(cell):
-    simulate.choose_sensors(cell, ('mocap',))
+    simulated_workcell.choose_sensors(cell, ('mocap',))
     assert list(cell.sensors) == ['mocap']
     assert cell.aim_at == 'mocap'
     with pytest.raises(InputError, match=r"no sensor 'sonar' in the cell \(mocap\)"):
-        simulate.choose_sensors(cell, ('sonar',))
+        simulated_workcell.choose_sensors(cell, ('sonar',))
 
 
 def test_sensors_stand_near_their_rough_place_and_look_at_the_workspace(cell):
     """Five std of the placement; another seed gives another place."""
     for name, sensor in place_all(cell, 3).items():
         T, rough = sensor.T_R_N, np.array(cell.sensors[name].rough_position_m)
-        assert np.all(np.abs(T[:3, 3] - rough) < 5 * simulate.PLACEMENT_STD_M)
+        assert np.all(np.abs(T[:3, 3] - rough) < 5 * simulated_workcell.PLACEMENT_STD_M)
         to_middle = np.array([0.0, 0.0, 0.6]) - T[:3, 3]
         np.testing.assert_allclose(T[:3, 2], to_middle / np.linalg.norm(to_middle), atol=1e-12)
     assert not np.allclose(
@@ -85,13 +86,13 @@ def planned(cell):
     counts = {'optimization': 12, 'validation': 6}
     sensors = place_all(cell, 5)
     places = {name: sensor.T_R_N for name, sensor in sensors.items()}
-    tour = simulate.plan_tour(chain, cell, places, counts, np.random.default_rng(5))
+    tour = simulated_workcell.plan_tour(chain, cell, places, counts, np.random.default_rng(5))
     return chain, sensors, tour
 
 
 def test_every_planned_solution_is_visited_nearest_first(planned):
     chain, _, tour = planned
-    visits = simulate.visit(tour, chain)
+    visits = simulated_workcell.visit(tour, chain)
     q = np.zeros(len(chain))
     for split, poses in visits.items():
         assert len(poses) == tour.poses[split] > 0
@@ -106,7 +107,7 @@ def test_every_planned_solution_is_visited_nearest_first(planned):
 
 def test_the_tool_faces_the_sensor_it_aims_at(planned):
     chain, sensors, tour = planned
-    for poses in simulate.visit(tour, chain).values():
+    for poses in simulated_workcell.visit(tour, chain).values():
         for solutions in poses:
             T = chain.forward(solutions[0])
             line = sensors['tracker'].T_R_N[:3, 3] - T[:3, 3]
@@ -116,7 +117,7 @@ def test_the_tool_faces_the_sensor_it_aims_at(planned):
 def test_ranges_out_of_reach_are_refused(cell):
     cell.poses.radius_m = (4.0, 5.0)
     with pytest.raises(InputError, match=r'dropped poses: 5 out of reach: no pose is left'):
-        simulate.plan_tour(
+        simulated_workcell.plan_tour(
             cell.chain(),
             cell,
             {name: sensor.T_R_N for name, sensor in place_all(cell, 1).items()},
