@@ -42,7 +42,7 @@ def read_session(folder: str | os.PathLike[str]) -> Session:
     >>> remaster_ros.read_session('no_such_folder')
     Traceback (most recent call last):
     ...
-    remaster_ros.errors.InputError: no_such_folder: no such session folder; give the folder of session.yaml
+    remaster_ros.errors.InputError: no_such_folder: no such session folder; give ...
     """
     from remaster_ros.session import reader
 
