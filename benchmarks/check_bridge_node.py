@@ -72,6 +72,8 @@ BEFORE = (
 """Imported before the forks: slow, and nothing of what is changed."""
 DOMAIN = 216
 TIMEOUT_S = 120.0
+CONTROL, CONTROL_EVERY = 'control', 40
+"""After so many mutants the tests run without a change: on an overloaded machine these fail, too."""
 
 
 class Changed(SourceFileLoader, MetaPathFinder):
@@ -138,7 +140,14 @@ def judge(
         else:
             todo.append(mutant)
     lines = {mutant.name: mutant.line for mutant in mutants_of(text)}
+    control = Mutant(CONTROL, 0, 0, text)
+    for place in range(0, len(todo) + len(todo) // CONTROL_EVERY + 1, CONTROL_EVERY + 1):
+        todo.insert(place, control)
+    controls: Counter[str] = Counter()
     for mutant, fate in run_all(module, path, reached, todo, args.children):
+        if mutant is control:
+            controls[fate] += 1
+            continue
         fates[mutant.name] = fate
         if args.resume:
             with args.resume.open('a', encoding='utf-8') as file:
@@ -150,7 +159,8 @@ def judge(
     counts = Counter(fates.values())
     print(
         f'{module}: {len(fates)} mutants, {dict(counts)}, {len(alive) - len(left)} explained, '
-        f'{len(left)} not; tests {alone_s:.0f} s alone, all {time.monotonic() - began:.0f} s',
+        f'{len(left)} not; of {controls.total()} runs without a change {controls["survived"]} passed; '
+        f'tests {alone_s:.0f} s alone, all {time.monotonic() - began:.0f} s',
         flush=True,
     )
     for name in left if args.resume else ():
