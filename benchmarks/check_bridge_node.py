@@ -73,7 +73,7 @@ BEFORE = (
 DOMAIN = 216
 TIMEOUT_S = 120.0
 CONTROL, CONTROL_EVERY = 'control', 40
-"""After so many mutants the tests run without a change: on an overloaded machine these fail, too."""
+"""After so many mutants the tests run without a change; on an overloaded machine they fail too."""
 
 
 class Changed(SourceFileLoader, MetaPathFinder):
@@ -159,8 +159,8 @@ def judge(
     counts = Counter(fates.values())
     print(
         f'{module}: {len(fates)} mutants, {dict(counts)}, {len(alive) - len(left)} explained, '
-        f'{len(left)} not; of {controls.total()} runs without a change {controls["survived"]} passed; '
-        f'tests {alone_s:.0f} s alone, all {time.monotonic() - began:.0f} s',
+        f'{len(left)} not; {controls["survived"]} of {controls.total()} runs without a change '
+        f'passed; tests {alone_s:.0f} s alone, all {time.monotonic() - began:.0f} s',
         flush=True,
     )
     for name in left if args.resume else ():
