@@ -1,7 +1,8 @@
 # Everything from a fresh clone on a Linux machine with Python 3.11+ and pip:
 #   make demo     the main job on fake hardware; ends by saying where the report is
 #                 (OUT=folder SEED=n ARGS='--full' are handed on)
-#   make test     the tests (PYTEST='-k name' is handed on)
+#   make test     the tests, eight minutes (PYTEST='-k name' is handed on)
+#   make qualify  all of them, and the campaigns of minutes that make test leaves out; an hour
 #   make check    lint, types, layers; CI runs this and make test
 #   make bench    the benchmarks, small (BENCH='bench_speed …' chooses, FULL=1 for all sizes)
 #   make docs     docs/parameters.md from the code
@@ -11,7 +12,7 @@
 
 SHELL := /bin/bash
 .NOTPARALLEL:
-.PHONY: help demo test check bench docs faults format clean
+.PHONY: help demo test qualify check bench docs faults format clean
 
 ifneq ($(and $(ROS_DISTRO),$(AMENT_PREFIX_PATH)),)
 KIND := ros
@@ -30,7 +31,7 @@ export PYTHON
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 help:
-	@sed -n '1,10s/^# \{0,1\}//p' Makefile
+	@sed -n '1,11s/^# \{0,1\}//p' Makefile
 
 $(VENV)/installed: setup.py setup.cfg $(CONSTRAINTS) tools/make-venv
 	@tools/make-venv $(VENV) $(KIND)
@@ -40,9 +41,14 @@ demo: $(VENV)/installed
 	$(BIN)/remaster demo $(if $(OUT),--out '$(OUT)') $(if $(SEED),--seed $(SEED)) $(ARGS)
 
 # Plugins that happen to be on the machine stay out: launch_testing of ROS breaks with pytest 9.
+RUN_TESTS = PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest \
+	-p pytest_timeout -p _hypothesis_pytestplugin
 test: $(VENV)/installed
-	PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest \
-		-p pytest_timeout -p _hypothesis_pytestplugin $(PYTEST)
+	$(RUN_TESTS) -p xdist.plugin -n 2 --dist loadgroup $(PYTEST)
+
+# What make test leaves out: repetitions, sweeps, campaigns, every row of docs/faults.md; an hour.
+qualify: $(VENV)/installed
+	FAULTS_PAGE=none $(RUN_TESTS) -m '' test $(PYTEST)
 
 check: $(VENV)/installed
 	$(BIN)/ruff check .
@@ -75,8 +81,8 @@ docs: $(VENV)/installed
 	$(BIN)/python docs/make_parameters.py
 
 faults: $(VENV)/installed
-	FAULTS_PAGE=$(or $(FAULTS),write) PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest -q \
-		-p pytest_timeout test/integration/test_device_faults.py test/system/test_fault_rows.py
+	FAULTS_PAGE=$(or $(FAULTS),write) $(RUN_TESTS) -q \
+		test/integration/test_device_faults.py test/system/test_fault_rows.py
 
 format: $(VENV)/installed
 	$(BIN)/ruff check --fix .

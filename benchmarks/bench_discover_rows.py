@@ -20,8 +20,10 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import common  # noqa: F401  its folder of helpers
 import numpy as np
-from common import CELL, CHAIN, MARKER_OF, MARKERS, machine, sensor_frames, table
+from common import machine, table
+from paper_experiment import CELL, CHAIN, MARKER_OF, MARKERS, sensor_frames
 
 from remaster_ros.session.reader import write_session
 from remaster_ros.simulation.session_simulator import SimulatedSensor, simulate_session

@@ -18,8 +18,10 @@ from __future__ import annotations
 import argparse
 import time
 
+import common  # noqa: F401  its folder of helpers
 import numpy as np
-from common import OPTIMIZATION, experiment, machine, progress, table
+from common import machine, progress, table
+from paper_experiment import OPTIMIZATION, experiment
 from paper_model import DIMENSION, NAMES, PaperModel, product_mode, product_states
 from scipy.special import gammaln
 

@@ -1,7 +1,7 @@
 """Do the planner's moves hit anything? Twelve cells, judged by what shares nothing with it.
 
 Each cell is planned as the planner node does it, stop by stop; every move of the tours, from the
-first on, is given to an independent judge (benchmarks/path_judges.py): sampled at 1 mm, with
+first on, is given to an independent judge (test/path_judges.py): sampled at 1 mm, with
 bodies grown by half of that. Also printed: what is dropped and why, ways around, and the time of
 planning 60 + 60 candidates with all their ways.
 
@@ -12,20 +12,19 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-import time
 from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 
+import common  # noqa: F401  its folder of helpers
 import numpy as np
-from common import in_parallel, machine, table
+from common import machine, table
+from parallel import in_parallel
 from path_cells import SPECS, CellSpec, make_cell
 from path_judges import collides
+from planned_moves import tours
 
 from remaster_ros.kinematics.collision import FLOOR, OBSTACLE, SELF_COLLISION
-from remaster_ros.nodes.tour_planner import TourPlanner
-from remaster_ros.session.workcell import Workcell
-from remaster_ros.types import FloatArray
 
 
 class Tally(NamedTuple):
@@ -44,43 +43,6 @@ class Tally(NamedTuple):
     ways_s: list[float]
     slowest_s: float
     samples: int
-
-
-def tours(
-    cell: Workcell, seeds: range, candidates: int = 60
-) -> tuple[list[FloatArray], Counter[str], int, list[float], list[float], float]:
-    """Return every move (n, k) of tours of a cell, what was dropped, and the times."""
-    chain = cell.chain()
-    moves, dropped, no_path = [], Counter[str](), 0
-    planning, ways, slowest = [], [], 0.0
-    for seed in seeds:
-        counts = {'registration': 3, 'optimization': candidates, 'validation': candidates}
-        T_R_N = {}
-        for name, sensor in cell.sensors.items():
-            T_R_N[name] = np.eye(4)
-            T_R_N[name][:3, 3] = sensor.rough_position_m
-        start = time.thread_time()
-        planner = TourPlanner(cell, chain, counts, seed, np.deg2rad(1.0))
-        tour = planner.collection(T_R_N)
-        planning.append(time.thread_time() - start)
-        dropped.update(tour.dropped_solutions)
-        here = np.clip(np.zeros(len(chain)), chain.lower, chain.upper)
-        if planner.model.trouble(here):
-            here = next(iter(tour.plans['optimization'].poses)).solutions[0]
-        ways.append(0.0)
-        while True:
-            start = time.thread_time()
-            stop = tour.next(here)
-            took = time.thread_time() - start
-            ways[-1] += took
-            slowest = max(slowest, took)
-            if stop is None:
-                break
-            no_path += len(stop.unreached)
-            for way, solution in zip(stop.paths, stop.solutions):
-                moves.append(np.vstack((here, way, solution)))
-                here = solution
-    return moves, dropped, no_path, planning, ways, slowest
 
 
 def judge_cell(job: tuple[CellSpec, int]) -> Tally:

@@ -27,8 +27,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+import common  # noqa: F401  its folder of helpers
 import numpy as np
-from common import CELL, CHAIN, ROOT, experiment, machine, table
+from common import ROOT, machine, table
+from paper_experiment import CELL, CHAIN, experiment
 from paper_model import rigid_fit
 
 from remaster_ros.calibration.fit import fit_session

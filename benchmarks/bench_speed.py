@@ -33,9 +33,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
+import common  # noqa: F401  its folder of helpers
 import emcee
 import numpy as np
-from common import OPTIMIZATION, experiment, machine, progress, table
+from common import machine, progress, table
+from paper_experiment import OPTIMIZATION, experiment
 from paper_model import DIMENSION, NAMES, PaperModel, product_mode, product_states
 
 from remaster_ros.calibration import convergence

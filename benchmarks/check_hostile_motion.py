@@ -13,17 +13,14 @@ physics: see test/hostile_judge.py. Ends with status 1 if anything was wrong.
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import common  # noqa: F401  its folder of helpers
 import numpy as np
 from common import machine, progress, table
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test'))
-
 from hostile_campaign import in_parallel
 from hostile_judge import Rules
 from hostile_known import known_situations

@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import common  # noqa: F401  its folder of helpers
 import numpy as np
-from common import CHAIN
+from paper_experiment import CHAIN
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.laplace import Mode, find_mode

@@ -18,8 +18,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import common  # noqa: F401  its folder of helpers
 import numpy as np
-from common import experiment, progress, table
+from common import progress, table
+from paper_experiment import experiment
 
 from remaster_ros.calibration.accuracy import solution_pairs
 from remaster_ros.calibration.estimate import Problem, estimate

@@ -10,9 +10,9 @@ import pytest
 pytest.importorskip('fcl', reason='needs the judge: pip install python-fcl')
 pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
-from bench_paths import tours
 from path_cells import SPECS, make_cell
 from path_judges import collides
+from planned_moves import tours
 
 CELLS = [
     'LWR 4+, low, 3 held values',

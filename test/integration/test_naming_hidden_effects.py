@@ -37,6 +37,7 @@ def discovered(recipe: Recipe) -> tuple[Discovery, object]:
     return found, hidden
 
 
+@pytest.mark.qualify
 def test_single_effects_are_named_with_joint_and_size() -> None:
     """Eight of the sixteen, drawn with everything else.
 
@@ -87,6 +88,7 @@ def test_nothing_is_named_where_nothing_is(noise: str) -> None:
     assert not found.effects
 
 
+@pytest.mark.qualify
 def test_two_effects_at_once() -> None:
     """Two joints that sag, where the greedy choice is a coupling, and backlash beside."""
     found, hidden = discovered(

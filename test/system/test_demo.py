@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from conftest import ROOT, call, node_arguments, wait_until
+from ros_rig import ROOT, call, node_arguments, wait_until
 
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -179,6 +179,7 @@ def test_third_parties_open_the_bag(demo):
     assert frames == {'mocap'}
 
 
+@pytest.mark.qualify
 def test_a_replay_at_ten_times_the_speed_gives_the_same_session_and_fit(
     demo, start, client, tmp_path
 ):

@@ -7,7 +7,7 @@ import sys
 import pytest
 import yaml
 from command_line import remaster
-from conftest import call, node_arguments, wait_until
+from ros_rig import call, node_arguments, wait_until
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(420)]
 
@@ -59,6 +59,7 @@ def test_a_healthy_arm_is_answered_with_figures_and_again(start, client, tmp_pat
     assert 'None. Every combination' in (out / 'report.html').read_text()
 
 
+@pytest.mark.qualify
 def test_a_demo_finds_what_is_hidden_and_opens_the_truth_at_the_end(ros_environment, tmp_path):
     out = tmp_path / 'out'
     process = subprocess.run(

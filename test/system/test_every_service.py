@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from command_line import remaster
-from conftest import call, node_arguments, wait_until
+from ros_rig import call, node_arguments, wait_until
 
 from remaster_ros.session.reader import read_session, write_session
 

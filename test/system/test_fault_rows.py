@@ -14,7 +14,7 @@ import fault_page
 import fault_rows
 import numpy as np
 import pytest
-from conftest import ROOT, _domains
+from ros_rig import ROOT, domains
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -50,7 +50,7 @@ class Benches:
 
             folder = self._folders.mktemp(f'faults_{next(self._numbers)}')
             self._kind, self.broken = kind, True
-            self._bench = Bench(folder, next(_domains), **fault_rows.BENCHES[kind])
+            self._bench = Bench(folder, next(domains), **fault_rows.BENCHES[kind])
             self._bench.begin()
         return self._bench
 
@@ -142,7 +142,7 @@ def test_a_robot_that_copies_its_commands_never_moves(tmp_path):
     """Found by a probe of a micrometre, before the first motion."""
     from fault_bench import Bench
 
-    bench = Bench(tmp_path, next(_domains))
+    bench = Bench(tmp_path, next(domains))
     try:
         bench.inject(robot={'copy': 1})
         bench.until(lambda: bench.observer.says('pose_planner', 'robot') == 'heard', 90, 'it')
@@ -168,7 +168,7 @@ def test_offsets_that_are_none(fault, tmp_path):
     environment = {
         **os.environ,
         'PYTHONPATH': os.pathsep.join(filter(None, (str(ROOT), os.environ.get('PYTHONPATH')))),
-        'ROS_DOMAIN_ID': str(next(_domains)),
+        'ROS_DOMAIN_ID': str(next(domains)),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
     }
     command = [sys.executable, '-m', 'remaster_ros.nodes', 'robot_bridge', '--ros-args']

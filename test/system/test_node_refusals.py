@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import pytest
-from conftest import node_arguments
+from ros_rig import node_arguments
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 

@@ -9,7 +9,7 @@ import sys
 import time
 
 import pytest
-from conftest import node_arguments, wait_until
+from ros_rig import node_arguments, wait_until
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 

@@ -1,7 +1,7 @@
 """Best-effort joint states are taken; what does not match is said."""
 
 import pytest
-from conftest import node_arguments, wait_until
+from ros_rig import node_arguments, wait_until
 
 from remaster_ros.session.workcell import read_cell
 

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import ROOT, node_arguments, wait_until
+from ros_rig import ROOT, node_arguments, wait_until
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import (
@@ -269,6 +269,7 @@ def register(rig, q, shift):
             return future.result()
 
 
+@pytest.mark.qualify
 def test_three_points_that_do_not_agree_register_nothing(rig):
     """Off by 0.15 m: not the marker, and far from what an arm to be calibrated is off by."""
     rig = rig('mocap')

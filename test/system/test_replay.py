@@ -1,7 +1,7 @@
 """A replay moves no arm: on a live graph it ends with status 2, and it leaves commands out."""
 
 import pytest
-from conftest import node_arguments, wait_until
+from ros_rig import node_arguments, wait_until
 
 from remaster_ros.session.bag import BagReader
 from remaster_ros.session.bag_writer import BagWriter

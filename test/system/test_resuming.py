@@ -4,8 +4,8 @@ import os
 import time
 
 import pytest
-from conftest import call, node_arguments
-from test_going_on import Cell
+from collection_rig import Cell
+from ros_rig import call, node_arguments
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -56,6 +56,7 @@ def test_a_killed_planner_goes_on_in_its_run(cell):
     cell.check(cell.complete())
 
 
+@pytest.mark.qualify
 @pytest.mark.parametrize('other', ['recorder', 'robot_bridge'])
 def test_it_waits_where_somebody_else_was_started_again(cell, other):
     restart(cell, other)
@@ -67,6 +68,7 @@ def test_it_waits_where_somebody_else_was_started_again(cell, other):
     cell.check(cell.complete())
 
 
+@pytest.mark.qualify
 def test_it_waits_after_a_pause_and_whatever_the_files_are_dated(cell):
     """Paused and killed at once; then a plan file that is dated in the future."""
     assert call(cell.client, '/remaster/pause').success
@@ -80,6 +82,7 @@ def test_it_waits_after_a_pause_and_whatever_the_files_are_dated(cell):
     stands(cell)
 
 
+@pytest.mark.qualify
 def test_a_session_of_another_day_waits(start, cell, tmp_path):
     """What a killed cell has left, with a plan file dated now: nobody holds its token."""
     for process in cell.nodes.values():

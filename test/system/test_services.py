@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 from command_line import remaster
-from conftest import call, node_arguments, wait_until
+from ros_rig import call, node_arguments, wait_until
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 

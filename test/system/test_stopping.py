@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import wait_until
+from ros_rig import wait_until
 
 from remaster_ros.session.reader import read_session
 
@@ -66,6 +66,7 @@ def test_while_it_starts(start, tmp_path, moment_s, signum):
     assert 'Traceback' not in process.stderr.read()
 
 
+@pytest.mark.qualify
 def test_while_it_collects(start, tmp_path):
     out = tmp_path / 'out'
     process = start(

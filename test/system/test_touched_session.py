@@ -5,7 +5,7 @@ import subprocess
 import time
 
 import pytest
-from test_going_on import Cell
+from collection_rig import Cell
 
 from remaster_ros.session.reader import read_session
 
@@ -60,6 +60,7 @@ def test_what_an_editor_did_is_undone_and_a_renamed_folder_holds_the_arm(start, 
     assert len(session.measurements) == int(cell.recorder('observations'))
 
 
+@pytest.mark.qualify
 def test_a_removed_folder_is_said_and_its_observations_come_back(start, client, tmp_path):
     cell = begun(start, client, tmp_path)
     shutil.rmtree(cell.session)

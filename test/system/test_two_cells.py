@@ -5,7 +5,7 @@ import socket
 import numpy as np
 import pytest
 import yaml
-from conftest import ROOT, call, wait_until
+from ros_rig import ROOT, call, wait_until
 
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain

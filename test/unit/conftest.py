@@ -16,7 +16,7 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.simulation.session_simulator import SimulatedSensor, simulate_session
 from remaster_ros.types import BasePrior, Measurements, Session
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 HOSTILE_NAME = 'tracker<script>&$x_{$'
 
 URDF = """<?xml version="1.0"?>

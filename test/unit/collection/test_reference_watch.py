@@ -222,6 +222,7 @@ def test_a_drift_is_told_from_a_bump():
         assert found[-1].size_m == pytest.approx(9e-4, rel=0.2)
 
 
+@pytest.mark.qualify
 def test_nothing_is_found_in_nothing():
     """At most 1 % of sessions have any alarm: 4 of 400 are expected, 11 have odds of 1 in 300."""
     alarms = 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from calibration_scenes import CHAIN, MARKERS, URDF, sensors
 from discovery_scenes import residuals_of
 
@@ -16,6 +17,7 @@ SCALE = 50e-6
 ECCENTRICITY_RAD = np.radians(0.03)
 
 
+@pytest.mark.qualify
 def test_curves_that_stand_in_for_a_weak_cause_give_way_to_it():
     """An eccentric encoder and a scale: curves of three joints explain both, and the scale better.
 

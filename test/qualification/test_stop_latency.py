@@ -4,7 +4,7 @@ import sys
 import time
 
 import pytest
-from conftest import node_arguments
+from ros_rig import node_arguments
 
 from remaster_ros.session.workcell import read_cell
 

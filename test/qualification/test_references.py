@@ -4,8 +4,8 @@ import csv
 
 import numpy as np
 import pytest
-from conftest import call
-from test_going_on import Cell
+from collection_rig import Cell
+from ros_rig import call
 
 from remaster_ros.session.journal import read_journal
 from remaster_ros.session.reader import read_session

@@ -13,8 +13,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from bench_calibration import RANKS, Outcome, one_session
-from common import in_parallel
+from calibration_study import RANKS, Outcome, one_session
+from parallel import in_parallel
 from scipy.stats import binom, chi2, kstest
 
 pytestmark = pytest.mark.slow

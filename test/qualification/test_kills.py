@@ -6,12 +6,12 @@ benchmarks/bench_kills.py is the long version.
 import os
 import random
 import signal
-import sys
 import time
 
 import pytest
 import yaml
-from conftest import ROOT, wait_until
+from kill_judge import judge, node_processes
+from ros_rig import wait_until
 
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
@@ -24,11 +24,6 @@ SENSOR_NODES = ('optitrack_markers', 'laser_tracker_markers')
 
 def test_killed_nodes_cost_nothing(start, tmp_path):
     """Recorder, planner, bridge and a random sensor node, one after the other."""
-    sys.path.insert(0, str(ROOT / 'benchmarks'))
-    try:
-        from bench_kills import judge, node_processes
-    finally:
-        sys.path.pop(0)
     print('seed', SEED)
     chooser = random.Random(SEED)
     out = tmp_path / 'out'

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import call, wait_until
+from ros_rig import call, wait_until
 
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain

@@ -1,0 +1,112 @@
+"""A small collection of real nodes on fake devices, without the demo around them."""
+
+import socket
+
+import numpy as np
+from ros_rig import ROOT, call, node_arguments, wait_until
+
+from remaster_ros.kinematics import transforms
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.nodes.demo import free_ports
+from remaster_ros.session.journal import read_journal
+from remaster_ros.session.reader import read_session
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.simulation.setup import make_world
+
+SEED = 11
+
+
+class Cell:
+    """A small collection of real nodes on fake devices, and what they say."""
+
+    def __init__(self, start, client, folder, require, sensors, candidates=2, reference_every=0):
+        from remaster_ros.nodes.status import listen
+
+        self.client, self.folder, self.session = client, folder, folder / 'session'
+        print('seed', SEED)
+        self.world = make_world(folder / 'world', read_cell('demo'), SEED, 10.0)
+        self.said, self.messages, self.results, self.events = {}, {}, [], []
+        listen(client, self._event, self._summary)
+        command, data, tracker = free_ports(
+            socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM
+        )
+        own = {
+            'fake_robot': {'world': folder / 'world'},
+            'pose_planner': {
+                'session': self.session,
+                'optimization_candidates': candidates,
+                'validation_candidates': 1,
+                'registration_candidates': 6,
+                'reference_every': reference_every,
+            },
+            'robot_bridge': {},
+            'recorder': {'session': self.session, 'require': require},
+        }
+        if 'mocap' in sensors:
+            ports = {'command_port': command, 'data_port': data}
+            own['fake_optitrack'] = {'world': folder / 'world', **ports}
+            own['optitrack_markers'] = ports
+        if 'tracker' in sensors:
+            own['fake_laser_tracker'] = {'world': folder / 'world', 'port': tracker}
+            own['laser_tracker_markers'] = {'port': tracker}
+        common = ROOT / 'config' / 'fake.yaml'
+
+        def begin(name):
+            # By the node's name, which in the file counts more than none.
+            values = {f'{name}:{key}': value for key, value in own[name].items()}
+            return start(f'remaster_ros.nodes.{name}', *node_arguments(common, **values))
+
+        self._begin = begin
+        self.nodes = {name: begin(name) for name in own}
+        self.until(lambda: self.said.get('pose_planner', {}).get('robot') == 'heard', 'the robot')
+        response = call(client, '/remaster/collect')
+        assert response.success, response.message
+
+    def kill_and_start(self, name):
+        self.nodes[name].kill()
+        self.nodes[name].wait()
+        self.nodes[name] = self._begin(name)
+
+    def _summary(self, node, message, values):
+        self.said[node], self.messages[node] = values, message
+
+    def _event(self, event):
+        self.events.append(event)
+        if (event.node, event.event) == ('recorder', 'configuration'):
+            self.results.append(event.values['result'])
+
+    def until(self, condition, what, timeout_s=120):
+        def turn():
+            for _ in range(20):
+                self.client.spin_some()
+            for name, process in self.nodes.items():
+                assert process.poll() is None, (name, process.communicate())
+            return condition()
+
+        try:
+            wait_until(turn, timeout_s, what)
+        except AssertionError:
+            print(self.messages, self.said)
+            raise
+
+    def recorder(self, key):
+        return self.said.get('recorder', {}).get(key, '')
+
+    def complete(self):
+        self.until(lambda: self.recorder('exit_status') == 'complete', 'the end')
+        return read_session(self.session)
+
+    def check(self, session):
+        """Each row once, and where the truth has its marker."""
+        chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+        m, truth = session.measurements, self.world.truth
+        for index, name in enumerate(session.sensor_names):
+            sensor, mine = truth.sensors[name], m.sensor == index
+            marker_R = chain.positions(m.q[mine], sensor.marker, truth.joint_offsets)
+            expected = transforms.apply(transforms.inverse(sensor.T_R_N), marker_R)
+            assert np.all(np.linalg.norm(m.position[mine] - expected, axis=1) < 0.4e-3), name
+        pairs = list(zip(m.configuration.tolist(), m.sensor.tolist()))
+        assert len(set(pairs)) == len(pairs)
+        tours = [r for r in read_journal(self.session / 'plan.jsonl').records if 'plans' in r]
+        planned = sum(len(p['solutions']) for s in tours[-1]['plans'].values() for p in s['poses'])
+        assert len(set(m.configuration.tolist())) == planned > 3

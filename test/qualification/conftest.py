@@ -1,0 +1,3 @@
+"""Campaigns of minutes: `make qualify` runs them, `make test` does not."""
+
+from ros_rig import client, ros_environment, start  # noqa: F401  fixtures

@@ -1,0 +1,111 @@
+"""Tests of real processes: each has a DDS domain, a ROS_HOME and processes of its own."""
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+# Of two test processes at a time, each counts from a place of its own.
+_worker = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
+domains = itertools.count(110 + 40 * (_worker % 2) + os.getpid() % 10)
+
+
+@pytest.fixture(scope='module')
+def ros_environment(tmp_path_factory):
+    """Return an environment with a DDS domain and a ROS_HOME of its own, on this machine only."""
+    pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get('PYTHONPATH'))))
+    return {
+        **os.environ,
+        'PYTHONPATH': path,
+        'ROS_DOMAIN_ID': str(next(domains)),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        # A halt is kept there: none of another test's.
+        'ROS_HOME': str(tmp_path_factory.mktemp('ros_home')),
+    }
+
+
+@pytest.fixture
+def start(ros_environment):
+    """Return a function that starts `python -m MODULE …`; whatever runs is ended with the test."""
+    running = []
+
+    def begin(module, *args, **options):
+        process = subprocess.Popen(
+            [sys.executable, '-m', module, *map(str, args)],
+            env=ros_environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            **options,
+        )
+        running.append(process)
+        return process
+
+    yield begin
+    for process in running:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+    for process in running:
+        try:
+            process.communicate(timeout=15)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+
+
+@pytest.fixture
+def client(ros_environment):
+    """Return a node in the test's own DDS domain that is spun by hand."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=int(ros_environment['ROS_DOMAIN_ID']))
+    node = rclpy.create_node('test_client', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    node.spin_some = lambda: executor.spin_once(timeout_sec=0.02)
+    yield node
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def node_arguments(params_file=None, **values):
+    """Return the arguments that give a node its parameters."""
+    args = ['--ros-args']
+    if params_file is not None:
+        args += ['--params-file', str(params_file)]
+    for name, value in values.items():
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        args += ['-p', f'{name}:={text}']
+    return args
+
+
+def wait_until(condition, timeout_s, what):
+    """Poll until `condition()` holds; fail the test after `timeout_s`."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, f'waited {timeout_s} s in vain for {what}'
+        time.sleep(0.05)
+
+
+def call(client, service, timeout_s=120):
+    """Call a Trigger service and return its response."""
+    from std_srvs.srv import Trigger
+
+    caller = client.create_client(Trigger, service)
+    assert caller.wait_for_service(timeout_sec=20.0), service
+    future = caller.call_async(Trigger.Request())
+    deadline = time.monotonic() + timeout_s
+    while not future.done():
+        assert time.monotonic() < deadline, f'no answer of {service}'
+        client.spin_some()
+    return future.result()
