@@ -190,7 +190,7 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
     cells = [
         cell
         for name, effect in EFFECTS.items()
-        if name not in untestable and name != 'marker_offset'
+        if name not in untestable and not effect.moves_the_fit
         for cell in effect.cells(residuals.context)
     ]
     search = Search(

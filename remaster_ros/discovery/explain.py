@@ -117,7 +117,7 @@ def describe(
     solution = selection.solution
     if not solution.cells:
         return (), ()
-    catalogue = Catalogue.of(data, [cell for cell in cells if cell.name != 'gear_periodic'])
+    catalogue = Catalogue.of(data, [cell for cell in cells if not EFFECTS[cell.name].costly])
     groups = sorted(grouped(solution.cells), key=lambda group: -_size(data, solution, group))
     parts = shares(data, groups, solution)
     effects = []
@@ -280,14 +280,15 @@ def in_words(group: Sequence[Cell], context: Context) -> str:
     """Return the sentence for a technician, with what the session cannot tell."""
     first = group[0]
     joints = _joints(group)
-    subject = first.subject or _listed(joints if first.name != 'joint_coupling' else joints[:1])
+    effect = EFFECTS[first.name]
+    subject = first.subject or _listed(joints[:1] if effect.driven_by_joint else joints)
     other = f'joint {joints[1]}' if len(joints) > 1 else ''
     place = first.place.replace('_', ' ')
     if first.joints:
         place += f' of joint {first.joints[0]}'
     if first.subject:
         place += f' of {first.subject}'
-    sentence = EFFECTS[first.name].sentence.format(
+    sentence = effect.sentence.format(
         subject=subject, other=other, driver=first.driver.replace('_', ' '), place=place
     )
     sentence = sentence[:1].upper() + sentence[1:]

@@ -7,17 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.registry import EFFECTS
 
-# Physical causes that strike all joints or links of an arm alike.
-FAMILIES: tuple[tuple[str, ...], ...] = (
-    ('joint_compliance',),
-    ('encoder_eccentricity',),
-    ('encoder_scale',),
-    ('backlash',),
-    ('settling',),
-    ('link_length', 'joint_axis_tilt'),
-    ('joint_error_curve',),
+FAMILIES: tuple[tuple[str, ...], ...] = tuple(
+    tuple(name for name, effect in EFFECTS.items() if effect.family == family)
+    for family in dict.fromkeys(effect.family for effect in EFFECTS.values() if effect.family)
 )
+"""Names of the effects of each family."""
 
 
 def relatives(cells: Sequence[Cell], cell: Cell) -> int:
@@ -50,7 +46,8 @@ def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
     groups: dict[tuple[str, ...], list[Cell]] = {}
     for cell in cells:
         key: tuple[str, ...] = (cell.name, cell.driver, cell.form, cell.subject)
-        if cell.name in ('unnamed', 'joint_coupling', 'gear_periodic'):
-            key += (str(cell.joints), cell.variant if cell.name == 'unnamed' else '')
+        cause_per = EFFECTS[cell.name].cause_per
+        if cause_per != 'effect':
+            key += (str(cell.joints), cell.variant if cause_per == 'variant' else '')
         groups.setdefault(key, []).append(cell)
     return [tuple(group) for group in groups.values()]

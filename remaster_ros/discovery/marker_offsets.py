@@ -13,13 +13,12 @@ import numpy as np
 from scipy.stats import chi2
 
 from remaster_ros.calibration.estimate import Estimate
-from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.effects.marker_offset import EFFECT as MARKER_OFFSET
 from remaster_ros.discovery.evidence import Solution
 from remaster_ros.discovery.explain import FoundEffect, Parameter
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.types import BoolArray, FloatArray, Priors, Session
 
-MARKER_OFFSET = 'marker_offset'
 # What the prior pulled back is further off than the fit says.
 FURTHER = 3.0
 # Family-wise error over all markers.
@@ -79,7 +78,7 @@ def loosened(session: Session, moved: Sequence[FoundEffect]) -> Priors | None:
     """
     places = {}
     for effect in moved:
-        if effect.name == MARKER_OFFSET:
+        if effect.name == MARKER_OFFSET.name:
             name = effect.parameters[0].name.removeprefix('x_')
             std = float(np.hypot(session.marker_std_m, FURTHER * (effect.size_m or 0.0)))
             places[name] = (session.markers[name], std)
@@ -120,7 +119,7 @@ def _effect(
     square: float,
     rank: int,
 ) -> FoundEffect:
-    effect = EFFECTS[MARKER_OFFSET]
+    effect = MARKER_OFFSET
     cause = effect.sentence.format(subject=name)
     if blind.any():
         unseen = ' and '.join(axis for axis, hidden in zip('xyz', blind, strict=True) if hidden)

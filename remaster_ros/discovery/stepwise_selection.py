@@ -18,6 +18,7 @@ import numpy as np
 
 from remaster_ros.discovery.cross_validation import held_out_error, worth_of
 from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import Solution, solve
 from remaster_ros.discovery.families import FAMILIES, family_log_prior, grouped, relatives
 from remaster_ros.discovery.residuals import Residuals
@@ -102,7 +103,7 @@ class Search:
     progress: Callable[[float], None]
 
     def __post_init__(self) -> None:
-        self._cheap = np.array([cell.name != 'gear_periodic' for cell in self.cells])
+        self._cheap = np.array([not EFFECTS[cell.name].costly for cell in self.cells])
         self._look_at(self.data)
 
     def _look_at(self, data: Residuals) -> None:
@@ -184,11 +185,11 @@ class Search:
 
     def grown(self, solution: Solution, family: tuple[str, ...]) -> Solution | None:
         """Return the set with all of a family that the data can see, less what does not pay."""
-        members = [cell for cell in self.catalogue.cells if cell.name in family]
-        if family == ('encoder_eccentricity',):
-            members = [cell for cell in members if cell.variant == '1+2']
-        if 'joint_axis_tilt' in family:
-            members = [cell for cell in members if len(cell.parameters) == 1]
+        members = [
+            cell
+            for cell in self.catalogue.cells
+            if cell.name in family and EFFECTS[cell.name].in_family(cell)
+        ]
         present = {(cell.name, cell.joints, cell.label) for cell in solution.cells}
         others = [cell for cell in members if (cell.name, cell.joints, cell.label) not in present]
         new = self.visible(solution.cells, others)

@@ -47,4 +47,5 @@ EFFECT = Effect(
     separate_by='each pose approached from both sides, by small and by large moves',
     cells=cells,
     needs=needs_approach,
+    family='backlashes',
 )

@@ -135,6 +135,21 @@ class Effect:
         All of its cells for a context.
     needs
         Tells why a context cannot show it; '' where it can.
+    family
+        Effects of one family strike all joints or links alike: they are tried together, too, and
+        share their prior probability. '' for an effect that comes alone.
+    in_family
+        Which of its cells are tried with the family: one for each joint, not every variant.
+    cause_per
+        How cells make causes: all cells of an ``effect`` are one cause, those of the same
+        ``joints``, or those of the same joints and ``variant``.
+    costly
+        It has too many cells to be tried again and again.
+    moves_the_fit
+        The offsets model absorbs it: it is judged by how far that fit moved the markers
+        (`marker_offsets`), not by the residuals.
+    driven_by_joint
+        Its cells' second joint is the one that drives; the sentence is about the first.
     """
 
     name: str
@@ -149,6 +164,12 @@ class Effect:
     separate_by: str
     cells: Callable[[Context], Iterable[Cell]]
     needs: Callable[[Context], str] = field(default=lambda context: '')
+    family: str = ''
+    in_family: Callable[[Cell], bool] = field(default=lambda cell: True)
+    cause_per: Literal['effect', 'joints', 'variant'] = 'effect'
+    costly: bool = False
+    moves_the_fit: bool = False
+    driven_by_joint: bool = False
 
 
 def at_joint(joint: int, *features: FloatArray) -> Design:

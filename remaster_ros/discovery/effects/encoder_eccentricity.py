@@ -53,4 +53,6 @@ EFFECT = Effect(
     sentence='The angle reading of {subject} errs once or twice per turn (encoder off centre).',
     separate_by='poses that turn the joint through its whole range, at the same gravity torque',
     cells=cells,
+    family='encoder eccentricities',
+    in_family=lambda cell: cell.variant == '1+2',
 )

@@ -40,4 +40,5 @@ EFFECT = Effect(
     sentence='The true turn of {subject} is not what is reported (gear ratio or encoder scale).',
     separate_by='poses that turn the joint through its whole range',
     cells=cells,
+    family='encoder scales',
 )

@@ -51,4 +51,6 @@ EFFECT = Effect(
     sentence='The gearbox of {subject} runs unevenly, in step with its teeth.',
     separate_by='poses that step the joint finely through one period, all else held',
     cells=cells,
+    cause_per='joints',
+    costly=True,
 )

@@ -68,4 +68,6 @@ EFFECT = Effect(
     sentence='The axis of {subject} is tilted against its drawing.',
     separate_by='all joint solutions of each pose: the tilt changes sign with the branch',
     cells=cells,
+    family='geometry',
+    in_family=lambda cell: cell.size == 1,
 )

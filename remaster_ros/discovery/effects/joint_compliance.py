@@ -47,4 +47,5 @@ EFFECT = Effect(
     separate_by='the same poses with and without a payload on the tool',
     cells=cells,
     needs=needs_gravity,
+    family='joint compliances',
 )

@@ -55,4 +55,6 @@ EFFECT = Effect(
     sentence='The angle of {subject} follows the angle of {other} (coupled drives).',
     separate_by='poses that turn one of the two joints and hold the other',
     cells=cells,
+    cause_per='joints',
+    driven_by_joint=True,
 )

@@ -66,4 +66,5 @@ EFFECT = Effect(
     separate_by='poses that step the joint through its range, all else held; '
     'with and without a payload',
     cells=cells,
+    family='joint error curves',
 )

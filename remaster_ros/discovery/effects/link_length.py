@@ -63,4 +63,6 @@ EFFECT = Effect(
     sentence='The link after {subject} is longer, shorter or offset against its drawing.',
     separate_by='poses that fold and stretch the arm, with the tool turned at each',
     cells=cells,
+    family='geometry',
+    in_family=lambda cell: cell.size == 1,
 )

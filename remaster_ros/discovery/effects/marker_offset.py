@@ -47,4 +47,5 @@ EFFECT = Effect(
     sentence='The marker {subject} is not where the session says it is on the tool.',
     separate_by='the marker measured against the tool plate, or the last joint turned by itself',
     cells=cells,
+    moves_the_fit=True,
 )

@@ -47,4 +47,5 @@ EFFECT = Effect(
     separate_by='longer waiting before each measurement, and large moves from both sides',
     cells=cells,
     needs=needs_approach,
+    family='settling joints',
 )

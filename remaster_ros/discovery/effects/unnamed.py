@@ -374,4 +374,5 @@ EFFECT = Effect(
     sentence='No named cause: {place} follows {driver}.',
     separate_by='poses in which {driver} changes and all else is held',
     cells=cells,
+    cause_per='variant',
 )

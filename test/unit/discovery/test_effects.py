@@ -1,8 +1,10 @@
 """Every effect's columns against numerical derivatives of its own equation."""
 
+import ast
 import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,8 +17,10 @@ from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.splines import basis, centers, knot_vector, roughness
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, rotation_vector_to_matrix, transform
+from remaster_ros.simulation.hidden_effects import NAMED
 
 STEP = 1e-6
+DISCOVERY = Path(__file__).parents[3] / 'remaster_ros' / 'discovery'
 
 
 @cache
@@ -193,3 +197,16 @@ def test_splines_sum_to_one_and_repeat_straight_lines():
     line = centers(knots)
     centered = line - line.mean()
     assert centered @ roughness(len(line)) @ centered < 0.01 * centered @ centered
+
+
+def test_every_named_effect_can_be_hidden():
+    """In the simulation's own equations, so that a test can ask whether it is found."""
+    assert set(NAMED) == set(EFFECTS) - {'unnamed'}
+
+
+@pytest.mark.parametrize('path', sorted(DISCOVERY.glob('*.py')), ids=lambda path: path.stem)
+def test_the_search_names_no_effect(path):
+    """What is special about an effect stands in its own file, as one of its attributes."""
+    tree = ast.parse(path.read_text(encoding='utf-8'))
+    texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+    assert not texts & set(EFFECTS)
