@@ -164,6 +164,9 @@ class Campaign:
         else:
             time.sleep(1.0)
         outcome.halted = bench.seen.halted(shown_from)
+        if kind.expected == 'halt' and not outcome.halted and bench.seen.summaries:
+            _, text, values = bench.seen.summaries[-1]
+            scene.note += f'; {bench.planner}; {text}; {values}'
         silent_from = scene.silent_from
         if outcome.halted:
             silent_from = silent_from or bench.seen.halt_time(shown_from)

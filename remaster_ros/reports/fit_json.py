@@ -14,225 +14,134 @@ import numpy as np
 from remaster_ros.compensation.export import exports
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
+from remaster_ros.reports import schemas
 from remaster_ros.session.files import cannot_write, make_folder, read_limited, write_atomically
 from remaster_ros.types import FloatArray, Session
 from remaster_ros.version import __version__
 
 if TYPE_CHECKING:
-    from remaster_ros.calibration.result import FitResult
+    from remaster_ros.calibration.result import FitResult, NoiseEstimate
 
-FORMAT = 'remaster-fit/1'
 FIT_FILE = 'fit.json'
 REPORT_FILE = 'report.html'
 APPLY_FOLDER = 'apply'
 FIT_LIMIT = 64 * 1024**2
 
 
-class _JointOffset(msgspec.Struct):
-    """One joint's zero-offset; where ``identifiable`` is false, ``why`` says what hides it."""
-
-    joint: str
-    mean_deg: float
-    std_deg: float
-    interval95_deg: tuple[float, float]
-    identifiable: bool
-    why: str
-
-
-class _GaugeDirection(msgspec.Struct):
-    """A combination of parameters that the data cannot see, and what fixes it."""
-
-    combination: dict[str, float]
-    why: str
-    fixed_by: str
-
-
-class _Registration(msgspec.Struct):
-    """T_R_N: the sensor's frame N in the robot base R."""
-
-    translation_m: tuple[float, float, float]
-    rotation_xyzw: tuple[float, float, float, float]
-    std_m: tuple[float, float, float]
-    std_rad: tuple[float, float, float]
-
-
-class _Marker(msgspec.Struct):
-    """A marker's position in the tool frame T."""
-
-    position_m: tuple[float, float, float]
-    std_m: tuple[float, float, float]
-
-
-class _Noise(msgspec.Struct):
-    """A sensor's noise per axis: of one row, and common to a pose (None: not told apart)."""
-
-    sigma_m: float
-    std_m: float
-    pose_sigma_m: float | None
-
-
-class _Sampler(msgspec.Struct):
-    """How the posterior was sampled; ``draws`` are kept draws of each chain."""
-
-    name: str
-    chains: int
-    draws: int
-    r_hat_max: float | None
-    ess_min: float | None
-    seconds: float | None
-
-
-class _Accuracy(msgspec.Struct):
-    """The three metrics by split; ``validation`` is None where nothing was held out."""
-
-    optimization: dict[str, Any] | None
-    validation: dict[str, Any] | None
-
-
-class _LeftOut(msgspec.Struct):
-    """A row that was not fitted, and why."""
-
-    observation: int
-    why: str
-
-
-class _Fit(msgspec.Struct):
-    """What the contract asks of fit.json."""
-
-    format: str
-    joint_offsets: list[_JointOffset]
-    gauge: list[_GaugeDirection]
-    registration: dict[str, _Registration]
-    markers: dict[str, _Marker]
-    noise: dict[str, _Noise]
-    sampler: _Sampler
-    accuracy: _Accuracy
-    left_out: list[_LeftOut]
-
-
-def fit_to_dict(result: FitResult) -> dict[str, Any]:
-    """Return a fit as fit.json has it.
-
-    Beyond the contract it holds ``version`` of this program, ``robot`` (name, joints, SHA-256 of
-    the URDF), ``session`` (what was measured) and ``parameters`` (every parameter's mean, std and
-    convergence, in the units of its name: m and rad), and ``explained_by_noise``: of every sensor
-    the mean error after (held out where there are such rows, without the worst twentieth) and what
-    the noise makes that the sensor states and that shows within poses (null where neither does).
-    """
-    session = result.session
+def fit_content(result: FitResult) -> schemas.Fit:
+    """Return a fit as fit.json has it."""
+    session, sampler = result.session, result.sampler
     draws = result.draws.reshape(-1, result.draws.shape[-1])
     mean, std = draws.mean(axis=0), draws.std(axis=0, ddof=1)
-    sampler = result.sampler
-    return {
-        'format': FORMAT,
-        'version': __version__,
-        'robot': {
-            'name': result.chain.name,
-            'urdf_sha256': session.urdf_sha256,
-            'joint_names': list(result.joint_names),
-            'base_link': session.base_link,
-            'tip_link': session.tip_link,
-        },
-        'session': _describe(session),
-        'joint_offsets': [
-            {
-                'joint': joint,
-                'mean_deg': float(np.degrees(result.joint_offsets[i])),
-                'std_deg': float(np.degrees(result.joint_offsets_std[i])),
-                'interval95_deg': np.degrees(result.joint_offsets_interval95[i]).tolist(),
-                'identifiable': bool(result.identifiable[i]),
-                'why': str(result.why[i]),
-            }
+    return schemas.Fit(
+        format=schemas.FIT_FORMAT,
+        version=__version__,
+        robot=schemas.Robot(
+            name=result.chain.name,
+            urdf_sha256=session.urdf_sha256,
+            joint_names=list(result.joint_names),
+            base_link=session.base_link,
+            tip_link=session.tip_link,
+        ),
+        session=_describe(session),
+        joint_offsets=[
+            schemas.JointOffset(
+                joint=joint,
+                mean_deg=float(np.degrees(result.joint_offsets[i])),
+                std_deg=float(np.degrees(result.joint_offsets_std[i])),
+                interval95_deg=np.degrees(result.joint_offsets_interval95[i]).tolist(),
+                identifiable=bool(result.identifiable[i]),
+                why=str(result.why[i]),
+            )
             for i, joint in enumerate(result.joint_names)
         ],
-        'gauge': [
-            {
-                'combination': {k: float(v) for k, v in direction.combination.items()},
-                'why': direction.why,
-                'fixed_by': direction.fixed_by,
-            }
-            for direction in result.gauge
+        gauge=[
+            schemas.GaugeCombination(
+                combination={name: float(share) for name, share in seen.combination.items()},
+                why=seen.why,
+                fixed_by=seen.fixed_by,
+            )
+            for seen in result.gauge
         ],
-        'registration': {
-            sensor: {
-                'translation_m': T_R_N[:3, 3].tolist(),
-                'rotation_xyzw': quaternion_xyzw(T_R_N[:3, :3]).tolist(),
-                'std_m': result.T_R_N_std_m[sensor].tolist(),
-                'std_rad': result.T_R_N_std_rad[sensor].tolist(),
-            }
+        registration={
+            sensor: schemas.Registration(
+                translation_m=T_R_N[:3, 3].tolist(),
+                rotation_xyzw=quaternion_xyzw(T_R_N[:3, :3]).tolist(),
+                std_m=result.T_R_N_std_m[sensor].tolist(),
+                std_rad=result.T_R_N_std_rad[sensor].tolist(),
+            )
             for sensor, T_R_N in result.T_R_N.items()
         },
-        'markers': {
-            marker: {
-                'position_m': position.tolist(),
-                'std_m': result.marker_std_m[marker].tolist(),
-            }
-            for marker, position in result.marker_positions.items()
+        markers={
+            name: schemas.Marker(
+                position_m=position.tolist(), std_m=result.marker_std_m[name].tolist()
+            )
+            for name, position in result.marker_positions.items()
         },
-        'noise': {
-            sensor: {
-                'sigma_m': noise.sigma_m,
-                'std_m': noise.std_m,
-                'pose_sigma_m': noise.pose_sigma_m,
-                'pose_std_m': noise.pose_sigma_std_m,
-                **{
-                    f'{direction}_{key}': value
-                    for direction, part in noise.directions.items()
-                    for key, value in (
-                        ('sigma_m', part.sigma_m),
-                        ('std_m', part.std_m),
-                        ('pose_sigma_m', part.pose_sigma_m),
-                        ('pose_std_m', part.pose_sigma_std_m),
-                    )
-                },
-            }
-            for sensor, noise in result.noise.items()
-        },
-        'sampler': {
-            'name': sampler.name,
-            'chains': int(sampler.chains),
-            'draws': int(sampler.draws),
-            'r_hat_max': _finite(np.max(sampler.r_hat)),
-            'ess_min': _finite(np.min(np.minimum(sampler.ess_bulk, sampler.ess_tail))),
-            'seconds': _finite(sampler.seconds),
-            'acceptance_rate': _finite(sampler.acceptance_rate),
-            'converged': bool(sampler.converged),
-            'message': sampler.message,
-            'precision': _finite(sampler.precision),
-            'precision_wanted': sampler.precision_wanted,
-            'log_density_error_max': _finite(sampler.log_density_error),
-            'log_density_checked_draws': int(sampler.checked),
-        },
-        'parameters': [
-            {
-                'name': name,
-                'mean': float(mean[i]),
-                'std': float(std[i]),
-                'r_hat': _finite(sampler.r_hat[i]),
-                'ess_bulk': _finite(sampler.ess_bulk[i]),
-                'ess_tail': _finite(sampler.ess_tail[i]),
-            }
+        noise={sensor: _noise(noise) for sensor, noise in result.noise.items()},
+        sampler=schemas.Sampler(
+            name=sampler.name,
+            chains=int(sampler.chains),
+            draws=int(sampler.draws),
+            r_hat_max=finite(np.max(sampler.r_hat)),
+            ess_min=finite(np.min(np.minimum(sampler.ess_bulk, sampler.ess_tail))),
+            seconds=finite(sampler.seconds),
+            acceptance_rate=finite(sampler.acceptance_rate),
+            converged=bool(sampler.converged),
+            message=sampler.message,
+            precision=finite(sampler.precision),
+            precision_wanted=sampler.precision_wanted,
+            log_density_error_max=finite(sampler.log_density_error),
+            log_density_checked_draws=int(sampler.checked),
+        ),
+        parameters=[
+            schemas.SampledParameter(
+                name=name,
+                mean=float(mean[i]),
+                std=float(std[i]),
+                r_hat=finite(sampler.r_hat[i]),
+                ess_bulk=finite(sampler.ess_bulk[i]),
+                ess_tail=finite(sampler.ess_tail[i]),
+            )
             for i, name in enumerate(result.parameter_names)
         ],
-        'accuracy': dict(result.accuracy),
-        'left_out': [
-            {'observation': int(observation), 'why': why} for observation, why in result.left_out
-        ],
-        'explained_by_noise': {
-            check.sensor: {
-                'explained': check.explained,
-                'after_m': check.error_m,
-                'noise_m': check.noise_error_m,
-                'stated_std_m': check.stated_m,
-                'within_pose_std_m': check.within_m,
-            }
+        accuracy=schemas.Accuracy(**result.accuracy),
+        left_out=[schemas.LeftOut(int(row), why) for row, why in result.left_out],
+        explained_by_noise={
+            check.sensor: schemas.NoiseCheck(
+                explained=check.explained,
+                after_m=check.error_m,
+                noise_m=check.noise_error_m,
+                stated_std_m=check.stated_m,
+                within_pose_std_m=check.within_m,
+            )
             for check in result.noise_checks
         },
+    )
+
+
+def _noise(noise: NoiseEstimate) -> schemas.Noise:
+    directions: dict[str, Any] = {
+        f'{direction}_{key}': value
+        for direction, part in noise.directions.items()
+        for key, value in (
+            ('sigma_m', part.sigma_m),
+            ('std_m', part.std_m),
+            ('pose_sigma_m', part.pose_sigma_m),
+            ('pose_std_m', part.pose_sigma_std_m),
+        )
     }
+    return schemas.Noise(
+        sigma_m=noise.sigma_m,
+        std_m=noise.std_m,
+        pose_sigma_m=noise.pose_sigma_m,
+        pose_std_m=noise.pose_sigma_std_m,
+        **directions,
+    )
 
 
-def write_fit(result: FitResult, path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Write fit.json in one step and return its content.
+def write_fit(result: FitResult, path: str | os.PathLike[str]) -> None:
+    """Write fit.json in one step.
 
     Raises
     ------
@@ -240,10 +149,8 @@ def write_fit(result: FitResult, path: str | os.PathLike[str]) -> dict[str, Any]
         The folder cannot be written to.
     """
     path = Path(path)
-    content = fit_to_dict(result)
     make_folder(path.parent)
-    write_atomically(path, msgspec.json.format(msgspec.json.encode(content), indent=2) + b'\n')
-    return content
+    write_atomically(path, schemas.encode(fit_content(result)))
 
 
 def read_fit(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -258,13 +165,16 @@ def read_fit(path: str | os.PathLike[str]) -> dict[str, Any]:
     data = read_limited(path, FIT_LIMIT, 'give the fit.json that "remaster fit" wrote')
     try:
         content = msgspec.json.decode(data)
-        fit = msgspec.convert(content, _Fit)
+        fit = msgspec.convert(content, schemas.Fit)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(
-            f'{path}: {" ".join(str(error).split())}; give a fit.json of format {FORMAT}'
+            f'{path}: {" ".join(str(error).split())}; give a fit.json of format '
+            f'{schemas.FIT_FORMAT}'
         ) from None
-    if fit.format != FORMAT:
-        raise InputError(f'{path}: format is {fit.format[:60]!r}, not {FORMAT!r}; fit again')
+    if fit.format != schemas.FIT_FORMAT:
+        raise InputError(
+            f'{path}: format is {fit.format[:60]!r}, not {schemas.FIT_FORMAT!r}; fit again'
+        )
     return content
 
 
@@ -350,22 +260,21 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
     return write_report(result, folder)
 
 
-def _describe(session: Session) -> dict[str, Any]:
+def _describe(session: Session) -> schemas.MeasuredSession:
     m = session.measurements
-    counts = {}
-    for split, rows in (('optimization', ~m.is_validation), ('validation', m.is_validation)):
-        counts[split] = {
-            'observations': int(rows.sum()),
-            'configurations': len(np.unique(m.configuration[rows])),
-            'poses': len(np.unique(m.pose[rows])),
-        }
-    return {
-        **counts,
-        'sensors': dict(session.sensors),
-        'created': session.created,
-        'exit_status': session.exit_status,
-    }
+    optimization, validation = (
+        schemas.Counts(
+            observations=int(rows.sum()),
+            configurations=len(np.unique(m.configuration[rows])),
+            poses=len(np.unique(m.pose[rows])),
+        )
+        for rows in (~m.is_validation, m.is_validation)
+    )
+    return schemas.MeasuredSession(
+        optimization, validation, dict(session.sensors), session.created, session.exit_status
+    )
 
 
-def _finite(number: float) -> float | None:
+def finite(number: float) -> float | None:
+    """Return a number, None in place of one that JSON has not."""
     return float(number) if np.isfinite(number) else None

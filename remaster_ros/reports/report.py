@@ -11,13 +11,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import msgspec
 import numpy as np
 from markupsafe import Markup
 
 from remaster_ros.calibration.noise_check import NoiseCheck
 from remaster_ros.collection.reference_session import changes
 from remaster_ros.reports.figures import draw_figures
-from remaster_ros.reports.fit_json import REPORT_FILE, fit_to_dict
+from remaster_ros.reports.fit_json import REPORT_FILE, fit_content
 from remaster_ros.reports.pages import inlined, page
 from remaster_ros.session.files import make_folder, write_atomically
 
@@ -81,7 +82,7 @@ def report_html(result: FitResult, drawings: dict[str, str]) -> str:
         scene = draw_view(result)
     return page(
         'report.html.jinja',
-        fit=fit_to_dict(result),
+        fit=msgspec.to_builtins(fit_content(result)),
         verdict=verdict(result),
         accuracy=_accuracy_rows(result),
         markers=_marker_rows(result),

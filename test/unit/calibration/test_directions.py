@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from calibration_scenes import scene
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import fit_session
-from remaster_ros.reports.fit_json import fit_to_dict
+from remaster_ros.reports.fit_json import fit_content
 from remaster_ros.types import Session
 
 
@@ -40,7 +41,7 @@ def test_depth_noise_is_found_and_sized() -> None:
     rms = np.sqrt((along.sigma_m**2 + 2.0 * across.sigma_m**2) / 3.0)
     assert noise.sigma_m == pytest.approx(rms, rel=1e-3)
     assert 'noise.mocap.along.sigma' in result.parameter_names
-    content = fit_to_dict(result)['noise']
+    content = msgspec.to_builtins(fit_content(result).noise)
     assert content['mocap']['along_sigma_m'] == along.sigma_m
     assert 'along_sigma_m' not in content['tracker']
 

@@ -83,7 +83,7 @@ class Rig:
             return
         q, velocity = self.arm.at(self.t)
         self.commands.append((self.t, q, velocity, points))
-        self.arm.follow(self.t, [servo.Waypoint(p.time_s, p.q, p.velocity) for p in points])
+        self.arm.follow(self.t, [servo.ServoPoint(p.time_s, p.q, p.velocity) for p in points])
 
     def cubics(self):
         """What the controller makes of each command, from where the arm really is."""

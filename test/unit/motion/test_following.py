@@ -467,7 +467,9 @@ def test_an_arm_that_was_not_seen_for_a_while_is_not_called_slow():
 @pytest.mark.parametrize('trajectory', [Trajectory((LINE,)), CORNERS])
 def test_a_servo_that_lags_and_overshoots_is_never_called_slow(trajectory):
     arm, joints = Arm(trajectory), servo.Motion(0.0, trajectory.start)
-    joints.follow(0.0, [servo.Waypoint(p.time_s, p.q, p.velocity) for p in trajectory.waypoints()])
+    joints.follow(
+        0.0, [servo.ServoPoint(p.time_s, p.q, p.velocity) for p in trajectory.waypoints()]
+    )
     for until in np.arange(0.05, trajectory.duration_s + 1.0, 0.05):
         assert arm.run(until, lambda t: joints.at(t)[0]) is None
         assert arm.lost == '', until

@@ -21,7 +21,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, matrix_from_rpy
 from remaster_ros.reports.fit_json import (
-    fit_to_dict,
+    fit_content,
     joint_offsets_rad,
     prepare_folder,
     read_fit,
@@ -32,7 +32,7 @@ from remaster_ros.reports.fit_json import (
 def test_fit_json_is_the_fit(fit_result, tmp_path):
     write_fit(fit_result, tmp_path / 'new' / 'fit.json')
     fit = read_fit(tmp_path / 'new' / 'fit.json')
-    assert fit == msgspec.json.decode(msgspec.json.encode(fit_to_dict(fit_result)))
+    assert fit == msgspec.json.decode(msgspec.json.encode(fit_content(fit_result)))
     assert fit['format'] == 'remaster-fit/1'
     assert [row['joint'] for row in fit['joint_offsets']] == list(fit_result.joint_names)
     offsets, std = joint_offsets_rad(fit, fit_result.joint_names)
@@ -59,7 +59,7 @@ def test_fit_json_is_the_fit(fit_result, tmp_path):
 
 
 def test_offsets_of_another_robot_are_refused(fit_result):
-    fit = fit_to_dict(fit_result)
+    fit = msgspec.to_builtins(fit_content(fit_result))
     with pytest.raises(InputError, match='use the fit of this robot'):
         joint_offsets_rad(fit, ['joint_1', 'joint_2'])
 
@@ -68,7 +68,7 @@ def test_offsets_of_another_robot_are_refused(fit_result):
     ('key', 'value'), [('std_deg', -0.01), ('std_deg', 1e30), ('mean_deg', -1e300)]
 )
 def test_offsets_that_are_no_angles_are_refused(fit_result, key, value):
-    fit = fit_to_dict(fit_result)
+    fit = msgspec.to_builtins(fit_content(fit_result))
     fit['joint_offsets'][2][key] = value
     with pytest.raises(InputError, match=f'joint_3: {key} is {value:g}, not '.replace('+', r'\+')):
         joint_offsets_rad(fit, fit_result.joint_names)
@@ -85,7 +85,8 @@ def test_offsets_that_are_no_angles_are_refused(fit_result, key, value):
 )
 def test_a_wrong_fit_json_is_refused(fit_result, tmp_path, change, problem):
     path = tmp_path / 'fit.json'
-    fit = write_fit(fit_result, path)
+    write_fit(fit_result, path)
+    fit = read_fit(path)
     change(fit)
     path.write_text(json.dumps(fit))
     with pytest.raises(InputError, match=problem) as caught:

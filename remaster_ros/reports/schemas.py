@@ -1,0 +1,297 @@
+"""What fit.json and discovery.json hold: each key once, for writing and for reading.
+
+A key without a default is what other programs rely on, and a file without it is refused. One that
+is `UNSET` by default stands there where this version has something to say; other makers' files may
+lack it, and keys that are not here are kept as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import msgspec
+from msgspec import UNSET, Struct, UnsetType
+
+FIT_FORMAT = 'remaster-fit/1'
+DISCOVERY_FORMAT = 'remaster-discovery/1'
+
+Triple = tuple[float, float, float]
+
+
+class Robot(Struct):
+    """Whose offsets these are."""
+
+    name: str
+    urdf_sha256: str
+    joint_names: list[str]
+    base_link: str
+    tip_link: str
+
+
+class Counts(Struct):
+    """What was measured of a split."""
+
+    observations: int
+    configurations: int
+    poses: int
+
+
+class MeasuredSession(Struct):
+    """What was measured: counts, sensor -> marker, when, and how it ended."""
+
+    optimization: Counts
+    validation: Counts
+    sensors: dict[str, str]
+    created: str
+    exit_status: str
+
+
+class JointOffset(Struct):
+    """One joint's zero-offset; where ``identifiable`` is false, ``why`` says what hides it."""
+
+    joint: str
+    mean_deg: float
+    std_deg: float
+    interval95_deg: tuple[float, float]
+    identifiable: bool
+    why: str
+
+
+class GaugeCombination(Struct):
+    """A combination of parameters that the data cannot see, and what fixes it."""
+
+    combination: dict[str, float]
+    why: str
+    fixed_by: str
+
+
+class Registration(Struct):
+    """T_R_N: the sensor's frame N in the robot base R."""
+
+    translation_m: Triple
+    rotation_xyzw: tuple[float, float, float, float]
+    std_m: Triple
+    std_rad: Triple
+
+
+class Marker(Struct):
+    """A marker's position in the tool frame T."""
+
+    position_m: Triple
+    std_m: Triple
+
+
+class Noise(Struct):
+    """A sensor's noise per axis: of one row, and common to a pose (None: not told apart).
+
+    Where it differs along and across the line of sight, both stand there as well.
+    """
+
+    sigma_m: float
+    std_m: float
+    pose_sigma_m: float | None
+    pose_std_m: float | UnsetType | None = UNSET
+    along_sigma_m: float | UnsetType = UNSET
+    along_std_m: float | UnsetType = UNSET
+    along_pose_sigma_m: float | UnsetType | None = UNSET
+    along_pose_std_m: float | UnsetType | None = UNSET
+    across_sigma_m: float | UnsetType = UNSET
+    across_std_m: float | UnsetType = UNSET
+    across_pose_sigma_m: float | UnsetType | None = UNSET
+    across_pose_std_m: float | UnsetType | None = UNSET
+
+
+class Sampler(Struct):
+    """How the posterior was sampled; ``draws`` are kept draws of each chain.
+
+    ``precision`` is the Monte Carlo error of the worst mean in standard deviations;
+    ``log_density_error_max`` that of the second-order density on the draws that were checked.
+    """
+
+    name: str
+    chains: int
+    draws: int
+    r_hat_max: float | None
+    ess_min: float | None
+    seconds: float | None
+    acceptance_rate: float | UnsetType | None = UNSET
+    converged: bool | UnsetType = UNSET
+    message: str | UnsetType = UNSET
+    precision: float | UnsetType | None = UNSET
+    precision_wanted: float | UnsetType | None = UNSET
+    log_density_error_max: float | UnsetType | None = UNSET
+    log_density_checked_draws: int | UnsetType = UNSET
+
+
+class SampledParameter(Struct):
+    """A parameter in the unit of its name (m, rad), and how well it was sampled."""
+
+    name: str
+    mean: float
+    std: float
+    r_hat: float | None
+    ess_bulk: float | None
+    ess_tail: float | None
+
+
+class Accuracy(Struct):
+    """The three metrics by split; ``validation`` is None where nothing was held out."""
+
+    optimization: Mapping[str, Any] | None
+    validation: Mapping[str, Any] | None
+
+
+class LeftOut(Struct):
+    """A row that was not fitted, and why."""
+
+    observation: int
+    why: str
+
+
+class NoiseCheck(Struct):
+    """Does noise explain what is left of a sensor's errors?
+
+    ``after_m`` is the mean error after (held out where there are such rows, without the worst
+    twentieth), ``noise_m`` what the noise makes that the sensor states and that shows within poses
+    (None where neither does).
+    """
+
+    explained: bool | None
+    after_m: float
+    noise_m: float | None
+    stated_std_m: float | None
+    within_pose_std_m: float | None
+
+
+class Fit(Struct):
+    """fit.json."""
+
+    format: str
+    joint_offsets: list[JointOffset]
+    gauge: list[GaugeCombination]
+    registration: dict[str, Registration]
+    markers: dict[str, Marker]
+    noise: dict[str, Noise]
+    sampler: Sampler
+    accuracy: Accuracy
+    left_out: list[LeftOut]
+    version: str | UnsetType = UNSET
+    robot: Robot | UnsetType = UNSET
+    session: MeasuredSession | UnsetType = UNSET
+    parameters: list[SampledParameter] | UnsetType = UNSET
+    explained_by_noise: dict[str, NoiseCheck] | UnsetType = UNSET
+
+
+class EffectParameter(Struct):
+    """A parameter of an effect, in its unit."""
+
+    name: str
+    value: float
+    std: float
+    unit: str
+
+
+class LookAlike(Struct):
+    """What could be mistaken for an effect, and what would tell."""
+
+    name: str
+    joints: list[int]
+    log_evidence_gain: float
+    separate_by: str
+
+
+class Effect(Struct):
+    """A cause; ``size_m`` is the RMS at the marker after absorption, ``share`` of the gain."""
+
+    name: str
+    joints: list[int]
+    place: str
+    driver: str
+    form: str
+    parameters: list[EffectParameter]
+    p_value: float
+    log_evidence_gain: float
+    confusable_with: list[LookAlike]
+    cause: str
+    size_m: float | UnsetType = UNSET
+    share: float | UnsetType | None = UNSET
+
+
+class Gain(Struct):
+    """RMS of the 3-D error over every validation row, and what the noise alone makes."""
+
+    held_out_rms_before_m: float | None
+    held_out_rms_after_m: float | None
+    noise_floor_m: float
+
+
+class NoiseOfDiscovery(Struct):
+    """What the search found of the noise."""
+
+    pose_common_fraction: float
+    outliers: list[int]
+    heteroscedastic: Mapping[str, Any]
+    sensors: dict[str, Noise] | UnsetType = UNSET
+
+
+class OffsetBefore(Struct):
+    """A joint's zero-offset without the effects; None where nothing bounds it."""
+
+    joint: str
+    mean_deg: float
+    std_deg: float | None
+
+
+class SearchedRows(Struct):
+    """Of a session of which the search saw a part."""
+
+    searched: int
+    rows: int
+    others_rms_before_m: float | None
+    others_rms_after_m: float | None
+
+
+class ConfirmedEffect(Struct):
+    """Which share of an effect's gain carries over to the other session."""
+
+    name: str
+    joints: list[int]
+    carried_over: float | None
+
+
+class Confirmed(Struct):
+    """What another session of the arm says."""
+
+    rms_before_m: float | None
+    rms_after_m: float | None
+    rms_own_m: float | None
+    same_offsets: bool
+    carried_over: float | None
+    confirmed: bool
+    effects: list[ConfirmedEffect]
+
+
+class Discovered(Struct):
+    """discovery.json."""
+
+    format: str
+    verdict: Literal['effects', 'none', 'undetermined']
+    effects: list[Effect]
+    gain: Gain
+    noise: NoiseOfDiscovery
+    joint_offsets_after: list[JointOffset]
+    version: str | UnsetType = UNSET
+    robot: Robot | UnsetType = UNSET
+    session: MeasuredSession | UnsetType = UNSET
+    metrics: Mapping[str, Any] | UnsetType = UNSET
+    untestable: dict[str, str] | UnsetType = UNSET
+    joint_offsets_before: list[OffsetBefore] | UnsetType = UNSET
+    sampler: Sampler | UnsetType = UNSET
+    rows_searched: SearchedRows | UnsetType = UNSET
+    confirmation: Confirmed | UnsetType = UNSET
+
+
+def encode(content: Struct) -> bytes:
+    """Return a file's bytes, indented."""
+    return msgspec.json.format(msgspec.json.encode(content), indent=2) + b'\n'
