@@ -24,7 +24,7 @@ from path_cells import SPECS, CellSpec, make_cell
 from path_judges import collides
 from planned_moves import tours
 
-from remaster_ros.kinematics.collision import FLOOR, OBSTACLE, SELF_COLLISION
+from remaster_ros.kinematics.body_pairs import FLOOR, OBSTACLE, SELF_COLLISION
 
 
 class Tally(NamedTuple):

@@ -27,7 +27,6 @@ names them all. The base itself touches the floor.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from math import ceil, degrees, radians
@@ -37,30 +36,20 @@ from numpy.typing import ArrayLike
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.bodies import Body, capsule, enclosing_points
-from remaster_ros.kinematics.convex_distance import ConvexDistances
-from remaster_ros.kinematics.line_of_sight import LinkCapsules, segment_distance
+from remaster_ros.kinematics.body_pairs import OBSTACLE, BodyPairs, Shortfall
+from remaster_ros.kinematics.line_of_sight import LinkCapsules
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.kinematics.transforms import apply, inverse
 from remaster_ros.types import BoolArray, FloatArray, IntArray
-
-SELF_COLLISION = 'self-collision'
-FLOOR = 'hits the floor'
-OBSTACLE = 'hits an obstacle'
 
 STEP_M = 0.01
 """No two bodies move by more relative to each other between two checks of a path, m."""
 HALF_STEP_M = STEP_M / 2
-RESERVE_M = 0.002
-"""What a planner keeps on top: an arm that stands a little off its path is still free, m."""
-
 ESCAPE_STEP_M = 0.002
 """The same on a way out, m."""
 ESCAPE_TOLERANCE_M = 1e-4
 """How much nearer what is too near may come from one check of a way out to the next, m."""
 
 _STRIDE = 8
-_SAMPLES = 300
-_MOST = 0.95
 _LIMIT_TOLERANCE_RAD = 1e-6
 
 
@@ -84,25 +73,6 @@ def arm_bodies(chain: SerialChain, given: Sequence[Body], link_radius: float) ->
             end = chain.T_fixed[link][:3, 3]
             bodies.append(Body(name, link, capsule(np.zeros(3), end, link_radius)))
     return bodies
-
-
-@dataclass(frozen=True)
-class Shortfall:
-    """Two bodies nearer to each other than is kept: which configuration, which pair, m."""
-
-    index: int
-    pair: int
-    distance: float
-    kept: float
-
-
-@dataclass(frozen=True)
-class _Placed:
-    """The bodies at configurations: frames (n, k + 1, 4, 4), ends of capsules (n, B, 3), m."""
-
-    frames: FloatArray
-    a: FloatArray
-    b: FloatArray
 
 
 class CollisionModel:
@@ -160,16 +130,8 @@ class CollisionModel:
         self.margin, self.unknown_offset = margin, unknown_offset
         self._sight = LinkCapsules(chain, link_radius)
         self.bodies = tuple(sorted(bodies, key=lambda body: body.link))
-        self.left_out: tuple[str, ...] = ()
-        self._link = np.array([body.link for body in self.bodies], dtype=np.int64)
-        ends = [body.capsule for body in self.bodies]
-        self._a = np.array([a for a, _, _ in ends]).reshape(-1, 3)
-        self._b = np.array([b for _, b, _ in ends]).reshape(-1, 3)
-        self._radius = np.array([radius for _, _, radius in ends])
-        self._convex = ConvexDistances([(body.shape, body.T_link_body) for body in self.bodies])
-        self._reach = self._reaches()
-        self._set_pairs(*self._possible_pairs())
-        self._apply_rule()
+        self._pairs = BodyPairs(chain, self.bodies, floor_z, margin, unknown_offset)
+        self.left_out = self._pairs.left_out
 
     # What is asked
 
@@ -254,17 +216,17 @@ class CollisionModel:
 
     def travel(self, start: FloatArray, end: FloatArray) -> float:
         """Bound how far any point of the arm moves between configurations, m, or relatively."""
-        return float((self._levers @ np.abs(end - start)).max(initial=0.0))
+        return float((self._pairs.levers @ np.abs(end - start)).max(initial=0.0))
 
     def pair_distances(self, q: FloatArray, pairs: IntArray) -> FloatArray:
         """Return the distances of pairs (p,) (see `Shortfall`) at configurations (n, k), m."""
-        placed = self._place(q)
-        bounds = self._lower_bounds(placed)
+        placed = self._pairs.place(q)
+        bounds = self._pairs.lower_bounds(placed)
         for column in pairs:
             rows = np.arange(len(q))
-            decided = self._measure_cheap(placed, rows, np.full(len(q), column), bounds)
+            decided = self._pairs.measure_cheap(placed, rows, np.full(len(q), column), bounds)
             for row in rows[~decided]:
-                bounds[row, column] = self._measure(placed, int(row), int(column))
+                bounds[row, column] = self._pairs.measure(placed, int(row), int(column))
         return bounds[:, pairs]
 
     def reasons(
@@ -274,7 +236,7 @@ class CollisionModel:
         q = np.asarray(q, dtype=float).reshape(-1, len(self.chain))
         reasons = np.full(len(q), '', dtype=f'U{len(OBSTACLE)}')
         for short in self.shortfalls(q, extra, first=True):
-            reasons[short.index] = self._category(short.pair)
+            reasons[short.index] = self._pairs.category(short.pair)
         return reasons
 
     def free_mask(self, q: ArrayLike, extra: float = 0.0) -> BoolArray:
@@ -305,11 +267,11 @@ class CollisionModel:
 
         With `first` one of each configuration is enough.
         """
-        return self._examine(self._place(q), extra, first=first)[0]
+        return self._pairs.examine(self._pairs.place(q), extra, first=first)[0]
 
     def words(self, short: Shortfall) -> str:
         """Put a shortfall into words."""
-        inner, outer = self._pair_names(short.pair)
+        inner, outer = self._pairs.names(short.pair)
         kept = f'{1e3 * short.kept:.0f} mm is kept'
         if short.distance < 0.0:
             return f'{outer} reaches {-1e3 * short.distance:.0f} mm into {inner}, {kept}'
@@ -327,253 +289,27 @@ class CollisionModel:
             f'{np.degrees(chain.lower[joint]):.2f} to {np.degrees(chain.upper[joint]):.2f} deg'
         )
 
-    # Pairs: two bodies, or a body and the floor (its inner body is -1)
-
-    def _possible_pairs(self) -> tuple[IntArray, IntArray]:
-        inner, outer = [], []
-        for j, second in enumerate(self.bodies):
-            if second.link == 0:
-                continue
-            for i, one in enumerate(self.bodies[:j]):
-                near = second.link - one.link <= 1 and {one.role, second.role} == {'link'}
-                if one.link < second.link and not near:
-                    inner.append(i)
-                    outer.append(j)
-            if self.floor_z is not None:
-                inner.append(-1)
-                outer.append(j)
-        return np.array(inner, dtype=np.int64), np.array(outer, dtype=np.int64)
-
-    def _set_pairs(
-        self, inner: IntArray, outer: IntArray, contact_only: BoolArray | None = None
-    ) -> None:
-        self._inner, self._outer = inner, outer
-        self._is_floor = inner < 0
-        shapes = [body.shape for body in self.bodies]
-        links = np.where(self._is_floor, 0, self._link[inner] if len(self._link) else 0)
-        # A box that stands still bounds flat and long bodies better than a capsule around it.
-        self._is_box = np.array(
-            [i >= 0 and self._link[i] == 0 and shapes[i].kind == 'box' for i in inner], dtype=bool
-        )
-        self._is_exact = np.array(
-            [
-                i >= 0 and shapes[i].is_its_capsule and shapes[j].is_its_capsule
-                for i, j in zip(inner, outer)
-            ],
-            dtype=bool,
-        )
-        joints = np.arange(1, len(self.chain) + 1)
-        between = joints > links[:, None]
-        # A first joint about the vertical moves nothing up or down.
-        upright = abs((self.chain.T_fixed[0][:3, :3] @ self.chain.axes[0])[2]) > 1 - 1e-12
-        if upright:
-            between[self._is_floor, 0] = False
-        self._between = between & (joints <= self._link[outer][:, None])
-        self._levers = np.where(self._between, self._reach[outer], 0.0)
-        self._contact_only = (
-            np.zeros(len(inner), dtype=bool) if contact_only is None else contact_only
-        )
-        self._most_kept = np.where(
-            self._contact_only,
-            0.0,
-            self.margin + self.unknown_offset * np.linalg.norm(self._levers, axis=1),
-        )
-        self._kinds = (
-            np.flatnonzero(self._is_floor),
-            np.flatnonzero(self._is_box),
-            np.flatnonzero(~self._is_floor & ~self._is_box),
-        )
-
-    def _apply_rule(self) -> None:
-        """Leave out what overlaps by construction; see the module's text."""
-        low = np.where(np.isfinite(self.chain.lower), self.chain.lower, -np.pi)
-        high = np.where(np.isfinite(self.chain.upper), self.chain.upper, np.pi)
-        q = low + np.random.default_rng(0).random((_SAMPLES, len(self.chain))) * (high - low)
-        touching, near = np.zeros(len(self._inner)), np.zeros(len(self._inner))
-        # With the planner's reserve: it must not drop all that the construction brings so near.
-        for short in self.shortfalls(q, RESERVE_M):
-            near[short.pair] += 1
-            touching[short.pair] += short.distance < 0.0
-        is_self = np.array([self._category(pair) == SELF_COLLISION for pair in range(len(near))])
-        share = np.where(is_self, _MOST, 1.0) * _SAMPLES
-        out, contact_only = touching >= share, near >= share
-        for pair in np.flatnonzero(out | contact_only):
-            inner, outer = self._pair_names(int(pair))
-            how = 'overlap by construction, not checked' if out[pair] else 'checked for contact'
-            self.left_out += (f'{inner} and {outer}: {how}',)
-        self._set_pairs(self._inner[~out], self._outer[~out], contact_only[~out])
-
-    def _category(self, pair: int) -> str:
-        if self._is_floor[pair]:
-            return FLOOR
-        inner = self.bodies[self._inner[pair]]
-        return OBSTACLE if inner.role == 'obstacle' else SELF_COLLISION
-
-    def _pair_names(self, pair: int) -> tuple[str, str]:
-        inner = 'the floor' if self._is_floor[pair] else self.bodies[self._inner[pair]].name
-        return inner, self.bodies[self._outer[pair]].name
-
-    def _reaches(self) -> FloatArray:
-        """Bound each body's distance from each joint's axis in any configuration, m, (B, k)."""
-        chain = self.chain
-        reach = np.zeros((len(self.bodies), len(chain)))
-        for b, body in enumerate(self.bodies):
-            far = 0.0
-            points = body.outline
-            for joint in range(body.link - 1, -1, -1):
-                # What a further joint turns stays as far from that joint's origin.
-                axis = chain.axes[joint]
-                across = np.linalg.norm(points - (points @ axis)[:, None] * axis, axis=1)
-                reach[b, joint] = far + across.max()
-                far += np.linalg.norm(points, axis=1).max()
-                points = chain.T_fixed[joint][None, :3, 3]
-        return reach
-
-    # Distances
-
-    def _place(self, q: FloatArray) -> _Placed:
-        frames = np.empty((len(q), len(self.chain) + 1, 4, 4))
-        frames[:, 0] = np.eye(4)
-        frames[:, 1:] = self.chain.frames(q)
-        own = frames[:, self._link]
-        rotation, origin = own[..., :3, :3], own[..., :3, 3]
-        a = (rotation @ self._a[:, :, None])[..., 0] + origin
-        b = (rotation @ self._b[:, :, None])[..., 0] + origin
-        return _Placed(frames, a, b)
-
-    def _lower_bounds(self, placed: _Placed) -> FloatArray:
-        """Return what each pair is apart at least, m, (n, P)."""
-        a, b, radius = placed.a, placed.b, self._radius
-        bounds = np.empty((len(a), len(self._inner)))
-        floor, boxes, others = self._kinds
-        if len(floor):
-            own = self._outer[floor]
-            lowest = np.minimum(a[:, own, 2], b[:, own, 2]) - radius[own]
-            bounds[:, floor] = lowest - (self.floor_z or 0.0)
-        for i in np.unique(self._inner[boxes]):
-            pairs = boxes[self._inner[boxes] == i]
-            own = self._outer[pairs]
-            T = inverse(self.bodies[i].T_link_body)
-            ends = np.stack((apply(T, a[:, own]), apply(T, b[:, own])))
-            half = self.bodies[i].shape.points.max(axis=0)
-            gaps = np.maximum(ends.min(axis=0) - half, -half - ends.max(axis=0))
-            bounds[:, pairs] = np.linalg.norm(np.maximum(gaps, 0.0), axis=-1) - radius[own]
-        if len(others):
-            i, j = self._inner[others], self._outer[others]
-            apart = segment_distance(a[:, i], b[:, i], a[:, j], b[:, j])
-            bounds[:, others] = apart - radius[i] - radius[j]
-        return bounds
-
-    def _kept(self, placed: _Placed, rows: IntArray, pairs: IntArray) -> FloatArray:
-        """Return the clearance of pairs (c,) at configurations (c,), m, (c,)."""
-        frames = placed.frames[rows, 1:]
-        axes = (frames[..., :3, :3] @ self.chain.axes[:, :, None])[..., 0]
-        own = self._outer[pairs]
-        ends = np.stack((placed.a[rows, own], placed.b[rows, own]), axis=1)
-        arms = np.cross(axes[:, None], ends[:, :, None] - frames[:, None, :, :3, 3])
-        on_floor = self._is_floor[pairs]
-        level = np.sqrt(np.maximum(0.0, 1.0 - axes[..., 2] ** 2))
-        radius = self._radius[own][:, None]
-        levers = np.where(
-            on_floor[:, None],
-            np.abs(arms[..., 2]).max(axis=1) + radius * level,
-            np.linalg.norm(arms, axis=-1).max(axis=1) + radius,
-        )
-        levers = np.where(self._between[pairs], levers, 0.0)
-        kept = self.margin + self.unknown_offset * np.linalg.norm(levers, axis=1)
-        # At most what the bound says: the capsule around a body is wider than the body.
-        return np.minimum(kept, self._most_kept[pairs])
-
-    def _extra(self, extra: float) -> FloatArray:
-        """Return what is kept on top, m, (P,): nothing where only contact counts."""
-        return np.where(self._contact_only, 0.0, extra)
-
-    def _measure(self, placed: _Placed, row: int, pair: int) -> float:
-        """Return the distance of a pair of bodies, m, negative where they overlap."""
-        inner, outer = int(self._inner[pair]), int(self._outer[pair])
-        frames = placed.frames[row]
-        return self._convex.distance(
-            inner, frames[self._link[inner]], outer, frames[self._link[outer]]
-        )
-
-    def _measure_cheap(
-        self, placed: _Placed, rows: IntArray, pairs: IntArray, bounds: FloatArray
-    ) -> BoolArray:
-        """Put distances that need no coal into `bounds` (n, P); return which were, (c,)."""
-        on_floor = self._is_floor[pairs]
-        for pair in np.unique(pairs[on_floor]):
-            own = rows[pairs == pair]
-            outer = int(self._outer[pair])
-            shape = self.bodies[outer].shape
-            T = placed.frames[own, self._link[outer]] @ self.bodies[outer].T_link_body
-            lowest = np.min(T[:, 2, :3] @ shape.points.T, axis=1) + T[:, 2, 3]
-            lowest = lowest - shape.ball - shape.disc * np.hypot(T[:, 2, 0], T[:, 2, 1])
-            bounds[own, pair] = lowest - (self.floor_z or 0.0)
-        return on_floor | self._is_exact[pairs]
-
-    def _candidates(
-        self, placed: _Placed, bounds: FloatArray, is_open: BoolArray | None, extra: float
-    ) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
-        """Return what may be too near: rows, pairs, what is kept, and whether it is decided.
-
-        What needs no coal is measured; of that only what is too near is returned.
-        """
-        on_top = self._extra(extra)
-        may = bounds < self._most_kept + on_top
-        rows, pairs = np.nonzero(may if is_open is None else may & is_open)
-        if not len(rows):
-            return rows, pairs, np.empty(0), np.empty(0, dtype=bool)
-        kept = self._kept(placed, rows, pairs) + on_top[pairs]
-        near = bounds[rows, pairs] < kept
-        rows, pairs, kept = rows[near], pairs[near], kept[near]
-        decided = self._measure_cheap(placed, rows, pairs, bounds)
-        near = bounds[rows, pairs] < kept
-        return rows[near], pairs[near], kept[near], decided[near]
-
-    def _examine(
-        self, placed: _Placed, extra: float, *, first: bool = False, one: bool = False
-    ) -> tuple[list[Shortfall], FloatArray]:
-        """Return shortfalls, and distances or lower bounds of them (n, P).
-
-        With `first` one of each configuration is enough, with `one` a single one.
-        """
-        bounds = self._lower_bounds(placed)
-        rows, pairs, kept, decided = self._candidates(placed, bounds, None, extra)
-        found: list[Shortfall] = []
-        done: set[int] = set()
-        # What is decided comes first, then what is probably too near: the rest costs more.
-        for n in np.lexsort((bounds[rows, pairs] - kept, self._is_floor[pairs], ~decided)):
-            row, pair = int(rows[n]), int(pairs[n])
-            if first and row in done:
-                continue
-            if not decided[n]:
-                bounds[row, pair] = self._measure(placed, row, pair)
-            if bounds[row, pair] < kept[n]:
-                found.append(Shortfall(row, pair, float(bounds[row, pair]), float(kept[n])))
-                done.add(row)
-                if one:
-                    break
-        return found, bounds
-
     # Swept paths
 
     def _sweep(self, start: FloatArray, end: FloatArray, extra: float) -> Shortfall | None:
         """Return something that is too near on the straight way in joint space."""
-        travel = self._levers @ np.abs(end - start)
+        travel = self._pairs.levers @ np.abs(end - start)
         steps = max(1, ceil(float(travel.max(initial=0.0)) / STEP_M))
         grid = np.unique(np.append(np.arange(0, steps, _STRIDE), steps))
         share = np.arange(steps + 1) / steps
         q = start + share[:, None] * (end - start)
         # Most ways that are not free show it at one of these.
-        found, _ = self._examine(self._place(q[[steps // 2, steps // 4, -1]]), extra, one=True)
+        found, _ = self._pairs.examine(
+            self._pairs.place(q[[steps // 2, steps // 4, -1]]), extra, one=True
+        )
         if found:
             return found[0]
-        found, distances = self._examine(self._place(q[grid]), extra, one=True)
+        found, distances = self._pairs.examine(self._pairs.place(q[grid]), extra, one=True)
         if found:
             return found[0]
         # Where neither end of an interval excludes a pair, all of the interval is looked at.
         least = distances[:-1] + distances[1:] - np.diff(grid)[:, None] / steps * travel
-        is_open = least / 2 < self._most_kept + self._extra(extra - HALF_STEP_M)
+        is_open = least / 2 < self._pairs.most_kept + self._pairs.on_top(extra - HALF_STEP_M)
         open_ones = np.flatnonzero(is_open.any(axis=1))
         inside = [np.arange(grid[row] + 1, grid[row + 1]) for row in open_ones]
         if not sum(map(len, inside)):
@@ -590,20 +326,20 @@ class CollisionModel:
         extra: float,
     ) -> Shortfall | None:
         """Check some steps (m,) of a way (n, k): the pairs (m, P) that are open there."""
-        placed = self._place(q[inside])
-        bounds = self._lower_bounds(placed)
-        rows, pairs, kept, decided = self._candidates(placed, bounds, is_open, extra)
+        placed = self._pairs.place(q[inside])
+        bounds = self._pairs.lower_bounds(placed)
+        rows, pairs, kept, decided = self._pairs.candidates(placed, bounds, is_open, extra)
         if decided.any():
             n = int(np.argmax(decided))
             row, pair = int(rows[n]), int(pairs[n])
             return Shortfall(row, pair, float(bounds[row, pair]), float(kept[n]))
-        most = self._most_kept + self._extra(extra)
+        most = self._pairs.most_kept + self._pairs.on_top(extra)
         beyond = np.full(len(per_step), -1.0)
         for n in range(len(rows)):
             row, pair = int(rows[n]), int(pairs[n])
             if inside[row] < beyond[pair]:
                 continue
-            distance = self._measure(placed, row, pair)
+            distance = self._pairs.measure(placed, row, pair)
             if distance < kept[n]:
                 return Shortfall(row, pair, distance, float(kept[n]))
             # So many steps further it cannot have come nearer than what is kept at most.

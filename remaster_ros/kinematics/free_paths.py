@@ -12,7 +12,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from remaster_ros.kinematics.collision import RESERVE_M, CollisionModel
+from remaster_ros.kinematics.body_pairs import RESERVE_M
+from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.types import FloatArray
 
 MOST_CHECKS = 400

@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike
 from scipy.stats import qmc
 
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics.collision import RESERVE_M, CollisionModel
+from remaster_ros.kinematics.body_pairs import RESERVE_M
+from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix, transform
 from remaster_ros.types import BoolArray, FloatArray, IntArray

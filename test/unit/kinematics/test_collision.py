@@ -7,9 +7,9 @@ import pytest
 from arms import planar_arm
 
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics import collision
+from remaster_ros.kinematics import body_pairs
 from remaster_ros.kinematics.bodies import Body, box, capsule, cylinder, hull, obstacle, sphere
-from remaster_ros.kinematics.collision import CollisionModel, arm_bodies
+from remaster_ros.kinematics.collision import HALF_STEP_M, CollisionModel, arm_bodies
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, matrix_from_rpy, transform
 
@@ -32,9 +32,9 @@ def at(x, y, z, rpy=(0, 0, 0)):
 
 def distances(model, q):
     """Every pair's distance at a configuration, by its names."""
-    pairs = np.arange(len(model._inner))
+    pairs = np.arange(len(model._pairs.inner))
     found = model.pair_distances(np.asarray(q, float)[None], pairs)[0]
-    return {model._pair_names(pair): d for pair, d in zip(pairs, found)}
+    return {model._pairs.names(pair): d for pair, d in zip(pairs, found)}
 
 
 # Bodies on a link of a one-joint arm, its joint at z = 0.3: link frame = R shifted up by 0.3.
@@ -131,7 +131,7 @@ def test_overlapping_bodies_have_negative_distances():
 )
 def test_folded_arm_hits_itself(q, hits):
     model = capsules(planar_arm(4), 0.06, floor_z=None, **EXACT)
-    assert (model.reasons(q)[0] == collision.SELF_COLLISION) == hits
+    assert (model.reasons(q)[0] == body_pairs.SELF_COLLISION) == hits
 
 
 def test_no_joint_alone_within_its_limits_makes_the_arm_hit_itself(lwr):
@@ -145,12 +145,12 @@ def test_no_joint_alone_within_its_limits_makes_the_arm_hit_itself(lwr):
 
 def test_the_lwr_hits_its_base_when_it_curls_up(lwr):
     curled = [0, np.deg2rad(115), 0, np.deg2rad(-115), 0, np.deg2rad(100), 0]
-    assert capsules(lwr).reasons(curled)[0] == collision.SELF_COLLISION
+    assert capsules(lwr).reasons(curled)[0] == body_pairs.SELF_COLLISION
 
 
 def test_floor(lwr):
     reaching_down = [0, np.deg2rad(110), 0, 0, 0, 0, 0]
-    assert capsules(lwr).reasons(reaching_down)[0] == collision.FLOOR
+    assert capsules(lwr).reasons(reaching_down)[0] == body_pairs.FLOOR
     assert capsules(lwr, floor_z=-1.0).trouble(reaching_down) == ''
     assert capsules(lwr, floor_z=None).trouble(reaching_down) == ''
     # Upright, on its pedestal, which touches the floor.
@@ -186,7 +186,7 @@ def test_a_tool_of_250_mm_is_part_of_the_arm(lwr):
     folded = q.copy()
     folded[:, 3] = np.deg2rad(-118.0)
     found = long.shortfalls(folded[bare.free_mask(folded)])
-    assert ('the link of joint_1', 'probe') in {long._pair_names(s.pair) for s in found}
+    assert ('the link of joint_1', 'probe') in {long._pairs.names(s.pair) for s in found}
     words = long.trouble(q[below][0])
     assert 'probe reaches' in words
     assert 'the floor' in words
@@ -203,8 +203,8 @@ def test_clearance_is_the_margin_and_the_unknown_offset_times_the_levers():
     delta = np.deg2rad(1.0)
     model = CollisionModel(chain, [ball, table], floor_z=None, margin=0.006, unknown_offset=delta)
     q = np.array([np.pi / 2, 0.0])
-    (pair,) = [p for p in range(len(model._inner)) if model._pair_names(p)[0] == 'table']
-    kept = model._kept(model._place(q[None]), np.array([0]), np.array([pair]))[0]
+    (pair,) = [p for p in range(len(model._pairs.inner)) if model._pairs.names(p)[0] == 'table']
+    kept = model._pairs.kept(model._pairs.place(q[None]), np.array([0]), np.array([pair]))[0]
     # The body's own radius belongs to its levers.
     assert kept == pytest.approx(0.006 + delta * np.hypot(0.61, 0.31))
     # At that height it is free; a hair lower it is not. The ball's underside is at 0.29.
@@ -225,7 +225,9 @@ def test_only_what_lifts_counts_for_the_floor():
         planar_arm(1, limit=3.0), [Body('ball', 1, sphere(0.01), at(0, 0, 0.8))]
     )
     for model, q, lever in ((upright, 0.3, 0.0), (level, np.pi / 2, 0.81), (level, 0.0, 0.01)):
-        kept = model._kept(model._place(np.array([[q]])), np.array([0]), np.array([0]))[0]
+        kept = model._pairs.kept(
+            model._pairs.place(np.array([[q]])), np.array([0]), np.array([0])
+        )[0]
         assert kept == pytest.approx(model.margin + np.deg2rad(1.0) * lever, abs=1e-12)
 
 
@@ -255,7 +257,7 @@ def test_an_arm_that_is_off_by_the_unknown_offset_still_hits_nothing(lwr, seed):
 def test_neighbours_and_what_always_overlaps_are_left_out_and_named(lwr):
     model = capsules(lwr)
     assert any('joint_5' in line and 'joint_7' in line for line in model.left_out)
-    names = {model._pair_names(p) for p in range(len(model._inner))}
+    names = {model._pairs.names(p) for p in range(len(model._pairs.inner))}
     assert ('the link of joint_3', 'the link of joint_5') in names
     assert ('the base', 'the link of joint_7') in names
     assert not any(a == 'the floor' and b == 'the base' for a, b in names)
@@ -272,8 +274,8 @@ def test_what_is_always_near_is_kept_from_touching_only():
     model = CollisionModel(chain, bodies, floor_z=None)
     assert model.left_out == ('base and collar: checked for contact',)
     q = np.random.default_rng(0).uniform(-3, 3, (50, 2))
-    assert model.free_mask(q, collision.RESERVE_M).all()
-    assert model.path_trouble(q, collision.RESERVE_M) == ''
+    assert model.free_mask(q, body_pairs.RESERVE_M).all()
+    assert model.path_trouble(q, body_pairs.RESERVE_M) == ''
 
 
 def test_a_tool_is_checked_against_the_link_before_its_own():
@@ -340,7 +342,7 @@ def test_sweeps_agree_with_the_finest_sampling(lwr, seed):
         outcomes.append(trouble == '')
         if trouble == '':
             # Between two checks it may be 5 mm nearer, no more.
-            assert all(s.distance > s.kept - collision.HALF_STEP_M for s in fine)
+            assert all(s.distance > s.kept - HALF_STEP_M for s in fine)
         else:
             assert fine
     assert 0.1 < np.mean(outcomes) < 0.98

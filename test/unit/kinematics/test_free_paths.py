@@ -7,7 +7,8 @@ import pytest
 from arms import planar_arm
 
 from remaster_ros.kinematics.bodies import Body, cylinder, obstacle, sphere
-from remaster_ros.kinematics.collision import RESERVE_M, CollisionModel, arm_bodies
+from remaster_ros.kinematics.body_pairs import RESERVE_M
+from remaster_ros.kinematics.collision import CollisionModel, arm_bodies
 from remaster_ros.kinematics.free_paths import free_path, way_out
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import transform
@@ -131,7 +132,7 @@ def test_on_a_way_out_nothing_gets_worse(lwr, seed):
         if path is None:
             continue
         ways += 1
-        pairs = np.arange(len(lwr._inner))
+        pairs = np.arange(len(lwr._pairs.inner))
         distances = lwr.pair_distances(path, pairs)
         short = lwr.shortfalls(path[:1])
         bad = np.isin(pairs, [each.pair for each in short])

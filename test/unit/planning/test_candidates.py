@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics import collision
+from remaster_ros.kinematics import body_pairs
 from remaster_ros.kinematics.collision import CollisionModel, arm_bodies
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.line_of_sight import LinkCapsules
@@ -136,11 +136,11 @@ def test_each_reason_is_counted(ik):
     assert only_reason(ik, [pose_facing_up(3.0, 0.5)]) == candidates.OUT_OF_REACH
     assert only_reason(ik, [pose_facing_up(0.45, 0.05)]) == candidates.JOINT_LIMITS
     reachable = [ik.chain.forward([0.4, 0.7, 0, -1.2, 0.3, 0.9, 0.2])]
-    assert only_reason(ik, reachable, floor_z=1.0) == collision.FLOOR
+    assert only_reason(ik, reachable, floor_z=1.0) == body_pairs.FLOOR
     # Half of this pose's solutions are outside the limits, half are too narrow at the elbow.
     folded = [ik.chain.forward([0.4, -0.5, 0, -2.0, 0.3, 0.9, 0.2])]
     thick = {'radius': 0.09, 'floor_z': None}
-    assert only_reason(ik, folded, **thick) == collision.SELF_COLLISION
+    assert only_reason(ik, folded, **thick) == body_pairs.SELF_COLLISION
     behind = reachable[0] @ [0, 0, -1, 1]
     sight = LineOfSight('tracker', behind[:3], np.array([0.1, 0, 0.02]))
     assert only_reason(ik, reachable, [sight]) == 'no line of sight to tracker'

@@ -6,7 +6,8 @@ from arms import planar_arm
 
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.bodies import obstacle
-from remaster_ros.kinematics.collision import RESERVE_M, CollisionModel, arm_bodies
+from remaster_ros.kinematics.body_pairs import RESERVE_M
+from remaster_ros.kinematics.collision import CollisionModel, arm_bodies
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.planning.candidates import (

@@ -1,0 +1,332 @@
+"""Pairs of bodies that may not touch: which there are, what each keeps, how far apart they are.
+
+A pair is two bodies, or a body and the floor (its inner body is -1). The rules stand in
+`collision`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.kinematics.bodies import Body
+from remaster_ros.kinematics.convex_distance import ConvexDistances
+from remaster_ros.kinematics.line_of_sight import segment_distance
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import apply, inverse
+from remaster_ros.types import BoolArray, FloatArray, IntArray
+
+SELF_COLLISION = 'self-collision'
+FLOOR = 'hits the floor'
+OBSTACLE = 'hits an obstacle'
+
+RESERVE_M = 0.002
+"""What a planner keeps on top: an arm that stands a little off its path is still free, m."""
+
+_SAMPLES = 300
+_MOST = 0.95
+
+
+@dataclass(frozen=True)
+class Shortfall:
+    """Two bodies nearer to each other than is kept: which configuration, which pair, m."""
+
+    index: int
+    pair: int
+    distance: float
+    kept: float
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The bodies at configurations: frames (n, k + 1, 4, 4), ends of capsules (n, B, 3), m."""
+
+    frames: FloatArray
+    a: FloatArray
+    b: FloatArray
+
+
+class BodyPairs:
+    """The pairs of an arm, its tool and markers, the obstacles and the floor.
+
+    Parameters
+    ----------
+    chain
+        The arm.
+    bodies
+        Everything, by link.
+    floor_z
+        Height of the floor in R, m; None where there is none to hit.
+    margin
+        Fixed part of the clearance, m.
+    unknown_offset
+        What a joint's zero-offset may be off by, rad.
+
+    Attributes
+    ----------
+    inner, outer
+        Indices of the two bodies of each pair, (P,); inner is -1 for the floor.
+    is_floor, contact_only
+        Pairs with the floor, and those that are kept from touching only, (P,).
+    levers
+        Bounds of how far the outer body moves relative to the inner one for a radian of each
+        joint, m, (P, k).
+    most_kept
+        The largest clearance of each pair, m, (P,).
+    left_out
+        What is not checked, or only for contact, and why, in words.
+    """
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        bodies: Sequence[Body],
+        floor_z: float | None,
+        margin: float,
+        unknown_offset: float,
+    ) -> None:
+        self.chain, self.bodies, self.floor_z = chain, tuple(bodies), floor_z
+        self.margin, self.unknown_offset = margin, unknown_offset
+        self.left_out: tuple[str, ...] = ()
+        self._link = np.array([body.link for body in self.bodies], dtype=np.int64)
+        ends = [body.capsule for body in self.bodies]
+        self._a = np.array([a for a, _, _ in ends]).reshape(-1, 3)
+        self._b = np.array([b for _, b, _ in ends]).reshape(-1, 3)
+        self._radius = np.array([radius for _, _, radius in ends])
+        self._convex = ConvexDistances([(body.shape, body.T_link_body) for body in self.bodies])
+        self._reach = self._reaches()
+        self._set_pairs(*self._possible_pairs())
+        self._apply_rule()
+
+    # Which pairs there are
+
+    def _possible_pairs(self) -> tuple[IntArray, IntArray]:
+        inner, outer = [], []
+        for j, second in enumerate(self.bodies):
+            if second.link == 0:
+                continue
+            for i, one in enumerate(self.bodies[:j]):
+                near = second.link - one.link <= 1 and {one.role, second.role} == {'link'}
+                if one.link < second.link and not near:
+                    inner.append(i)
+                    outer.append(j)
+            if self.floor_z is not None:
+                inner.append(-1)
+                outer.append(j)
+        return np.array(inner, dtype=np.int64), np.array(outer, dtype=np.int64)
+
+    def _set_pairs(
+        self, inner: IntArray, outer: IntArray, contact_only: BoolArray | None = None
+    ) -> None:
+        self.inner, self.outer = inner, outer
+        self.is_floor = inner < 0
+        shapes = [body.shape for body in self.bodies]
+        links = np.where(self.is_floor, 0, self._link[inner] if len(self._link) else 0)
+        # A box that stands still bounds flat and long bodies better than a capsule around it.
+        self._is_box = np.array(
+            [i >= 0 and self._link[i] == 0 and shapes[i].kind == 'box' for i in inner], dtype=bool
+        )
+        self._is_exact = np.array(
+            [
+                i >= 0 and shapes[i].is_its_capsule and shapes[j].is_its_capsule
+                for i, j in zip(inner, outer)
+            ],
+            dtype=bool,
+        )
+        joints = np.arange(1, len(self.chain) + 1)
+        between = joints > links[:, None]
+        # A first joint about the vertical moves nothing up or down.
+        upright = abs((self.chain.T_fixed[0][:3, :3] @ self.chain.axes[0])[2]) > 1 - 1e-12
+        if upright:
+            between[self.is_floor, 0] = False
+        self._between = between & (joints <= self._link[outer][:, None])
+        self.levers = np.where(self._between, self._reach[outer], 0.0)
+        self.contact_only = (
+            np.zeros(len(inner), dtype=bool) if contact_only is None else contact_only
+        )
+        self.most_kept = np.where(
+            self.contact_only,
+            0.0,
+            self.margin + self.unknown_offset * np.linalg.norm(self.levers, axis=1),
+        )
+        self._kinds = (
+            np.flatnonzero(self.is_floor),
+            np.flatnonzero(self._is_box),
+            np.flatnonzero(~self.is_floor & ~self._is_box),
+        )
+
+    def _apply_rule(self) -> None:
+        """Leave out what overlaps by construction; see the module's text."""
+        low = np.where(np.isfinite(self.chain.lower), self.chain.lower, -np.pi)
+        high = np.where(np.isfinite(self.chain.upper), self.chain.upper, np.pi)
+        q = low + np.random.default_rng(0).random((_SAMPLES, len(self.chain))) * (high - low)
+        touching, near = np.zeros(len(self.inner)), np.zeros(len(self.inner))
+        # With the planner's reserve: it must not drop all that the construction brings so near.
+        for short in self.examine(self.place(q), RESERVE_M)[0]:
+            near[short.pair] += 1
+            touching[short.pair] += short.distance < 0.0
+        is_self = np.array([self.category(pair) == SELF_COLLISION for pair in range(len(near))])
+        share = np.where(is_self, _MOST, 1.0) * _SAMPLES
+        out, contact_only = touching >= share, near >= share
+        for pair in np.flatnonzero(out | contact_only):
+            inner, outer = self.names(int(pair))
+            how = 'overlap by construction, not checked' if out[pair] else 'checked for contact'
+            self.left_out += (f'{inner} and {outer}: {how}',)
+        self._set_pairs(self.inner[~out], self.outer[~out], contact_only[~out])
+
+    def category(self, pair: int) -> str:
+        """Return what a collision of the pair is."""
+        if self.is_floor[pair]:
+            return FLOOR
+        inner = self.bodies[self.inner[pair]]
+        return OBSTACLE if inner.role == 'obstacle' else SELF_COLLISION
+
+    def names(self, pair: int) -> tuple[str, str]:
+        """Return the names of inner and outer body."""
+        inner = 'the floor' if self.is_floor[pair] else self.bodies[self.inner[pair]].name
+        return inner, self.bodies[self.outer[pair]].name
+
+    def _reaches(self) -> FloatArray:
+        """Bound each body's distance from each joint's axis in any configuration, m, (B, k)."""
+        chain = self.chain
+        reach = np.zeros((len(self.bodies), len(chain)))
+        for b, body in enumerate(self.bodies):
+            far = 0.0
+            points = body.outline
+            for joint in range(body.link - 1, -1, -1):
+                # What a further joint turns stays as far from that joint's origin.
+                axis = chain.axes[joint]
+                across = np.linalg.norm(points - (points @ axis)[:, None] * axis, axis=1)
+                reach[b, joint] = far + across.max()
+                far += np.linalg.norm(points, axis=1).max()
+                points = chain.T_fixed[joint][None, :3, 3]
+        return reach
+
+    # Distances
+
+    def place(self, q: FloatArray) -> Placed:
+        """Return where the bodies are at configurations (n, k)."""
+        frames = np.empty((len(q), len(self.chain) + 1, 4, 4))
+        frames[:, 0] = np.eye(4)
+        frames[:, 1:] = self.chain.frames(q)
+        own = frames[:, self._link]
+        rotation, origin = own[..., :3, :3], own[..., :3, 3]
+        a = (rotation @ self._a[:, :, None])[..., 0] + origin
+        b = (rotation @ self._b[:, :, None])[..., 0] + origin
+        return Placed(frames, a, b)
+
+    def lower_bounds(self, placed: Placed) -> FloatArray:
+        """Return what each pair is apart at least, m, (n, P)."""
+        a, b, radius = placed.a, placed.b, self._radius
+        bounds = np.empty((len(a), len(self.inner)))
+        floor, boxes, others = self._kinds
+        if len(floor):
+            own = self.outer[floor]
+            lowest = np.minimum(a[:, own, 2], b[:, own, 2]) - radius[own]
+            bounds[:, floor] = lowest - (self.floor_z or 0.0)
+        for i in np.unique(self.inner[boxes]):
+            pairs = boxes[self.inner[boxes] == i]
+            own = self.outer[pairs]
+            T = inverse(self.bodies[i].T_link_body)
+            ends = np.stack((apply(T, a[:, own]), apply(T, b[:, own])))
+            half = self.bodies[i].shape.points.max(axis=0)
+            gaps = np.maximum(ends.min(axis=0) - half, -half - ends.max(axis=0))
+            bounds[:, pairs] = np.linalg.norm(np.maximum(gaps, 0.0), axis=-1) - radius[own]
+        if len(others):
+            i, j = self.inner[others], self.outer[others]
+            apart = segment_distance(a[:, i], b[:, i], a[:, j], b[:, j])
+            bounds[:, others] = apart - radius[i] - radius[j]
+        return bounds
+
+    def kept(self, placed: Placed, rows: IntArray, pairs: IntArray) -> FloatArray:
+        """Return the clearance of pairs (c,) at configurations (c,), m, (c,)."""
+        frames = placed.frames[rows, 1:]
+        axes = (frames[..., :3, :3] @ self.chain.axes[:, :, None])[..., 0]
+        own = self.outer[pairs]
+        ends = np.stack((placed.a[rows, own], placed.b[rows, own]), axis=1)
+        arms = np.cross(axes[:, None], ends[:, :, None] - frames[:, None, :, :3, 3])
+        on_floor = self.is_floor[pairs]
+        level = np.sqrt(np.maximum(0.0, 1.0 - axes[..., 2] ** 2))
+        radius = self._radius[own][:, None]
+        levers = np.where(
+            on_floor[:, None],
+            np.abs(arms[..., 2]).max(axis=1) + radius * level,
+            np.linalg.norm(arms, axis=-1).max(axis=1) + radius,
+        )
+        levers = np.where(self._between[pairs], levers, 0.0)
+        kept = self.margin + self.unknown_offset * np.linalg.norm(levers, axis=1)
+        # At most what the bound says: the capsule around a body is wider than the body.
+        return np.minimum(kept, self.most_kept[pairs])
+
+    def on_top(self, extra: float) -> FloatArray:
+        """Return what is kept on top, m, (P,): nothing where only contact counts."""
+        return np.where(self.contact_only, 0.0, extra)
+
+    def measure(self, placed: Placed, row: int, pair: int) -> float:
+        """Return the distance of a pair of bodies, m, negative where they overlap."""
+        inner, outer = int(self.inner[pair]), int(self.outer[pair])
+        frames = placed.frames[row]
+        return self._convex.distance(
+            inner, frames[self._link[inner]], outer, frames[self._link[outer]]
+        )
+
+    def measure_cheap(
+        self, placed: Placed, rows: IntArray, pairs: IntArray, bounds: FloatArray
+    ) -> BoolArray:
+        """Put distances that need no coal into `bounds` (n, P); return which were, (c,)."""
+        on_floor = self.is_floor[pairs]
+        for pair in np.unique(pairs[on_floor]):
+            own = rows[pairs == pair]
+            outer = int(self.outer[pair])
+            shape = self.bodies[outer].shape
+            T = placed.frames[own, self._link[outer]] @ self.bodies[outer].T_link_body
+            lowest = np.min(T[:, 2, :3] @ shape.points.T, axis=1) + T[:, 2, 3]
+            lowest = lowest - shape.ball - shape.disc * np.hypot(T[:, 2, 0], T[:, 2, 1])
+            bounds[own, pair] = lowest - (self.floor_z or 0.0)
+        return on_floor | self._is_exact[pairs]
+
+    def candidates(
+        self, placed: Placed, bounds: FloatArray, is_open: BoolArray | None, extra: float
+    ) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
+        """Return what may be too near: rows, pairs, what is kept, and whether it is decided.
+
+        What needs no coal is measured; of that only what is too near is returned.
+        """
+        on_top = self.on_top(extra)
+        may = bounds < self.most_kept + on_top
+        rows, pairs = np.nonzero(may if is_open is None else may & is_open)
+        if not len(rows):
+            return rows, pairs, np.empty(0), np.empty(0, dtype=bool)
+        kept = self.kept(placed, rows, pairs) + on_top[pairs]
+        near = bounds[rows, pairs] < kept
+        rows, pairs, kept = rows[near], pairs[near], kept[near]
+        decided = self.measure_cheap(placed, rows, pairs, bounds)
+        near = bounds[rows, pairs] < kept
+        return rows[near], pairs[near], kept[near], decided[near]
+
+    def examine(
+        self, placed: Placed, extra: float, *, first: bool = False, one: bool = False
+    ) -> tuple[list[Shortfall], FloatArray]:
+        """Return shortfalls, and distances or lower bounds of them (n, P).
+
+        With `first` one of each configuration is enough, with `one` a single one.
+        """
+        bounds = self.lower_bounds(placed)
+        rows, pairs, kept, decided = self.candidates(placed, bounds, None, extra)
+        found: list[Shortfall] = []
+        done: set[int] = set()
+        # What is decided comes first, then what is probably too near: the rest costs more.
+        for n in np.lexsort((bounds[rows, pairs] - kept, self.is_floor[pairs], ~decided)):
+            row, pair = int(rows[n]), int(pairs[n])
+            if first and row in done:
+                continue
+            if not decided[n]:
+                bounds[row, pair] = self.measure(placed, row, pair)
+            if bounds[row, pair] < kept[n]:
+                found.append(Shortfall(row, pair, float(bounds[row, pair]), float(kept[n])))
+                done.add(row)
+                if one:
+                    break
+        return found, bounds
