@@ -9,10 +9,11 @@ hardly, are named as well.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from remaster_ros.calibration.gauge_words import in_words, resolving_priors, together
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.initial_guess import robust_spread
 from remaster_ros.calibration.model import Model
@@ -104,12 +105,12 @@ def find_gauge(
     directions, why = [], [''] * model.joints
     for column, pivot in enumerate(pivots):
         combination = _about_origin(model, null[:, column], scale)
-        words = _in_words(model, combination)
+        words = in_words(model, combination)
         if pivot in held:
             at = x[pivot] if pivot >= model.core else 0.0
             fixed_by = f'{model.names[pivot]} = {at:g}'
         else:
-            fixed_by = _resolving_priors(priors, x, null[:, column], model)
+            fixed_by = resolving_priors(priors, x, null[:, column], model)
         directions.append(GaugeDirection(_entries(model, combination), words, fixed_by))
         for joint in np.flatnonzero(combination[: model.joints]):
             text = f'the data cannot see it: {words}; fixed by {fixed_by}'
@@ -134,7 +135,7 @@ def _hardly_seen(
     main = np.where(size > WEAK_SHARE * size.max(), direction, 0.0)
     combination = _about_origin(model, main, scale)
     words = (
-        f'{_together(model, combination)} hardly change the observations; poses that are spread '
+        f'{together(model, combination)} hardly change the observations; poses that are spread '
         f'further and turn the tool, or a prior on {model.names[joint]}, would tell them apart'
     )
     known = f'the data, though {model.names[joint]} only to {np.degrees(std):.2f} deg'
@@ -333,76 +334,3 @@ def _about_origin(model: Model, direction: FloatArray, scale: FloatArray) -> Flo
     if largest > 1.0 + 1e-6:
         moved /= moved[np.argmax(np.abs(moved))]
     return moved
-
-
-def _in_words(model: Model, direction: FloatArray) -> str:
-    joints = np.flatnonzero(direction[: model.joints])
-    sensors = [
-        index
-        for index in range(len(model.sensor_names))
-        if np.any(direction[model.registration(index)])
-    ]
-    markers = [
-        index for index in range(len(model.marker_names)) if np.any(direction[model.marker(index)])
-    ]
-    if len(joints) == 1:
-        joint, amount = model.names[joints[0]], direction[joints[0]]
-        if not sensors and not markers:
-            return f'{joint} moves no marker; a marker off its axis would show it'
-        if joints[0] == 0 and not markers:
-            return (
-                f'{joint} offset = a rotation of the '
-                f'{_listed([model.sensor_names[s] for s in sensors])} registration'
-                f'{"s" if len(sensors) > 1 else ""} about the base axis; '
-                'a known base frame (base_prior) would tell them apart'
-            )
-        if joints[0] == model.joints - 1 and not sensors:
-            moved = [
-                f'marker {model.marker_names[m]} moved tangentially, '
-                f'{_per_degree(direction[model.marker(m)] / amount)} mm per degree'
-                for m in markers
-            ]
-            return f'{joint} offset = {_listed(moved)}; a measured marker would tell them apart'
-    return (
-        f'{_together(model, direction)} change no observation; poses that are spread further and '
-        'turn the tool, or a prior on one of them, would tell them apart'
-    )
-
-
-def _together(model: Model, direction: FloatArray) -> str:
-    moved = [
-        f'{name} ({value:+.3g})'
-        for name, value in zip(model.names, direction, strict=True)
-        if value != 0.0
-    ]
-    return f'{_listed(moved)} together'
-
-
-def _per_degree(shift: FloatArray) -> str:
-    return f'{np.radians(1.0) * np.linalg.norm(shift) * 1e3:.3f}'
-
-
-def _listed(parts: Sequence[str]) -> str:
-    if len(parts) < 2:
-        return ''.join(parts)
-    return f'{", ".join(parts[:-1])} and {parts[-1]}'
-
-
-def _resolving_priors(
-    priors: Sequence[Prior], x: FloatArray, direction: FloatArray, model: Model
-) -> str:
-    """Name the priors that hold a direction: those that change along it."""
-    core = replace(model, extension=None)
-    pull = {
-        prior.description: float(
-            np.linalg.norm(
-                prior_rows(core, [prior], x[: model.core], natural=True)[1]
-                @ direction[: model.core]
-            )
-        )
-        for prior in priors
-    }
-    pull['the prior on the effects'] = float(
-        np.linalg.norm(model.extension_root @ model.theta(direction))
-    )
-    return _listed([name for name, p in pull.items() if p > 1e-3 * max(pull.values())])

@@ -6,11 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from remaster_ros.collection.reference_watch import (
-    ReferenceReading,
-    ReferenceWatch,
-    SetupChange,
-)
+from remaster_ros.collection.reference_readings import ReferenceReading, SetupChange
+from remaster_ros.collection.reference_watch import ReferenceWatch
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray, Session
 

@@ -19,11 +19,11 @@ from remaster_ros.planning.candidates import (
     order_solutions,
     plan_poses,
 )
+from remaster_ros.planning.free_order import free_way
 from remaster_ros.planning.tour_order import (
     REFERENCE,
     REGISTRATION,
     Tour,
-    free_way,
     registration_tour,
 )
 from remaster_ros.session.workcell import Workcell

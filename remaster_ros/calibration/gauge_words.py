@@ -1,0 +1,88 @@
+"""Directions that the data cannot see, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.priors import Prior, prior_rows
+from remaster_ros.types import FloatArray
+
+
+def in_words(model: Model, direction: FloatArray) -> str:
+    """Say which parameters change together without any effect, and what would tell them apart."""
+    joints = np.flatnonzero(direction[: model.joints])
+    sensors = [
+        index
+        for index in range(len(model.sensor_names))
+        if np.any(direction[model.registration(index)])
+    ]
+    markers = [
+        index for index in range(len(model.marker_names)) if np.any(direction[model.marker(index)])
+    ]
+    if len(joints) == 1:
+        joint, amount = model.names[joints[0]], direction[joints[0]]
+        if not sensors and not markers:
+            return f'{joint} moves no marker; a marker off its axis would show it'
+        if joints[0] == 0 and not markers:
+            return (
+                f'{joint} offset = a rotation of the '
+                f'{listed([model.sensor_names[s] for s in sensors])} registration'
+                f'{"s" if len(sensors) > 1 else ""} about the base axis; '
+                'a known base frame (base_prior) would tell them apart'
+            )
+        if joints[0] == model.joints - 1 and not sensors:
+            moved = [
+                f'marker {model.marker_names[m]} moved tangentially, '
+                f'{_per_degree(direction[model.marker(m)] / amount)} mm per degree'
+                for m in markers
+            ]
+            return f'{joint} offset = {listed(moved)}; a measured marker would tell them apart'
+    return (
+        f'{together(model, direction)} change no observation; poses that are spread further and '
+        'turn the tool, or a prior on one of them, would tell them apart'
+    )
+
+
+def together(model: Model, direction: FloatArray) -> str:
+    """List the parameters of a direction with their shares."""
+    moved = [
+        f'{name} ({value:+.3g})'
+        for name, value in zip(model.names, direction, strict=True)
+        if value != 0.0
+    ]
+    return f'{listed(moved)} together'
+
+
+def _per_degree(shift: FloatArray) -> str:
+    return f'{np.radians(1.0) * np.linalg.norm(shift) * 1e3:.3f}'
+
+
+def listed(parts: Sequence[str]) -> str:
+    """Join parts by commas and an `and`."""
+    if len(parts) < 2:
+        return ''.join(parts)
+    return f'{", ".join(parts[:-1])} and {parts[-1]}'
+
+
+def resolving_priors(
+    priors: Sequence[Prior], x: FloatArray, direction: FloatArray, model: Model
+) -> str:
+    """Name the priors that hold a direction: those that change along it."""
+    core = replace(model, extension=None)
+    pull = {
+        prior.description: float(
+            np.linalg.norm(
+                prior_rows(core, [prior], x[: model.core], natural=True)[1]
+                @ direction[: model.core]
+            )
+        )
+        for prior in priors
+    }
+    pull['the prior on the effects'] = float(
+        np.linalg.norm(model.extension_root @ model.theta(direction))
+    )
+    return listed([name for name, p in pull.items() if p > 1e-3 * max(pull.values())])
