@@ -128,7 +128,8 @@ class ArmSupervisor:
 
     def recorder_waits(self, waiting_for: str, wall_s: float) -> list[Action]:
         """Take the recorder's sign of life, and which required sensor it misses ('' for none)."""
-        return self._hear('recorder', f'waiting for {waiting_for}' if waiting_for else '', wall_s)
+        why = f'waiting for {waiting_for}' if waiting_for else ''
+        return self._note_alive('recorder', why, wall_s)
 
     def plan(
         self,
@@ -211,7 +212,7 @@ class ArmSupervisor:
             actions = self._conclude(visit, *visit.judge(seen, self._rate), seen)
         elif self._braking is not None:
             actions = self._watch_braking(self._braking, seen)
-        return actions + self._hear('robot', '', wall_s)
+        return actions + self._note_alive('robot', '', wall_s)
 
     def path_found(self, number: int, answer: PathAnswer, wall_s: float) -> list[Action]:
         """Take the answer to a `CheckPath`; one that was asked before the last counts nothing."""
@@ -327,8 +328,8 @@ class ArmSupervisor:
         """Whether a collection is running: what is wrong with the robot then halts it."""
         return self._interlocks.collecting or self._visit is not None
 
-    def _hear(self, name: str, reason: str, wall_s: float) -> list[Action]:
-        self._interlocks.hear(name, reason, wall_s)
+    def _note_alive(self, name: str, reason: str, wall_s: float) -> list[Action]:
+        self._interlocks.note_alive(name, reason, wall_s)
         return self.tick(wall_s)
 
     def _doubt(self, why: str, wall_s: float, *, jumped: bool = False) -> list[Action]:

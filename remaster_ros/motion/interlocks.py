@@ -30,13 +30,13 @@ class Interlocks:
         self.must_collect = False
         self._run = ''
         self._heartbeat_s = heartbeat_s
-        self._heard: dict[str, float] = {}
+        self._seen: dict[str, float] = {}
         self._reasons: dict[str, str] = {}
         self._looked_wall: float | None = None
 
-    def hear(self, name: str, reason: str, wall_s: float) -> None:
+    def note_alive(self, name: str, reason: str, wall_s: float) -> None:
         """Take a sign of life, and why the arm must not move; '' if it may."""
-        self._heard[name], self._reasons[name] = wall_s, reason
+        self._seen[name], self._reasons[name] = wall_s, reason
 
     def planner(self, reason: str, run: str, wall_s: float) -> bool:
         """Take the planner's state; return whether a collection was begun, or is not running.
@@ -54,7 +54,7 @@ class Interlocks:
         self._run = run
         if begun:
             self.must_collect = False
-        self.hear('planner', reason, wall_s)
+        self.note_alive('planner', reason, wall_s)
         return begun
 
     def set(self, name: str, reason: str) -> None:
@@ -76,22 +76,22 @@ class Interlocks:
             return
         pause = wall_s - last
         # Who was heard since is no exception, and nobody was heard in the future.
-        self._heard = {name: min(heard + pause, wall_s) for name, heard in self._heard.items()}
+        self._seen = {name: min(seen + pause, wall_s) for name, seen in self._seen.items()}
 
     def silence_s(self, name: str, wall_s: float) -> float:
         """Return how long somebody was not heard, s; infinite if never."""
-        return wall_s - self._heard[name] if name in self._heard else np.inf
+        return wall_s - self._seen[name] if name in self._seen else np.inf
 
     def fell_silent(self, name: str, wall_s: float) -> str:
         """Return in words that somebody who was heard is silent now; ''."""
-        if name in self._heard and self.silence_s(name, wall_s) > self._heartbeat_s:
+        if name in self._seen and self.silence_s(name, wall_s) > self._heartbeat_s:
             return f'no sign of {name} for {self._heartbeat_s:g} s'
         return ''
 
     @property
     def collecting(self) -> bool:
         """Whether the planner runs a collection that a person began."""
-        return 'planner' in self._heard and not self.reason('planner') and not self.must_collect
+        return 'planner' in self._seen and not self.reason('planner') and not self.must_collect
 
     def blocked(self, wall_s: float) -> str:
         """Return why the arm must not move; '' if it may."""

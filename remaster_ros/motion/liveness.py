@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
-UNHEARD_S = 10.0
+UNSEEN_S = 10.0
 """A node that has not been heard at all may still be starting for so long, s."""
 BACK_S = 1.0
 """What a node that was started again publishes may find its way so much later than its word, s."""
@@ -23,7 +23,7 @@ class Liveness:
         Those that read all the time. One whose node was started (again) is absent until a reading
         has come: what it publishes may find its way later than what it says.
     since_s
-        When listening began, s: for `UNHEARD_S` from then a required sensor may be there though
+        When listening began, s: for `UNSEEN_S` from then a required sensor may be there though
         it has not been heard. As a rule, long ago.
 
     Attributes
@@ -45,13 +45,13 @@ class Liveness:
         self._started: dict[str, str] = {}
         self._back: dict[str, float] = {}
         self._new: set[str] = set()
-        self._heard: dict[str, float] = {}
+        self._seen: dict[str, float] = {}
         self._trouble: dict[str, str] = {}
         self._read: dict[str, float] = {}
         self.readings = dict.fromkeys(sensors, 0)
         self.words: dict[str, int] = {}
 
-    def says(
+    def node_reports(
         self,
         sensor: str,
         ready: bool,
@@ -77,7 +77,7 @@ class Liveness:
         """
         if sensor not in self.readings:
             return
-        self._heard[sensor] = now_s
+        self._seen[sensor] = now_s
         self.words[sensor] = self.words.get(sensor, 0) + 1
         self._trouble[sensor] = '' if ready else message or 'not ready'
         before = self._started.get(sensor, '')
@@ -115,17 +115,17 @@ class Liveness:
         return why
 
     def _why(self, name: str, now_s: float) -> str:
-        if name not in self._heard:
+        if name not in self._seen:
             return ''
-        if now_s - self._heard[name] > self._heartbeat_s:
+        if now_s - self._seen[name] > self._heartbeat_s:
             return f'its node has been silent for {self._heartbeat_s:g} s'
         if name in self._new:
             return self._trouble[name] or 'no reading since its node was started'
         return self._trouble[name]
 
     def _why_unsure(self, name: str, now_s: float) -> str:
-        unheard = name not in self._heard and name not in self._read
-        if unheard and now_s - self._since_s < UNHEARD_S:
+        unseen = name not in self._seen and name not in self._read
+        if unseen and now_s - self._since_s < UNSEEN_S:
             return 'its node has not been heard yet'
         if now_s - self._back.get(name, float('-inf')) < BACK_S:
             return 'its node has just been started again'

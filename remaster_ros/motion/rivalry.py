@@ -37,12 +37,14 @@ class DuplicateNodeCheck:
         # What each rival said last: how long it had been running, s.
         self._uptimes_s: dict[str, float] = {}
 
-    def hear_itself(self, now_s: float) -> None:
+    def update_own(self, now_s: float) -> None:
         """Take this node's own summary, which came back: what is published here is heard here."""
         if self.alone_since_s is None:
             self.alone_since_s = now_s
 
-    def hear(self, started: str, uptime_s: float, own_uptime_s: float, now_s: float) -> bool:
+    def update_other(
+        self, started: str, uptime_s: float, own_uptime_s: float, now_s: float
+    ) -> bool:
         """Take a summary of another start of this node's name.
 
         Parameters

@@ -36,7 +36,7 @@ class EmergencyLink:
     ) -> None:
         self._node, self._on_state, self._silence_s = node, on_state, silence_s
         self.topic = node.resolve_topic_name(topic) if topic else ''
-        self._heard: deque[float] = deque(maxlen=PERIODIC)
+        self._stamps: deque[float] = deque(maxlen=PERIODIC)
         if not topic:
             return
         # The last value of a publisher that keeps it, and whatever any publisher sends from now
@@ -52,17 +52,17 @@ class EmergencyLink:
         """Return why the state of the circuit is not known; '' where it is, or is not used."""
         if not self.topic:
             return ''
-        if not self._heard:
+        if not self._stamps:
             return f'{self.topic} (emergency_stop_topic) is silent: nothing moves without it'
         if not self._node.count_publishers(self.topic):
             return f'nobody publishes {self.topic} (emergency_stop_topic) any more'
-        if len(self._heard) == PERIODIC:
-            longest = max(later - earlier for earlier, later in pairwise(self._heard))
-            silent_s = time.monotonic() - self._heard[-1]
+        if len(self._stamps) == PERIODIC:
+            longest = max(later - earlier for earlier, later in pairwise(self._stamps))
+            silent_s = time.monotonic() - self._stamps[-1]
             if longest <= self._silence_s < silent_s - longest:
                 return f'{self.topic} (emergency_stop_topic) has been silent for {silent_s:.1f} s'
         return ''
 
     def _on_message(self, message: Bool) -> None:
-        self._heard.append(time.monotonic())
+        self._stamps.append(time.monotonic())
         self._on_state(message.data)

@@ -179,18 +179,18 @@ class PosePlanner(RemasterNode):
             why = 'its run was in another boot of this computer, or was ended'
         elif passed_s > self.p.resume_within_s:
             why = f'its run has been without a planner for {passed_s:.0f} s'
-        elif not all(self._poses.says(name, 'started') for name in PEERS):
+        elif not all(self._poses.value(name, 'started') for name in PEERS):
             self._why = 'waiting for robot_bridge and recorder to confirm the run'
             return
         else:
-            says = self._poses.says
-            other = [name for name in PEERS if says(name, 'run') != self._left]
+            value = self._poses.value
+            other = [name for name in PEERS if value(name, 'run') != self._left]
             if other:
                 why = f'{" and ".join(other)} did not take part in its run'
-            elif halted := says('robot_bridge', 'halted'):
+            elif halted := value('robot_bridge', 'halted'):
                 why = f'the arm is halted: {halted}'
-            elif says('recorder', 'changed_run') in (self._left, 'unknown'):
-                why = says('recorder', 'changed')
+            elif value('recorder', 'changed_run') in (self._left, 'unknown'):
+                why = value('recorder', 'changed')
         with self._lock:
             left, self._left = self._left, ''
             if left and not why:
@@ -216,16 +216,16 @@ class PosePlanner(RemasterNode):
         if self.state in ('complete', 'failed'):
             response.message = f'the collection is {self.state}: {self._why or "start anew"}'
             return response
-        if halted := self._poses.says('robot_bridge', 'halted'):
+        if halted := self._poses.value('robot_bridge', 'halted'):
             response.message = f'the arm is halted: {halted}; /remaster/clear_halt, then collect'
             return response
-        if self._poses.says('recorder', 'exit_status') == 'complete':
+        if self._poses.value('recorder', 'exit_status') == 'complete':
             response.message = "the recorder's session is complete; give it a new folder"
             return response
-        if self._poses.says('recorder', 'changed_run') == 'unknown':
+        if self._poses.value('recorder', 'changed_run') == 'unknown':
             response.message = 'the recorder was started just now; try again in a second'
             return response
-        if self.state != 'running' and self._poses.says('recorder', 'changed_run') not in (
+        if self.state != 'running' and self._poses.value('recorder', 'changed_run') not in (
             '',
             'none',
         ):
@@ -327,7 +327,7 @@ class PosePlanner(RemasterNode):
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
         self._preflight.on_summary(node, message, values)
-        self._poses.hear(node, values)
+        self._poses.take_summary(node, values)
         if node == 'robot_bridge' and values.get('halted'):
             self._set_state('paused', values['halted'], only_from='running')
         run = self._run
@@ -357,7 +357,7 @@ class PosePlanner(RemasterNode):
         self._write_state()
         if self.journal.trouble and not self._is_written():
             return
-        if self.state != 'running' or self._q is None or not self._heard():
+        if self.state != 'running' or self._q is None or not self._all_alive():
             return
         if not self._is_cleared():
             return
@@ -425,17 +425,17 @@ class PosePlanner(RemasterNode):
 
     def _check_session(self) -> None:
         """Refuse to add another plan's poses to a session."""
-        theirs = self._poses.says('recorder', 'plan')
-        observations = self._poses.says('recorder', 'observations')
+        theirs = self._poses.value('recorder', 'plan')
+        observations = self._poses.value('recorder', 'observations')
         if theirs not in ('', self.journal.id) and observations != '0':
-            session = self._poses.says('recorder', 'session')
+            session = self._poses.value('recorder', 'session')
             raise InputError(
                 f'the session {session} holds observations of another plan than '
                 f'{self.journal.path}; give the planner the same session folder as the recorder, '
                 'or begin a new session'
             )
 
-    def _heard(self) -> bool:
+    def _all_alive(self) -> bool:
         """Whether clock, bridge and recorder are there for the next pose."""
         if self.clock_trouble:
             self._why = self.clock_trouble
@@ -490,7 +490,7 @@ class PosePlanner(RemasterNode):
             assert self.journal.tour is not None
             raise InsufficientDataError(
                 f'no registration of {", ".join(missing)} after {self.journal.tour.visited} poses '
-                f'({self._poses.says("recorder", "registration")}); the recorder counts why '
+                f'({self._poses.value("recorder", "registration")}); the recorder counts why '
                 'readings were rejected'
             )
         return None if proposed is None else proposed[0]

@@ -27,7 +27,7 @@ MATCH_WALL_S = 0.5
 class _Peer:
     """The last summary of a node that must know the pose under way."""
 
-    heard_wall: float
+    last_seen_wall: float
     values: dict[str, str]
 
 
@@ -58,12 +58,12 @@ class PosePublisher:
         self._told: dict[str, str] = {}
         self._matched_wall: float | None = None
 
-    def hear(self, node: str, values: dict[str, str]) -> None:
+    def take_summary(self, node: str, values: dict[str, str]) -> None:
         """Take the summary of a node."""
         if node in PEERS:
             self._peers[node] = _Peer(time.monotonic(), values)
 
-    def says(self, node: str, key: str) -> str:
+    def value(self, node: str, key: str) -> str:
         """Return a value of a peer's last summary; '' where it is not there."""
         peer = self._peers.get(node)
         return peer.values.get(key, '') if peer else ''
@@ -94,12 +94,14 @@ class PosePublisher:
         """Whether the open pose is to be announced (again): somebody does not know it."""
         if not self.stamp:
             return True
-        if self.says('recorder', 'state') == 'measuring':
+        if self.value('recorder', 'state') == 'measuring':
             return False
         missed_wall = self._published_wall + ANNOUNCE_WALL_S
         return any(
             peer.values.get('pose') != self.stamp
-            and (peer.values.get('started') != self._told[node] or peer.heard_wall > missed_wall)
+            and (
+                peer.values.get('started') != self._told[node] or peer.last_seen_wall > missed_wall
+            )
             for node, peer in self._peers.items()
         )
 

@@ -119,7 +119,7 @@ class PoseTracker:
         self._solutions: FloatArray | None = None
         self._stamp = ''
 
-    def hear_pose(self, values: Mapping[str, str]) -> None:
+    def take_pose(self, values: Mapping[str, str]) -> None:
         """Take the values of the planner's event ``pose``."""
         # Bags of the first version have neither ids nor plan.
         ids = values.get('ids', ' '.join(map(str, range(int(values['solutions'])))))
@@ -132,7 +132,7 @@ class PoseTracker:
             values.get('last') == 'yes',
         )
 
-    def hear_solutions(self, message: JointTrajectory) -> None:
+    def take_solutions(self, message: JointTrajectory) -> None:
         """Take /remaster/joint_solutions; without points it takes the pose back."""
         self._stamp, self._solutions = '', None
         names = list(message.joint_names)

@@ -149,7 +149,7 @@ class Recorder(RemasterNode):
         bag.subscribe(JointState, 'joint_states', self._on_joint_state, JOINT_STATES)
         bag.subscribe(JointState, 'remaster/settled', self._on_settled)
         poses = self._pose_tracker
-        bag.subscribe(JointTrajectory, 'remaster/joint_solutions', poses.hear_solutions)
+        bag.subscribe(JointTrajectory, 'remaster/joint_solutions', poses.take_solutions)
         bag.subscribe(JointTrajectory, 'joint_trajectory_controller/joint_trajectory')
         clients = {}
         for name, sensor in self.cell.sensors.items():
@@ -207,7 +207,7 @@ class Recorder(RemasterNode):
 
     def _on_event(self, event: Event) -> None:
         if (event.node, event.event) == ('pose_planner', 'pose'):
-            self._pose_tracker.hear_pose(event.values)
+            self._pose_tracker.take_pose(event.values)
             if event.values['split'] not in (REFERENCE, REGISTRATION):
                 self._say_change(self._watching.leave(self.registrar.T_R_N))
             if not self._disk.full and not self.journal.closed:
@@ -223,7 +223,7 @@ class Recorder(RemasterNode):
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
         if 'sensor' in values:
-            self._liveness.says(
+            self._liveness.node_reports(
                 values['sensor'],
                 values.get('ready') == 'yes',
                 message,

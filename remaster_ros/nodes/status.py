@@ -120,7 +120,7 @@ class NodeStatus:
             return
         now = time.monotonic()
         if started == self._started:
-            self._duplicates.hear_itself(now)
+            self._duplicates.update_own(now)
             return
         try:
             uptime_s = float(values['uptime_s'])
@@ -129,7 +129,7 @@ class NodeStatus:
         # A replay publishes what a node of this name once said, and is another node.
         if self._namesakes() < 2:
             return
-        if self._duplicates.hear(started, uptime_s, now - self._started_wall, now):
+        if self._duplicates.update_other(started, uptime_s, now - self._started_wall, now):
             self._node.failure = InputError(  # type: ignore[attr-defined]
                 f'{own} is running already in this ROS domain, for {uptime_s:.0f} s, on another '
                 'computer or for another user; end that one, or give this one a namespace '

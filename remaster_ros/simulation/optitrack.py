@@ -48,7 +48,7 @@ Address = tuple[str, int]
 class _Client:
     """A unicast client: when it was last heard (wall time), and its bitstream."""
 
-    heard_s: float
+    last_seen_s: float
     version: Version
 
 
@@ -232,7 +232,7 @@ class FakeOptiTrackServer:
                 continue
             with self._lock:
                 if address in self._clients:
-                    self._clients[address].heard_s = time.monotonic()
+                    self._clients[address].last_seen_s = time.monotonic()
             for answer in self._answers(request, address):
                 self._send(answer, address, self._version_of(address))
 
@@ -263,7 +263,7 @@ class FakeOptiTrackServer:
         with self._lock:
             self._clients[address] = _Client(time.monotonic(), version)
             while len(self._clients) > MAX_CLIENTS:
-                self._clients.pop(min(self._clients, key=lambda a: self._clients[a].heard_s))
+                self._clients.pop(min(self._clients, key=lambda a: self._clients[a].last_seen_s))
 
     def _server_info(self) -> natnet.ServerInfo:
         group, data_port = self._group
@@ -307,7 +307,7 @@ class FakeOptiTrackServer:
             return
         oldest = time.monotonic() - self._client_timeout_s
         with self._lock:
-            silent = [address for address, c in self._clients.items() if c.heard_s < oldest]
+            silent = [address for address, c in self._clients.items() if c.last_seen_s < oldest]
             for address in silent:
                 del self._clients[address]
         for address in silent:

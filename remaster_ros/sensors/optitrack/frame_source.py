@@ -72,7 +72,7 @@ class SourceLock:
         self.source: Source | None = None
         self._last: Source | None = None
         self.taken = 0
-        self._heard_s = 0.0
+        self._last_frame_s = 0.0
         self._answered = False
         self._others: dict[Source, _Other] = {}
 
@@ -82,7 +82,7 @@ class SourceLock:
 
     def release_if_silent(self, now_s: float) -> bool:
         """Free the lock after a silence of its holder; tell whether it was freed now."""
-        if self.source is None or now_s - self._heard_s <= self._silence_s:
+        if self.source is None or now_s - self._last_frame_s <= self._silence_s:
             return False
         self.source = None
         self._answered = False
@@ -106,12 +106,12 @@ class SourceLock:
         if self.is_refused(source, now_s):
             return SourceVerdict.FOREIGN
         if source == self.source:
-            self._heard_s = now_s
+            self._last_frame_s = now_s
             for other in self._others.values():
                 other.beside = other.beside or now_s - other.first_s > PROBATION_S
             return SourceVerdict.BELIEVED
         if source == self._last:
-            self.source, self._heard_s = source, now_s
+            self.source, self._last_frame_s = source, now_s
             return SourceVerdict.BELIEVED
         if not self._answered:
             return SourceVerdict.PROBATION
@@ -121,7 +121,7 @@ class SourceLock:
             return SourceVerdict.PROBATION
         del self._others[source]
         self.source = self._last = source
-        self._heard_s = now_s
+        self._last_frame_s = now_s
         self.taken += 1
         return SourceVerdict.BELIEVED
 

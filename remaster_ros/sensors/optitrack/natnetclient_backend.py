@@ -147,10 +147,10 @@ class NatNetClientBackend(MarkerFollower):
         source = client.data_sock._sock
         source.settimeout(POLL_S)
         failures = 0
-        heard_at = time.monotonic()
+        last_frame_s = time.monotonic()
         while not self._stopping.is_set() and failures < FAILURES_IN_A_ROW:
             if self._release_silent_source() or (
-                time.monotonic() - heard_at > self._settings.silence_s
+                time.monotonic() - last_frame_s > self._settings.silence_s
             ):
                 return
             try:
@@ -167,7 +167,7 @@ class NatNetClientBackend(MarkerFollower):
             except ProtocolError as error:
                 self._note_malformed(error)
                 continue
-            heard_at = time.monotonic()
+            last_frame_s = time.monotonic()
             sample = self._take_whole_frame(frame, received_s, sender)
             if sender != self._lock.source:
                 continue

@@ -12,10 +12,10 @@ def settle(a_started_s, b_started_s, ids=('1', '2'), delay_s=0.0, turns=3):
     ends = [False, False]
     for turn in range(turns):
         sent_s = 10.0 + 0.5 * turn
-        heard_s = sent_s + delay_s
+        last_seen_s = sent_s + delay_s
         for me, other in ((0, 1), (1, 0)):
-            ends[me] |= nodes[me].hear(
-                ids[other], sent_s - begun[other], heard_s - begun[me], heard_s
+            ends[me] |= nodes[me].update_other(
+                ids[other], sent_s - begun[other], last_seen_s - begun[me], last_seen_s
             )
     return ends
 
@@ -36,26 +36,26 @@ def test_never_both_go_on(delay_s, apart_s, ids):
 def test_the_last_words_of_a_killed_process_end_nobody():
     """One message of a node that had run for long, after its successor was started."""
     node = DuplicateNodeCheck('2')
-    node.hear_itself(0.0)
-    assert not node.hear('1', 5000.0, 0.6, 0.6)
+    node.update_own(0.0)
+    assert not node.update_other('1', 5000.0, 0.6, 0.6)
     # The same once more, as a late copy.
-    assert not node.hear('1', 5000.0, 0.7, 0.7)
-    assert node.hear('1', 5000.5, 1.1, 1.1)
+    assert not node.update_other('1', 5000.0, 0.7, 0.7)
+    assert node.update_other('1', 5000.5, 1.1, 1.1)
 
 
 def test_alone_only_after_listening_and_without_a_rival():
     node = DuplicateNodeCheck('1')
     assert not node.alone(100.0)
-    node.hear_itself(100.0)
-    node.hear_itself(101.0)
+    node.update_own(100.0)
+    node.update_own(101.0)
     assert not node.alone(100.0 + LISTEN_S - 0.01)
     assert node.alone(100.0 + LISTEN_S)
-    node.hear('2', 1.0, 50.0, 110.0)
+    node.update_other('2', 1.0, 50.0, 110.0)
     assert not node.alone(111.0)
     assert node.alone(110.0 + LISTEN_S)
 
 
 def test_a_rival_before_it_has_heard_itself_does_not_count_as_listening():
     node = DuplicateNodeCheck('1')
-    node.hear('2', 1.0, 50.0, 10.0)
+    node.update_other('2', 1.0, 50.0, 10.0)
     assert node.alone_since_s is None
