@@ -13,18 +13,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from remaster_ros.errors import DeviceError, InputError
+from remaster_ros.errors import DeviceError
 from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.messages import stamp_of, temperature_topic, transform_array
 from remaster_ros.nodes.parameters import declare, parameter
-from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import LATCHED, RELIABLE, NodeStatus
+from remaster_ros.nodes.running import run
+from remaster_ros.nodes.sensor_node import SensorNode, SensorState
+from remaster_ros.nodes.status import LATCHED, RELIABLE
 from remaster_ros.sensors.laser_tracker.client import (
     LaserTrackerClient,
     LaserTrackerError,
@@ -32,7 +33,6 @@ from remaster_ros.sensors.laser_tracker.client import (
     TrackerReading,
     TrackerStatus,
 )
-from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 
 
@@ -75,20 +75,15 @@ class Parameters:
     )
 
 
-class LaserTrackerMarkers(RemasterNode):
+class LaserTrackerMarkers(SensorNode):
     """See the module's text."""
 
     def __init__(self) -> None:
         super().__init__('laser_tracker_markers')
         self.p = declare(self, Parameters)
-        cell = read_cell(self.p.cell)
-        if self.p.sensor not in cell.sensors:
-            raise InputError(
-                f'laser_tracker_markers: parameter sensor is {self.p.sensor!r}; '
-                f'the cell has {", ".join(cell.sensors)}'
-            )
-        sensor = cell.sensors[self.p.sensor]
-        self._marker_T = np.array(cell.markers[sensor.marker])
+        self.open_sensor(self.p.cell, self.p.sensor)
+        sensor = self.cell.sensors[self.p.sensor]
+        self._marker_T = np.array(self.cell.markers[sensor.marker])
         self._T_N_R: FloatArray | None = None
         self._marker_R: FloatArray | None = None
         self._state, self._trouble = 'connecting', ''
@@ -107,7 +102,6 @@ class LaserTrackerMarkers(RemasterNode):
         self._arrival_s: float | None = None
         self._commanded = threading.Event()
         self._ending = threading.Event()
-        self._publisher = self.create_publisher(PointStamped, sensor.topic, RELIABLE)
         self._temperatures = self.create_publisher(
             Temperature, temperature_topic(sensor.topic), RELIABLE
         )
@@ -127,7 +121,7 @@ class LaserTrackerMarkers(RemasterNode):
             self._on_measure,
             callback_group=MutuallyExclusiveCallbackGroup(),
         )
-        self.status = NodeStatus(self, self._summary)
+        self.open_status()
         self._thread = threading.Thread(target=self._keep_locked, daemon=True)
         self._thread.start()
 
@@ -247,13 +241,9 @@ class LaserTrackerMarkers(RemasterNode):
         took = time.monotonic() - began
         self._trouble = ''
         self._publish_temperature(reading)
-        message = PointStamped()
-        message.header.stamp = stamp_of(reading.stamp_s)
-        message.header.frame_id = self.p.sensor
-        message.point.x, message.point.y, message.point.z = map(float, reading.position)
         # What the instrument took is not the software's time.
         self.status.event('measured', 'measured', instrument_wall_s=f'{took:.6f}')
-        self._publisher.publish(message)
+        self.publish_reading(reading.position, reading.stamp_s)
         response.success, response.message = True, 'measured'
         return response
 
@@ -288,21 +278,23 @@ class LaserTrackerMarkers(RemasterNode):
         assert failure is not None
         raise failure
 
-    def _summary(self) -> tuple[str, str, dict[str, Any]]:
-        trouble = self.clock_trouble or self._trouble
-        measures = self._state == 'ready' and self.tracker.connected and not self.clock_trouble
-        level = 'ok' if not trouble else 'warn' if self._state == 'ready' else 'error'
+    def state(self) -> SensorState:
+        """Return how the instrument is, and what it has refused."""
         values: dict[str, Any] = {
-            'sensor': self.p.sensor,
-            'ready': 'yes' if measures else 'no',
             'state': self._state,
-            'trouble': trouble,
             'lock': self.tracker.status.value,
             **self.tracker.counts,
         }
         if self._temperature_c is not None:
             values['temperature_c'] = self._temperature_c
-        return level, trouble or self._state, values
+        can_measure = self._state == 'ready'
+        return SensorState(
+            ready=can_measure and self.tracker.connected,
+            trouble=self._trouble,
+            message=self._state,
+            level='ok' if not self._trouble else 'warn' if can_measure else 'error',
+            values=values,
+        )
 
     def close(self) -> None:
         """Let the instrument go."""

@@ -8,22 +8,17 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
-from geometry_msgs.msg import PointStamped
-
-from remaster_ros.errors import DeviceError, InputError
-from remaster_ros.nodes.messages import stamp_of
+from remaster_ros.errors import DeviceError
 from remaster_ros.nodes.parameters import declare, parameter
-from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import RELIABLE, NodeStatus
+from remaster_ros.nodes.running import run
+from remaster_ros.nodes.sensor_node import SensorNode, SensorState
 from remaster_ros.sensors.clock_offset import ClockMapping
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.diagnosis import NatNetSettings, warning
 from remaster_ros.sensors.optitrack.frame_gate import MarkerChoice, MarkerSample
 from remaster_ros.sensors.optitrack.marker_follower import MarkerFollower
 from remaster_ros.sensors.optitrack.natnetclient_backend import NatNetClientBackend
-from remaster_ros.session.workcell import read_cell
 
 
 @dataclass(frozen=True)
@@ -56,27 +51,18 @@ class Parameters:
     )
 
 
-class OptiTrackMarkers(RemasterNode):
+class OptiTrackMarkers(SensorNode):
     """See the module's text."""
 
     def __init__(self) -> None:
         super().__init__('optitrack_markers')
         self.p = declare(self, Parameters)
-        cell = read_cell(self.p.cell)
-        if self.p.sensor not in cell.sensors:
-            raise InputError(
-                f'optitrack_markers: parameter sensor is {self.p.sensor!r}; '
-                f'the cell has {", ".join(cell.sensors)}'
-            )
+        self.open_sensor(self.p.cell, self.p.sensor)
         simulated = self.get_parameter('use_sim_time').value
         self._clock_mapping = ClockMapping(simulated=bool(simulated))
-        self._publisher = self.create_publisher(
-            PointStamped, cell.sensors[self.p.sensor].topic, RELIABLE
-        )
-        self.published = 0
         self.client = self._make_client()
         self.client.start()
-        self.status = NodeStatus(self, self._summary)
+        self.open_status()
         self._started_s = time.monotonic()
         self._timer = self.create_timer(0.5, self._check_start, clock=self.status.steady)
 
@@ -114,29 +100,18 @@ class OptiTrackMarkers(RemasterNode):
         if sample.received_s <= 0.0:
             # A simulated clock that has not been heard yet: nobody can say when this was.
             return
-        message = PointStamped()
         captured = self._clock_mapping.capture_time(
             sample.timestamp_s, sample.age_s, sample.received_s
         )
-        message.header.stamp = stamp_of(captured)
-        message.header.frame_id = self.p.sensor
-        message.point.x, message.point.y, message.point.z = map(float, sample.position)
-        self._publisher.publish(message)
-        self.published += 1
+        self.publish_reading(sample.position, captured)
 
-    def _summary(self) -> tuple[str, str, dict[str, Any]]:
+    def state(self) -> SensorState:
+        """Return what the frames, and those that do not come, tell."""
         status = self.client.status()
         diagnosis = self.client.diagnosis()
-        trouble = self.clock_trouble or diagnosis.message
-        # A hidden marker is no reason to stop the arm: moving on shows it again.
-        ready = diagnosis.fault in ('none', 'marker') and not self.clock_trouble
         values = {
-            'sensor': self.p.sensor,
-            'ready': 'yes' if ready else 'no',
             'fault': diagnosis.fault,
-            'trouble': trouble,
             'frames': status.frames,
-            'published': self.published,
             'lost': status.lost,
             'source': status.source,
             'sources_taken': status.sources_taken,
@@ -144,8 +119,13 @@ class OptiTrackMarkers(RemasterNode):
             **{f'dropped_{reason}': count for reason, count in status.dropped.items()},
         }
         odd = warning(status)
-        level = 'error' if trouble else 'warn' if odd else 'ok'
-        return level, trouble or odd or 'ok', values
+        return SensorState(
+            ready=diagnosis.fault in ('none', 'marker'),
+            trouble=diagnosis.message,
+            message=odd or 'ok',
+            level='error' if diagnosis.message else 'warn' if odd else 'ok',
+            values=values,
+        )
 
     def close(self) -> None:
         """Say goodbye to the server."""
