@@ -33,6 +33,11 @@ FAST, LATE_FAST_WALL_S = 5.0, 0.5
 machine that is busy with it may delay by so much, s of wall time."""
 DRIFT = 2e-4
 """Two clocks may run apart by so many seconds a second."""
+SHORTEN = 0.05
+"""Where reports come sooner than was learned, what is usual follows by so many seconds a second.
+
+What was learned from reports that a network held up would excuse late ones afterwards.
+"""
 LEARN, LEARN_WALL_S = 5, 1.0
 """By so many reports at least, over so much wall time (s), is learned how long one takes.
 
@@ -186,7 +191,7 @@ class JointReports:
         return '', ''
 
     def _learn(self, report: JointReport) -> None:
-        """Follow how long a report usually takes; a drift of the clocks, but no jump."""
+        """Follow how long a report usually takes: at once where it takes less, else a drift."""
         delay = report.clock_s - report.stamp_s
         if self._delay is None:
             self._delays.append((report.wall_s, delay))
@@ -196,5 +201,5 @@ class JointReports:
             return
         assert self._last is not None
         passed = min(report.wall_s - self._last.wall_s, 1.0)
-        step = DRIFT * passed * max(self.clock.rate, 1.0)
-        self._delay += float(np.clip(delay - self._delay, -step, step))
+        passed *= max(self.clock.rate, 1.0)
+        self._delay += float(np.clip(delay - self._delay, -SHORTEN * passed, DRIFT * passed))
