@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -170,6 +170,27 @@ class Effect:
     costly: bool = False
     moves_the_fit: bool = False
     driven_by_joint: bool = False
+
+    def cell(
+        self,
+        *,
+        columns: Callable[[Context], Design],
+        parameters: tuple[str, ...],
+        joints: tuple[int, ...] = (),
+        **more: Any,
+    ) -> Cell:
+        """Return a cell of this effect; see `Cell` for the arguments."""
+        return Cell(
+            name=self.name,
+            place=self.place,
+            driver=self.driver,
+            form=self.form,
+            unit=self.unit,
+            columns=columns,
+            parameters=parameters,
+            joints=joints,
+            **more,
+        )
 
 
 def at_joint(joint: int, *features: FloatArray) -> Design:

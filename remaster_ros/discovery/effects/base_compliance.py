@@ -24,14 +24,9 @@ def cells(context: Context) -> Iterator[Cell]:
         ('isotropic', isotropic, ('base_compliance',)),
         ('by axis', by_axis, ('base_compliance_x', 'base_compliance_y')),
     ):
-        yield Cell(
-            name=EFFECT.name,
+        yield EFFECT.cell(
             joints=(),
-            place=EFFECT.place,
-            driver=EFFECT.driver,
-            form=EFFECT.form,
             parameters=parameters,
-            unit=EFFECT.unit,
             columns=columns,
             drawn_from=2,
             variant=variant,

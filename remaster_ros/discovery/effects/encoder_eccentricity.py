@@ -25,16 +25,11 @@ def cells(context: Context) -> Iterator[Cell]:
                 waves = [wave(order * angle) for order in orders for wave in (np.sin, np.cos)]
                 return at_joint(joint, *waves)
 
-            yield Cell(
-                name=EFFECT.name,
+            yield EFFECT.cell(
                 joints=(joint,),
-                place=EFFECT.place,
-                driver=EFFECT.driver,
-                form=EFFECT.form,
                 parameters=tuple(
                     f'{wave}{order}_{joint}' for order in orders for wave in ('sin', 'cos')
                 ),
-                unit=EFFECT.unit,
                 columns=columns,
                 drawn_from=context.joints * len(ORDERS),
                 variant='+'.join(map(str, orders)),

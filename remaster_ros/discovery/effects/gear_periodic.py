@@ -25,14 +25,9 @@ def cells(context: Context) -> Iterator[Cell]:
                 phase = order * context.measurements.q[:, joint - 1]
                 return at_joint(joint, np.sin(phase), np.cos(phase))
 
-            yield Cell(
-                name=EFFECT.name,
+            yield EFFECT.cell(
                 joints=(joint,),
-                place=EFFECT.place,
-                driver=EFFECT.driver,
-                form=EFFECT.form,
                 parameters=(f'sin{order}_{joint}', f'cos{order}_{joint}'),
-                unit=EFFECT.unit,
                 columns=columns,
                 drawn_from=context.joints * len(orders),
                 variant=str(order),

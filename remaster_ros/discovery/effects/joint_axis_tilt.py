@@ -33,14 +33,9 @@ def cells(context: Context) -> Iterator[Cell]:
                     context, [turn @ axis for axis in chosen], context.joint_origin(joint)
                 )
 
-            yield Cell(
-                name=EFFECT.name,
+            yield EFFECT.cell(
                 joints=(joint,),
-                place=EFFECT.place,
-                driver=EFFECT.driver,
-                form=EFFECT.form,
                 parameters=tuple(f'tilt_{axis}_{joint}' for axis in axes),
-                unit=EFFECT.unit,
                 columns=columns,
                 drawn_from=(context.joints - 1)
                 * (1 if len(axes) > 1 else RARITY * len(directions)),

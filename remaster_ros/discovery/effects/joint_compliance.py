@@ -21,14 +21,9 @@ def cells(context: Context) -> Iterator[Cell]:
         def columns(context: Context, joint: int = joint) -> Design:
             return at_joint(joint, context.gravity_torque[:, joint - 1])
 
-        yield Cell(
-            name=EFFECT.name,
+        yield EFFECT.cell(
             joints=(joint,),
-            place=EFFECT.place,
-            driver=EFFECT.driver,
-            form=EFFECT.form,
             parameters=(f'compliance_{joint}',),
-            unit=EFFECT.unit,
             columns=columns,
             drawn_from=context.joints,
         )

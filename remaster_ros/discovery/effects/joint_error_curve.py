@@ -38,14 +38,9 @@ def cells(context: Context) -> Iterator[Cell]:
             values = basis(context.measurements.q[:, joint - 1], knots)
             return Design(joint - 1, values)
 
-        yield Cell(
-            name=EFFECT.name,
+        yield EFFECT.cell(
             joints=(joint,),
-            place=EFFECT.place,
-            driver=EFFECT.driver,
-            form=EFFECT.form,
             parameters=tuple(f'curve_{joint}_at_{angle:+.1f}deg' for angle in angles),
-            unit=EFFECT.unit,
             columns=columns,
             drawn_from=RARITY * context.joints,
             penalty=roughness(len(angles)),

@@ -22,14 +22,9 @@ def cells(context: Context) -> Iterator[Cell]:
             ) -> Design:
                 return displaced(context.link_rotation(link) @ direction)
 
-            yield Cell(
-                name=EFFECT.name,
+            yield EFFECT.cell(
                 joints=(link,),
-                place=EFFECT.place,
-                driver=EFFECT.driver,
-                form=EFFECT.form,
                 parameters=(f'length_{link}' if axis == 'along' else f'offset_{axis}_{link}',),
-                unit=EFFECT.unit,
                 columns=columns,
                 drawn_from=len(context.links()) * len(directions),
                 variant=axis,

@@ -21,14 +21,9 @@ def cells(context: Context) -> Iterator[Cell]:
             turn = context.tool[:, :3, :3]
             return displaced(*(turn[:, :, axis] * mine for axis in range(3)))
 
-        yield Cell(
-            name=EFFECT.name,
+        yield EFFECT.cell(
             joints=(),
-            place=EFFECT.place,
-            driver=EFFECT.driver,
-            form=EFFECT.form,
             parameters=tuple(f'{axis}_{name}' for axis in 'xyz'),
-            unit=EFFECT.unit,
             columns=columns,
             drawn_from=len(context.marker_names),
             subject=name,

@@ -34,14 +34,9 @@ def cells(context: Context) -> Iterator[Cell]:
             ('shift', shift, shifts),
             ('shift and turn', motion, shifts + turns),
         ):
-            yield Cell(
-                name=EFFECT.name,
+            yield EFFECT.cell(
                 joints=(),
-                place=EFFECT.place,
-                driver=EFFECT.driver,
-                form=EFFECT.form,
                 parameters=parameters,
-                unit=EFFECT.unit,
                 columns=columns,
                 drawn_from=2 * len(context.sensor_names),
                 variant=variant,

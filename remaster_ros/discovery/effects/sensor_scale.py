@@ -33,14 +33,9 @@ def cells(context: Context) -> Iterator[Cell]:
             ('depth', depth, (f'scale_z_{name}',)),
             ('by axis', by_axis, tuple(f'scale_{axis}_{name}' for axis in 'xyz')),
         ):
-            yield Cell(
-                name=EFFECT.name,
+            yield EFFECT.cell(
                 joints=(),
-                place=EFFECT.place,
-                driver=EFFECT.driver,
-                form=EFFECT.form,
                 parameters=parameters,
-                unit=EFFECT.unit,
                 columns=columns,
                 drawn_from=3 * len(context.sensor_names),
                 variant=variant,
