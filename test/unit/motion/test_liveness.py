@@ -19,6 +19,7 @@ def test_silent_or_not_ready_is_absent_and_says_why():
     assert liveness.absent(14.0) == {'mocap': silent}
     liveness.node_reports('tracker', False, '', 14.0)
     assert liveness.absent(14.0)['tracker'] == 'not ready'
+    assert liveness.words == {'mocap': 1, 'tracker': 3}
 
 
 def test_readings_are_counted_and_dated():

@@ -59,3 +59,22 @@ def test_a_rival_before_it_has_heard_itself_does_not_count_as_listening():
     node = DuplicateNodeCheck('1')
     node.update_other('2', 1.0, 50.0, 10.0)
     assert node.alone_since_s is None
+
+
+@pytest.mark.parametrize(
+    ('own', 'rival', 'uptime_s', 'ends'),
+    [
+        # At the very difference up to which the identities decide, and at that which decides alone.
+        ('2', '1', 2.5, True),
+        ('1', '2', 2.5, True),
+        ('1', '2', 1.5, False),
+        ('2', '1', 1.5, True),
+        # Its own summary come back is no rival.
+        ('1', '1', 1.0, False),
+    ],
+)
+def test_differences_that_are_the_bounds_themselves(own, rival, uptime_s, ends):
+    node = DuplicateNodeCheck(own)
+    node.update_own(0.0)
+    assert not node.update_other(rival, uptime_s - 0.5, 0.5, 0.5)
+    assert node.update_other(rival, uptime_s, 1.0, 1.0) is ends

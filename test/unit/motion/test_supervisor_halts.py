@@ -408,6 +408,38 @@ def test_while_nothing_is_collected_a_clock_may_be_set(rig):
     rig.run(20.0, lambda: rig.said(Settled))
 
 
+def test_a_recorder_that_answers_nothing_is_no_failure_of_the_arm(rig):
+    """The arm was there each time: it is not halted, however often that happens in a row."""
+    rig.plan([0.3, 0.0], [0.2, 0.1], [0.1, 0.2], [0.0, 0.3])
+    rig.run(150.0, lambda: len(rig.said(Failed)) == 4)
+    assert len(rig.said(Settled)) == 4 > RULES.failures_in_a_row
+    assert not rig.said(Halted)
+
+
+def test_before_a_planner_is_there_a_clock_may_be_set():
+    rig = Rig(begun=False)
+    rig.alive.discard('planner')
+    rig.run(2.0)
+    rig.stamp_shift = -3600.0
+    rig.run(3.0)
+    assert rig.supervisor.trouble == ''
+    rig.alive.add('planner')
+    rig.plan([0.3, 0.0])
+    rig.run(20.0, lambda: rig.said(Settled))
+
+
+def test_a_halt_that_was_cleared_before_the_planner_came_waits_for_a_person():
+    """A planner that runs on, under a run that this bridge has not met, begins nothing."""
+    rig = Rig(begun=False, halted='an emergency stop')
+    rig.alive.discard('planner')
+    rig.run(2.0)
+    assert rig.supervisor.clear_halt() == ''
+    rig.do(rig.supervisor.planner_is('running', rig.wall, 'a run'))
+    assert rig.supervisor.blocked(rig.wall) == 'the halt was cleared: /remaster/collect goes on'
+    rig.do(rig.supervisor.planner_is('running', rig.wall, 'another run'))
+    assert '/remaster/collect' not in rig.supervisor.blocked(rig.wall)
+
+
 def test_a_pause_while_the_arm_settles_commands_nothing(rig):
     """Its move is over: there is nothing to be stopped, and it is commanded again afterwards."""
     rig.plan([0.3, 0.0])
