@@ -69,6 +69,7 @@ def test_a_rival_before_it_has_heard_itself_does_not_count_as_listening():
         ('1', '2', 2.5, True),
         ('1', '2', 1.5, False),
         ('2', '1', 1.5, True),
+        ('2', '1', -0.5, True),
         # Its own summary come back is no rival.
         ('1', '1', 1.0, False),
     ],
@@ -76,5 +77,6 @@ def test_a_rival_before_it_has_heard_itself_does_not_count_as_listening():
 def test_differences_that_are_the_bounds_themselves(own, rival, uptime_s, ends):
     node = DuplicateNodeCheck(own)
     node.update_own(0.0)
-    assert not node.update_other(rival, uptime_s - 0.5, 0.5, 0.5)
-    assert node.update_other(rival, uptime_s, 1.0, 1.0) is ends
+    # Both have been running for two seconds more.
+    assert not node.update_other(rival, 2.0 + uptime_s - 0.5, 2.5, 2.5)
+    assert node.update_other(rival, 2.0 + uptime_s, 3.0, 3.0) is ends

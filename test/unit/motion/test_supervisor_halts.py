@@ -416,6 +416,14 @@ def test_a_recorder_that_answers_nothing_is_no_failure_of_the_arm(rig):
     assert not rig.said(Halted)
 
 
+def test_a_recorder_that_answers_nothing_does_not_count_with_failures_of_the_arm(rig):
+    rig.alter = restless(rig, (1, 2))
+    rig.plan([0.3, 0.0], [0.2, 0.1], [0.1, 0.2], [0.0, 0.3])
+    rig.run(150.0, lambda: len(rig.said(Settled)) == 2)
+    assert [f.solution for f in rig.said(Failed)] == [0, 1, 2]
+    assert not rig.said(Halted)
+
+
 def test_before_a_planner_is_there_a_clock_may_be_set():
     rig = Rig(begun=False)
     rig.alive.discard('planner')
