@@ -64,7 +64,7 @@ def test_a_rival_before_it_has_heard_itself_does_not_count_as_listening():
 @pytest.mark.parametrize(
     ('own', 'rival', 'uptime_s', 'ends'),
     [
-        # At the very difference up to which the identities decide, and at that which decides alone.
+        # At the difference up to which the identities decide, and at that which decides alone.
         ('2', '1', 2.5, True),
         ('1', '2', 2.5, True),
         ('1', '2', 1.5, False),
