@@ -44,7 +44,7 @@ demo: $(VENV)/installed
 RUN_TESTS = PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest \
 	-p pytest_timeout -p _hypothesis_pytestplugin
 test: $(VENV)/installed
-	$(RUN_TESTS) -p xdist.plugin -n 2 --dist loadgroup $(PYTEST)
+	$(RUN_TESTS) -p xdist.plugin -n 2 --dist loadgroup --no-loadscope-reorder $(PYTEST)
 
 # What make test leaves out: repetitions, sweeps, campaigns, every row of docs/faults.md; an hour.
 qualify: $(VENV)/installed

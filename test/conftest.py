@@ -18,8 +18,8 @@ PIP_ONLY = {
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Share the tests out: real processes one test at a time, of the rest a file to a worker."""
-    if not config.pluginmanager.hasplugin('xdist'):
+    """Share the tests out: real processes to one worker, of the rest a file to a worker."""
+    if not hasattr(config, 'workerinput'):
         return
     for item in items:
         real = {'system', 'qualification'}.intersection(item.path.parts)
