@@ -41,14 +41,12 @@ demo: $(VENV)/installed
 	$(BIN)/remaster demo $(if $(OUT),--out '$(OUT)') $(if $(SEED),--seed $(SEED)) $(ARGS)
 
 # Plugins that happen to be on the machine stay out: launch_testing of ROS breaks with pytest 9.
-RUN_TESTS = PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(BIN)/python -m pytest \
-	-p pytest_timeout -p _hypothesis_pytestplugin
 test: $(VENV)/installed
-	$(RUN_TESTS) -p xdist.plugin -n 2 --dist loadgroup --no-loadscope-reorder $(PYTEST)
+	tools/run-tests $(BIN)/python $(PYTEST)
 
 # What make test leaves out: repetitions, sweeps, campaigns, every row of docs/faults.md; an hour.
 qualify: $(VENV)/installed
-	FAULTS_PAGE=none $(RUN_TESTS) -m '' test $(PYTEST)
+	FAULTS_PAGE=none tools/run-tests $(BIN)/python test -m '' $(PYTEST)
 
 check: $(VENV)/installed
 	$(BIN)/ruff check .
@@ -81,7 +79,7 @@ docs: $(VENV)/installed
 	$(BIN)/python docs/make_parameters.py
 
 faults: $(VENV)/installed
-	FAULTS_PAGE=$(or $(FAULTS),write) $(RUN_TESTS) -q \
+	FAULTS_PAGE=$(or $(FAULTS),write) tools/run-tests $(BIN)/python -q \
 		test/integration/test_device_faults.py test/system/test_fault_rows.py
 
 format: $(VENV)/installed

@@ -96,7 +96,6 @@ setup(
         'test': [
             'pytest>=7.4',
             'pytest-timeout',
-            'pytest-xdist',
             'hypothesis',
             'colcon-common-extensions',
             *JUDGES,

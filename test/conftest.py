@@ -16,16 +16,6 @@ PIP_ONLY = {
     'trimesh': 'trimesh',
 }
 
-
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Share the tests out: real processes to one worker, of the rest a file to a worker."""
-    if not hasattr(config, 'workerinput'):
-        return
-    for item in items:
-        real = {'system', 'qualification'}.intersection(item.path.parts)
-        item.add_marker(pytest.mark.xdist_group('real processes' if real else str(item.path)))
-
-
 _missing = [name for name, module in PIP_ONLY.items() if importlib.util.find_spec(module) is None]
 if _missing:
     pytest.exit(
