@@ -408,8 +408,7 @@ def nothing(bench: Bench) -> None:
 
 
 def _common(name: str) -> tuple[Row, ...]:
-    quick = {'pose_planner': 'stuck', 'recorder': 'stuck', 'robot_bridge': ''}
-    sensor = name in SENSOR_OF
+    quick = {'recorder': 'stuck', 'laser_tracker_markers': 'stuck'}
     rows = (
         ('off', 'killed, and started after 6 s', killed(name), started(name), 6.0),
         ('restarted', 'killed, and started at once', restarted(name), nothing, 5.0),
@@ -425,7 +424,7 @@ def _common(name: str) -> tuple[Row, ...]:
             inject,
             end,
             lasts_s,
-            quick=kind == quick.get(name, 'stuck' * sensor),
+            quick=kind == quick.get(name),
             times=name == 'robot_bridge',
         )
         for kind, fault, inject, end, lasts_s in rows

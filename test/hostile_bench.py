@@ -86,6 +86,7 @@ class Bench(BridgeProcess):
         self.lines = self.calm
         self.seen = Seen()
         self.planner, self.waiting_for, self.silent = 'waiting', '', set[str]()
+        self._runs = 0
         self.emergency_shown: bool | None = None
         self.answers = True
         self.worst_gap_s = 0.0
@@ -174,9 +175,16 @@ class Bench(BridgeProcess):
         # The time before: the message may arrive before this thread runs again.
         now = time.monotonic()
         self.running_since.append((now, state))
+        if state == 'running' != self.planner:
+            # A person's /remaster/collect.
+            self._runs += 1
         self.planner = state
-        self._say('pose_planner', state=state, run='hostile', phase='collection')
+        self._say_plan()
         return now
+
+    def _say_plan(self) -> None:
+        run = f'hostile {self._runs}' if self.planner == 'running' else ''
+        self._say('pose_planner', state=self.planner, run=run, phase='collection')
 
     def was_running(self, time_s: float) -> bool:
         """Whether the planner's newest state at a time was running."""
@@ -266,7 +274,7 @@ class Bench(BridgeProcess):
 
     def _heartbeat(self) -> None:
         if 'pose_planner' not in self.silent:
-            self._say('pose_planner', state=self.planner, run='hostile', phase='collection')
+            self._say_plan()
         if 'recorder' not in self.silent:
             self._say('recorder', state='waiting', run='hostile', waiting_for=self.waiting_for)
         if self.emergency_shown is not None:

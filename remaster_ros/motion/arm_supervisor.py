@@ -243,9 +243,7 @@ class ArmSupervisor:
         if not self.halted:
             return 'the arm is not halted'
         self.halted = ''
-        # A planner that does not run begins only by a person's word; one that runs has to be heard
-        # of otherwise first.
-        self._interlocks.must_collect = not self._interlocks.reason('planner')
+        self._interlocks.must_collect = True
         self._must_probe = self._must_look = True
         self._way_out, self._offered = self._offered, None
         # What was not believed may be the truth now: a robot that was mastered, a clock that was

@@ -8,6 +8,9 @@ NAMES = ('planner', 'recorder', 'robot')
 """Who must be alive; their reasons not to move count in this order."""
 OBSERVED = ('safety_link', 'controller', 'clock', 'rivals')
 """What else must be right."""
+KNOWN_S = 1.0
+"""A planner's run that is met this soon after its first summary may be an old one: summaries that
+were under way while this process started come all at once, s of wall time."""
 OWN_PAUSE_S = 0.5
 """Between two looks at the clock passes less, s of wall time, or this process was paused."""
 
@@ -29,6 +32,7 @@ class Interlocks:
     def __init__(self, heartbeat_s: float) -> None:
         self.must_collect = False
         self._run = ''
+        self._planner_since_wall = -np.inf
         self._heartbeat_s = heartbeat_s
         self._seen: dict[str, float] = {}
         self._reasons: dict[str, str] = {}
@@ -41,21 +45,29 @@ class Interlocks:
     def planner(self, reason: str, run: str, wall_s: float) -> bool:
         """Take the planner's state; return whether a collection was begun, or is not running.
 
+        What `must_collect` waits for is another run than the last one, not a pause: a summary from
+        before may come late.
+
         Parameters
         ----------
         reason
             Why the arm must not move; '' while a collection runs.
         run
-            Names the run; another one than before was begun by a person since.
+            Names the run, '' where none is under way; another one than before was begun by a
+            person since.
         wall_s
             Now, s.
         """
-        begun = bool(reason) or (run != self._run and bool(self._run))
-        self._run = run
-        if begun:
-            self.must_collect = False
+        if self.silence_s('planner', wall_s) > self._heartbeat_s:
+            self._planner_since_wall = wall_s
+        is_new = bool(run) and run != self._run
+        began_another = is_new and bool(self._run)
+        if is_new:
+            self._run = run
+            if wall_s - self._planner_since_wall >= KNOWN_S:
+                self.must_collect = False
         self.note_alive('planner', reason, wall_s)
-        return begun
+        return bool(reason) or began_another
 
     def set(self, name: str, reason: str) -> None:
         """Take why the arm must not move; '' if it may."""
@@ -99,6 +111,7 @@ class Interlocks:
         silent = [name for name in NAMES if self.silence_s(name, wall_s) > limit]
         if silent:
             return f'no sign of {", ".join(silent)} for {limit:g} s'
-        if self.must_collect:
+        reason = next(filter(None, map(self.reason, (*NAMES, *OBSERVED))), '')
+        if not reason and self.must_collect:
             return 'the halt was cleared: /remaster/collect goes on'
-        return next(filter(None, map(self.reason, (*NAMES, *OBSERVED))), '')
+        return reason

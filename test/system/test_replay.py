@@ -14,7 +14,7 @@ STATE, TRAJECTORY = 'sensor_msgs/msg/JointState', 'trajectory_msgs/msg/JointTraj
 NAMES = list(read_cell('demo').chain().joint_names)
 
 
-@pytest.fixture(params=['old', 'new'])
+@pytest.fixture(params=[pytest.param('old', marks=pytest.mark.qualify), 'new'])
 def bag(request, tmp_path):
     """Two seconds of an arm and of what it was told, as bags have held it before, and do now."""
     from rclpy.serialization import serialize_message
@@ -90,6 +90,7 @@ def test_a_controller_that_listens_is_never_told(start, client, bag, more):
     assert not heard
 
 
+@pytest.mark.qualify
 def test_a_controller_that_comes_later_is_never_told(start, client, old_bag):
     """Not one message reaches it: who is matched is looked at before each command."""
     from sensor_msgs.msg import JointState
@@ -113,6 +114,7 @@ def test_a_robot_is_refused(start, client, old_bag):
     assert 'this graph is live: /test_client publishes /joint_states' in line
 
 
+@pytest.mark.qualify
 def test_a_robot_that_comes_later_ends_it(start, client, old_bag):
     from sensor_msgs.msg import JointState
 
@@ -150,6 +152,7 @@ def test_a_recorder_only_listens_and_writes_commands_under_another_name(
     assert COMMANDS not in counts
 
 
+@pytest.mark.qualify
 def test_another_namespace_is_another_graph(start, client, old_bag):
     """A robot in /left does not keep a replay in /right from playing, nor hears it."""
     from sensor_msgs.msg import JointState

@@ -122,7 +122,9 @@ def test_solutions_are_taken_by_the_names_of_the_joints(bridge):
     np.testing.assert_allclose(moves(bench)[0].q[-1], target, atol=1e-9)
 
 
-@pytest.mark.parametrize('silent', ['pose_planner', 'recorder'])
+@pytest.mark.parametrize(
+    'silent', ['pose_planner', pytest.param('recorder', marks=pytest.mark.qualify)]
+)
 def test_silence_holds_the_arm_and_it_goes_on_by_itself(bridge, silent):
     bench = bridge()
     bench.silent.add(silent)

@@ -108,7 +108,9 @@ def start_elsewhere(ros_environment, tmp_path):
         process.communicate()
 
 
-@pytest.mark.parametrize('node', ['robot_bridge', 'optimizer'])
+@pytest.mark.parametrize(
+    'node', [pytest.param('robot_bridge', marks=pytest.mark.qualify), 'optimizer']
+)
 def test_on_two_computers(start_elsewhere, client, said, node):
     """By what the two publish: the one that has been running for less time ends."""
     first = start_elsewhere(node)

@@ -53,6 +53,7 @@ class Rig:
         self.delay_s = self.stamp_shift = 0.0
         self.rate = rate
         self.told_wall = -np.inf
+        self.told_state, self.runs = '', 0
         self.under_way = []
         if not begun:
             return
@@ -101,7 +102,7 @@ class Rig:
         if self.wall - self.told_wall >= 0.5:
             self.told_wall = self.wall
             if 'planner' in self.alive:
-                self.do(self.supervisor.planner_is(self.state, self.wall))
+                self.do(self.supervisor.planner_is(self.state, self.wall, self.token()))
             if 'recorder' in self.alive:
                 self.do(self.supervisor.recorder_waits(self.waiting_for, self.wall))
         while self.under_way and self.under_way[0][0] <= self.t - self.delay_s + 1e-9:
@@ -113,6 +114,13 @@ class Rig:
                     )
                 )
         self.do(self.supervisor.tick(self.wall))
+
+    def token(self):
+        """As the planner's: another one for each /remaster/collect, none while it does not run."""
+        if self.state == 'running' and self.told_state != 'running':
+            self.runs += 1
+        self.told_state = self.state
+        return f'run {self.runs}' if self.state == 'running' else ''
 
     def noisy(self):
         # No encoder reads the same twice.

@@ -328,8 +328,12 @@ class Rig:
         self.taken(self.said, array, 'events' if ': ' in name else 'summaries')
 
     def say_planner(self, state=None):
+        if state == 'running' != self.state:
+            # A person's /remaster/collect.
+            self.run_token += ', another'
         self.state = state or self.state
-        self.say('pose_planner', state=self.state, run=self.run_token)
+        token = self.run_token if self.state == 'running' else ''
+        self.say('pose_planner', state=self.state, run=token)
 
     def plan(self, *targets, names=None, ways=None, ways_stamp=None):
         """Publish a pose with these solutions, and waypoints by solution; returns its stamp."""
