@@ -43,7 +43,7 @@ class Interlocks:
         self._seen[name], self._reasons[name] = wall_s, reason
 
     def planner(self, reason: str, run: str, wall_s: float) -> bool:
-        """Take the planner's state; return whether a collection was begun, or is not running.
+        """Take the planner's state; return whether another collection was begun.
 
         What `must_collect` waits for is another run than the last one, not a pause: a summary from
         before may come late.
@@ -67,7 +67,7 @@ class Interlocks:
             if wall_s - self._planner_since_wall >= KNOWN_S:
                 self.must_collect = False
         self.note_alive('planner', reason, wall_s)
-        return bool(reason) or began_another
+        return began_another
 
     def set(self, name: str, reason: str) -> None:
         """Take why the arm must not move; '' if it may."""

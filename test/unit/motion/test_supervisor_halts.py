@@ -661,6 +661,19 @@ def test_three_failures_in_a_row_halt_and_the_third_is_not_lost(rig):
     assert len(rig.said(Halted)) == 1
 
 
+@pytest.mark.parametrize('pauses', [True, False])
+def test_failures_are_counted_anew_in_another_run(rig, pauses):
+    rig.alter = restless(rig)
+    rig.plan([0.5, 0.5], [0.2, 0.2], [0.4, 0.4], [0.1, 0.1], [0.3, 0.3])
+    rig.run(60.0, lambda: len(rig.said(Failed)) == 2)
+    if pauses:
+        rig.do(rig.supervisor.planner_is('paused', rig.wall))
+    rig.told_state = ''
+    rig.run(60.0, lambda: len(rig.said(Failed)) == 4)
+    assert not rig.said(Halted)
+    rig.run(60.0, lambda: rig.said(Halted))
+
+
 @pytest.mark.parametrize('bad', [[9.0, 9.0], [np.nan, 0.0]])
 def test_a_planner_whose_configurations_are_all_refused_is_not_followed_to_its_end(rig, bad):
     """A collection of which nothing is commanded would be complete in seconds."""
