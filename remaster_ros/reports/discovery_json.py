@@ -12,10 +12,9 @@ import numpy as np
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.explain import FoundEffect
-from remaster_ros.errors import InputError
 from remaster_ros.reports import schemas
-from remaster_ros.reports.fit_json import FIT_LIMIT, REPORT_FILE, finite, fit_content
-from remaster_ros.session.files import cannot_write, make_folder, read_limited, write_atomically
+from remaster_ros.reports.fit_json import finite, fit_content, read_result, remove_report
+from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.version import __version__
 
 DISCOVERY_FILE = 'discovery.json'
@@ -121,10 +120,7 @@ def save_discovery(
     msgspec.json.decode(encoded, type=schemas.Discovered)
     write_atomically(folder / DISCOVERY_FILE, encoded)
     if not figures:
-        try:
-            (folder / REPORT_FILE).unlink(missing_ok=True)
-        except OSError as error:
-            raise cannot_write(folder / REPORT_FILE, error) from None
+        remove_report(folder)
         return folder / DISCOVERY_FILE
     # Matplotlib and the templates take a second to import: only where a report is made.
     from remaster_ros.reports.discovery_report import write_discovery_report
@@ -140,18 +136,6 @@ def read_discovery(path: str | os.PathLike[str]) -> dict[str, Any]:
     InputError
         One line naming the file, the key and the remedy.
     """
-    path = Path(path)
-    data = read_limited(path, FIT_LIMIT, 'give the discovery.json that "remaster discover" wrote')
-    try:
-        content = msgspec.json.decode(data)
-        found = msgspec.convert(content, schemas.Discovered)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(
-            f'{path}: {" ".join(str(error).split())}; give a discovery.json of format '
-            f'{schemas.DISCOVERY_FORMAT}'
-        ) from None
-    if found.format != schemas.DISCOVERY_FORMAT:
-        raise InputError(
-            f'{path}: format is {found.format[:60]!r}, not {schemas.DISCOVERY_FORMAT!r}'
-        )
-    return content
+    return read_result(
+        Path(path), schemas.Discovered, schemas.DISCOVERY_FORMAT, DISCOVERY_FILE, 'discover'
+    )

@@ -161,21 +161,48 @@ def read_fit(path: str | os.PathLike[str]) -> dict[str, Any]:
     InputError
         One line naming the file, the key and the remedy.
     """
-    path = Path(path)
-    data = read_limited(path, FIT_LIMIT, 'give the fit.json that "remaster fit" wrote')
+    return read_result(Path(path), schemas.Fit, schemas.FIT_FORMAT, FIT_FILE, 'fit')
+
+
+def read_result(
+    path: Path,
+    schema: type[schemas.Fit | schemas.Discovered],
+    form: str,
+    name: str,
+    verb: str,
+) -> dict[str, Any]:
+    """Read the file `name` that a verb wrote, and check it against its schema and format.
+
+    Raises
+    ------
+    InputError
+        One line naming the file, the key and the remedy.
+    """
+    data = read_limited(path, FIT_LIMIT, f'give the {name} that "remaster {verb}" wrote')
     try:
         content = msgspec.json.decode(data)
-        fit = msgspec.convert(content, schemas.Fit)
+        found = msgspec.convert(content, schema)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(
-            f'{path}: {" ".join(str(error).split())}; give a fit.json of format '
-            f'{schemas.FIT_FORMAT}'
+            f'{path}: {" ".join(str(error).split())}; give a {name} of format {form}'
         ) from None
-    if fit.format != schemas.FIT_FORMAT:
-        raise InputError(
-            f'{path}: format is {fit.format[:60]!r}, not {schemas.FIT_FORMAT!r}; fit again'
-        )
+    if found.format != form:
+        raise InputError(f'{path}: format is {found.format[:60]!r}, not {form!r}; {verb} again')
     return content
+
+
+def remove_report(folder: Path) -> None:
+    """Remove the report of an earlier run, which would contradict the new result.
+
+    Raises
+    ------
+    InputError
+        It cannot be removed.
+    """
+    try:
+        (folder / REPORT_FILE).unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(folder / REPORT_FILE, error) from None
 
 
 def joint_offsets_rad(
@@ -249,10 +276,7 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
     for name, text in exports(result).items():
         write_atomically(folder / APPLY_FOLDER / name, text)
     if not figures:
-        try:
-            (folder / REPORT_FILE).unlink(missing_ok=True)
-        except OSError as error:
-            raise cannot_write(folder / REPORT_FILE, error) from None
+        remove_report(folder)
         return folder / FIT_FILE
     # Matplotlib and the templates take a second to import: only where a report is made.
     from remaster_ros.reports.report import write_report
