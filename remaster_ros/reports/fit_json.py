@@ -181,13 +181,15 @@ def read_result(
     data = read_limited(path, FIT_LIMIT, f'give the {name} that "remaster {verb}" wrote')
     try:
         content = msgspec.json.decode(data)
-        found = msgspec.convert(content, schema)
+        # First: another file's keys would only confuse.
+        given = content.get('format', form) if isinstance(content, dict) else form
+        if given != form:
+            raise InputError(f'{path}: format is {str(given)[:60]!r}, not {form!r}; {verb} again')
+        msgspec.convert(content, schema)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(
             f'{path}: {" ".join(str(error).split())}; give a {name} of format {form}'
         ) from None
-    if found.format != form:
-        raise InputError(f'{path}: format is {found.format[:60]!r}, not {form!r}; {verb} again')
     return content
 
 

@@ -95,6 +95,12 @@ def test_a_wrong_fit_json_is_refused(fit_result, tmp_path, change, problem):
     assert '\n' not in str(caught.value)
 
 
+def test_the_file_of_another_verb_is_called_so(tmp_path):
+    (tmp_path / 'fit.json').write_text('{"format": "remaster-discovery/1", "noise": {"a": 1.0}}')
+    with pytest.raises(InputError, match="format is 'remaster-discovery/1', not 'remaster-fit/1'"):
+        read_fit(tmp_path / 'fit.json')
+
+
 @pytest.mark.parametrize('data', [b'', b'{', b'[]', b'\xff\xfe', b'[' * 100_000])
 def test_what_is_no_fit_json_is_refused(data, tmp_path):
     (tmp_path / 'fit.json').write_bytes(data)
