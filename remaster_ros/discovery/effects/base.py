@@ -6,9 +6,10 @@ The true joint angle is the reported one plus the zero-offset plus effects at th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -18,14 +19,7 @@ from remaster_ros.types import FloatArray
 Place = Literal[
     'joint_angle', 'link_translation', 'link_rotation', 'base_rotation', 'marker', 'sensor_frame'
 ]
-PLACES: tuple[Place, ...] = (
-    'joint_angle',
-    'link_translation',
-    'link_rotation',
-    'base_rotation',
-    'marker',
-    'sensor_frame',
-)
+PLACES: tuple[Place, ...] = get_args(Place)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,13 +76,13 @@ class Cell:
     """
 
     name: str
-    joints: tuple[int, ...]
     place: Place
     driver: str
     form: str
     parameters: tuple[str, ...]
     unit: str
     columns: Callable[[Context], Design]
+    joints: tuple[int, ...] = ()
     drawn_from: int = 1
     penalty: FloatArray | None = None
     variant: str = ''
@@ -172,30 +166,45 @@ class Effect:
     driven_by_joint: bool = False
 
     def cell(
-        self,
-        *,
-        columns: Callable[[Context], Design],
-        parameters: tuple[str, ...],
-        joints: tuple[int, ...] = (),
-        **more: Any,
+        self, columns: Callable[[Context], Design], parameters: Iterable[str], **more: Any
     ) -> Cell:
-        """Return a cell of this effect; see `Cell` for the arguments."""
-        return Cell(
-            name=self.name,
-            place=self.place,
-            driver=self.driver,
-            form=self.form,
-            unit=self.unit,
-            columns=columns,
-            parameters=parameters,
-            joints=joints,
-            **more,
-        )
+        """Return a cell of this effect; ``more`` are further arguments of `Cell`."""
+        own = {name: getattr(self, name) for name in ('name', 'place', 'driver', 'form', 'unit')}
+        return Cell(columns=columns, parameters=tuple(parameters), **{**own, **more})
+
+    def at_joints(
+        self,
+        joints: Iterable[int],
+        features: Callable[[Context, int], Sequence[FloatArray]],
+        parameters: Sequence[str],
+        **more: Any,
+    ) -> Iterator[Cell]:
+        """Give a cell for each of some joints (1-based), which adds to that joint's angle.
+
+        Parameters
+        ----------
+        joints
+            Which.
+        features
+            Context and joint to m added angles, rad per unit, (n,) each.
+        parameters
+            Names of the m parameters, with ``{joint}`` for the joint.
+        more
+            Further arguments of `Cell`.
+        """
+        for joint in joints:
+            yield self.cell(
+                partial(_added, joint=joint, features=features),
+                [name.format(joint=joint) for name in parameters],
+                joints=(joint,),
+                **more,
+            )
 
 
-def at_joint(joint: int, *features: FloatArray) -> Design:
-    """Return columns that add features (n,) to the angle of a joint (1-based)."""
-    return Design(joint - 1, np.stack(features, axis=-1))
+def _added(
+    context: Context, joint: int, features: Callable[[Context, int], Sequence[FloatArray]]
+) -> Design:
+    return Design(joint - 1, np.stack(features(context, joint), axis=-1))
 
 
 def displaced(*shifts: FloatArray) -> Design:

@@ -206,7 +206,7 @@ class Context:
         Every value is that which the row has here, also where it depends on other rows: time
         since the first row, the move before, a sensor's centre.
         """
-        return PartOfScene(
+        return PartOfContext(
             self.chain,
             self.measurements.select(rows),
             self.sensor_names,
@@ -257,7 +257,7 @@ class Context:
 
 
 @dataclass(frozen=True, eq=False)
-class PartOfScene(Context):
+class PartOfContext(Context):
     """Some rows of a context; what depends on more than a row itself is that of the whole.
 
     Attributes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
@@ -15,19 +16,17 @@ def cells(context: Context) -> Iterator[Cell]:
     against how well the session claims to know them.
     """
     for index, name in enumerate(context.marker_names):
-
-        def columns(context: Context, index: int = index) -> Design:
-            mine = (context.marker == index)[:, None]
-            turn = context.tool[:, :3, :3]
-            return displaced(*(turn[:, :, axis] * mine for axis in range(3)))
-
         yield EFFECT.cell(
-            joints=(),
-            parameters=tuple(f'{axis}_{name}' for axis in 'xyz'),
-            columns=columns,
+            partial(_moved, marker=index),
+            [f'{axis}_{name}' for axis in 'xyz'],
             drawn_from=len(context.marker_names),
             subject=name,
         )
+
+
+def _moved(context: Context, marker: int) -> Design:
+    mine = (context.marker == marker)[:, None]
+    return displaced(*(context.tool[:, :3, axis] * mine for axis in range(3)))
 
 
 EFFECT = Effect(
