@@ -70,7 +70,7 @@ class Cell:
     penalty
         For free forms: precision of the parameters, (m, m), up to the smoothness; None else.
     variant
-        Tells cells of the same name and joints apart: the order of a harmonic, an axis.
+        Distinguishes cells of the same name and joints: the order of a harmonic, an axis.
     subject
         The sensor or marker it is about; '' where it is about joints or the whole arm.
     """
@@ -95,7 +95,7 @@ class Cell:
 
     @property
     def key(self) -> tuple[str, tuple[int, ...], str, str, str, str]:
-        """What makes this cell another than the others."""
+        """What distinguishes this cell from all others."""
         return self.name, self.joints, self.place, self.driver, self.form, self.label
 
     @property
@@ -106,7 +106,7 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """A physical cause with a name: everything that the program knows of it.
+    """A physical cause with a name: everything that the program needs to find and explain it.
 
     Attributes
     ----------
@@ -124,11 +124,11 @@ class Effect:
         For a technician; ``{subject}`` (its joints or sensor), ``{other}`` (the joint that
         drives) and ``{driver}`` are filled in.
     separate_by
-        Which measurements tell it from others.
+        Which measurements distinguish it from others.
     cells
         All of its cells for a context.
     needs
-        Tells why a context cannot show it; '' where it can.
+        Returns why a context cannot show it; '' where it can.
     family
         Effects of one family strike all joints or links alike: they are tried together, too, and
         share their prior probability. '' for an effect that comes alone.
@@ -218,15 +218,15 @@ def turned(context: Context, axes: Sequence[FloatArray], about: FloatArray) -> D
 
 
 def needs_gravity(context: Context) -> str:
-    """Say why gravity's effects cannot be tested; '' where they can."""
+    """Return why gravity's effects cannot be tested; '' where they can."""
     return '' if context.has_gravity else 'the URDF has no link masses, so gravity is unknown'
 
 
 def needs_approach(context: Context) -> str:
-    """Say why approach and last move cannot be tested; '' where they can."""
+    """Return why approach and last move cannot be tested; '' where they can."""
     return '' if context.has_approach else 'where the arm came from (from_q) is not recorded'
 
 
 def needs_time(context: Context) -> str:
-    """Say why drift cannot be tested; '' where it can."""
+    """Return why drift cannot be tested; '' where it can."""
     return '' if context.has_time else 'all rows have the same time'

@@ -17,7 +17,7 @@ HIGHEST_ORDER = 400
 
 
 def cells(context: Context) -> Iterator[Cell]:
-    """Sine and cosine at every whole order that the rows are enough to tell."""
+    """Sine and cosine at every whole order that the number of rows allows."""
     highest = int(min(HIGHEST_ORDER, 4 * len(context)))
     orders = range(LOWEST_ORDER, highest + 1)
     for order in orders:

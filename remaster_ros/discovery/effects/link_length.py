@@ -1,4 +1,4 @@
-"""Link length: a joint's axis lies elsewhere on the link before it than the drawing says."""
+"""Link length: a joint's axis lies elsewhere on the link before it than drawn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Marker offset: the marker is not where the session says it is on the tool."""
+"""Marker offset: the marker is not at its stated place on the tool."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def cells(context: Context) -> Iterator[Cell]:
     """Each marker, along the axes of the tool frame.
 
     The offsets model fits the markers already: this cell is judged by how far the fit moved them,
-    against how well the session claims to know them.
+    against their stated accuracy.
     """
     for index, name in enumerate(context.marker_names):
         yield EFFECT.cell(
@@ -38,7 +38,7 @@ EFFECT = Effect(
     source='eq. 8 of Van Wyk et al. with the marker as a parameter',
     unit='m',
     plausible=(1e-5, 2e-2),
-    sentence='The marker {subject} is not where the session says it is on the tool.',
+    sentence='The marker {subject} is not at its stated place on the tool.',
     separate_by='the marker measured against the tool plate, or the last joint turned by itself',
     cells=cells,
     moves_the_fit=True,

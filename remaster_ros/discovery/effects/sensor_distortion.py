@@ -11,7 +11,7 @@ from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.types import FloatArray
 
-# No lens bends lengths about the sensor's origin, and over most rooms it looks like a plain scale.
+# No lens distorts lengths about the sensor's origin, and in most rooms it resembles a scale.
 SPHERE_RARITY = 20
 # Name, form, unit, and axes where it has a parameter for each.
 VARIANTS = (

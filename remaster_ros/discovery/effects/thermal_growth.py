@@ -54,7 +54,7 @@ def _has_length(context: Context, link: int) -> bool:
 
 
 def needs_warming(context: Context) -> str:
-    """Say why growth cannot be tested; '' where it can."""
+    """Return why growth cannot be tested; '' where it can."""
     if context.has_temperature or context.has_time:
         return ''
     return 'neither temperature nor time varies'
