@@ -11,7 +11,7 @@ from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.metropolis import random_walk_sampler
-from remaster_ros.calibration.paper_sampler import HALF_WIDTH, PaperPosterior, paper_posterior
+from remaster_ros.calibration.paper import HALF_WIDTH, PaperPosterior, paper_posterior
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import apply, inverse, transform
 
