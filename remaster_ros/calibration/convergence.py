@@ -3,8 +3,8 @@
 Rank-normalised split R-hat and effective sample sizes of Vehtari, Gelman, Simpson, Carpenter and
 Bürkner (2021), "Rank-normalization, folding, and localization", Bayesian Analysis 16(2),
 doi:10.1214/20-BA1221, as arviz-stats computes them. ``draws`` has the shape (chains, draws, ...)
-everywhere; every further index is a quantity of its own. A quantity that never moves has nothing
-to judge: its figures are NaN.
+everywhere; every further index is a quantity of its own. The figures of a quantity
+that never moves are NaN.
 """
 
 from __future__ import annotations
@@ -74,12 +74,12 @@ def _figures(statistic: str, draws: FloatArray, **options: Any) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class SamplerInfo:
-    """How the draws were made and whether they can be believed.
+    """How the draws were made and whether they are reliable.
 
     Attributes
     ----------
     name
-        Which sampler, in words.
+        Which sampler it was, for the report.
     chains, draws
         Number of chains, and of draws kept of each.
     acceptance_rate
@@ -98,7 +98,7 @@ class SamplerInfo:
         Every R-hat at most 1.01 and every effective sample size at least what the precision
         takes, 400 where none was asked for.
     message
-        The verdict in words.
+        The verdict with its figures, for the report.
     """
 
     name: str

@@ -59,11 +59,11 @@ def fit_session(
     progress
         Called with the stage and the share of it that is done.
     clock
-        Returns seconds, to time the sampler; core has no clock of its own.
+        Returns seconds, to time the sampler.
     extension
         Further physical effects to fit; the paper's model has none.
     priors
-        What is known beforehand, instead of what the session says; the paper's model has none.
+        What is known beforehand, in place of the session's own priors; the paper's model has none.
 
     Raises
     ------

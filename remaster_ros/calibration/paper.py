@@ -1,9 +1,9 @@
 """The source paper's estimator, exactly: equations 8 and 12 to 16 of Van Wyk et al.
 
-Kept to compare with: it does not converge within its 2e5 steps, and one chain alone hides that.
-Several chains run side by side, each from a three-point registration of its own, so that R-hat
-can tell. Units inside are the paper's, mm and degrees, because its proposals are one number for
-both.
+It does not converge within its 2e5 steps, which one chain alone does not show. Therefore several
+chains run side by side, each from a three-point registration of its own, and R-hat shows it.
+
+Units inside are the paper's, mm and degrees, because its proposals are one number for both.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.identifiability import Gauge, find_gauge
 from remaster_ros.calibration.initial_guess import referenced, register
 from remaster_ros.calibration.laplace import find_mode
-from remaster_ros.calibration.metropolis import Chains, random_walk_sampler
+from remaster_ros.calibration.metropolis import random_walk_sampler
 from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.priors import TIGHTEST_PRIOR
@@ -127,27 +127,6 @@ def paper_posterior(
     return PaperPosterior(chain, rows, measured, markers, T_N_R)
 
 
-def sample_paper(
-    posterior: PaperPosterior,
-    *,
-    steps: int,
-    rng: np.random.Generator,
-    progress: Callable[[float], None] | None = None,
-) -> Chains:
-    """Run the paper's chain: all parameters at once by U(-0.0125, 0.0125) mm and deg, eq. 16."""
-    start = posterior.start()
-    return random_walk_sampler(
-        posterior.log_density,
-        lambda source: source.uniform(-HALF_WIDTH, HALF_WIDTH, start.shape),
-        start=start,
-        steps=steps,
-        burn_in=int(BURN_IN_SHARE * steps),
-        rng=rng,
-        trace_every=max(1, steps // 1000),
-        progress=progress,
-    )
-
-
 def fit_paper(
     problem: Problem,
     *,
@@ -157,6 +136,8 @@ def fit_paper(
     progress: Callable[[float], None] | None = None,
 ) -> Sampled:
     """Fit a problem as the paper does: markers at nominal, nothing left out, nothing held.
+
+    All parameters move at once by U(-0.0125, 0.0125) mm and degrees (eq. 16).
 
     Parameters
     ----------
@@ -175,7 +156,17 @@ def fit_paper(
     target = paper_posterior(
         chain, measurements, rows, problem.markers, problem.sensor_names, chains, rng
     )
-    run = sample_paper(target, steps=steps, rng=rng, progress=progress)
+    start = target.start()
+    run = random_walk_sampler(
+        target.log_density,
+        lambda source: source.uniform(-HALF_WIDTH, HALF_WIDTH, start.shape),
+        start=start,
+        steps=steps,
+        burn_in=int(BURN_IN_SHARE * steps),
+        rng=rng,
+        trace_every=max(1, steps // 1000),
+        progress=progress,
+    )
     # Registrations of all chains as corrections to their mean, about the data's centroid.
     T_N_R = target.split(run.draws)[0]
     model = referenced(identity, measurements, problem.fitted, inverse(T_N_R[0, -1]))
@@ -184,7 +175,7 @@ def fit_paper(
     model = referenced(identity, measurements, problem.fitted, model.T_R_N(mean))
     rows = Rows.of(measurements, problem.fitted, model.reference)
     at_mean = model.vector(model.offsets(mean), problem.markers)
-    # Over the markers too: that the paper takes their places as exact tells nothing about them.
+    # Over the markers too: the paper takes their places as exact, which does not determine them.
     found = find_gauge(model, at_mean, rows, problem.marker_priors(model))
     # The parameters that the paper has: not the markers. One noise for each sensor.
     moved = np.arange(model.joints + 6 * len(model.sensor_names))
@@ -247,7 +238,7 @@ def _paper_gauge(gauge: Gauge, model: Model) -> Gauge:
 
 
 def _taken_as_known(gauge: Gauge, model: Model, marker_std_m: FloatArray) -> FloatArray:
-    """Return the std that markers as well as they are known leave each offset, rad, (k,)."""
+    """Return the std of each offset that follows from that of the markers, rad, (k,)."""
     variance = np.zeros(model.joints)
     for direction in gauge.directions:
         entries = direction.combination

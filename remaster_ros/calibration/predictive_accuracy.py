@@ -9,9 +9,9 @@ a turn of joint 1 and of the registration, or of the last joint and of the marke
 count. At visited configurations this predicts what eq. 18 measures.
 
 *The paper's.* Both places in the robot base, only the offsets differ, the marker is that of the
-estimate. Offsets that no data can tell count in full: nearly half of the paper's "Vernier" error
-is its offset of joint 1, which is a turn of the sensor. Where the fit holds such an offset at 0 it
-adds nothing; the paper's own chain lets it wander.
+estimate. Offsets that are not identifiable count in full: nearly half of the paper's "Vernier"
+error is its offset of joint 1, which is a turn of the sensor. Where the fit holds such an offset
+at 0 it adds nothing; the paper's own chain lets it wander.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Predictive:
 
     @cached_property
     def mean_offsets(self) -> FloatArray:
-        """The paper's estimate: the means of the draws, also of what nothing tells, rad, (k,)."""
+        """The paper's estimate: the means of the draws, identifiable or not, rad, (k,)."""
         return self.model.offsets(self.draws).mean(axis=0)
 
     def without_extension(self) -> Predictive:
@@ -89,8 +89,8 @@ def random_configurations(
 ) -> Measurements:
     """Return rows at joint configurations drawn uniformly within the joint limits.
 
-    Neither collisions nor lines of sight are looked at: the whole workspace counts, as in the
-    paper. The sensors take turns, each with the marker it follows in ``seen``.
+    Neither collisions nor lines of sight are checked: the whole workspace counts, as in the paper.
+    The sensors take turns, each with the marker it follows in ``seen``.
     """
     followed = [seen.marker[np.flatnonzero(seen.sensor == s)[0]] for s in np.unique(seen.sensor)]
     sensor = np.arange(count) % len(followed)
@@ -138,7 +138,7 @@ def theoretical_distances(
     blocks = np.array_split(rows, -(-len(rows) // _BLOCK_ROWS))
     parts: tuple[list[Distances], list[Distances]] = ([], [])
     for index, block in enumerate(blocks):
-        # Every block of rows meets draws of its own, so that all draws have their say.
+        # Every block of rows takes other draws, so that all draws are used.
         taken = order[(index * per_block + np.arange(per_block)) % draws]
         seen = Rows.of(measurements, block, predictive.model.reference)
         both = _block(predictive, seen, taken, rng)

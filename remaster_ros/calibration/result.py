@@ -22,12 +22,13 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, inverse, matrix_to_rotation_vector
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Session
 
-# An offset that a prior tells counts as known up to so many times what the data leave the others.
+# An offset that a prior determines counts as identifiable where its standard deviation is at most
+# so many times the median of those that the data determine.
 AS_GOOD_AS_SEEN = 2.0
-# A mastering is off by tenths of a degree. More is a joint that has lost it, or joints, signs or a
-# robot model that are not those of the arm that was measured.
+# A mastering is off by tenths of a degree. A larger offset is that of a joint that has lost its
+# mastering, or joints, signs or the robot model are not those of the arm that was measured.
 LARGEST_OFFSET = np.radians(5.0)
-# Of an angle that nothing is known of: uniform over the turn.
+# Of an unknown angle, uniform over the turn.
 UNKNOWN_STD = np.pi / np.sqrt(3.0)
 
 
@@ -43,7 +44,7 @@ class NoiseEstimate:
     sigma_m: float
     std_m: float
     pose_sigma_m: float | None
-    pose_sigma_std_m: float | None
+    pose_std_m: float | None
     directions: Mapping[str, NoiseEstimate] = field(default_factory=dict)
 
 
@@ -69,18 +70,18 @@ class FitResult:
         rad, (chains, draws, k); zeros where a joint is held by the gauge (paper mode holds none).
     joint_offsets, joint_offsets_std, joint_offsets_interval95
         Posterior mean and std, rad, (k,), and 95 % interval, rad, (k, 2). A joint that neither
-        data nor prior tell has mean 0, the std of a uniform turn, and the whole turn.
+        data nor prior determine has mean 0, the std of a uniform turn, and the whole turn.
     identifiable
-        False where the data cannot tell a joint's offset, (k,); true all the same where a prior
-        tells it nearly as well as the data tell the others.
+        False where the data do not determine a joint's offset, (k,); true all the same where a
+        prior determines it nearly as well as the data determine the others.
     why
-        What the data alone cannot tell it from; '' where they can, k strings.
+        What the data alone do not distinguish it from; '' where they do, k strings.
     gauge
-        Every combination of parameters that the data cannot see.
+        Every combination of parameters that the data do not determine.
     T_R_N, T_R_N_std_m, T_R_N_std_rad
         Registration of each sensor, (4, 4), with std of its translation and of its rotation
         along and about the axes of R, (3,) each; like all of the rest for offsets of 0 where
-        nothing tells them.
+        they are not identifiable.
     marker_positions, marker_std_m
         Markers in T, m, (3,) each.
     noise
@@ -138,7 +139,7 @@ class FitResult:
 
     @property
     def implausible(self) -> tuple[str, ...]:
-        """A line for each joint whose offset is told, and too large for one of mastering."""
+        """A line for each joint whose offset is identifiable and too large for a mastering."""
         return tuple(
             f'{joint}: an offset of {np.degrees(offset):.2f} degrees is more than a mastering is '
             f'off by ({np.degrees(LARGEST_OFFSET):.0f}); before it is used, check joint order, '
@@ -161,16 +162,16 @@ class Sampled:
     z, eta
         Pinned parameters, (chains, draws, size), and noise coordinates, (chains, draws, e).
     z_mean
-        Mean of z, joints that nothing tells at 0, (size,).
+        Mean of z, joints that are not identifiable at 0, (size,).
     moved
         Indices of the sampled parameters, (m,).
     run, name
-        The chains, in the natural units and the order of `FitResult.parameter_names`, and what
-        was done, in words.
+        The chains, in natural units and in the order of `FitResult.parameter_names`, and which
+        sampler it was.
     precision
         That was asked for; None where a number of draws was.
     gauge
-        What the data cannot see.
+        What the data do not determine.
     taken_as_known
         Standard deviation, rad, of what the sampler took as known exactly and the session does
         not, in each joint's offset, (k,); it is added to that of the draws.
@@ -226,7 +227,7 @@ def build_result(
     """Summarise the draws; ``seconds`` is how long they took, ``rng`` for section V-C."""
     posterior, gauge, measurements = sampled.posterior, sampled.gauge, problem.measurements
     model = posterior.model
-    # In pinned coordinates any value of a joint that nothing tells fits as well as 0.
+    # In pinned coordinates any value of a joint that is not identifiable fits as well as 0.
     unfixed = np.isin(np.arange(model.joints), gauge.held)
     z = sampled.z.copy()
     z[..., np.flatnonzero(unfixed)] = 0.0
@@ -251,10 +252,6 @@ def build_result(
         draws=sampled.z.reshape(-1, model.size),
         sigma=total_noise.reshape(-1, *total_noise.shape[2:]),
     )
-    splits = {
-        'optimization': np.setdiff1d(problem.fitted, left_rows),
-        'validation': np.flatnonzero(measurements.is_validation),
-    }
     names = _sampled_names(posterior, sampled.moved)
 
     def by_sensor(values: FloatArray) -> dict[str, FloatArray]:
@@ -291,7 +288,12 @@ def build_result(
         residuals_before=measurements.position - predicted_before,
         residuals_after=residuals_after,
         accuracy=accuracy_of(
-            measurements, splits, predicted_before, predicted_after, predictive, rng
+            measurements,
+            np.setdiff1d(problem.fitted, left_rows),
+            predicted_before,
+            predicted_after,
+            predictive,
+            rng,
         ),
         left_out=tuple(zip(left_out.tolist(), (why for _, why in sampled.left_out), strict=True)),
         noise_checks=check_noise(
@@ -314,7 +316,7 @@ def _offset_summary(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return mean (k,), std (k,) and 95 % interval (k, 2) of offsets (n, k), rad.
 
-    Of joints that nothing tells, where ``unfixed`` is true, 0 and those of the whole turn.
+    Of joints that are not identifiable, where ``unfixed`` is true, 0 and those of the whole turn.
     """
     mean = draws.mean(axis=0)
     std = np.hypot(draws.std(axis=0, ddof=1), taken_as_known)
@@ -330,7 +332,7 @@ def _offset_summary(
 
 
 def _identifiable(why: tuple[str, ...], std: FloatArray) -> BoolArray:
-    """Tell which offsets (k,) the data tell, or a prior nearly as well as they tell the others."""
+    """Return which offsets (k,) the data determine, or a prior nearly as well as the others."""
     seen = np.array([not text for text in why])
     if not seen.any():
         return seen
@@ -359,7 +361,7 @@ def _noise(posterior: Posterior, eta: FloatArray) -> dict[str, NoiseEstimate]:
             sigma_m=float(sigma.mean()),
             std_m=float(sigma.std(ddof=1)),
             pose_sigma_m=float(pose_sigma.mean()) if known else None,
-            pose_sigma_std_m=float(pose_sigma.std(ddof=1)) if known else None,
+            pose_std_m=float(pose_sigma.std(ddof=1)) if known else None,
         )
 
     result = {}

@@ -41,7 +41,7 @@ ALLOWANCE = 100_000
 POOR_ACCEPTANCE = 0.15
 # Where independent draws by the proposal with the mode's noise are worth less than this share of
 # themselves, it is factorised for every draw. So many draws are tried.
-POOR_WEIGHTS = 0.7
+POOR_WEIGHTS = 0.8
 TRIAL_DRAWS = 1000
 # In tens of dimensions a Student t of few degrees of freedom hardly ever hits the bulk.
 ADAPTED_FREEDOM = 15.0
@@ -66,7 +66,7 @@ class Sampling(NamedTuple):
     run
         Points as `Posterior` defines them.
     name
-        What was done, in words.
+        Which sampler it was, for the report.
     """
 
     run: Chains

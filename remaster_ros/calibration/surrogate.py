@@ -13,6 +13,7 @@ order is left out. How far the result is from the exact density is measured in e
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement, product
 
 import numpy as np
 
@@ -83,7 +84,7 @@ class Surrogate:
         """Expand about a mode."""
         posterior = mode.linearisation.posterior
         width = np.sqrt(np.diag(mode.covariance))
-        parts = [*_data_parts(mode, width), *_prior_part(mode, width)]
+        parts = [*_data_parts(mode, width), _prior_part(mode, width)]
         centre = np.concatenate((mode.z[posterior.free], mode.eta))
         return cls(posterior, centre, tuple(parts))
 
@@ -139,15 +140,10 @@ def _data_parts(mode: Mode, width: FloatArray) -> list[_Part]:
 
     grams = posterior.gram(joined, f + 1 + len(pairs))
     variances = posterior.variances(mode.eta)
+    sensor_of_cell = np.array([posterior.channels[c.channel].sensor for c in posterior.cells])
     parts = []
     for sensor in range(len(model.sensor_names)):
-        cells = np.array(
-            [
-                index
-                for index, cell in enumerate(posterior.cells)
-                if posterior.channels[cell.channel].sensor == sensor
-            ]
-        )
+        cells = np.flatnonzero(sensor_of_cell == sensor)
         size = np.sum(np.diagonal(grams[cells], axis1=1, axis2=2) / variances[cells, None], axis=0)
         linear = np.flatnonzero(size[:f] > 0.0)
         moved = np.sqrt(size[f + 1 :]) * width[first] * width[second]
@@ -191,7 +187,7 @@ def _part(
     return _Part(linear, first[chosen], second[chosen], chief, summed, strong, products)
 
 
-def _prior_part(mode: Mode, width: FloatArray) -> list[_Part]:
+def _prior_part(mode: Mode, width: FloatArray) -> _Part:
     """Return the part of the priors: their residuals to second order, by differences."""
     linearisation = mode.linearisation
     posterior = linearisation.posterior
@@ -200,10 +196,6 @@ def _prior_part(mode: Mode, width: FloatArray) -> list[_Part]:
     first, second = (core[side] for side in np.triu_indices(len(core)))
     if not posterior.priors:
         first = second = np.zeros(0, dtype=np.int64)
-    everything = np.arange(f)
-    if len(first) == 0:
-        return [_Part(everything, first, second, first, linearisation.prior[None], first, ())]
-
     # Steps of a share of each parameter's width, at least of what differences resolve.
     h = np.maximum(width, 1e-4)
     steps = np.zeros((4, len(first), f))
@@ -213,8 +205,9 @@ def _prior_part(mode: Mode, width: FloatArray) -> list[_Part]:
         steps[corner, pair, second] += b * h[second]
     z = np.concatenate((mode.z[free] + steps.reshape(-1, f), mode.z[free][None]))
     x = model.natural(posterior.parameters(z))
-    values = np.concatenate([prior.residual(x) for prior in posterior.priors], axis=1)
-    corners = values[:-1].reshape(4, len(first), -1)
+    residuals = [prior.residual(x) for prior in posterior.priors]
+    values = np.concatenate([np.zeros((len(x), 0)), *residuals], axis=1)
+    corners = values[:-1].reshape(4, len(first), values.shape[1])
     bent = (corners[0] - corners[1] - corners[2] + corners[3]) / 4.0
     bent /= (h[first] * h[second])[:, None]
     bent[first == second] *= 0.5
@@ -231,21 +224,19 @@ def _prior_part(mode: Mode, width: FloatArray) -> list[_Part]:
     none = np.zeros(0, dtype=np.int64)
     strong = np.flatnonzero(size[chosen] > NEGLIGIBLE_SQUARED)
     curved = ((-1, bent[strong] @ bent[strong].T),) if len(strong) > 0 else ()
-    return [_Part(everything, first[chosen], second[chosen], none, straight[None], strong, curved)]
+    return _Part(np.arange(f), first[chosen], second[chosen], none, straight[None], strong, curved)
 
 
 def _bent_pairs(model: Model, free: IntArray) -> list[tuple[int, int]]:
     """Return the pairs of free parameters, by model index, whose product moves a prediction."""
     inner = [i for i in range(1, model.joints - 1) if i in free]
     markers = [i for i in range(model.marker(0).start, model.core) if i in free]
-    pairs = [(i, j) for i in inner for j in inner if i <= j]
-    pairs += [(i, m) for i in inner for m in markers]
+    pairs = [*combinations_with_replacement(inner, 2), *product(inner, markers)]
     for sensor in range(len(model.sensor_names)):
         start = model.registration(sensor).start
         turns = [i for i in range(start + 3, start + 6) if i in free]
-        pairs += [(a, b) for a in turns for b in turns if a <= b]
-        pairs += [(i, a) for i in inner for a in turns]
-        pairs += [(a, m) for a in turns for m in markers]
+        pairs += combinations_with_replacement(turns, 2)
+        pairs += [*product(inner, turns), *product(turns, markers)]
     return pairs
 
 
@@ -261,11 +252,10 @@ def _second_derivatives(
     """
     pose = model.inner_pose(z, rows)
     result = np.zeros((len(rows), 3, len(pairs)))
-    index = {pair: place for place, pair in enumerate(pairs)}
     start = model.marker(0).start
     spans = dict(rows.spans)
     turned = {sensor: _rotation_derivatives(z[model.registration(sensor)][3:]) for sensor in spans}
-    for (i, j), place in index.items():
+    for place, (i, j) in enumerate(pairs):
         half = 0.5 if i == j else 1.0
         if j < model.joints:
             bent = np.cross(pose.axes[:, i], pose.by_joints[:, :, j])
@@ -298,23 +288,10 @@ def _by_marker(model: Model, tool: FloatArray, rows: Rows, index: int) -> FloatA
 def _rotation_derivatives(vector: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return exp(r), its first (3, 3, 3) and second (3, 3, 3, 3) derivatives, by differences."""
     h = 1e-4
-    unit = h * np.eye(3)
-    first = np.stack(
-        [
-            rotation_vector_to_matrix(vector + a) - rotation_vector_to_matrix(vector - a)
-            for a in unit
-        ]
-    ) / (2.0 * h)
-    second = np.array(
-        [
-            [
-                rotation_vector_to_matrix(vector + a + b)
-                - rotation_vector_to_matrix(vector + a - b)
-                - rotation_vector_to_matrix(vector - a + b)
-                + rotation_vector_to_matrix(vector - a - b)
-                for b in unit
-            ]
-            for a in unit
-        ]
-    ) / (4.0 * h**2)
-    return rotation_vector_to_matrix(vector), first, second
+    a = h * np.eye(3)
+    b = a[:, None]
+    turn = rotation_vector_to_matrix
+    first = (turn(vector + a) - turn(vector - a)) / (2.0 * h)
+    second = turn(vector + a + b) - turn(vector + a - b) - turn(vector - a + b)
+    second = (second + turn(vector - a - b)) / (4.0 * h**2)
+    return turn(vector), first, second

@@ -132,7 +132,7 @@ def test_a_joint_that_is_hardly_seen_is_named() -> None:
         -weak[0].combination['joint_3'], rel=0.2
     )
     assert 'hardly change the observations' in weak[0].why
-    assert 'would tell them apart' in weak[0].why
+    assert 'would separate them' in weak[0].why
     # It is seen all the same, if badly: no reason why it could not be.
     assert gauge.held.tolist() == [0]
     assert [bool(why) for why in gauge.why] == [True, *[False] * 5, True]

@@ -226,7 +226,7 @@ def test_an_error_that_noise_does_not_explain_is_never_green(fit_result, check, 
         assert '0.110 mm per axis within a pose' in told
         assert 'makes 0.176 mm' in told
     else:
-        assert 'this session cannot tell' in judged.headline
+        assert 'this session cannot show' in judged.headline
         assert 'measure poses in all their joint solutions' in told
     assert judged.points[0].startswith('tracker: ')
     html = report_html(replace(fit_result, noise_checks=(check,)), {})
