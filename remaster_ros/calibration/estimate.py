@@ -13,6 +13,7 @@ from remaster_ros.calibration.identifiability import Gauge, find_gauge
 from remaster_ros.calibration.initial_guess import robust_start
 from remaster_ros.calibration.laplace import Mode, find_mode
 from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.priors import Prior, base_prior, marker_prior, offset_prior
@@ -257,14 +258,8 @@ def with_directions(mode: Mode) -> Mode:
     posterior = mode.linearisation.posterior
     split: list[int] = []
     for sensor in range(len(posterior.model.sensor_names)):
-        tried = Posterior.of(
-            posterior.model,
-            posterior.rows,
-            posterior.priors,
-            posterior.free,
-            mode.z,
-            [*split, sensor],
-        )
+        noise_model = NoiseModel.of(posterior.rows, posterior.model.reference, [*split, sensor])
+        tried = replace(posterior, reference=mode.z, noise_model=noise_model)
         try:
             other = find_mode(tried)
         except InsufficientDataError:

@@ -180,8 +180,8 @@ def fit_paper(
     # The parameters that the paper has: not the markers. One noise for each sensor.
     moved = np.arange(model.joints + 6 * len(model.sensor_names))
     nominal = model.vector(np.zeros(model.joints), problem.markers)
-    posterior = Posterior.of(model, rows, (), moved[model.joints :], nominal)
-    posterior = replace(posterior, separable=())
+    free = moved[model.joints :]
+    posterior = Posterior.of(model, rows, (), free, nominal).without_pose_sigma()
 
     def columns(states: FloatArray) -> FloatArray:
         x, sigma = _paper_natural(target, model, states)

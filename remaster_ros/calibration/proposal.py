@@ -135,7 +135,7 @@ class LaplaceProposal:
     @property
     def _unfolded(self) -> int:
         """Number of noise coordinates that may be negative: those of sigma."""
-        return len(self.mode.linearisation.posterior.channels)
+        return len(self.mode.linearisation.posterior.noise_model.channels)
 
     @property
     def _noise(self) -> StudentT:

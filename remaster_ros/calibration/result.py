@@ -15,6 +15,7 @@ from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.identifiability import Gauge, GaugeDirection
 from remaster_ros.calibration.metropolis import Chains
 from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.noise import Noise
 from remaster_ros.calibration.noise_check import NoiseCheck, check_noise
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.predictive_accuracy import Predictive
@@ -202,22 +203,22 @@ def sampled_columns(
 
     The moved parameters, every channel's sigma, and the pose_sigma of those that have one.
     """
-    sigma, pose_sigma = posterior.noise(eta)
-    separate = pose_sigma[..., list(posterior.separable)]
-    return np.concatenate((x[..., moved], sigma, separate), axis=-1)
+    noise = posterior.noise(eta)
+    separate = noise.pose_sigma[..., list(posterior.noise_model.separable)]
+    return np.concatenate((x[..., moved], noise.sigma, separate), axis=-1)
 
 
 def _sampled_names(posterior: Posterior, moved: IntArray) -> tuple[str, ...]:
     """Return the names of `sampled_columns`."""
-    model = posterior.model
+    model, noise_model = posterior.model, posterior.noise_model
     noises = [
         '.'.join(filter(None, ('noise', model.sensor_names[channel.sensor], channel.direction)))
-        for channel in posterior.channels
+        for channel in noise_model.channels
     ]
     return (
         *(model.names[index] for index in moved),
         *(f'{noise}.sigma' for noise in noises),
-        *(f'{noises[index]}.pose_sigma' for index in posterior.separable),
+        *(f'{noises[index]}.pose_sigma' for index in noise_model.separable),
     )
 
 
@@ -244,7 +245,8 @@ def build_result(
     left_rows = np.array([row for row, _ in sampled.left_out], dtype=np.int64)
     left_out = measurements.observation[left_rows]
     residuals_after = measurements.position - predicted_after
-    total_noise = posterior.total_noise(sampled.eta)
+    noise = posterior.noise(sampled.eta)
+    total_noise = posterior.noise_model.total_noise(noise)
     predictive = Predictive(
         model=model,
         before=sampled.z_before,
@@ -279,7 +281,7 @@ def build_result(
         T_R_N_std_rad=by_sensor(turns.std(axis=0, ddof=1)),
         marker_positions=by_marker(markers),
         marker_std_m=by_marker(model.markers(x_draws).std(axis=0, ddof=1)),
-        noise=_noise(posterior, sampled.eta),
+        noise=_noise(posterior, noise),
         sampler=SamplerInfo.of(
             sampled.run, names, name=sampled.name, wanted=sampled.precision, seconds=seconds
         ),
@@ -349,13 +351,14 @@ def predicted_rows(problem: Problem, model: Model, z: FloatArray) -> FloatArray:
     return apply(inverse(model.reference)[measurements.sensor], predicted)
 
 
-def _noise(posterior: Posterior, eta: FloatArray) -> dict[str, NoiseEstimate]:
-    """Return the noise of every sensor from draws of its coordinates (chains, draws, e)."""
-    by_sensor, by_channel = posterior.sensor_noise(eta), posterior.noise(eta)
-    separate = {posterior.channels[index].sensor for index in posterior.separable}
+def _noise(posterior: Posterior, by_channel: Noise) -> dict[str, NoiseEstimate]:
+    """Return the noise of every sensor from draws of that of the channels (chains, draws, …)."""
+    noise_model = posterior.noise_model
+    by_sensor = noise_model.sensor_noise(by_channel)
+    separate = {noise_model.channels[index].sensor for index in noise_model.separable}
 
-    def estimate(noise: tuple[FloatArray, FloatArray], at: int, sensor: int) -> NoiseEstimate:
-        sigma, pose_sigma = (part[..., at] for part in noise)
+    def estimate(noise: Noise, at: int, sensor: int) -> NoiseEstimate:
+        sigma, pose_sigma = noise.sigma[..., at], noise.pose_sigma[..., at]
         known = sensor in separate
         return NoiseEstimate(
             sigma_m=float(sigma.mean()),
@@ -368,7 +371,7 @@ def _noise(posterior: Posterior, eta: FloatArray) -> dict[str, NoiseEstimate]:
     for sensor, name in enumerate(posterior.model.sensor_names):
         directions = {
             channel.direction: estimate(by_channel, index, sensor)
-            for index, channel in enumerate(posterior.channels)
+            for index, channel in enumerate(noise_model.channels)
             if channel.sensor == sensor and channel.direction
         }
         result[name] = replace(estimate(by_sensor, sensor, sensor), directions=directions)
