@@ -160,16 +160,15 @@ def _null_space(
     scale = np.where(scale > ROUNDING * scale.max(), scale, unseen)
     triangle = triangle / scale
     _, singular, vectors = np.linalg.svd(triangle, full_matrices=True)
-    singular = np.append(singular, np.zeros(len(vectors) - len(singular)))
-    null = singular < ROUNDING * singular[0]
-
-    basis, pivots = _reduce((vectors[null] / scale).T, scale, _kinds(model))
+    rank = np.count_nonzero(singular >= ROUNDING * singular[0])
+    basis, pivots = _reduce(vectors[rank:].T, scale, _kinds(model))
     # For what is badly determined a prior on effects counts as data: it separates them.
     root = np.zeros((len(model.extension_root), model.size))
     root[:, model.core :] = model.extension_root
     triangle = np.asarray(np.linalg.qr(np.concatenate((triangle, root / scale)), 'r'))
-    angles = np.array([_is_angle(model, index) for index in range(model.size)])
-    for direction, pivot, _ in _nearly_null(triangle, scale, pivots, angles, UNKNOWN_ANGLE):
+    for direction, pivot, _ in _nearly_null(
+        triangle, scale, pivots, _angles(model), UNKNOWN_ANGLE
+    ):
         basis = np.column_stack((basis, direction))
         pivots.append(pivot)
     joints = np.arange(model.size) < model.joints
@@ -227,10 +226,12 @@ def _nearly_null(
     return found
 
 
-def _is_angle(model: Model, index: int) -> bool:
-    if index >= model.core:
-        return False
-    return index < model.joints or model.names[index].rsplit('.', 1)[-1].startswith('r')
+def _angles(model: Model) -> BoolArray:
+    """Return which of the model's parameters are angles, (size,); effects are not counted."""
+    angles = np.arange(model.size) < model.joints
+    for sensor in range(len(model.sensor_names)):
+        angles[model.registration(sensor)][3:] = True
+    return angles
 
 
 def _kinds(model: Model) -> tuple[IntArray, ...]:
@@ -245,13 +246,13 @@ def _kinds(model: Model) -> tuple[IntArray, ...]:
 
 
 def _reduce(
-    null: FloatArray, scale: FloatArray, kinds: tuple[IntArray, ...]
+    work: FloatArray, scale: FloatArray, kinds: tuple[IntArray, ...]
 ) -> tuple[FloatArray, list[int]]:
-    """Bring the basis to reduced echelon form: one pivot each, 1 there and 0 in the others.
+    """Bring a basis (size, d) to reduced echelon form: one pivot each, 1 there, 0 in the others.
 
-    So each direction has few parameters: any rotation of the basis spans the same space.
+    The basis comes in units of the scale (size,) and is returned in those of the parameters. So
+    each direction has few parameters: any rotation of the basis spans the same space.
     """
-    work = null * scale[:, None]
     pivots: list[int] = []
     for column in range(work.shape[1]):
         for kind in kinds:
@@ -263,50 +264,40 @@ def _reduce(
         pivots.append(pivot)
         work[:, [column, column + offset]] = work[:, [column + offset, column]]
         work[:, column] /= work[pivot, column]
-        for other in range(work.shape[1]):
-            if other != column:
-                work[:, other] -= work[pivot, other] * work[:, column]
+        others = work[pivot].copy()
+        others[column] = 0.0
+        work = work - np.outer(work[:, column], others)
     null = work / scale[:, None]
-    for column, pivot in enumerate(pivots):
-        null[:, column] /= null[pivot, column]
-    order = np.argsort(pivots)
-    return null[:, order], [pivots[index] for index in order]
+    null /= null[pivots, np.arange(len(pivots))]
+    return null[:, np.argsort(pivots)], sorted(pivots)
 
 
 def _unresolved(
     by_direction: FloatArray, pivots: list[int], model: Model, scale: FloatArray
 ) -> set[int]:
-    """Return the pivots that no prior resolves; all of them must be joints, to be held."""
+    """Return the pivots that no prior resolves; all of them must be joints or effects, to be held.
+
+    A pivot counts as unknown from a certain standard deviation by the priors on. For an effect, of
+    any unit, that is a million times what the data would leave it if it were alone.
+    """
+    limit = np.where(_angles(model), UNKNOWN_ANGLE, 1e3)
+    limit[model.core :] = 1e6 / scale[model.core :]
     held: set[int] = set()
     while True:
         active = [column for column, pivot in enumerate(pivots) if pivot not in held]
-        if not active:
-            return held
         std = _standard_deviations(by_direction[:, active])
-        loose = [i for i, c in enumerate(active) if std[i] > _limit(model, pivots[c], scale)]
+        loose = {pivots[c]: s for c, s in zip(active, std, strict=True) if s > limit[pivots[c]]}
         if not loose:
             return held
-        # Effects may have any unit: all of the unresolved ones are held at once.
-        effects = {pivots[active[i]] for i in loose if pivots[active[i]] >= model.core}
-        held |= effects
-        joints = [i for i in loose if pivots[active[i]] < model.joints]
-        if effects:
-            continue
-        if not joints:
-            names = ', '.join(model.names[pivots[active[i]]] for i in loose)
+        # All of the effects are held at once: their units cannot be compared.
+        effects = {pivot for pivot in loose if pivot >= model.core}
+        joints = {pivot: s for pivot, s in loose.items() if pivot < model.joints}
+        if not effects and not joints:
             raise InsufficientDataError(
-                f'the observations do not determine {names}; '
+                f'the observations do not determine {", ".join(model.names[p] for p in loose)}; '
                 'measure poses that are spread further and turn the tool'
             )
-        held.add(pivots[active[max(joints, key=lambda i: std[i])]])
-
-
-def _limit(model: Model, index: int, scale: FloatArray) -> float:
-    """Return the prior std from which on a parameter counts as unknown."""
-    if index >= model.core:
-        # Of any unit: a million times what the data would leave it if it were alone.
-        return 1e6 / float(scale[index])
-    return UNKNOWN_ANGLE if _is_angle(model, index) else 1e3
+        held |= effects or {max(joints, key=joints.__getitem__)}
 
 
 def _standard_deviations(by_direction: FloatArray) -> FloatArray:

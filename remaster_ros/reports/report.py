@@ -96,6 +96,9 @@ def verdict(result: FitResult) -> Headline:
     where = 'on poses it never fitted' if validated else 'on the fitted poses'
     change = f'{before:.3f} mm to {after:.3f} mm {where}'
     unexplained = [check for check in result.noise_checks if not check.explained]
+    changes = _references(result)[1]
+    points = [_compared(check) for check in unexplained] + changes
+    mood = 'caution'
     if not result.sampler.converged:
         mood = 'bad'
         headline = (
@@ -105,12 +108,11 @@ def verdict(result: FitResult) -> Headline:
     elif gain >= NOTICEABLE_GAIN:
         times = f'{gain:.1f} times' if gain < 10 else f'{gain:.0f} times'
         headline = f'The mean position error falls from {change}: {times} smaller.'
-        mood = 'good'
         if unexplained:
-            mood = 'caution'
             headline += f' {_dominated(unexplained)}'
+        elif validated and not changes:
+            mood = 'good'
     elif gain > 1 / NOTICEABLE_GAIN:
-        mood = 'caution'
         headline = (
             f'The zero-offsets hardly matter here: the mean position error goes from {change}. '
             + (_dominated(unexplained) if unexplained else 'That is what noise explains.')
@@ -118,17 +120,11 @@ def verdict(result: FitResult) -> Headline:
     else:
         mood = 'bad'
         headline = f'The offsets make it worse: the mean position error goes from {change}.'
-
-    points = [_compared(check) for check in unexplained]
-    points += _references(result)[1]
-    if _references(result)[1] and mood == 'good':
-        mood = 'caution'
     if result.implausible:
         mood = 'bad'
         headline += ' Do not apply the offsets yet: they are larger than a mastering is off by.'
         points = [*result.implausible, *points]
     if not validated:
-        mood = 'caution' if mood == 'good' else mood
         points.append(
             'There are no validation poses, so the gain is not proven: measure some and fit again.'
         )
