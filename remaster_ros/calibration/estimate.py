@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -113,9 +112,17 @@ class Problem:
                     'are needed to register it and to estimate its noise'
                 )
         priors = Priors() if priors is None else priors
-        _require_known('joint', priors.joint_offsets, chain.joint_names)
-        _require_known('marker', priors.markers, session.marker_names)
-        _require_known('sensor', priors.base, session.sensor_names)
+        for kind, named, names in (
+            ('joint', priors.joint_offsets, chain.joint_names),
+            ('marker', priors.markers, session.marker_names),
+            ('sensor', priors.base, session.sensor_names),
+        ):
+            for name in named:
+                if name not in names:
+                    raise InputError(
+                        f"there is a prior on {kind} '{name}', but the session has "
+                        f'{", ".join(names)}; correct the name or leave it out'
+                    )
         places = [
             priors.markers.get(name, (session.markers[name], session.marker_std_m))
             for name in marker_names
@@ -135,10 +142,8 @@ class Problem:
     def marker_priors(self, model: Model) -> tuple[Prior, ...]:
         """Return the priors on the markers."""
         return tuple(
-            marker_prior(model, index, nominal, float(std))
-            for index, (nominal, std) in enumerate(
-                zip(self.markers, self.marker_std_m, strict=True)
-            )
+            marker_prior(model, index, self.markers[index], float(self.marker_std_m[index]))
+            for index in range(len(self.markers))
         )
 
     def other_priors(self, model: Model) -> tuple[Prior, ...]:
@@ -292,15 +297,6 @@ def hold_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
         reference=posterior.model.pinned(natural),
     )
     return find_mode(held)
-
-
-def _require_known(kind: str, given: Mapping[str, object], names: Sequence[str]) -> None:
-    for name in given:
-        if name not in names:
-            raise InputError(
-                f"there is a prior on {kind} '{name}', but the session has {', '.join(names)}; "
-                'correct the name or leave it out'
-            )
 
 
 def _require_information(rows: Rows, free: IntArray, model: Model) -> None:

@@ -26,7 +26,7 @@ from remaster_ros.calibration.result import Sampled, sampled_columns
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import inverse, matrix_from_rpy, transform
-from remaster_ros.types import FloatArray, IntArray, Measurements
+from remaster_ros.types import FloatArray, IntArray
 
 STEPS = 200_000
 BURN_IN_SHARE = 0.875
@@ -63,6 +63,21 @@ class PaperPosterior:
     measured: FloatArray
     markers: FloatArray
     T_N_R: FloatArray
+
+    @classmethod
+    def of(cls, problem: Problem, chains: int, rng: np.random.Generator) -> PaperPosterior:
+        """Assemble; each chain and sensor is registered by three points of its own."""
+        identity = np.tile(np.eye(4), (len(problem.sensor_names), 1, 1))
+        rows = Rows.of(problem.measurements, problem.fitted, identity)
+        measured = problem.measurements.position[rows.source]
+        nominal = problem.chain.positions(rows.q, problem.markers[rows.marker])
+        T_N_R = np.empty((chains, len(problem.sensor_names), 4, 4))
+        for sensor, span in rows.spans:
+            name = problem.sensor_names[sensor]
+            for index in range(chains):
+                three = span.start + _three_points(nominal[span], name, rng)
+                T_N_R[index, sensor] = inverse(register(nominal[three], measured[three], name))
+        return cls(problem.chain, rows, measured, problem.markers, T_N_R)
 
     @property
     def sensors(self) -> int:
@@ -106,27 +121,6 @@ class PaperPosterior:
         return np.where(positive, value, -np.inf)
 
 
-def paper_posterior(
-    chain: SerialChain,
-    measurements: Measurements,
-    rows: Rows,
-    markers: FloatArray,
-    sensor_names: tuple[str, ...],
-    chains: int,
-    rng: np.random.Generator,
-) -> PaperPosterior:
-    """Draw three points per chain and sensor for the initial registrations, and assemble."""
-    measured = measurements.position[rows.source]
-    nominal = chain.positions(rows.q, markers[rows.marker])
-    T_N_R = np.empty((chains, len(sensor_names), 4, 4))
-    for sensor, span in rows.spans:
-        for index in range(chains):
-            three = span.start + _three_points(nominal[span], sensor_names[sensor], rng)
-            T_R_N = register(nominal[three], measured[three], sensor_names[sensor])
-            T_N_R[index, sensor] = inverse(T_R_N)
-    return PaperPosterior(chain, rows, measured, markers, T_N_R)
-
-
 def fit_paper(
     problem: Problem,
     *,
@@ -150,12 +144,8 @@ def fit_paper(
     progress
         Called with the share done.
     """
-    measurements, chain = problem.measurements, problem.chain
-    identity = problem.empty_model()
-    rows = Rows.of(measurements, problem.fitted, identity.reference)
-    target = paper_posterior(
-        chain, measurements, rows, problem.markers, problem.sensor_names, chains, rng
-    )
+    measurements, identity = problem.measurements, problem.empty_model()
+    target = PaperPosterior.of(problem, chains, rng)
     start = target.start()
     run = random_walk_sampler(
         target.log_density,

@@ -87,8 +87,8 @@ class FitResult:
         Markers in T, m, (3,) each.
     noise
         By sensor.
-    T_R_N_before, marker_positions_before
-        The same fit with all offsets held at zero.
+    T_R_N_before
+        Registrations of the same fit with all offsets held at zero.
     residuals_before, residuals_after
         Measured minus modelled position in N for every row of the session, m, (n, 3).
     accuracy
@@ -97,10 +97,10 @@ class FitResult:
         (observation, reason) of every gross error.
     noise_checks
         Of every sensor: is what the fit leaves what noise explains?
-    theta_names, theta_units
+    theta_names
         Of the extension's m parameters; empty without one.
     theta, theta_std
-        Posterior mean and std in these units, (m,).
+        Their posterior mean and std, in their units, (m,).
     theta_draws
         (chains, draws, m).
     """
@@ -126,14 +126,12 @@ class FitResult:
     noise: Mapping[str, NoiseEstimate]
     sampler: SamplerInfo
     T_R_N_before: Mapping[str, FloatArray]
-    marker_positions_before: Mapping[str, FloatArray]
     residuals_before: FloatArray
     residuals_after: FloatArray
     accuracy: Mapping[str, Any]
     left_out: tuple[tuple[int, str], ...]
     noise_checks: tuple[NoiseCheck, ...]
     theta_names: tuple[str, ...]
-    theta_units: tuple[str, ...]
     theta: FloatArray
     theta_std: FloatArray
     theta_draws: FloatArray
@@ -286,7 +284,6 @@ def build_result(
             sampled.run, names, name=sampled.name, wanted=sampled.precision, seconds=seconds
         ),
         T_R_N_before=by_sensor(model.T_R_N(x_before)),
-        marker_positions_before=by_marker(model.markers(x_before)),
         residuals_before=measurements.position - predicted_before,
         residuals_after=residuals_after,
         accuracy=accuracy_of(
@@ -306,7 +303,6 @@ def build_result(
             parameters=len(sampled.moved),
         ),
         theta_names=model.extension.names if model.extension is not None else (),
-        theta_units=model.extension.units if model.extension is not None else (),
         theta=model.theta(sampled.z_mean),
         theta_std=model.theta(flat).std(axis=0, ddof=1),
         theta_draws=model.theta(sampled.z),
