@@ -35,9 +35,10 @@ def in_words(model: Model, direction: FloatArray) -> str:
                 'a known base frame (base_prior) would separate them'
             )
         if joints[0] == model.joints - 1 and not sensors:
+            per_degree = 1e3 * np.radians(1.0) / abs(amount)
             moved = [
                 f'marker {model.marker_names[m]} moved tangentially, '
-                f'{_per_degree(direction[model.marker(m)] / amount)} mm per degree'
+                f'{per_degree * np.linalg.norm(direction[model.marker(m)]):.3f} mm per degree'
                 for m in markers
             ]
             return f'{joint} offset = {listed(moved)}; a measured marker would separate them'
@@ -55,10 +56,6 @@ def together(model: Model, direction: FloatArray) -> str:
         if value != 0.0
     ]
     return f'{listed(moved)} together'
-
-
-def _per_degree(shift: FloatArray) -> str:
-    return f'{np.radians(1.0) * np.linalg.norm(shift) * 1e3:.3f}'
 
 
 def listed(parts: Sequence[str]) -> str:

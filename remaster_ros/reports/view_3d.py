@@ -53,8 +53,11 @@ def draw_view(result: FitResult) -> View3D:
     points = apply(T_R_N, m.position[shown])
     # From where the marker was measured to where the model has it: minus the residual.
     vectors = {
-        'before': -_rotate(T_before, result.residuals_before[shown]),
-        'after': -_rotate(T_R_N, result.residuals_after[shown]),
+        when: -np.einsum('nij,nj->ni', T[:, :3, :3], residuals[shown])
+        for when, T, residuals in (
+            ('before', T_before, result.residuals_before),
+            ('after', T_R_N, result.residuals_after),
+        )
     }
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     typical = float(np.median(np.linalg.norm(vectors['before'], axis=1)))
@@ -174,10 +177,6 @@ def _segments(starts: FloatArray, ends: FloatArray) -> FloatArray:
     """Return start, end, gap, start, end, gap, … for one line trace."""
     gap = np.full_like(starts, np.nan)
     return np.stack((starts, ends, gap), axis=1).reshape(-1, 3)
-
-
-def _rotate(T: FloatArray, vectors: FloatArray) -> FloatArray:
-    return np.einsum('nij,nj->ni', T[:, :3, :3], vectors)
 
 
 def _evenly(count: int, most: int) -> IntArray:

@@ -138,7 +138,7 @@ def test_the_draws_do_not_depend_on_the_proposal() -> None:
         assert kstest(sample, walk.draws[..., index].ravel()).pvalue > 1e-3 / posterior.size
 
 
-def test_poor_proposals_are_adapted_and_said_so() -> None:
+def test_poor_proposals_are_adapted_and_the_name_shows_it() -> None:
     """A Laplace proposal with the noise three standard deviations off and half as wide."""
     found = estimate(Problem.of(scene(13, poses=8)[0]))
     width = np.sqrt(np.diag(found.mode.eta_covariance))

@@ -117,7 +117,7 @@ def test_sampling_goes_on_until_the_precision_is_reached() -> None:
     assert lengths[1] > lengths[0]
 
 
-def test_a_precision_that_is_not_reached_is_said_so(monkeypatch) -> None:
+def test_a_precision_that_is_not_reached_is_reported(monkeypatch) -> None:
     monkeypatch.setattr(sampling, 'ALLOWANCE', 900)
     session, _ = scene(43, poses=12)
     result = fit_session(session, rng=np.random.default_rng(6), precision=0.005)

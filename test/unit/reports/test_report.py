@@ -1,4 +1,4 @@
-"""The report is one page that needs nothing else, says the verdict, and stays of bounded size."""
+"""The report is one page that needs nothing else, with the verdict, and of bounded size."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_the_page_is_whole_and_needs_nothing_else(page, html):
         assert reference in page.ids
 
 
-def test_the_page_says_what_was_found(fit_result, page):
+def test_the_page_shows_what_was_found(fit_result, page):
     text = ' '.join(' '.join(page.text).split())
     metrics = fit_result.accuracy['validation']['post_registration']
     before, after = (f'{metrics[side]["mean_mm"]:.3f} mm' for side in ('before', 'after'))
@@ -315,7 +315,7 @@ def with_references(fit_result, shift_m):
     return replace(fit_result, session=replace(session, references=references)), name
 
 
-def test_what_changed_in_the_session_is_said_first(fit_result):
+def test_what_changed_in_the_session_is_reported_first(fit_result):
     assert 'id="references"' not in report_html(fit_result, {})
     result, _ = with_references(fit_result, 0.0)
     html = report_html(result, {})
