@@ -207,10 +207,8 @@ def table_ii(cases: Cases, chains: Mapping[str, FitResult]) -> Iterator[str]:
         for noise in NOISES:
             found = cases[sensor, noise].fit.noise[sensor]
             text = f'{1e3 * found.sigma_m:.3f} ± {1e3 * found.std_m:.3f} per point'
-            if found.pose_sigma_m is not None and found.pose_sigma_std_m is not None:
-                text += (
-                    f', {1e3 * found.pose_sigma_m:.3f} ± {1e3 * found.pose_sigma_std_m:.3f} common'
-                )
+            if found.pose_sigma_m is not None and found.pose_std_m is not None:
+                text += f', {1e3 * found.pose_sigma_m:.3f} ± {1e3 * found.pose_std_m:.3f} common'
             cells.append(text)
         rows.append(('sigma (mm)', title, f'{mean:.3f} ± {std:.3f}', *cells))
     yield '## Table II: corrections of the registration, and the noise'
