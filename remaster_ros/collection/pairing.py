@@ -66,8 +66,8 @@ class PairedReading:
     stamp_s: float
     q: FloatArray
     position: FloatArray
-    std: FloatArray | None
-    samples: int
+    std: FloatArray | None = None
+    samples: int = 1
 
 
 @dataclass(frozen=True)

@@ -233,32 +233,6 @@ def _unseen(arm: CollisionModel, q: FloatArray, sight: LineOfSight) -> BoolArray
     return turned_away | arm.hides(q, sight.marker_T, sight.sensor_R)
 
 
-def order_by_proximity(points: ArrayLike, start: ArrayLike) -> IntArray:
-    """Order points (n, 3) so that each is the nearest of the rest to the one before it.
-
-    Parameters
-    ----------
-    points
-        m, (n, 3).
-    start
-        Where the tool is now, m, (3,).
-
-    Returns
-    -------
-    ndarray
-        Indices into points, (n,).
-    """
-    points, here = np.asarray(points, dtype=float), np.asarray(start, dtype=float)
-    left = np.ones(len(points), dtype=bool)
-    order = np.empty(len(points), dtype=np.int64)
-    for i in range(len(points)):
-        distances = np.where(left, np.linalg.norm(points - here, axis=-1), np.inf)
-        order[i] = np.argmin(distances)
-        left[order[i]] = False
-        here = points[order[i]]
-    return order
-
-
 def order_solutions(
     solutions: ArrayLike, q_current: ArrayLike, velocity_limits: ArrayLike = 1.0
 ) -> IntArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,7 +54,7 @@ class FileMetadata:
         }
 
 
-def metadata_text(files: list[FileMetadata], topics: list[TopicMetadata]) -> str:
+def metadata_text(files: list[FileMetadata], topics: Iterable[TopicMetadata]) -> str:
     """Return metadata.yaml for a bag of these MCAP files, in the order recorded."""
     filled = [file for file in files if file.count]
     whole = FileMetadata('', count=sum(file.count for file in files))

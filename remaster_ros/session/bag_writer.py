@@ -26,11 +26,11 @@ from remaster_ros.session.bag_metadata import (
 )
 from remaster_ros.session.files import (
     PatientFile,
-    cannot_write,
     make_new_folder,
     remove_leftovers,
     sync_folder,
     write_atomically,
+    writing,
 )
 from remaster_ros.session.manifest import add_to_manifest, read_manifest
 from remaster_ros.session.message_definitions import definition_of
@@ -77,7 +77,9 @@ class BagWriter:
         self._last_ns = self._shift_ns = 0
         if resume and any(self.folder.glob('*.mcap')):
             recover_bag(self.folder)
-            self._learn(BagReader(self.folder))
+            reader = BagReader(self.folder)
+            self._files, self._last_ns = reader.files, reader.end_ns
+            self._topics = _topics_of(reader, latched)
         else:
             if resume:
                 _remove_beginnings(self.folder)
@@ -102,16 +104,6 @@ class BagWriter:
             self._file.close()
             raise
         self._metadata_waits = False
-
-    def _learn(self, reader: BagReader) -> None:
-        """Take over what the files so far hold."""
-        self._files = reader.files
-        self._last_ns = reader.end_ns
-        for topic, msgtype in reader.topics.items():
-            type_hash = definition_of(msgtype)[1]
-            latched = topic in self._latched
-            count = reader.counts[topic]
-            self._topics[topic] = TopicMetadata(topic, msgtype, type_hash, latched, count)
 
     def write(self, topic: str, msgtype: str, cdr: bytes, stamp_ns: int) -> None:
         """Write one message.
@@ -177,10 +169,8 @@ class BagWriter:
         file, self._file = self._file, None
         self._writer.finish()
         file.close()
-        try:
+        with writing(self._path):
             sync_folder(self.folder)
-        except OSError as error:
-            raise cannot_write(self._path, error) from None
         self._write_metadata()
         add_to_manifest(self.folder, self._path.name)
 
@@ -201,17 +191,11 @@ class BagWriter:
             self._schemas[msgtype] = self._writer.register_schema(
                 msgtype, 'ros2msg', definition.encode()
             )
-        self._topics.setdefault(
-            topic, TopicMetadata(topic, msgtype, type_hash, topic in self._latched)
-        )
+        latched = topic in self._latched
+        self._topics.setdefault(topic, TopicMetadata(topic, msgtype, type_hash, latched))
+        about = {'offered_qos_profiles': qos_text(latched), 'topic_type_hash': type_hash}
         self._channels[topic] = self._writer.register_channel(
-            topic,
-            'cdr',
-            self._schemas[msgtype],
-            {
-                'offered_qos_profiles': qos_text(topic in self._latched),
-                'topic_type_hash': type_hash,
-            },
+            topic, 'cdr', self._schemas[msgtype], about
         )
         self._list_topics()
 
@@ -224,7 +208,7 @@ class BagWriter:
             self._metadata_waits = True
 
     def _write_metadata(self) -> None:
-        text = metadata_text(self._files, list(self._topics.values()))
+        text = metadata_text(self._files, self._topics.values())
         write_atomically(self.folder / METADATA_FILE, text)
 
 
@@ -253,16 +237,15 @@ def recover_bag(folder: str | os.PathLike[str]) -> str:
         with BagWriter(work) as writer:
             for message in reader.messages_of(last):
                 writer.write(*message)
-        try:
+        with writing(path):
             os.replace(writer._path, path)
             sync_folder(folder)
-        except OSError as error:
-            raise cannot_write(path, error) from None
         _remove_work(folder)
     listed = read_manifest(folder)
     unlisted = [file.name for file in reader.files if file.name not in listed]
     if unlisted:
-        write_atomically(folder / METADATA_FILE, _metadata_of(reader))
+        topics = _topics_of(reader, LATCHED_TOPICS)
+        write_atomically(folder / METADATA_FILE, metadata_text(reader.files, topics.values()))
     for name in unlisted:
         add_to_manifest(folder, name)
     if not reader.torn_bytes:
@@ -270,18 +253,14 @@ def recover_bag(folder: str | os.PathLike[str]) -> str:
     return f'{path}: its last {reader.torn_bytes} bytes were no whole message and are dropped'
 
 
-def _metadata_of(reader: BagReader) -> str:
-    topics = [
-        TopicMetadata(
-            topic,
-            msgtype,
-            definition_of(msgtype)[1],
-            topic in LATCHED_TOPICS,
-            reader.counts[topic],
+def _topics_of(reader: BagReader, latched: Collection[str]) -> dict[str, TopicMetadata]:
+    """Return the topics of a bag by name, those of `latched` offered transient_local."""
+    return {
+        topic: TopicMetadata(
+            topic, msgtype, definition_of(msgtype)[1], topic in latched, reader.counts[topic]
         )
         for topic, msgtype in reader.topics.items()
-    ]
-    return metadata_text(reader.files, topics)
+    }
 
 
 _WORK = '.recovery'
@@ -290,14 +269,12 @@ _WORK = '.recovery'
 def _remove_work(folder: Path) -> None:
     """Remove the work of a recovery that was itself killed, or is done."""
     work = folder / _WORK
-    try:
+    with writing(work):
         if work.is_dir():
             for file in work.iterdir():
                 os.unlink(file)
             os.rmdir(work)
             sync_folder(folder)
-    except OSError as error:
-        raise cannot_write(work, error) from None
 
 
 def _remove_beginnings(folder: Path) -> None:

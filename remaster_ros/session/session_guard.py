@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from remaster_ros.errors import DiskError
-from remaster_ros.session.files import cannot_write, reason
+from remaster_ros.session.files import reason, writing
 
 Signature = tuple[int, int, int, int]
 """Device, inode, bytes, time of change in ns."""
@@ -26,12 +26,11 @@ def signature(path: Path) -> Signature | None:
     DiskError
         It cannot be looked at.
     """
-    try:
-        found = path.stat()
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise cannot_write(path, error) from None
+    with writing(path):
+        try:
+            found = path.stat()
+        except FileNotFoundError:
+            return None
     return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
 
 
@@ -72,10 +71,8 @@ class SessionGuard:
         It is kept open: the number of a folder that was removed is given to the next one.
         """
         self.close()
-        try:
+        with writing(self._folder):
             self._descriptor = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
-        except OSError as error:
-            raise cannot_write(self._folder, error) from None
 
     def close(self) -> None:
         """Look no more; closing again does nothing."""
@@ -119,12 +116,11 @@ def set_aside(path: Path) -> str:
     while os.path.lexists(aside):
         number += 1
         aside = path.with_name(f'{path.name}.changed{number}')
-    try:
-        os.rename(path, aside)
-    except FileNotFoundError:
-        return ''
-    except OSError as error:
-        raise cannot_write(path, error) from None
+    with writing(path):
+        try:
+            os.rename(path, aside)
+        except FileNotFoundError:
+            return ''
     return aside.name
 
 

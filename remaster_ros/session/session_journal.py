@@ -8,17 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.session.files import read_limited
 from remaster_ros.session.journal import Record
-from remaster_ros.session.reader import HEADER, OBSERVATIONS_LIMIT, ROWS
+from remaster_ros.session.plain_data import from_plain, to_plain
+from remaster_ros.session.reader import HEADER, OBSERVATIONS_LIMIT, ROWS, read_header
 from remaster_ros.session.session_writer import ExitStatus, SessionWriter
-from remaster_ros.session.session_yaml import YAML_LIMIT, parse_header
 from remaster_ros.types import FloatArray, Observation, Session, Split
 
 SHIFT_S = 1.0
@@ -100,7 +97,7 @@ class SessionJournal:
             self._results = {}
         elif kind == 'configuration':
             self._decide(record['pose'], record['solution'], record['result'])
-            readings = [_reading(content) for content in record.get('readings', ())]
+            readings = from_plain(record.get('readings', []), list[PairedReading])
             if record.get('split') == REGISTRATION:
                 self.registration += readings
             elif record.get('split') == REFERENCE and readings:
@@ -193,11 +190,11 @@ class SessionJournal:
         }
         number = 0 if self._writer is None else self._writer.configurations
         if split == REGISTRATION:
-            self._append({**record, 'readings': [_content(reading) for reading in readings]})
+            self._append({**record, 'readings': to_plain(readings)})
         else:
             if split == REFERENCE:
                 record['number'] = number
-                record['readings'] = [_content(reading) for reading in readings]
+                record['readings'] = to_plain(readings)
             self._append(record, self._rows(pose, split, readings, from_q, temperatures_c))
             self.observations += len(readings)
         self._decide(pose, solution, result)
@@ -279,11 +276,7 @@ class SessionJournal:
 
 def is_complete(folder: Path) -> bool:
     """Whether a folder holds a session that is complete; `InputError` where it is none."""
-    path = folder / HEADER
-    if not path.exists():
-        return False
-    header = parse_header(read_limited(path, YAML_LIMIT, 'it was there a moment ago'), path)
-    return header.exit_status == 'complete'
+    return (folder / HEADER).exists() and read_header(folder).exit_status == 'complete'
 
 
 def _split(name: str) -> Split:
@@ -291,27 +284,3 @@ def _split(name: str) -> Split:
     if name == 'validation':
         return 'validation'
     return 'reference' if name == REFERENCE else 'optimization'
-
-
-def _content(reading: PairedReading) -> dict[str, Any]:
-    return {
-        'sensor': reading.sensor,
-        'marker': reading.marker,
-        'stamp_s': reading.stamp_s,
-        'q': reading.q.tolist(),
-        'position': reading.position.tolist(),
-        'samples': reading.samples,
-        **({} if reading.std is None else {'std': reading.std.tolist()}),
-    }
-
-
-def _reading(content: dict[str, Any]) -> PairedReading:
-    return PairedReading(
-        sensor=content['sensor'],
-        marker=content['marker'],
-        stamp_s=content['stamp_s'],
-        q=np.array(content['q']),
-        position=np.array(content['position']),
-        std=np.array(content['std']) if 'std' in content else None,
-        samples=content['samples'],
-    )

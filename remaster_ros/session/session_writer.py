@@ -45,7 +45,8 @@ from remaster_ros.session.reader import (
 from remaster_ros.session.safe_yaml import dump_yaml, load_yaml
 from remaster_ros.session.sequence_rules import RowKeys, SequenceRules
 from remaster_ros.session.session_guard import SessionGuard, set_aside
-from remaster_ros.session.session_yaml import YAML_LIMIT, parse_header, write_header
+from remaster_ros.session.session_yaml import parse_header, write_header
+from remaster_ros.session.yaml_records import YAML_LIMIT
 from remaster_ros.types import Observation, Session
 
 JOURNAL = 'journal.jsonl'

@@ -278,7 +278,7 @@ def test_unknown_yaml_keys_are_reported_and_kept(folder, caplog):
     with caplog.at_level(logging.WARNING, 'remaster_ros'):
         extra = read_session(folder).extra
     assert extra == {'cell': {'operator': 'no', 'humidity': 0.4}, 'robot': {'serial': '0123'}}
-    assert re.findall("unknown key '(.*?)'", caplog.text) == ['cell', 'robot.serial']
+    assert re.findall("unknown key '(.*?)'", caplog.text) == ['robot.serial', 'cell']
 
 
 def test_existing_files_are_not_overwritten(session, folder):
