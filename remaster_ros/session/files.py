@@ -87,7 +87,7 @@ def make_new_folder(folder: Path) -> None:
         )
 
 
-def write_atomically(path: Path, data: str | bytes) -> None:
+def write_atomically(path: Path, data: str | bytes | bytearray) -> None:
     """Replace a file in one step, durable on return: readers see the old text or the new.
 
     Raises
@@ -247,7 +247,7 @@ class PatientFile:
             os.close(self._descriptor)
 
 
-def write_all(descriptor: int, data: bytes) -> None:
+def write_all(descriptor: int, data: bytes | bytearray) -> None:
     """Write all of `data`, however many calls the system takes for it."""
     written = 0
     while written < len(data):

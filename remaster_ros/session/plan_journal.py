@@ -23,7 +23,7 @@ from remaster_ros.planning.candidates import Plan, PlannedPose
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, PoseVisit, Tour
 from remaster_ros.session.files import make_folder
 from remaster_ros.session.journal import Journal, Record
-from remaster_ros.session.session_writer import PLAN
+from remaster_ros.session.session_opening import PLAN
 from remaster_ros.types import FloatArray
 
 NO_FREE_PATH = 'no_free_path'

@@ -8,7 +8,7 @@ acknowledged it still has in memory, so it can write it again.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from remaster_ros.errors import DiskError
@@ -41,12 +41,16 @@ class SessionGuard:
     ----------
     folder
         The session's.
-    holds
-        By name of the file: whether these bytes are what the writer put there.
+    names
+        The files.
+    content
+        Name of a file -> the bytes that the writer put there.
     """
 
-    def __init__(self, folder: Path, holds: Mapping[str, Callable[[bytes], bool]]) -> None:
-        self._folder, self._holds = folder, holds
+    def __init__(
+        self, folder: Path, names: Sequence[str], content: Callable[[str], bytes]
+    ) -> None:
+        self._folder, self._names, self._content = folder, names, content
         self._descriptor = -1
         self.take_place()
         self._seen: dict[str, Signature | None] = {}
@@ -57,7 +61,7 @@ class SessionGuard:
 
     def note_all(self) -> None:
         """Take all files as they are now."""
-        for name in self._holds:
+        for name in self._names:
             self.note(name)
 
     def is_in_place(self) -> bool:
@@ -89,7 +93,7 @@ class SessionGuard:
             Read every file; else only those whose size or time of change is another.
         """
         wrong = {}
-        for name, holds in self._holds.items():
+        for name in self._names:
             path, seen = self._folder / name, self._seen.get(name)
             now = signature(path)
             if now is None:
@@ -97,7 +101,7 @@ class SessionGuard:
             elif seen is None or now[:2] != seen[:2] or not path.is_file():
                 wrong[name] = 'was replaced by another file, as editors do when they save'
             elif content or now != seen:
-                if holds(_read(path)):
+                if _read(path) == self._content(name):
                     self._seen[name] = now
                 else:
                     wrong[name] = 'was changed'

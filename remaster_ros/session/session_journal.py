@@ -15,7 +15,8 @@ from remaster_ros.session.files import read_limited
 from remaster_ros.session.journal import Record
 from remaster_ros.session.plain_data import from_plain, to_plain
 from remaster_ros.session.reader import HEADER, OBSERVATIONS_LIMIT, ROWS, read_header
-from remaster_ros.session.session_writer import ExitStatus, SessionWriter
+from remaster_ros.session.session_writer import SessionWriter
+from remaster_ros.session.session_yaml import ExitStatus
 from remaster_ros.types import FloatArray, Observation, Session, Split
 
 SHIFT_S = 1.0

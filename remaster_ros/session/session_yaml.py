@@ -19,6 +19,7 @@ from remaster_ros.session.yaml_records import BaseFrame, Bounds, Triple, out_of_
 from remaster_ros.types import Measurements, Session
 
 FORMAT = 'remaster-session/1'
+ExitStatus = Literal['complete', 'stopped', 'aborted']
 MARKER_STD = Bounds(0.0, 0.4, 'm', remedy='; 0.3 where nothing is known of their places')
 
 log = logging.getLogger('remaster_ros')
@@ -47,7 +48,7 @@ class SessionHeader(msgspec.Struct):
     settle_s: Annotated[float, Bounds(0.0, unit='s')]
     marker_std_m: Annotated[float, MARKER_STD] = 0.5e-3
     base_prior: dict[str, BaseFrame] = {}
-    exit_status: Literal['', 'complete', 'stopped', 'aborted'] = ''
+    exit_status: Literal['', ExitStatus] = ''
     created: str = ''
     notes: str = ''
     extra: dict[str, Any] = {}
@@ -127,6 +128,11 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
     header = _checked(to_plain(content), 'session to be written: ')
     given = {key: value for key, value in to_plain(header).items() if value not in ('', {})}
     return dump_yaml(_merge(given, session.extra))
+
+
+def with_exit_status(text: str, exit_status: str) -> str:
+    """Return the text of a session.yaml with another exit status."""
+    return dump_yaml({**load_yaml(text), 'exit_status': exit_status})
 
 
 def _checked(content: Mapping[str, Any], where: str) -> SessionHeader:
