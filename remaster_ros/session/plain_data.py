@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 import numpy as np
-
-Record = TypeVar('Record')
 
 
 def to_plain(value: Any) -> Any:
@@ -15,8 +13,8 @@ def to_plain(value: Any) -> Any:
     return msgspec.to_builtins(value, enc_hook=lambda array: array.tolist())
 
 
-def from_plain(content: Any, record: type[Record]) -> Record:
-    """Return the dataclass or struct that `to_plain` made plain; its arrays are of floats.
+def from_plain(content: Any, record: Any) -> Any:
+    """Return what `to_plain` made plain, a `record` (a type); its arrays are of floats.
 
     Raises
     ------
