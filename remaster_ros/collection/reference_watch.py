@@ -14,7 +14,6 @@ from collections.abc import Mapping
 import numpy as np
 from scipy import stats
 
-from remaster_ros.collection.reference_causes import Cause, Place, causes
 from remaster_ros.collection.reference_readings import (
     ReferenceReading,
     ReferenceRound,
@@ -22,6 +21,7 @@ from remaster_ros.collection.reference_readings import (
 )
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.planning.reference_choice import Cause, Place, causes
 from remaster_ros.planning.tour_order import nearest_solution
 from remaster_ros.types import FloatArray, IntArray
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-from collections.abc import Mapping
 from math import degrees, pi, radians
 from pathlib import Path
 from typing import Annotated
@@ -15,10 +14,11 @@ import numpy as np
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.bodies import Body, Shape, box, cylinder, obstacle, sphere
 from remaster_ros.kinematics.collision import HALF_STEP_M, CollisionModel, arm_bodies
+from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_rpy, transform
 from remaster_ros.kinematics.urdf_geometry import MeshReader, chain_bodies
-from remaster_ros.planning.candidates import LineOfSight, PoseRanges
+from remaster_ros.planning.candidates import LIMIT_MARGIN_RAD, LineOfSight, PoseRanges, Scene
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.meshes import mesh_reader
 from remaster_ros.session.reader import URDF_LIMIT
@@ -236,18 +236,32 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
             for name, sensor in self.sensors.items()
         }
 
-    def lines_of_sight(self, sensors_R: Mapping[str, FloatArray]) -> list[LineOfSight]:
-        """Return what every pose must keep free, for sensors at these origins in R, m, (3,)."""
-        return [
+    def scene(
+        self,
+        chain: SerialChain,
+        limit_margin_rad: float = LIMIT_MARGIN_RAD,
+        *,
+        without_meshes: bool = False,
+    ) -> Scene:
+        """Return what the poses of this cell are planned from; arguments and errors as above."""
+        sights = [
             LineOfSight(
                 name,
-                sensors_R[name],
+                np.array(sensor.rough_position_m),
                 np.array(self.markers[sensor.marker]),
                 radians(sensor.max_angle_deg),
+                sensor.marker,
             )
             for name, sensor in self.sensors.items()
-            if name in sensors_R
         ]
+        return Scene(
+            InverseKinematics(chain, self.held(chain)),
+            self.collision_model(chain, without_meshes=without_meshes),
+            self.poses.ranges(),
+            sights,
+            self.aim_at,
+            limit_margin_rad,
+        )
 
 
 def _no_mesh(name: str) -> None:

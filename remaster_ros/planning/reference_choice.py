@@ -1,4 +1,4 @@
-"""What can change beside an arm in mid-run, and how each change shows at reference configurations.
+"""Reference configurations: what can change beside an arm in mid-run, and where it shows best.
 
 Each cause moves the measured markers linearly in few parameters; all displacements are in the
 robot base frame R.
