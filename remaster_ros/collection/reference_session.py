@@ -24,14 +24,14 @@ def changes(
         return 0, []
     readings = [
         ReferenceReading(
-            int(m.configuration[i]),
             session.sensor_names[m.sensor[i]],
             session.marker_names[m.marker[i]],
+            float(m.stamp_s[i]),
             m.q[i],
             m.position[i],
-            float(m.stamp_s[i]),
             m.std[i] if np.all(np.isfinite(m.std[i])) else None,
             max(int(m.samples[i]), 1),
+            configuration=int(m.configuration[i]),
         )
         for i in range(len(m))
     ]

@@ -20,7 +20,7 @@ from remaster_ros.session.files import (
     write_atomically,
 )
 from remaster_ros.session.manifest import check_data, read_manifest
-from remaster_ros.session.observations import format_measurements, parse_observations
+from remaster_ros.session.observations import RowFormat, format_measurements
 from remaster_ros.session.session_yaml import SessionHeader, parse_header, write_header
 from remaster_ros.session.yaml_records import YAML_LIMIT
 from remaster_ros.types import Measurements, Session
@@ -79,7 +79,7 @@ def _read(folder: Path, sums: dict[str, str]) -> Session:
     data = read_limited(rows_path, OBSERVATIONS_LIMIT, 'a session folder holds observations.csv')
     check_data(sums, rows_path, data)
     names = tuple(header.sensors), tuple(header.markers)
-    measurements = parse_observations(data, rows_path, chain, *names)
+    measurements = RowFormat(rows_path, chain, *names).parse(data)
     references = None
     if measurements.is_reference is not None:
         of_references = measurements.is_reference
@@ -121,10 +121,9 @@ def write_session(folder: str | os.PathLike[str], session: Session) -> None:
     folder = Path(folder)
     chain = read_chain(session.urdf, folder / URDF, session.base_link, session.tip_link)
     header = write_header(session, URDF, session.exit_status)
-    rows = format_measurements(
-        all_rows(session), session.sensor_names, session.marker_names
-    ).encode()
-    parse_observations(rows, folder / ROWS, chain, session.sensor_names, session.marker_names)
+    names = session.sensor_names, session.marker_names
+    rows = format_measurements(all_rows(session), *names).encode()
+    RowFormat(folder / ROWS, chain, *names).parse(rows)
     make_new_folder(folder)
     write_atomically(folder / URDF, session.urdf)
     write_atomically(folder / ROWS, rows)

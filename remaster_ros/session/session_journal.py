@@ -7,6 +7,7 @@ twice, and the points that its sensors were registered by.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from remaster_ros.collection.pairing import PairedReading
@@ -69,7 +70,6 @@ class SessionJournal:
         self._results: dict[tuple[int, int], str] = {}
         self._last_pose: int | None = None
         self._shift_s = 0.0
-        self._told = 0
         self.reopen()
 
     def reopen(self) -> None:
@@ -80,7 +80,7 @@ class SessionJournal:
             self.closed = 'complete'
             self.notes = [f'{self.folder}: this session is complete; name a new folder to record']
             return
-        self._writer, self._told = SessionWriter(self.folder, self._header, resume=True), 0
+        self._writer = SessionWriter(self.folder, self._header, resume=True)
         self.closed, self.notes = '', []
         self.observations = self._writer.observations
         if self._writer.resumed:
@@ -224,15 +224,9 @@ class SessionJournal:
                 pose=pose,
                 configuration=writer.configurations,
                 split=_split(split),
-                stamp_s=reading.stamp_s + self._shift_s,
-                sensor=reading.sensor,
-                marker=reading.marker,
-                q=reading.q,
-                position=reading.position,
                 from_q=from_q,
-                std=reading.std,
-                samples=reading.samples,
                 temperature_c=temperature_c,
+                **vars(replace(reading, stamp_s=reading.stamp_s + self._shift_s)),
             )
             for number, (reading, temperature_c) in enumerate(pairs)
         ]
@@ -255,11 +249,10 @@ class SessionJournal:
 
     def take_restored(self) -> list[str]:
         """Return what was restored since the last call, a line each."""
-        lines, self._told = self._restored()[self._told :], len(self._restored())
+        if self._writer is None:
+            return []
+        lines, self._writer.restored = self._writer.restored, []
         return lines
-
-    def _restored(self) -> list[str]:
-        return [] if self._writer is None else self._writer.restored
 
     @property
     def beyond_repair(self) -> str:

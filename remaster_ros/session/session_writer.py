@@ -19,7 +19,7 @@ from remaster_ros.errors import InputError, MovedError
 from remaster_ros.session.files import AppendFile, make_folder, read_limited, write_atomically
 from remaster_ros.session.journal import Journal, Record
 from remaster_ros.session.manifest import write_sums
-from remaster_ros.session.observations import check_row, format_header, format_observation
+from remaster_ros.session.observations import RowFormat, format_header, format_observation
 from remaster_ros.session.reader import HEADER, OBSERVATIONS_LIMIT, ROWS, URDF, read_chain
 from remaster_ros.session.sequence_rules import RowKeys, SequenceRules
 from remaster_ros.session.session_guard import SessionGuard, set_aside
@@ -92,11 +92,10 @@ class SessionWriter:
     ) -> None:
         self.folder = Path(folder)
         self._rows_path = self.folder / ROWS
-        self._chain = read_chain(
-            header.urdf, self.folder / URDF, header.base_link, header.tip_link
-        )
-        self._sensors, self._markers = header.sensor_names, header.marker_names
-        self._empty_rows = format_header(len(self._chain)).encode()
+        chain = read_chain(header.urdf, self.folder / URDF, header.base_link, header.tip_link)
+        names = header.sensor_names, header.marker_names
+        self._format = RowFormat(self._rows_path, chain, *names)
+        self._empty_rows = format_header(len(chain)).encode()
         self._text = write_header(header, URDF, 'aborted')
         self._urdf = header.urdf.encode()
         files = {URDF: self._urdf, ROWS: self._empty_rows, HEADER: self._text.encode()}
@@ -161,8 +160,8 @@ class SessionWriter:
         self._line = 2
         self.observations = self.configurations = 0
         self.last_stamp_s: float | None = None
-        for row in (row for rows in pieces for row in rows):
-            self._accept(self._check(row, self._line, self._rules))
+        rows = [row for piece in pieces for row in piece]
+        self._accept(self._format.check(rows, self._line, self._rules.branch()))
 
     def append(self, observation: Observation) -> None:
         """Write one observation; durable on return, or not there at all (see `record`)."""
@@ -188,8 +187,8 @@ class SessionWriter:
         if self._closed:
             raise InputError(f'{self.folder}: the session is closed; start a new one')
         self.check()
-        rows = [format_observation(observation).rstrip('\n') for observation in observations]
-        keys = self._checked(rows)
+        rows = [format_observation(observation) for observation in observations]
+        keys = self._format.check(rows, self._line, self._rules.branch())
         if rows:
             record = {**record, 'rows': rows}
         self._journal.append(record)
@@ -207,8 +206,7 @@ class SessionWriter:
                 self.release()
             raise
         self._guard.note(ROWS)
-        for key in keys:
-            self._accept(key)
+        self._accept(keys)
 
     def check(self, *, content: bool = False) -> None:
         """Notice what others did to the files, and restore them; `restored` lists what.
@@ -269,26 +267,14 @@ class SessionWriter:
         self._guard.take_place()
         self.beyond_repair = 'the folder was removed, and with it the bag and the plan'
 
-    def _checked(self, rows: Sequence[str]) -> list[RowKeys]:
-        """Hold the rows of one record to what the reader demands of them."""
-        keys = []
-        rules = self._rules.branch()
-        for number, row in enumerate(rows, start=self._line):
-            keys.append(self._check(row, number, rules))
-            rules.accept(keys[-1])
-        return keys
-
-    def _check(self, row: str, line: int, rules: SequenceRules) -> RowKeys:
-        return check_row(
-            row, line, self._rows_path, self._chain, self._sensors, self._markers, rules
-        )
-
-    def _accept(self, key: RowKeys) -> None:
-        self._rules.accept(key)
-        self._line = key.line + 1
-        self.observations = max(self.observations, key.observation + 1)
-        self.configurations = max(self.configurations, key.configuration + 1)
-        self.last_stamp_s = key.stamp_s
+    def _accept(self, keys: Sequence[RowKeys]) -> None:
+        """Take rows that are on the disk for the last ones."""
+        for key in keys:
+            self._rules.accept(key)
+            self._line = key.line + 1
+            self.observations = max(self.observations, key.observation + 1)
+            self.configurations = max(self.configurations, key.configuration + 1)
+            self.last_stamp_s = key.stamp_s
 
     def close(self, exit_status: ExitStatus = 'complete') -> ExitStatus:
         """Write to session.yaml how the session ended, and the checksums of all files.

@@ -68,9 +68,10 @@ class Scene:
                 position = transforms.apply(transforms.inverse(T), point) + noise
                 self.readings.append(
                     ReferenceReading(
-                        self.configuration, name, marker, stands, position, self.time_s,
+                        name, marker, self.time_s, stands, position,
                         None if name == 'tracker' else np.full(3, 1e-5),
                         1 if name == 'tracker' else 30,
+                        configuration=self.configuration,
                     )
                 )  # fmt: skip
             self.configuration += 1
