@@ -45,26 +45,26 @@ def exports(result: FitResult) -> dict[str, str]:
             result.session.urdf,
             result.chain,
             np.where(result.identifiable, result.joint_offsets, 0.0),
-            notes=(
-                *(f'CHECK FIRST: {line}' for line in result.implausible),
-                *(
-                    f'left out, not identifiable: {joint}: {why}'
-                    for joint, why in left_out(result).items()
-                ),
-            ),
+            _notes(result),
         ),
     }
 
 
+def _notes(result: FitResult) -> list[str]:
+    """Return what the user of a file must know, a line each."""
+    return [
+        *(f'CHECK FIRST: {line}' for line in result.implausible),
+        *(
+            f'left out, not identifiable: {joint}: {" ".join(why.split())}'
+            for joint, why in left_out(result).items()
+        ),
+    ]
+
+
 def left_out(result: FitResult) -> dict[str, str]:
     """Return the joints whose offsets are not applied -> what the data cannot tell them from."""
-    return {
-        joint: why
-        for joint, known, why in zip(
-            result.joint_names, result.identifiable, result.why, strict=True
-        )
-        if not known
-    }
+    unknown = np.flatnonzero(~result.identifiable)
+    return {result.joint_names[i]: result.why[i] for i in unknown}
 
 
 def remaster_text(result: FitResult) -> str:
@@ -110,17 +110,13 @@ def layer_text(result: FitResult) -> str:
         '#   angle to the planner      = reported angle + offset\n'
         "# Shift the joint limits as well: the controller's limits apply to its own angles.\n"
     )  # fmt: skip
-    for line in result.implausible:
-        head += f'# CHECK FIRST: {line}\n'
-    missing = left_out(result)
-    for joint, why in missing.items():
-        head += f'# Left out, not identifiable: {joint}: {" ".join(why.split())}\n'
+    head += ''.join(f'# {note}\n' for note in _notes(result))
     known = np.flatnonzero(result.identifiable)
     lists: dict[str, list[str] | list[float]] = {
         'joint_names': [result.joint_names[i] for i in known],
         'joint_offsets': [float(result.joint_offsets[i]) for i in known],
         'joint_offsets_std': [float(result.joint_offsets_std[i]) for i in known],
-        'left_out': list(missing),
+        'left_out': list(left_out(result)),
     }
     parameters = {
         'robot': result.chain.name,

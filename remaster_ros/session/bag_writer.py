@@ -78,7 +78,7 @@ class BagWriter:
         if resume and any(self.folder.glob('*.mcap')):
             recover_bag(self.folder)
             reader = BagReader(self.folder)
-            self._files, self._last_ns = reader.files, reader.end_ns
+            self._files, self._last_ns = reader.files, reader.whole.last_ns
             self._topics = _topics_of(reader, latched)
         else:
             if resume:
