@@ -77,7 +77,7 @@ class Rejection:
     Attributes
     ----------
     reason
-        A word to count by: ``moving``, ``unseen``, ``clock``, ``stale``, ``too_few``,
+        A name to count by: ``moving``, ``unseen``, ``clock``, ``stale``, ``too_few``,
         ``unsteady``, ``frozen``, ``swapped``, ``device``, ``absent`` or ``not_waited``.
     detail
         One line with the numbers.
@@ -89,7 +89,7 @@ class Rejection:
 
 
 LONGEST_GAP_S = 5.0
-"""Without a report of the joints for so long nobody knows that the arm stood still, s."""
+"""Without a report of the joints for so long it is unknown whether the arm stood still, s."""
 
 CLOCK_BACK_S = 0.1
 """A report that is older than the last one by more than this comes from a clock set back, s."""
@@ -109,7 +109,7 @@ class Pairing:
     motion_tolerance
         A report further than this from `q_settled` on any joint means the arm moved, rad.
     require
-        Whom the arm waits for: ``all`` sensors, ``any`` of them, or one by its name. A sensor
+        What the arm waits for: ``all`` sensors, ``any`` of them, or one by its name. A sensor
         that is not required and has no reading by then is left out.
     """
 
@@ -131,7 +131,7 @@ class Pairing:
         self._now_s = self._looked_s = settled_stamp_s
         self._excused_s = dict.fromkeys(self.rules, 0.0)
         self._silent_s = dict.fromkeys(self.rules, 0.0)
-        self._words: dict[str, int] = {}
+        self._message_counts: dict[str, int] = {}
         self._joints: list[tuple[float, FloatArray]] = []
         self._readings: dict[str, list[MarkerReading]] = {name: [] for name in self.rules}
 
@@ -152,17 +152,20 @@ class Pairing:
             self._decide(reading.stamp_s)
 
     def fail(self, sensor: str, detail: str) -> None:
-        """Note that the device itself said that there is no measurement."""
+        """Note that the device itself reported that there is no measurement."""
         self._set(Rejection(sensor, 'device', detail))
 
     def give_up(
-        self, now_s: float, absent: Collection[str] = (), words: Mapping[str, int] | None = None
+        self,
+        now_s: float,
+        absent: Collection[str] = (),
+        message_counts: Mapping[str, int] | None = None,
     ) -> None:
         """Reject every sensor whose time is over at `now_s`.
 
         A cut cable shows only when the heartbeat is over, and simulated time may run faster than
-        that: a required sensor is not rejected before its node has been heard again, and if that
-        turns out to be absent, all of its silence is excused.
+        that: a required sensor is not rejected before a message of its node has come
+        again; if the node turns out to be absent, the whole time without messages is excused.
 
         Parameters
         ----------
@@ -171,9 +174,9 @@ class Pairing:
         absent
             Sensors that are not there at all now: a required one is waited for, and the time is
             not counted; another one is left out.
-        words
-            How often each sensor's node has been heard (`Presence.words`); without it, or for a
-            sensor that is not in it, silence means nothing.
+        message_counts
+            How many messages each sensor's node has sent (`Presence.words`); without it, or for
+            a sensor that is not in it, a time without messages is not counted.
         """
         passed = max(now_s - self._looked_s, 0.0)
         self._looked_s = now_s
@@ -183,21 +186,27 @@ class Pairing:
                 self._silent_s[name] = 0.0
             elif name in self.rules:
                 self._set(Rejection(name, 'absent', 'it is not there, and not required'))
-        self._listen(words or {}, passed, absent)
+        self._add_silence(message_counts or {}, passed, absent)
         for name, rules in self.rules.items():
             allowed = self._allowed_s(rules)
             unsure = self.is_required(name) and self._silent_s[name] > 0.0
             if now_s > self.settled_stamp_s + allowed and not unsure:
                 self._set(self._late(rules, allowed))
 
-    def _listen(self, words: Mapping[str, int], passed_s: float, absent: Collection[str]) -> None:
-        """Add up how long each sensor's node has said nothing that is not excused yet."""
+    def _add_silence(
+        self, counts: Mapping[str, int], passed_s: float, absent: Collection[str]
+    ) -> None:
+        """Add up how long each sensor's node has sent nothing, as far as not excused yet."""
         for name in self.rules:
-            if name in words and words[name] == self._words.get(name) and name not in absent:
+            if (
+                name in counts
+                and counts[name] == self._message_counts.get(name)
+                and name not in absent
+            ):
                 self._silent_s[name] += passed_s
             else:
                 self._silent_s[name] = 0.0
-        self._words = dict(words)
+        self._message_counts = dict(counts)
 
     def has_reading(self, sensor: str) -> bool:
         """Whether anything of a sensor has come."""
@@ -221,7 +230,7 @@ class Pairing:
         self._reject_rest('not_waited', f'the arm waits for {self.require}')
 
     def waited_s(self) -> dict[str, float]:
-        """How long the arm stood for whom, s: from one sensor's decision to the next one's."""
+        """How long the arm stood for each sensor, s: from one decision to the next."""
         waited, since = dict.fromkeys(self.rules, 0.0), self.settled_stamp_s
         for name, at in sorted(self._decided_s.items(), key=lambda item: item[1]):
             waited[name], since = at - since, at
@@ -266,7 +275,7 @@ class Pairing:
                 if dwell is None:
                     continue
                 end, used = dwell
-            # Without a later joint state nobody knows that the arm stood still to the end.
+            # Only a later joint state shows that the arm stood still to the end.
             if not self._joints or self._joints[-1][0] < end:
                 continue
             self._set(self._judge(rules, used, end))

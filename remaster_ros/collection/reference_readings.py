@@ -37,7 +37,7 @@ class SetupChange:
         Configurations that it happened between: the last one that was as at first (None where it
         was so from the first) and the first one that was not.
     p_value
-        Of the round that told it.
+        Of the round that showed it.
     look_alikes
         Other subjects that explain the same readings.
     """

@@ -4,7 +4,7 @@ The references are measured twice at the beginning: how far the two rounds lie a
 and sensor together repeat to, the noise that every later difference is held against. Each later
 round is held against them by F tests; the probabilities of a false alarm of all rounds of a
 session, however many, add up to what is stated (alpha spending: round r spends 6 / (π r)² of it).
-Only a round that differs is then asked for its cause.
+Only for a round that differs a cause is looked for.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from remaster_ros.types import FloatArray, IntArray
 FALSE_ALARM = 0.01
 """Probability that a session in which nothing changes has any alarm."""
 STOP_M = 0.5e-3
-"""A change of this size stops a collection where nothing else is asked for."""
+"""A change of this size stops a collection by default."""
 LEAST_STD_M = 2e-6
 """No sensor and no arm repeat better than this."""
 FEWEST_FREEDOMS = 6
 """With fewer repeated numbers a sensor's noise is not known."""
 LOOKS_ALIKE = 6.0
-"""Causes whose information criteria differ by less than this (odds of 20) are not told apart."""
+"""Causes whose information criteria differ by less than this (odds of 20) are not distinguished."""
 UNEXPLAINED_P = 1e-4
 UNEXPLAINED_SHARE = 0.05
 """What a cause leaves of the displacements is the straight line's share of it, up to here."""
@@ -50,7 +50,7 @@ class ReferenceWatch:
     markers
         Nominal positions in the tool frame, m, (3,).
     stop_m
-        Two first rounds that lie further apart than this tell nothing of later changes, m.
+        Two first rounds that lie further apart than this show nothing of later changes, m.
     false_alarm
         See `FALSE_ALARM`.
 
@@ -93,7 +93,7 @@ class ReferenceWatch:
         self._rounds[-1].rows[key] = reading
 
     def begins_round(self, reading: ReferenceReading) -> bool:
-        """Tell whether `add` would take a reading for the first of another round."""
+        """Return whether `add` would take a reading for the first of another round."""
         return not self._open or self._key(reading) in self._rounds[-1].rows
 
     def _key(self, reading: ReferenceReading) -> tuple[int, str]:
@@ -283,7 +283,7 @@ class ReferenceWatch:
         patterns: list[tuple[int | None, FloatArray]] = []
         patterns += [(i, (at >= i).astype(float)) for i in steps]
         if len(steps) > 1:
-            # One later round cannot tell a drift from a step.
+            # With one later round a drift and a step look the same.
             span = max(float(np.ptp(stamps)), 1e-9)
             patterns.append((None, (stamps - stamps.min()) / span))
         fits: list[tuple[float, float, FloatArray, Cause, int | None]] = []

@@ -28,7 +28,7 @@ JOINT_LIMITS = 'outside the joint limits'
 NO_LINE_OF_SIGHT = 'no line of sight to '  # the sensor's name follows
 
 LIMIT_MARGIN_RAD = np.deg2rad(1.0)
-"""Distance kept from the joint limits where nothing else is asked for, rad."""
+"""Distance kept from the joint limits by default, rad."""
 
 _FULL_TURN = (0.0, 2 * np.pi)
 
@@ -282,7 +282,7 @@ def _reasons(
     arm: CollisionModel, q: FloatArray, lines_of_sight: Sequence[LineOfSight]
 ) -> np.ndarray[tuple[int], np.dtype[np.str_]]:
     """Return why each solution (m, k) is no good, or '', (m,); the first reason wins."""
-    # More than the bridge asks for: an arm that stands a little off a planned way may still move.
+    # More than the bridge requires: an arm that stands a little off a planned way may still move.
     collisions = arm.reasons(q, RESERVE_M)
     bad = [collisions != '', *(_unseen(arm, q, sight) for sight in lines_of_sight)]
     names = [NO_LINE_OF_SIGHT + sight.sensor for sight in lines_of_sight]
@@ -290,7 +290,7 @@ def _reasons(
 
 
 def _unseen(arm: CollisionModel, q: FloatArray, sight: LineOfSight) -> BoolArray:
-    """Tell where the marker faces away from the sensor, or the arm is in between, (m,)."""
+    """Return where the marker faces away from the sensor, or the arm is in between, (m,)."""
     T = arm.chain.forward(q)
     to_sensor = sight.sensor_R - arm.chain.positions(q, sight.marker_T)
     facing = np.sum(T[:, :3, 2] * to_sensor, axis=-1) / np.linalg.norm(to_sensor, axis=-1)

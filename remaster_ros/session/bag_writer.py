@@ -91,7 +91,7 @@ class BagWriter:
         self._file: PatientFile | None = PatientFile(self._path)
         try:
             self._writer = Writer(
-                # It asks for no more than write and tell.
+                # MCAP's writer calls no more than write and tell.
                 self._file,  # type: ignore[arg-type]
                 compression=CompressionType.NONE,
                 use_chunking=False,
@@ -218,7 +218,7 @@ def recover_bag(folder: str | os.PathLike[str]) -> str:
     Returns
     -------
     str
-        What could not be kept, in words; '' where nothing was lost. A bag that was closed is left
+        What could not be kept; '' where nothing was lost. A bag that was closed is left
         as it is.
 
     Raises

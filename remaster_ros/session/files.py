@@ -1,4 +1,4 @@
-"""Reading files from strangers and writing files that survive a crash."""
+"""Reading files of unknown origin and writing files that survive a crash."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def read_limited(path: Path, limit: int, missing: str) -> bytes:
     limit
         Largest size accepted, bytes.
     missing
-        What to tell the user where there is no such file.
+        The remedy in the message where there is no such file.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def decode_text(data: bytes, path: Path) -> str:
 
 
 def make_folder(folder: Path) -> None:
-    """Create an output folder with its parents; an `InputError` says why it cannot be."""
+    """Create an output folder with its parents; an `InputError` with the reason where it cannot be."""
     with writing(folder):
         new = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
@@ -273,7 +273,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def cannot_write(path: Path, error: OSError) -> DiskError:
-    """Return the error that says why a file or folder cannot be written, and the remedy."""
+    """Return the error with the reason why a file or folder cannot be written, and the remedy."""
     return DiskError(
         f'{path}: cannot be written ({reason(error)}); '
         'name a folder you may write to, with free space'
@@ -281,5 +281,5 @@ def cannot_write(path: Path, error: OSError) -> DiskError:
 
 
 def reason(error: Exception) -> str:
-    """Return an operating-system error in words, without the path it repeats."""
+    """Return the text of an operating-system error, without the path that it repeats."""
     return getattr(error, 'strerror', None) or str(error)

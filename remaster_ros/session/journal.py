@@ -1,4 +1,4 @@
-"""Append-only journals: JSON lines with a checksum each, durable before anybody is told.
+"""Append-only journals: JSON lines with a checksum each, durable before `append` returns.
 
 A crash can leave only the last line incomplete: cut anywhere, also inside a character, or with
 zeros where the file system had reserved blocks but not yet written them. Such a line was never
@@ -57,7 +57,7 @@ class Journal:
     records, content
         Every record so far, and the bytes of all their lines.
     lost
-        What was cut off when opening, in words; '' where nothing was.
+        What was cut off when opening, in a line; '' where nothing was.
 
     Raises
     ------

@@ -84,7 +84,7 @@ def read_mesh(path: Path) -> FloatArray:
 
     try:
         loaded = trimesh.load_scene(BytesIO(content), file_type=kind[1:], skip_materials=True)
-        # Instances in their places; COLLADA says how long its unit is.
+        # Instances in their places; COLLADA files state the length of their unit.
         parts: list[Any] = [getattr(part, 'vertices', ()) for part in loaded.dump()]
         vertices = np.array([point for part in parts for point in part], dtype=float)
         vertices = vertices.reshape(-1, 3)

@@ -67,7 +67,7 @@ class _Stop(_Route, kw_only=True, tag='stop'):
 
 
 class _Round(msgspec.Struct, tag_field='kind', tag='round'):
-    """A round of the references was asked for."""
+    """A round of the references is next, by request."""
 
 
 class _Outcome(msgspec.Struct, tag_field='kind', tag='outcome'):
@@ -102,7 +102,7 @@ class PlanJournal:
     Attributes
     ----------
     id
-        Tells this plan from others; '' before there is one.
+        Identifies this plan; '' before there is one.
     tour
         The tour under way, at the stop where it was; None where there is none.
     stop
@@ -116,7 +116,7 @@ class PlanJournal:
     run
         The token of the run that it was in, '' where none was under way.
     lost
-        What a crash has cut off, in words; '' where nothing was.
+        What a crash has cut off, in a line; '' where nothing was.
     trouble
         Why something is not on the disk yet; '' where everything is.
 

@@ -1,4 +1,4 @@
-"""Bring a session folder that a crash has left to rest, and say what was lost."""
+"""Finish a session folder that a crash has left incomplete, and report what was lost."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from remaster_ros.types import Measurements
 
 @dataclass
 class Recovery:
-    """What a recovery found, in words, a line each.
+    """What a recovery found, a line each.
 
     Attributes
     ----------
     finished
-        Whether anything was to be finished; False where the folder was at rest.
+        Whether anything was to be finished; False where the folder was complete.
     lost
         What could not be kept: what was being written, and never acknowledged.
     """

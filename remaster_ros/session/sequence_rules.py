@@ -38,7 +38,7 @@ class SequenceRules:
         self._of_configuration: MutableMapping[int, RowKeys] = {}
 
     def branch(self) -> SequenceRules:
-        """Return rules that know the same rows; what they accept stays unknown here."""
+        """Return rules after the same rows; rows that they accept change nothing here."""
         rules = SequenceRules()
         rules._last = self._last
         rules._of_observation = ChainMap({}, self._of_observation)

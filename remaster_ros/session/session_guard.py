@@ -19,7 +19,7 @@ Signature = tuple[int, int, int, int]
 
 
 def signature(path: Path) -> Signature | None:
-    """Return what tells a file and its state from others; None where there is none.
+    """Return what identifies a file and its state; None where there is none.
 
     Raises
     ------
@@ -65,7 +65,7 @@ class SessionGuard:
             self.note(name)
 
     def is_in_place(self) -> bool:
-        """Tell whether the folder of this name is still the one that was opened."""
+        """Return whether the folder of this name is still the one that was opened."""
         found, mine = signature(self._folder), os.fstat(self._descriptor)
         return found is not None and found[:2] == (mine.st_dev, mine.st_ino)
 
@@ -79,7 +79,7 @@ class SessionGuard:
             self._descriptor = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
 
     def close(self) -> None:
-        """Look no more; closing again does nothing."""
+        """Let the folder go; closing again does nothing."""
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
             os.close(descriptor)
@@ -90,7 +90,7 @@ class SessionGuard:
         Parameters
         ----------
         content
-            Read every file; else only those whose size or time of change is another.
+            Read every file; else only those whose size or time of change is different.
         """
         wrong = {}
         for name in self._names:

@@ -1,4 +1,4 @@
-"""The recorder's memory: the session it writes, and what it has decided so far.
+"""What a recorder keeps on the disk: the session, and its decisions so far.
 
 A recorder that is started again finds here what it decided before, so that nothing is recorded
 twice, and the points that its sensors were registered by.
@@ -27,12 +27,12 @@ _FINAL = ('recorded', 'partial')
 
 
 class SessionJournal:
-    """Write a session, new or unfinished, and remember what was decided.
+    """Write a session, new or unfinished, and keep what was decided.
 
     Parameters
     ----------
     folder
-        The session's. A complete session is not written to: `closed` says so from the start.
+        The session's. A complete session is not written to; `closed` is set from the start.
     header
         Everything but the observations.
 
@@ -45,11 +45,11 @@ class SessionJournal:
     observations
         How many observations there are.
     notes
-        What a user should know of how the session was found, a line each.
+        The state in which the session was found, for the user, a line each.
     registration
         The readings that the sensors were registered by in the runs before.
     watched
-        What the references told in the runs before, in order: ``reference`` with the number of the
+        What was measured at the references in the runs before, in order: ``reference`` with the number of the
         configuration and its readings, ``other`` for any other configuration, ``accepted`` where
         a person had seen to a change.
 

@@ -1,7 +1,7 @@
 """Write a session observation by observation, and go on with one after whatever has happened.
 
 Each record goes into the journal first (a line with a checksum, synced), then its rows go into
-observations.csv (synced), and only then does the caller learn that it is recorded. All rows of a
+observations.csv (synced), and only then does the call return. All rows of a
 configuration are one record: after a crash they are all there or none is. What the journal holds
 and observations.csv does not is added when the session is opened again.
 """
@@ -41,7 +41,7 @@ FILES = (HEADER, URDF, ROWS, JOURNAL)
 class SessionWriter:
     """Write a session; what `append` or `record` returned from is on the disk.
 
-    The folder can be read at any moment: it says ``exit_status: aborted`` until `close`, and a
+    The folder can be read at any moment: it has ``exit_status: aborted`` until `close`, and a
     line cut off by a crash is the only thing a reader may find incomplete. A writer is also a
     context manager: it closes as ``complete``, or as ``aborted`` where an exception passes.
 
@@ -305,7 +305,7 @@ class SessionWriter:
         sums = {name: hashlib.sha256(self._content(name)).hexdigest() for name in FILES}
         write_sums(self.folder, sums)
         self._closed_as = exit_status
-        # Behind the checksums: nobody else may write as long as they are not there.
+        # After the checksums: until they are there no other process may write.
         self.release()
         return exit_status
 

@@ -38,7 +38,7 @@ class _Sensor(msgspec.Struct):
 class SessionHeader(msgspec.Struct):
     """session.yaml as validated; the fields are the keys of the file.
 
-    ``extra`` holds the keys this version does not know, nested as they were.
+    ``extra`` holds the keys that this version does not use, nested as they were.
     """
 
     format: str

@@ -229,13 +229,6 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
             link_radius=self.link_radius_m,
         )
 
-    def rough_places(self) -> dict[str, FloatArray]:
-        """Return T_R_N of each sensor as far as it is known beforehand, not turned, (4, 4)."""
-        return {
-            name: transform(np.eye(3), np.array(sensor.rough_position_m))
-            for name, sensor in self.sensors.items()
-        }
-
     def scene(
         self,
         chain: SerialChain,

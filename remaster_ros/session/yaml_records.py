@@ -43,7 +43,7 @@ class Bounds:
     above
         Whether `least` itself is refused.
     remedy
-        What else the message says.
+        Further text of the message.
     """
 
     least: float = -math.inf
@@ -58,10 +58,10 @@ class Bounds:
             return f'{key}: {value} is not a finite number; correct it'
         if self.least < value <= self.most or (value == self.least and not self.above):
             return ''
-        words = [f'above {self.least:g}' if self.above else f'from {self.least:g}']
+        limits = [f'above {self.least:g}' if self.above else f'from {self.least:g}']
         if math.isfinite(self.most):
-            words.append(f'to {self.most:g}')
-        text = f'{key} is {value:g}; it must be {" ".join((*words, self.unit)).rstrip()}'
+            limits.append(f'to {self.most:g}')
+        text = f'{key} is {value:g}; it must be {" ".join((*limits, self.unit)).rstrip()}'
         if self.unit == 'm' and abs(value) > self.most:
             text += f'; if millimetres were meant, write {value / 1e3:g}'
         elif self.unit == 'degrees' and 0.0 < value < self.least:

@@ -16,7 +16,7 @@ from remaster_ros.types import FloatArray
 def plan_tour(
     chain: SerialChain,
     cell: Workcell,
-    places: Mapping[str, FloatArray],
+    places: Mapping[str, FloatArray] | None,
     counts: Mapping[str, int],
     rng: np.random.Generator,
     *,
@@ -29,7 +29,7 @@ def plan_tour(
     chain, cell
         The arm, and where it works.
     places
-        T_R_N of every sensor that has to see its marker, (4, 4).
+        T_R_N of every sensor that has to see its marker, (4, 4); None for the cell's rough places.
     counts
         Split -> number of candidate poses.
     rng
@@ -44,7 +44,9 @@ def plan_tour(
         No closed form for this robot, or no pose to fit that it can take.
     """
     scene = cell.scene(chain, without_meshes=without_meshes)
-    sensors_R = {name: T_R_N[:3, 3] for name, T_R_N in places.items()}
+    sensors_R = scene.rough_R
+    if places is not None:
+        sensors_R = {name: T_R_N[:3, 3] for name, T_R_N in places.items()}
     plans = {split: scene.plan(n, sensors_R, rng) for split, n in counts.items() if n}
     tour = Tour(chain, plans)
     if not tour.poses['optimization']:
