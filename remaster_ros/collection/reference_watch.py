@@ -34,7 +34,7 @@ LEAST_STD_M = 2e-6
 FEWEST_FREEDOMS = 6
 """With fewer repeated numbers a sensor's noise is not known."""
 LOOKS_ALIKE = 6.0
-"""Causes whose information criteria differ by less than this (odds of 20) are not distinguished."""
+"""Causes whose information criteria differ by less than this (odds of 20) look the same."""
 UNEXPLAINED_P = 1e-4
 UNEXPLAINED_SHARE = 0.05
 """What a cause leaves of the displacements is the straight line's share of it, up to here."""

@@ -3,9 +3,9 @@
 The true joint angle is the reported one plus the offset. Each way corrects all of it, so only one
 may be in use at a time.
 
-An offset that the data do not determine is in none of the three: its mean is a choice of the fit (0, or
-where the marker's nominal place leads), and applied it would move the arm for no reason. Each file
-lists the joints that are left out, and why.
+An offset that the data do not determine is in none of the three: its mean is a choice of the fit
+(0, or where the marker's nominal place leads), and applied it would move the arm for no reason.
+Each file lists the joints that are left out, and why.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def _notes(result: FitResult) -> list[str]:
 
 
 def left_out(result: FitResult) -> dict[str, str]:
-    """Return the joints whose offsets are not applied -> the reason: what they cannot be separated from."""
+    """Return the joints whose offsets are not applied, and why."""
     unknown = np.flatnonzero(~result.identifiable)
     return {result.joint_names[i]: result.why[i] for i in unknown}
 
@@ -92,8 +92,8 @@ def remaster_text(result: FitResult) -> str:
             f'3. A corrected robot model for planner and controller: {URDF_FILE}.',
             '',
             *((head, *rows) if rows else ('  No joint: these data determine no offset.',)),
-            *(('', 'Left out of all three, as the data do not determine their offsets. Leave these',
-               'joints as they are:', *notes) if notes else ()),
+            *(('', 'Left out of all three, as the data do not determine their offsets. Leave',
+               'these joints as they are:', *notes) if notes else ()),
             '',
             'Afterwards measure a few poses again and run "remaster accuracy": it shows whether',
             'the offsets are in use.',

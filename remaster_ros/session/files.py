@@ -67,7 +67,7 @@ def decode_text(data: bytes, path: Path) -> str:
 
 
 def make_folder(folder: Path) -> None:
-    """Create an output folder with its parents; an `InputError` with the reason where it cannot be."""
+    """Create an output folder with its parents, durable on return; `InputError` if impossible."""
     with writing(folder):
         new = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)

@@ -49,9 +49,9 @@ class SessionJournal:
     registration
         The readings that the sensors were registered by in the runs before.
     watched
-        What was measured at the references in the runs before, in order: ``reference`` with the number of the
-        configuration and its readings, ``other`` for any other configuration, ``accepted`` where
-        a person had seen to a change.
+        What was measured at the references in the runs before, in order: ``reference`` with the
+        number of the configuration and its readings, ``other`` for any other configuration,
+        ``accepted`` where a person had seen to a change.
 
     Raises
     ------
