@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
@@ -191,11 +192,11 @@ class SessionJournal:
         }
         number = 0 if self._writer is None else self._writer.configurations
         if split == REGISTRATION:
-            self._append({**record, 'readings': to_plain(readings)})
+            self._append({**record, 'readings': _plain(readings)})
         else:
             if split == REFERENCE:
                 record['number'] = number
-                record['readings'] = to_plain(readings)
+                record['readings'] = _plain(readings)
             self._append(record, self._rows(pose, split, readings, from_q, temperatures_c))
             self.observations += len(readings)
         self._decide(pose, solution, result)
@@ -278,3 +279,8 @@ def _split(name: str) -> Split:
     if name == 'validation':
         return 'validation'
     return 'reference' if name == REFERENCE else 'optimization'
+
+
+def _plain(readings: Sequence[PairedReading]) -> list[dict[str, Any]]:
+    """Return readings as the journal has them: what is None is left out."""
+    return [{k: v for k, v in reading.items() if v is not None} for reading in to_plain(readings)]
