@@ -9,7 +9,6 @@ only copy of an observation.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
 from pathlib import Path
 from types import TracebackType
 
@@ -49,8 +48,6 @@ class BagWriter:
     ----------
     folder
         New or empty; the bag's name is the folder's.
-    latched
-        Topics offered transient_local: who subscribes late still gets their last message.
     resume
         Go on with the bag that the folder holds: finish the file of a killed writer, and begin
         the next one, as rosbag2 does where it splits a bag.
@@ -61,15 +58,8 @@ class BagWriter:
         The folder holds files, with `resume` a damaged bag, or cannot be written to.
     """
 
-    def __init__(
-        self,
-        folder: str | os.PathLike[str],
-        latched: Collection[str] = LATCHED_TOPICS,
-        *,
-        resume: bool = False,
-    ) -> None:
+    def __init__(self, folder: str | os.PathLike[str], *, resume: bool = False) -> None:
         self.folder = Path(folder)
-        self._latched = latched
         self._topics: dict[str, TopicMetadata] = {}
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
@@ -79,7 +69,7 @@ class BagWriter:
             recover_bag(self.folder)
             reader = BagReader(self.folder)
             self._files, self._last_ns = reader.files, reader.whole.last_ns
-            self._topics = _topics_of(reader, latched)
+            self._topics = _topics_of(reader)
         else:
             if resume:
                 _remove_beginnings(self.folder)
@@ -191,9 +181,9 @@ class BagWriter:
             self._schemas[msgtype] = self._writer.register_schema(
                 msgtype, 'ros2msg', definition.encode()
             )
-        latched = topic in self._latched
-        self._topics.setdefault(topic, TopicMetadata(topic, msgtype, type_hash, latched))
-        about = {'offered_qos_profiles': qos_text(latched), 'topic_type_hash': type_hash}
+        offered = qos_text(topic in LATCHED_TOPICS)
+        self._topics.setdefault(topic, _described(topic, msgtype))
+        about = {'offered_qos_profiles': offered, 'topic_type_hash': type_hash}
         self._channels[topic] = self._writer.register_channel(
             topic, 'cdr', self._schemas[msgtype], about
         )
@@ -244,7 +234,7 @@ def recover_bag(folder: str | os.PathLike[str]) -> str:
     listed = read_manifest(folder)
     unlisted = [file.name for file in reader.files if file.name not in listed]
     if unlisted:
-        topics = _topics_of(reader, LATCHED_TOPICS)
+        topics = _topics_of(reader)
         write_atomically(folder / METADATA_FILE, metadata_text(reader.files, topics.values()))
     for name in unlisted:
         add_to_manifest(folder, name)
@@ -253,14 +243,17 @@ def recover_bag(folder: str | os.PathLike[str]) -> str:
     return f'{path}: its last {reader.torn_bytes} bytes were no whole message and are dropped'
 
 
-def _topics_of(reader: BagReader, latched: Collection[str]) -> dict[str, TopicMetadata]:
-    """Return the topics of a bag by name, those of `latched` offered transient_local."""
+def _topics_of(reader: BagReader) -> dict[str, TopicMetadata]:
+    """Return the topics of a bag by name."""
     return {
-        topic: TopicMetadata(
-            topic, msgtype, definition_of(msgtype)[1], topic in latched, reader.counts[topic]
-        )
+        topic: _described(topic, msgtype, reader.counts[topic])
         for topic, msgtype in reader.topics.items()
     }
+
+
+def _described(topic: str, msgtype: str, count: int = 0) -> TopicMetadata:
+    _, type_hash = definition_of(msgtype)
+    return TopicMetadata(topic, msgtype, type_hash, topic in LATCHED_TOPICS, count)
 
 
 _WORK = '.recovery'

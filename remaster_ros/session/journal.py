@@ -72,9 +72,13 @@ class Journal:
             self._lock()
             self.records, whole, torn = read_journal(path)
             self.content = bytearray(whole)
-            self.lost = torn_words(path, len(self.records), torn)
+            self.lost = ''
             if torn:
                 self._file.truncate(len(whole))
+                self.lost = (
+                    f'{path}, line {len(self.records) + 1}: {torn} bytes of a line cut off while '
+                    'being written are dropped'
+                )
         except BaseException:
             self._file.close()
             raise
@@ -161,15 +165,6 @@ def read_journal(path: Path) -> JournalText:
             'take another copy of the file'
         )
     return JournalText(records, data[:size], len(rest))
-
-
-def torn_words(path: Path, whole: int, torn: int) -> str:
-    """Return what of a journal with `whole` good lines is dropped; '' where nothing is."""
-    if not torn:
-        return ''
-    return (
-        f'{path}, line {whole + 1}: {torn} bytes of a line cut off while being written are dropped'
-    )
 
 
 def format_record(record: Record) -> bytes:
