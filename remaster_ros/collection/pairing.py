@@ -143,13 +143,13 @@ class Pairing:
         elif stamp_s > self._now_s:
             self._now_s = stamp_s
             self._joints.append((stamp_s, np.asarray(q, float)))
-            self._decide(stamp_s)
+            self._decide()
 
     def add_reading(self, sensor: str, reading: MarkerReading) -> None:
         """Take one marker reading; older than the settling, or of an unknown sensor: ignored."""
         if sensor in self._readings and reading.stamp_s > self.settled_stamp_s:
             self._readings[sensor].append(reading)
-            self._decide(reading.stamp_s)
+            self._decide()
 
     def fail(self, sensor: str, detail: str) -> None:
         """Note that the device itself reported that there is no measurement."""
@@ -260,46 +260,34 @@ class Pairing:
             rules.sensor, 'stale', f'{what} within {allowed:.1f} s after the arm settled'
         )
 
-    def _decide(self, stamp_s: float) -> None:
+    def _decide(self) -> None:
         for name, rules in self.rules.items():
-            if name in self.decided:
-                continue
-            readings = self._readings[name]
-            if rules.single_shot:
-                if not readings:
-                    continue
-                end = readings[0].stamp_s
-                used = readings[:1]
-            else:
-                dwell = self._dwell(rules, readings)
-                if dwell is None:
-                    continue
-                end, used = dwell
-            # Only a later joint state shows that the arm stood still to the end.
-            if not self._joints or self._joints[-1][0] < end:
-                continue
-            self._set(self._judge(rules, used, end))
+            used = None if name in self.decided else self._used(rules)
+            # Only a joint state after the end shows that the arm stood still to the end.
+            if used and self._joints and self._joints[-1][0] >= used[0]:
+                self._set(self._judge(rules, *used))
 
-    def _dwell(
-        self, rules: SensorRules, readings: list[MarkerReading]
-    ) -> tuple[float, list[MarkerReading]] | None:
-        """End of a stream's dwell and the readings in it; None while it lasts."""
+    def _used(self, rules: SensorRules) -> tuple[float, list[MarkerReading]] | None:
+        """Return the end of a measurement and the readings in it; None while it lasts."""
+        readings = self._readings[rules.sensor]
+        if not readings:
+            return None
+        if rules.single_shot:
+            return readings[0].stamp_s, readings[:1]
         end = self.settled_stamp_s + rules.dwell_s
         # The dwell is over for this sensor once it has sent something later than its end.
-        if not readings or readings[-1].stamp_s <= end:
+        if readings[-1].stamp_s <= end:
             return None
         used = [reading for reading in readings if reading.stamp_s <= end]
-        if len(used) < rules.min_samples:
-            if len(readings) < rules.min_samples:
-                return None
-            used = readings[: rules.min_samples]
-            end = used[-1].stamp_s
-            if end > self.settled_stamp_s + self._allowed_s(rules):
-                return None
-        return end, used
+        if len(used) >= rules.min_samples:
+            return end, used
+        used = readings[: rules.min_samples]
+        end = used[-1].stamp_s
+        late = end > self.settled_stamp_s + self._allowed_s(rules)
+        return None if late or len(used) < rules.min_samples else (end, used)
 
     def _judge(
-        self, rules: SensorRules, used: list[MarkerReading], end: float
+        self, rules: SensorRules, end: float, used: list[MarkerReading]
     ) -> PairedReading | Rejection:
         stamps = np.array([stamp for stamp, _ in self._joints])
         q = np.array([joints for _, joints in self._joints])
