@@ -13,11 +13,8 @@ from remaster_ros.kinematics.transforms import looking_at, transform
 from remaster_ros.planning.candidates import candidate_poses, plan_poses
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.offline_tour import LIMIT_MARGIN_RAD
-from remaster_ros.simulation.session_simulator import (
-    SessionTruth,
-    SimulatedSensor,
-    simulate_session,
-)
+from remaster_ros.simulation.session_simulator import simulate_session
+from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor
 from remaster_ros.types import FloatArray, Session
 
 CELL = read_cell('demo')

@@ -46,6 +46,7 @@ from remaster_ros.session.session_writer import JOURNAL
 from remaster_ros.session.workcell import config_path, read_cell
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.setup import make_world
+from remaster_ros.simulation.truth import to_plain
 
 FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
 NODES = (
@@ -165,7 +166,7 @@ class Demo:
         print_offsets(self.console, result, world.truth)
         if discovery is not None:
             print_hidden(self.console, discovery, world.truth)
-        (self.out / 'truth.yaml').write_text(yaml.safe_dump(world.truth.to_dict()))
+        (self.out / 'truth.yaml').write_text(yaml.safe_dump(to_plain(world.truth)))
         self.console.print(f'session: {self.session}')
         name = 'report.html' if self.p.figures else 'fit.json'
         self.console.print(f'report: {self.fit / name}')

@@ -15,7 +15,7 @@ from remaster_ros.simulation.expected_findings import (
     named_cause,
     true_parameters,
 )
-from remaster_ros.simulation.world import WorldTruth
+from remaster_ros.simulation.truth import SessionTruth
 
 
 class ConfigurationTimes:
@@ -84,7 +84,7 @@ def print_times(console: Console, times: ConfigurationTimes) -> None:
     console.print(table)
 
 
-def print_offsets(console: Console, fit: dict[str, Any], truth: WorldTruth) -> None:
+def print_offsets(console: Console, fit: dict[str, Any], truth: SessionTruth) -> None:
     """Print offsets against the truth, which is opened only here, and the error on validation."""
     table = Table(title='joint zero-offsets, degrees')
     for heading in ('joint', 'estimate', 'std', 'hidden truth', 'off by, std'):
@@ -119,7 +119,7 @@ def print_offsets(console: Console, fit: dict[str, Any], truth: WorldTruth) -> N
     console.print(accuracy)
 
 
-def print_hidden(console: Console, discovery: dict[str, Any], truth: WorldTruth) -> None:
+def print_hidden(console: Console, discovery: dict[str, Any], truth: SessionTruth) -> None:
     """Print what was found beside what was hidden, which is opened only here, and the gain."""
     found: dict[Any, list[dict[str, Any]]] = {}
     for effect in discovery['effects']:

@@ -43,7 +43,7 @@ class FakeOptiTrackNode(RemasterNode):
         self.server = FakeOptiTrackServer(
             world,
             p.sensor,
-            np.random.default_rng([world.truth.seed, 3]),
+            np.random.default_rng([world.seed, 3]),
             version=(major, minor),
             transport='unicast' if p.transport == 'unicast' else 'multicast',
             rate_hz=p.rate,

@@ -66,7 +66,7 @@ class FakeRobotNode(RemasterNode):
             make_private_folder(folder)
             self._drawn = folder
             self.world = make_world(self._drawn, read_cell(self.p.cell), self.p.seed, self.p.rate)
-        rng = np.random.default_rng([self.world.truth.seed, 2])
+        rng = np.random.default_rng([self.world.seed, 2])
         self.arm = FakeArm(self.world, rng)
         reliable = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
         self._states = self.create_publisher(JointState, 'joint_states', reliable)

@@ -14,6 +14,7 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.simulation.hidden_effects import ARC_MINUTE, NAMED, Circumstances, HiddenEffect
+from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.simulation.world_model import WorldModel
 from remaster_ros.types import FloatArray
 
@@ -255,6 +256,18 @@ def hide(
             size_m = scale * rng.uniform(*USUAL_M)
         effects.append(draw_effect(stage, kind, rng, size_m, request.joint))
     return tuple(effects)
+
+
+def with_effects(
+    truth: SessionTruth,
+    stage: WorldModel,
+    requests: Sequence[EffectSpec],
+    rng: np.random.Generator,
+) -> SessionTruth:
+    """Return a truth in which so much more is wrong, as `hide` draws it."""
+    effects = hide(stage, requests, rng)
+    sizes_m = tuple(stage.size_m(effect) for effect in effects)
+    return replace(truth, effects=effects, effect_sizes_m=sizes_m)
 
 
 def draw_effect(

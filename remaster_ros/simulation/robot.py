@@ -17,6 +17,11 @@ from remaster_ros.simulation.faults import Numbers, is_out
 from remaster_ros.simulation.world import World
 from remaster_ros.types import FloatArray
 
+REPEATABILITY_RAD = 2e-5
+"""Standard deviation with which a joint comes back to a commanded position."""
+ENCODER_RAD = 2e-6
+"""Standard deviation of the noise of a reported joint position."""
+
 
 @dataclass(frozen=True)
 class TrajectoryPoint:
@@ -74,7 +79,7 @@ class FakeArm:
             return reason
         columns = [list(names).index(name) for name in self.names]
         # The arm does not come back to quite the same place twice.
-        stray = self._rng.normal(0.0, self.world.truth.repeatability_rad, len(columns))
+        stray = self._rng.normal(0.0, REPEATABILITY_RAD, len(columns))
         waypoints = []
         for point in points:
             q = np.asarray(point.positions, float)[columns] + stray
@@ -129,7 +134,7 @@ class FakeArm:
             return self._last
         now -= faults.get('late', 0.0)
         q, velocity = self.world.reported(now)
-        q = q + self._rng.normal(0.0, self.world.truth.encoder_rad, len(q))
+        q = q + self._rng.normal(0.0, ENCODER_RAD, len(q))
         if 'copy' in faults and self._commanded is not None and now >= self._commanded[0]:
             q = self._commanded[1]
         if 'drift' in faults:

@@ -7,7 +7,8 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.workcell import config_path
 from remaster_ros.simulation.faults import inject
 from remaster_ros.simulation.robot import FakeArm, TrajectoryPoint
-from remaster_ros.simulation.world import SensorTruth, World, WorldTruth
+from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor
+from remaster_ros.simulation.world import World, WorldContent
 
 
 class SteppedWorld(World):
@@ -26,19 +27,21 @@ def world(tmp_path):
     rng = np.random.default_rng(5)
     T = np.eye(4)
     T[:3, 3] = [2.0, 0.0, 1.0]
-    truth = WorldTruth(
-        5, rng.normal(0, 0.005, 7), {'mocap': SensorTruth(T, np.array([0.1, 0, 0]), np.pi)}
-    )
-    world = SteppedWorld.create(
-        tmp_path / 'world',
-        truth,
+    content = WorldContent(
+        SessionTruth(
+            rng.normal(0, 0.005, 7),
+            {'sir': np.array([0.1, 0, 0])},
+            {'mocap': SimulatedSensor('sir', T)},
+        ),
+        seed=5,
+        rate=10.0,
         urdf=urdf,
         base_link=chain.base_link,
         tip_link=chain.tip_link,
-        rate=10.0,
         start_q=np.array([0, 0.3, 0, -1.2, 0, 1.0, 0]),
         link_radius_m=0.06,
     )
+    world = SteppedWorld.create(tmp_path / 'world', content)
     yield world
     world.close()
 
@@ -120,7 +123,7 @@ def test_the_marker_is_where_offsets_put_it(world):
     """True angle = reported one + zero-offset."""
     truth = world.truth
     T = world.chain.forward(world.start_q + truth.joint_offsets)
-    expected = T @ [*truth.sensors['mocap'].marker, 1.0]
+    expected = T @ [*truth.markers['sir'], 1.0]
     seen = truth.sensors['mocap'].T_R_N @ [*world.marker_in_sensor('mocap', 100.0), 1.0]
     np.testing.assert_allclose(seen, expected, atol=1e-12)
 
