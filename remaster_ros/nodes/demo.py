@@ -1,7 +1,7 @@
 """The main job on fake hardware: start every node, collect, fit, and print what was found.
 
-Real nodes in processes of their own, real DDS, real sockets; the fakes share a hidden World, and
-its truth is opened only at the very end, to be compared with the estimate.
+Real nodes in processes of their own, real DDS, real sockets; the fakes share a hidden World, whose
+truth is compared with the estimate only at the very end.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from remaster_ros.nodes.demo_summary import (
     print_offsets,
     print_times,
 )
+from remaster_ros.nodes.launching import ALL_NODES, CORE, FAKES, SENSORS
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.processes import NodeProcesses
 from remaster_ros.nodes.running import report
@@ -47,16 +48,6 @@ from remaster_ros.session.workcell import config_path, read_cell
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.setup import make_world
 from remaster_ros.simulation.truth import to_plain
-
-FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
-NODES = (
-    'pose_planner',
-    'robot_bridge',
-    'optitrack_markers',
-    'laser_tracker_markers',
-    'recorder',
-    'optimizer',
-)
 
 
 @dataclass(frozen=True)
@@ -207,7 +198,7 @@ class Demo:
         }
         own['fake_optitrack'].update(ports)
         own['fake_laser_tracker']['port'] = tracker_port
-        for name in (*FAKES, *NODES):
+        for name in ALL_NODES:
             self.processes.start(name, common, own.get(name, {}))
 
     def _spin(self) -> None:
@@ -215,7 +206,7 @@ class Demo:
         if self._stopping:
             raise KeyboardInterrupt
         for name in self.processes.check():
-            # What it said last is no longer so.
+            # The last summary of the killed process no longer holds.
             self.node.summaries.pop(name, None)
             self.console.print(f'{name} was killed, and is started again')
 
@@ -228,13 +219,13 @@ class Demo:
             self._spin()
 
     def _ready(self) -> bool:
-        """Whether every node is up, the robot is heard and both sensors are there."""
-        said = self.node.summaries
+        """Whether every node is up, the robot reports and both sensors measure."""
+        summaries = self.node.summaries
         return (
-            all(name in said for name in NODES)
-            and said['pose_planner']['robot'] == 'heard'
-            and said['laser_tracker_markers']['state'] == 'ready'
-            and said['optitrack_markers']['published'] != '0'
+            summaries.keys() >= {*CORE, *SENSORS}
+            and summaries['pose_planner']['robot'] == 'heard'
+            and summaries['laser_tracker_markers']['state'] == 'ready'
+            and summaries['optitrack_markers']['published'] != '0'
         )
 
     def _trigger(self, service: str, server: str, timeout_s: float = 30.0) -> None:
@@ -275,12 +266,12 @@ class Demo:
                         completed=int(planner.get('configurations_done', 0)),
                     )
                 if planner.get('state') == 'idle' and planner.get('resuming') == 'no':
-                    # It was killed, and could not be certain that its run still lives.
+                    # It was killed and waits for a person to resume its run.
                     self._trigger('remaster/collect', 'pose_planner')
                 recorder = self.node.summaries.get('recorder', {})
                 if planner.get('state') == 'paused' and recorder.get('changed'):
-                    # What a person would look at; in the demo nobody has anything to mend.
-                    self.console.print(f'the references say: {recorder["changed"]}')
+                    # A person would look at the cell first; in the demo there is nothing to mend.
+                    self.console.print(f'changed since the reference: {recorder["changed"]}')
                     self.console.print('going on, as /remaster/collect does')
                     self._trigger('remaster/collect', 'pose_planner')
                 if planner.get('state') == 'failed':
@@ -290,13 +281,15 @@ class Demo:
 
             self._wait(complete, 3600.0, 'the collection to complete')
         self.console.print(self.node.planned)
-        recorder = self.node.summaries['recorder']
-        waited = [
+        measuring = [
             f'{key.removeprefix("waited_s_")} {value} s'
-            for key, value in recorder.items()
+            for key, value in self.node.summaries['recorder'].items()
             if key.startswith('waited_s_')
         ]
-        self.console.print(f'the arm stood waiting for {", ".join(waited)} (world time)')
+        self.console.print(
+            f'the arm stood still for measuring: {", ".join(measuring)} (world time, sum of all '
+            'configurations; a sensor that measures beside a faster one counts only beyond it)'
+        )
 
     def close(self) -> None:
         """End every process and remove the hidden World."""
