@@ -85,17 +85,7 @@ class TrackerInstrument:
         self._command = Command.UNKNOWN
         self._last_measured: FloatArray | None = None
         self._out: list[Event] = []
-        b = self.behaviour
-        self._settings: dict[Command, tuple[Value, ...]] = {
-            Command.GET_UNITS: (1, 0, 0, 0, 0),
-            Command.GET_ENVIRONMENT: (b.temperature_c, b.pressure_hpa, b.humidity_percent),
-            Command.GET_MEASUREMENT_MODE: (0,),
-            Command.GET_COORDINATE_SYSTEM_TYPE: (0,),
-            Command.GET_STATIONARY_MODE: (1000, 1),
-            Command.GET_REFLECTOR: (1,),
-            Command.GET_SEARCH: (50.0, 10_000),
-            Command.GET_STATISTIC_MODE: (0, 0),
-        }
+        self._settings = {setting.get: setting.initial for setting in SETTINGS.values()}
 
     # What a client sees
 
@@ -120,22 +110,15 @@ class TrackerInstrument:
         command = request.command
         if command in SETTINGS:
             self._set(command, request.values)
-        elif command in self._settings:
-            self._reply(command, 0, self._settings[command])
-        elif command is Command.GET_SYSTEM_STATUS:
-            self._system_status()
-        elif command is Command.GET_TRACKER_STATUS:
-            self._reply(command, 0, (self.readiness,))
-        elif command is Command.GET_MEASUREMENT_STATUS_INFO:
-            self._measurement_status()
-        elif command is Command.GET_REFLECTORS:
-            self._reflectors()
+        elif command in _TAKES_TIME:
+            self._begin(command, request.values)
         elif command is Command.STOP_MEASUREMENT:
             self._reply(command)
             if self._operation and self._command is Command.START_MEASUREMENT:
                 self.abort()
-        elif command in _TAKES_TIME:
-            self._begin(command, request.values)
+        elif answers := self._answers(command):
+            for values in answers:
+                self._reply(command, 0, values)
         else:
             self._reply(command, Status.NOT_IMPLEMENTED)
         return self._sent()
@@ -179,15 +162,15 @@ class TrackerInstrument:
         return LENGTH_UNITS_M[int(self._settings[Command.GET_UNITS][0])]
 
     def _set(self, command: Command, values: tuple[Value, ...]) -> None:
-        get, change = SETTINGS[command]
+        setting = SETTINGS[command]
         status = Status.SERVER_BUSY if self._operation else refusal(command, values)
         if status == Status.ALL_OK:
             if command is Command.SET_UNITS:
                 self._convert_lengths(int(values[0]))
-            self._settings[get] = values
+            self._settings[setting.get] = values
         self._reply(command, status)
         if status == Status.ALL_OK:
-            self._out.append(StatusChange(change))
+            self._out.append(StatusChange(setting.change))
 
     def _convert_lengths(self, unit: int) -> None:
         """Keep the search radius what it is when its unit changes."""
@@ -195,31 +178,26 @@ class TrackerInstrument:
         scale = self._unit_m / LENGTH_UNITS_M[unit]
         self._settings[Command.GET_SEARCH] = (float(radius) * scale, timeout)
 
-    def _system_status(self) -> None:
-        warm = self._time >= self._warm_at
-        processor = 5 if self._initialized else 3
-        laser, adm = (3, 2) if warm else (0, 1)
-        self._reply(
-            Command.GET_SYSTEM_STATUS,
-            0,
-            (Status.ALL_OK, processor, laser, adm, 3, 8, 500, 0, 0, 390001),
-        )
-
-    def _measurement_status(self) -> None:
-        # Tracker, its compensation, ADM, its compensation, reflector, face 1, initialised.
-        flags = 1 | 2 | 4 | 8 | self.locked * 2048 | 4096 | self._initialized * 65536
-        self._reply(Command.GET_MEASUREMENT_STATUS_INFO, 0, (Status.ALL_OK, flags))
-
-    def _reflectors(self) -> None:
-        for number, (kind, offset, name) in REFLECTORS.items():
-            values = (
-                len(REFLECTORS),
-                number,
-                kind,
-                offset / self._unit_m,
-                name.encode('utf-16le'),
-            )
-            self._reply(Command.GET_REFLECTORS, 0, values)
+    def _answers(self, command: Command) -> list[tuple[Value, ...]]:
+        """Return the values of each reply to a query; none where it is no query."""
+        if command in self._settings:
+            return [self._settings[command]]
+        if command is Command.GET_TRACKER_STATUS:
+            return [(self.readiness,)]
+        if command is Command.GET_SYSTEM_STATUS:
+            processor = 5 if self._initialized else 3
+            laser, adm = (3, 2) if self._time >= self._warm_at else (0, 1)
+            return [(Status.ALL_OK, processor, laser, adm, 3, 8, 500, 0, 0, 390001)]
+        if command is Command.GET_MEASUREMENT_STATUS_INFO:
+            # Tracker, its compensation, ADM, its compensation, reflector, face 1, initialised.
+            flags = 1 | 2 | 4 | 8 | self.locked * 2048 | 4096 | self._initialized * 65536
+            return [(Status.ALL_OK, flags)]
+        if command is Command.GET_REFLECTORS:
+            return [
+                (len(REFLECTORS), number, kind, offset / self._unit_m, name.encode('utf-16le'))
+                for number, (kind, offset, name) in REFLECTORS.items()
+            ]
+        return []
 
     # Commands that take time
 
@@ -229,6 +207,7 @@ class TrackerInstrument:
             self._reply(command, status)
             return
         if command is Command.START_MEASUREMENT:
+            # Its result follows later.
             self._reply(command)
         self._command, self._operation = command, self._start(command, values)
         self._out.append(self._readiness_change())
