@@ -1,4 +1,4 @@
-"""ROS shell of the fake laser tracker; it speaks emScon, and nothing else, to the product."""
+"""ROS shell of the fake laser tracker, whose only connection to the product is emScon."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ROS shell of the fake OptiTrack server; it speaks NatNet, and nothing else, to the product."""
+"""ROS shell of the fake OptiTrack server, whose only connection to the product is NatNet."""
 
 from __future__ import annotations
 
