@@ -5,8 +5,9 @@ import pytest
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.workcell import config_path
+from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.faults import inject
-from remaster_ros.simulation.robot import FakeArm, TrajectoryPoint
+from remaster_ros.simulation.robot import FakeArm
 from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor
 from remaster_ros.simulation.world import World, WorldContent
 
@@ -51,8 +52,9 @@ def arm(world):
     return FakeArm(world, np.random.default_rng(7))
 
 
-def go(arm, target, seconds=2.0, names=None, **kwargs):
-    return arm.command(names or arm.names, [TrajectoryPoint(seconds, target, **kwargs)])
+def go(arm, target, seconds=2.0, names=None, velocities=None):
+    velocity = None if velocities is None else np.array(velocities)
+    return arm.command(names or arm.names, [ServoPoint(seconds, np.array(target), velocity)])
 
 
 def test_it_follows_permuted_names(world, arm):
@@ -92,7 +94,7 @@ def test_what_it_cannot_follow_is_dropped_with_a_reason(world, arm, change, reas
 
 
 def test_times_must_increase_and_not_end_in_the_past(arm):
-    points = [TrajectoryPoint(1.0, [0.0] * 7), TrajectoryPoint(1.0, [0.1] * 7)]
+    points = [ServoPoint(1.0, np.zeros(7)), ServoPoint(1.0, np.full(7, 0.1))]
     assert 'increase' in arm.command(arm.names, points)
     assert 'past' in arm.command(arm.names, points[:1], start_s=50.0)
 
