@@ -35,13 +35,14 @@ from remaster_ros.nodes.demo_summary import (
     print_offsets,
     print_times,
 )
-from remaster_ros.nodes.launching import ALL_NODES, CORE, FAKES, SENSORS
+from remaster_ros.nodes.launching import ALL_NODES, CORE, SENSORS
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.processes import NodeProcesses
 from remaster_ros.nodes.running import report
 from remaster_ros.nodes.status import Event, listen
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import read_fit
+from remaster_ros.session.files import cannot_write
 from remaster_ros.session.session_journal import is_complete
 from remaster_ros.session.session_writer import JOURNAL
 from remaster_ros.session.workcell import config_path, read_cell
@@ -113,21 +114,20 @@ class Demo:
     def __init__(self, node: Conductor, stopping: list[int]) -> None:
         self.node, self.p, self._stopping = node, node.p, stopping
         self.console = Console(quiet=self.p.quiet)
+        # Refused before anything is written.
+        self.requests = [EffectSpec.parse(text) for text in self.p.hide.split(',') if text]
         self.out = output_folder(Path(self.p.out))
         self.session, self.fit = self.out / 'session', self.out / 'fit'
         self.discovery = self.out / 'discovery'
-        self.requests = [EffectSpec.parse(text) for text in self.p.hide.split(',') if text]
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self.hidden = Path(tempfile.mkdtemp(prefix='remaster_world_'))
-        (self.out / 'log').mkdir(exist_ok=True)
         self.processes = NodeProcesses(
             self.out / 'log',
             {
                 'PYTHONUNBUFFERED': '1',
                 # A halt of the fake arm is kept with its session, not with those of real arms.
                 'ROS_HOME': str((self.out / 'ros_home').resolve()),
-                **_domain_environment(),
             },
         )
 
@@ -149,26 +149,22 @@ class Demo:
         self._collect()
         self.console.print('fitting')
         self._trigger('remaster/fit', 'optimizer', timeout_s=300.0)
-        result = read_fit(self.fit / 'fit.json')
-        discovery = self._discover() if self.requests else None
+        results = [('report', self.fit, 'fit.json')]
+        if self.requests:
+            self.console.print('looking for causes')
+            self._trigger('remaster/discover', 'optimizer', timeout_s=300.0)
+            results.append(('causes', self.discovery, 'discovery.json'))
         self.processes.stop()
         print_times(self.console, self.node.times)
         # Only here, after everything that estimates has ended, is the truth opened.
-        print_offsets(self.console, result, world.truth)
-        if discovery is not None:
+        print_offsets(self.console, read_fit(self.fit / 'fit.json'), world.truth)
+        if self.requests:
+            discovery = read_discovery(self.discovery / 'discovery.json')
             print_hidden(self.console, discovery, world.truth)
         (self.out / 'truth.yaml').write_text(yaml.safe_dump(to_plain(world.truth)))
         self.console.print(f'session: {self.session}')
-        name = 'report.html' if self.p.figures else 'fit.json'
-        self.console.print(f'report: {self.fit / name}')
-        if discovery is not None:
-            name = 'report.html' if self.p.figures else 'discovery.json'
-            self.console.print(f'causes: {self.discovery / name}')
-
-    def _discover(self) -> dict[str, Any]:
-        self.console.print('looking for causes')
-        self._trigger('remaster/discover', 'optimizer', timeout_s=300.0)
-        return read_discovery(self.discovery / 'discovery.json')
+        for label, folder, data in results:
+            self.console.print(f'{label}: {folder / ("report.html" if self.p.figures else data)}')
 
     def _start(self) -> None:
         common = config_path('fake.yaml')
@@ -176,28 +172,28 @@ class Demo:
             socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM
         )
         ports = {'command_port': command_port, 'data_port': data_port}
-        size = self.p.candidates
+        size, world, session = self.p.candidates, str(self.hidden), str(self.session)
         own: dict[str, dict[str, Any]] = {
-            **{name: {'world': str(self.hidden)} for name in FAKES},
+            'fake_robot': {'world': world},
+            'fake_optitrack': {'world': world, **ports},
+            'fake_laser_tracker': {'world': world, 'port': tracker_port},
             'pose_planner': {
                 'seed': self.p.seed,
-                'session': str(self.session),
+                'session': session,
                 'optimization_candidates': size,
                 'validation_candidates': size,
             },
-            'recorder': {'session': str(self.session)},
+            'recorder': {'session': session},
             'optimizer': {
-                'session': str(self.session),
+                'session': session,
                 'out': str(self.fit),
                 'discovery': str(self.discovery),
                 'seed': self.p.seed,
                 'figures': self.p.figures,
             },
-            'optitrack_markers': dict(ports),
+            'optitrack_markers': ports,
             'laser_tracker_markers': {'port': tracker_port},
         }
-        own['fake_optitrack'].update(ports)
-        own['fake_laser_tracker']['port'] = tracker_port
         for name in ALL_NODES:
             self.processes.start(name, common, own.get(name, {}))
 
@@ -298,28 +294,24 @@ class Demo:
 
 
 def output_folder(path: Path) -> Path:
-    """Make a new folder, use an empty one, or that of a demo which was interrupted.
+    """Make a new folder and its log/, use an empty one, or that of an interrupted demo.
 
     Raises
     ------
     InputError
         If it holds something or cannot be written.
     """
+    session = path / 'session'
     try:
         path.mkdir(parents=True, exist_ok=True)
-        session = path / 'session'
-        if (session / JOURNAL).exists() and not is_complete(session):
-            return path
-        if any(path.iterdir()):
+        unfinished = (session / JOURNAL).exists() and not is_complete(session)
+        if any(path.iterdir()) and not unfinished:
             raise InputError(
                 f'{path} is not empty, and holds no unfinished session; give --out a new folder'
             )
-        (path / 'log').mkdir()
-        (path / 'log').rmdir()
+        (path / 'log').mkdir(exist_ok=True)
     except OSError as error:
-        raise InputError(
-            f'{path}: cannot write there ({error.strerror}); give another --out'
-        ) from None
+        raise cannot_write(path, error) from None
     return path
 
 
@@ -342,13 +334,9 @@ def _is_free(kind: int, port: int) -> bool:
         return True
 
 
-def _domain_environment() -> dict[str, str]:
-    """Keep the demo's DDS traffic on this machine and apart from other runs."""
-    return {name: os.environ[name] for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE')}
-
-
 def main(args: list[str] | None = None) -> int:
     """Run the demo; returns its exit status."""
+    # The traffic of the demo and its nodes stays on this machine, and apart from other demos.
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     stopping: list[int] = []
