@@ -28,7 +28,7 @@ from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import FitResult, fit_session
 from remaster_ros.calibration.sampling import sample_posterior
 from remaster_ros.kinematics.transforms import inverse, rotation_vector_to_matrix, transform
-from remaster_ros.simulation.session_simulator import SessionTruth
+from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.types import FloatArray, Session
 
 SENSORS = {'mocap': 'Motion Capture', 'tracker': 'Laser Tracker'}

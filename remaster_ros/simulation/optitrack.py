@@ -133,7 +133,6 @@ class FakeOptiTrackServer:
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
         self._latest: Frame | None = None
-        self.frames_sent = 0
 
     @property
     def command_port(self) -> int:
@@ -207,7 +206,6 @@ class FakeOptiTrackServer:
             self._latest = frame
             for message in self._spoiler.spoil(frame, self._world.faults(self._sensor)):
                 self._distribute(message)
-            self.frames_sent += 1
 
     def _distribute(self, frame: Frame | bytes) -> None:
         if self._data is not None:
