@@ -23,21 +23,11 @@ from remaster_ros.sensors.laser_tracker.protocol import codes
 from remaster_ros.sensors.laser_tracker.protocol.codes import Change, Command, Readiness, Status
 from remaster_ros.sensors.laser_tracker.protocol.packets import Value
 from remaster_ros.sensors.laser_tracker.settings import (
-    Environment,
     LaserTrackerSettings,
     TrackerReading,
     TrackerStatus,
 )
 from remaster_ros.types import FARTHEST_M, FloatArray
-
-__all__ = [
-    'Environment',
-    'LaserTrackerClient',
-    'LaserTrackerError',
-    'LaserTrackerSettings',
-    'TrackerReading',
-    'TrackerStatus',
-]
 
 _SLEW_S = 15.0
 """Time-out of turning to a position, s: half a turn of a slow head."""

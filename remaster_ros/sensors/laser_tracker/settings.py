@@ -75,7 +75,7 @@ class LaserTrackerSettings:
                 raise InputError(f'laser tracker: {name} is {value}; it must be above 0')
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrackerReading(MarkerReading):
     """One ADM measurement.
 
@@ -88,6 +88,5 @@ class TrackerReading(MarkerReading):
     """
 
     std: FloatArray
-    temperature_c: float
     pressure_hpa: float
     humidity_percent: float

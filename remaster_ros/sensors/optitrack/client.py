@@ -15,12 +15,7 @@ from collections import deque
 from collections.abc import Callable
 
 from remaster_ros.errors import DeviceError
-from remaster_ros.sensors.optitrack.diagnosis import (
-    Diagnosis,
-    NatNetSettings,
-    StreamStatus,
-)
-from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice, MarkerSample
+from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerSample
 from remaster_ros.sensors.optitrack.frame_source import Source
 from remaster_ros.sensors.optitrack.marker_follower import MarkerFollower
 from remaster_ros.sensors.optitrack.protocol import natnet
@@ -36,21 +31,12 @@ from remaster_ros.sensors.optitrack.protocol.natnet import (
     ProtocolError,
     ServerInfo,
 )
+from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.sensors.optitrack.sockets import (
     open_multicast_socket,
     open_socket,
     port_is_closed,
 )
-
-__all__ = [
-    'Diagnosis',
-    'Dropped',
-    'MarkerChoice',
-    'MarkerSample',
-    'NatNetClient',
-    'NatNetSettings',
-    'StreamStatus',
-]
 
 RETRY_S = 0.5
 KEEPALIVE_S = 1.0

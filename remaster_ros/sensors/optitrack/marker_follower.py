@@ -11,7 +11,6 @@ from collections.abc import Callable
 from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.optitrack.diagnosis import (
     Diagnosis,
-    NatNetSettings,
     StreamStatus,
     diagnose,
 )
@@ -19,6 +18,7 @@ from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerGate, Marke
 from remaster_ros.sensors.optitrack.frame_source import Source, SourceLock, SourceVerdict, describe
 from remaster_ros.sensors.optitrack.protocol.frames import Frame
 from remaster_ros.sensors.optitrack.protocol.natnet import ServerInfo, Version
+from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.sensors.optitrack.sockets import interface_towards, resolve
 
 FOREIGN_REMEMBERED = 4

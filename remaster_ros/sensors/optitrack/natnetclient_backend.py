@@ -18,7 +18,7 @@ from collections.abc import Callable
 from typing import Any
 
 from remaster_ros.errors import DeviceError, InputError
-from remaster_ros.sensors.optitrack.diagnosis import Diagnosis, NatNetSettings
+from remaster_ros.sensors.optitrack.diagnosis import Diagnosis
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerSample
 from remaster_ros.sensors.optitrack.marker_follower import MarkerFollower
 from remaster_ros.sensors.optitrack.protocol import natnet
@@ -30,6 +30,7 @@ from remaster_ros.sensors.optitrack.protocol.frames import (
 )
 from remaster_ros.sensors.optitrack.protocol.natnet import ProtocolError
 from remaster_ros.sensors.optitrack.protocol.wire import OLDEST_VERSION
+from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.sensors.optitrack.sockets import open_socket, port_is_closed
 
 NEWEST_READ = (2, 10)
