@@ -1,7 +1,7 @@
 """Measurements on request: the service, where the marker should be, and when the arm arrives.
 
-Between requests the driver may find a lost marker again: it is told as soon as the arm has
-arrived, so that a search falls into the settle time.
+Between requests the driver may find a lost marker again: `prepare` is called as soon as the arm
+has arrived, so that a search falls into the settle time.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ class MeasureService:
         took = time.monotonic() - began
         node.trouble = ''
         self._publish_temperature(reading)
-        # What the instrument took is not the software's time.
+        # For the report of times: what the instrument took is not the software's.
         node.status.event('measured', 'measured', instrument_wall_s=f'{took:.6f}')
         node.publish_reading(reading)
         response.success, response.message = True, 'measured'

@@ -1,8 +1,8 @@
 """The node of any sensor: one marker's readings out, and whether the sensor is ready.
 
-The device is known to its driver alone (`remaster_ros.sensors`). The node opens the driver, tries
-again while that fails, publishes readings with their time of capture, and publishes the state that
-preflight, planner and recorder need.
+What is particular to a device lies in its driver (`remaster_ros.sensors`). The node opens the
+driver, tries again while that fails, publishes readings with their time of capture, and publishes
+the state that preflight, planner and recorder need.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class SensorNode(RemasterNode):
     trouble
         Why the device was not opened, or what it refused last; ''.
     in_use
-        Held while something is asked of the device.
+        Held while a command of the device is under way.
     """
 
     def __init__(self, name: str) -> None:

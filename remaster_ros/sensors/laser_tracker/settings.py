@@ -1,4 +1,4 @@
-"""What the laser tracker driver is told, and what it returns."""
+"""Settings of the laser tracker's client, and what it returns."""
 
 from __future__ import annotations
 
@@ -8,11 +8,35 @@ from enum import Enum
 import numpy as np
 
 from remaster_ros.errors import InputError
+from remaster_ros.sensors.laser_tracker.protocol import codes
+from remaster_ros.sensors.laser_tracker.protocol.codes import Change, Command
+from remaster_ros.sensors.laser_tracker.protocol.packets import Value
 from remaster_ros.types import FloatArray, MarkerReading
+
+_UNITS = codes.METRE, codes.RADIAN, codes.CELSIUS, codes.MILLIBAR, codes.RELATIVE_HUMIDITY
+SET_FOR_READINGS: tuple[tuple[Command, Command, tuple[Value, ...], str], ...] = (
+    (Command.SET_UNITS, Command.GET_UNITS, _UNITS, 'units (metre, radian, °C, mbar)'),
+    (
+        Command.SET_COORDINATE_SYSTEM_TYPE,
+        Command.GET_COORDINATE_SYSTEM_TYPE,
+        (codes.RIGHT_HANDED_CARTESIAN,),
+        'coordinate system (right-handed Cartesian)',
+    ),
+    (
+        Command.SET_MEASUREMENT_MODE,
+        Command.GET_MEASUREMENT_MODE,
+        (codes.STATIONARY,),
+        'measurement mode (stationary)',
+    ),
+)
+"""What a reading depends on: the command that sets it, the one that reads it back, the values, and
+what they are."""
+CHANGES_OF_READINGS = (Change.UNITS, Change.COORDINATE_SYSTEM_TYPE, Change.MEASUREMENT_MODE)
+"""Status changes after which these are read back."""
 
 
 class TrackerStatus(Enum):
-    """What the instrument last said of itself."""
+    """What the instrument last reported."""
 
     DISCONNECTED = 'disconnected'
     NOT_READY = 'not ready'

@@ -94,7 +94,7 @@ class StreamStatus:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is wrong, in one word and in one line with the remedy."""
+    """What is wrong: its kind, and one line with the remedy."""
 
     fault: Fault
     message: str
@@ -104,7 +104,7 @@ HEALTHY = Diagnosis('none', '')
 
 
 def diagnose(status: StreamStatus, settings: NatNetSettings) -> Diagnosis:
-    """Tell why readings are missing; `HEALTHY` if they are not."""
+    """Return why readings are missing; `HEALTHY` if they are not."""
     if status.server is None:
         return _unanswered(status, settings)
     version = status.version or status.server.natnet_version
@@ -227,7 +227,7 @@ def _refused(status: StreamStatus) -> str:
 
 
 def warning(status: StreamStatus) -> str:
-    """Tell what is odd while readings come: who else sends; '' if nobody does."""
+    """Return which other programs send while readings come; '' if none does."""
     others = [*status.rivals, *status.foreign]
     if not others or not status.source:
         return ''

@@ -1,7 +1,7 @@
 """An OptiTrack bar as the sensor of a node: the measured positions of one marker.
 
 Occluded, model-filled and otherwise unmeasured frames never become a reading; they are counted
-with their reason in the state, which also tells what is wrong when nothing comes.
+with their reason in the state, which also states what is wrong when nothing comes.
 """
 
 from __future__ import annotations
@@ -100,5 +100,5 @@ class OptiTrackDriver(StreamDriver):
         )
 
     def close(self) -> None:
-        """Take leave of the server."""
+        """Disconnect from the server."""
         self.client.stop()

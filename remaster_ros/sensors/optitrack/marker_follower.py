@@ -1,4 +1,4 @@
-"""What every OptiTrack client of ours does: one thread, one marker, one honest account."""
+"""What both OptiTrack clients have in common: the thread, the marker, counts and diagnosis."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class MarkerFollower(ABC):
         self.stop()
 
     def status(self) -> StreamStatus:
-        """Return a snapshot of what has arrived, been dropped and is known of the server."""
+        """Return a snapshot of counts and of what the server has answered."""
         now = time.monotonic()
         gate = self._gate
         return StreamStatus(
@@ -144,7 +144,7 @@ class MarkerFollower(ABC):
         )
 
     def diagnosis(self) -> Diagnosis:
-        """Tell what is wrong when readings are missing, and the remedy."""
+        """Return what is wrong when readings are missing, and the remedy."""
         return diagnose(self.status(), self._settings)
 
     @abstractmethod

@@ -1,9 +1,9 @@
 """The optional backend ``client: natnetclient``: PyPI ``natnetclient``, guarded.
 
 That package (LGPL, 2018) reads NatNet 2.6 to 2.10 from a server on the same computer that sends
-its frames unicast to a fixed port. It trusts every datagram, never forgets an old marker and
-waits a minute for silence to end. So it runs here without its own thread: each datagram is first
-checked by our decoder, then read by ``natnetclient`` with its memory cleared, and a reading
+its frames unicast to a fixed port. It checks no datagram, keeps markers that are no longer sent
+and waits a minute where nothing comes. So it runs here without its own thread: each datagram is
+first checked by our decoder, then read by ``natnetclient`` with its memory cleared, and a reading
 counts only if both agree on it.
 """
 
@@ -45,14 +45,14 @@ class NatNetClientBackend(MarkerFollower):
     Parameters
     ----------
     settings
-        Must say ``unicast``; frames are expected on `data_port` of this computer.
+        `transport` must be ``unicast``; frames are expected on `data_port` of this computer.
     on_sample, clock
         As for `NatNetClient`.
 
     Raises
     ------
     InputError
-        If ``natnetclient`` is not installed, or the settings ask for what it cannot do.
+        If ``natnetclient`` is not installed, or the settings need what it cannot do.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class NatNetClientBackend(MarkerFollower):
             raise DeviceError(f'OptiTrack: {self._refusal}')
 
     def diagnosis(self) -> Diagnosis:
-        """Tell what is wrong when readings are missing, and the remedy."""
+        """Return what is wrong when readings are missing, and the remedy."""
         return Diagnosis('version', self._refusal) if self._refusal else super().diagnosis()
 
     def _open(self) -> None:

@@ -22,7 +22,7 @@ class NatNetSettings:
     """Settings of a client; those made with `parameter` are parameters of the node as well.
 
     Group and data port matter for multicast only (the data port for ``client: natnetclient``
-    too). A `bitstream` can be asked of servers from 4.0 on, in unicast.
+    too). A `bitstream` can be requested from servers of 4.0 or newer, in unicast.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class NatNetSettings:
 
     @property
     def wanted_version(self) -> Version | None:
-        """The bitstream to ask for, None for the server's own."""
+        """The bitstream to request, None for the server's own."""
         return natnet.parse_version(self.bitstream) if self.bitstream else None
 
 

@@ -1,7 +1,7 @@
 """How NatNet's items lie in their bytes: one description to read, to write and to step over.
 
 A codec is put together from smaller ones for one version of the protocol. What comes from the
-network is never trusted: a count is checked before anything is allocated for it.
+network may be damaged: a count is checked before anything is allocated for it.
 """
 
 from __future__ import annotations

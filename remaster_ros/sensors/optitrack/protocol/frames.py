@@ -63,7 +63,7 @@ class LabeledMarker(NamedTuple):
     size
         Diameter, m.
     params
-        The flags above; NatNet 2 knows the first three only.
+        The flags above; NatNet 2 has the first three only.
     residual
         Metres per ray; None before NatNet 3.
     """
@@ -207,7 +207,7 @@ def decode_frame(payload: bytes, version: Version, *, markers_only: bool = False
 
 
 def encode_frame(frame: Frame, version: Version) -> bytes:
-    """Encode the payload of a FRAMEOFDATA message; what the version does not know is left out.
+    """Encode the payload of a FRAMEOFDATA message; what the version does not have is left out.
 
     Raises
     ------
@@ -274,8 +274,8 @@ def _positions(rows: list[tuple]) -> list[tuple]:
 
 
 def _labeled(rows: list[tuple], *, has_residual: bool) -> list[LabeledMarker]:
-    """Build the labelled markers; one sum tells whether any number needs a closer look."""
-    # Past the named tuple's own constructor, which takes as long as all the rest of a frame.
+    """Build the labelled markers; the sum of all numbers shows whether one is not finite."""
+    # The named tuple's own constructor would take as long as all the rest of a frame.
     make = tuple.__new__
     if has_residual:
         markers = [

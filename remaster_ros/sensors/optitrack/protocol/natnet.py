@@ -40,7 +40,7 @@ _TWO_CLOCKS = Row('2Q')
 
 
 class MessageId(IntEnum):
-    """What the first two bytes of a datagram say."""
+    """Kind of a message: the first two bytes of a datagram."""
 
     CONNECT = 0
     SERVERINFO = 1
@@ -96,7 +96,7 @@ class ServerInfo:
 
 @dataclass(frozen=True)
 class Response:
-    """The answer to a REQUEST; what it means depends on what was asked."""
+    """The answer to a REQUEST; its meaning depends on the request."""
 
     payload: bytes
 
@@ -152,7 +152,7 @@ class ClientRequest:
     text
         The command of a REQUEST.
     wanted_version
-        The bitstream that a CONNECT asks for; None for the server's own.
+        The bitstream that a CONNECT requests; None for the server's own.
     clock
         The client's clock of an ECHOREQUEST.
     """
@@ -169,7 +169,7 @@ def split_datagram(datagram: bytes) -> tuple[int, bytes]:
     Raises
     ------
     ProtocolError
-        If the datagram is shorter than its header says.
+        If the datagram is shorter than its header states.
     """
     if len(datagram) < _HEADER.size:
         raise ProtocolError(f'a datagram of {len(datagram)} bytes has no header')
@@ -215,24 +215,23 @@ def decode_message(
         For anything that is not a whole, valid message from a server.
     """
     message_id, payload = split_datagram(datagram)
-    if message_id == MessageId.FRAMEOFDATA:
-        return decode_frame(payload, _known(version), markers_only=markers_only)
-    if message_id == MessageId.SERVERINFO:
-        return _decode_server_info(payload)
-    if message_id == MessageId.MODELDEF:
-        return decode_model_definition(payload, _known(version))
-    if message_id == MessageId.RESPONSE:
-        return Response(payload)
-    if message_id == MessageId.MESSAGESTRING:
-        return MessageString(_text(payload))
-    if message_id == MessageId.ECHORESPONSE:
-        return EchoResponse(*_TWO_CLOCKS.read(Reader(payload)))
-    if message_id in (
-        MessageId.UNRECOGNIZED_REQUEST,
-        MessageId.DISCONNECT,
-        MessageId.DISCONNECT_BY_TIMEOUT,
-    ):
-        return Notice(MessageId(message_id))
+    match message_id:
+        case MessageId.FRAMEOFDATA:
+            return decode_frame(payload, _known(version), markers_only=markers_only)
+        case MessageId.SERVERINFO:
+            return _decode_server_info(payload)
+        case MessageId.MODELDEF:
+            return decode_model_definition(payload, _known(version))
+        case MessageId.RESPONSE:
+            return Response(payload)
+        case MessageId.MESSAGESTRING:
+            return MessageString(_text(payload))
+        case MessageId.ECHORESPONSE:
+            return EchoResponse(*_TWO_CLOCKS.read(Reader(payload)))
+        case (
+            MessageId.UNRECOGNIZED_REQUEST | MessageId.DISCONNECT | MessageId.DISCONNECT_BY_TIMEOUT
+        ):
+            return Notice(MessageId(message_id))
     raise ProtocolError(f'message {message_id} is none that a server sends')
 
 
@@ -263,7 +262,7 @@ def encode_message(message: Message, version: Version) -> bytes:
 
 
 def decode_request(datagram: bytes) -> ClientRequest:
-    """Decode what a client sent; its header's length is not trusted, clients get it wrong.
+    """Decode what a client sent; the length in its header is ignored, as clients get it wrong.
 
     Raises
     ------
@@ -309,11 +308,6 @@ def encode_command_request(command: str) -> bytes:
 def encode_echo_request(clock: int) -> bytes:
     """Encode ECHOREQUEST with the client's clock, any unsigned 64-bit number."""
     return join_datagram(MessageId.ECHOREQUEST, _CLOCK.write(clock))
-
-
-def encode_plain_request(message_id: MessageId) -> bytes:
-    """Encode a request without content: REQUEST_MODELDEF, KEEPALIVE, DISCONNECT."""
-    return join_datagram(message_id)
 
 
 def parse_version(text: str) -> Version:

@@ -1,7 +1,7 @@
 """The versions of NatNet, and bounds-checked reading of a datagram; no sockets.
 
-Everything is little-endian and packed. Bytes from the network are never trusted: whatever is
-wrong with them comes out as one `ProtocolError`, and nothing is allocated for a count that the
+Everything is little-endian and packed. Bytes from the network may be anything: whatever is
+wrong with them is raised as `ProtocolError`, and nothing is allocated for a count that the
 bytes left could not hold.
 """
 
@@ -20,7 +20,7 @@ Quaternion = tuple[float, float, float, float]
 """x, y, z, w."""
 
 OLDEST_VERSION: Version = (2, 6)
-"""The first bitstream with the flags that tell a measured marker from a guessed one."""
+"""The first bitstream with the flags that distinguish a measured marker from a guessed one."""
 NEWEST_VERSION: Version = (4, 3)
 """The last described layout; 4.4 and later 4.x are read as this one and fail where they differ."""
 
@@ -31,7 +31,7 @@ _I32 = Struct('<i')
 
 
 class ProtocolError(Exception):
-    """Bytes that are not what NatNet says they must be; the message tells where."""
+    """Bytes that are not as NatNet defines them; the message states where."""
 
 
 def require_supported(version: Version) -> None:
