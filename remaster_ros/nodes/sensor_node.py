@@ -65,8 +65,15 @@ class SensorNode(RemasterNode):
                 f'{self.get_name()}: parameter sensor is {self.sensor!r}; the cell has '
                 f'{", ".join(cell.sensors)}'
             )
-        topic = cell.sensors[self.sensor].topic
-        self._readings = self.create_publisher(PointStamped, topic, RELIABLE)
+        described = cell.sensors[self.sensor]
+        triggered = issubclass(driver, TriggeredDriver)
+        if described.single_shot != triggered:
+            raise InputError(
+                f'{self.get_name()}: sensor {self.sensor} of {p.cell} has single_shot '
+                f'{str(described.single_shot).lower()}, but a {driver.device} '
+                f'{"measures on request" if triggered else "streams"}; correct single_shot'
+            )
+        self._readings = self.create_publisher(PointStamped, described.topic, RELIABLE)
         self.published = 0
         self.trouble = ''
         self.in_use = threading.Lock()

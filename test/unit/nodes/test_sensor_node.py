@@ -36,7 +36,6 @@ PLACE = np.array([0.5, -0.25, 2.0])
 class GaugeParameters(SensorParameters):
     """Parameters of a gauge."""
 
-    sensor: str = parameter('mocap', 'its name')
     scale: float = parameter(1.0, 'a number', low=0.5, high=2.0)
 
 
@@ -116,6 +115,9 @@ def rig(monkeypatch, tmp_path):
                 )
             ),
         )
+        triggered = issubclass(driver, TriggeredDriver)
+        place = 'laser_tracker' if triggered else 'optitrack'
+        parameters = {'sensor': 'tracker' if triggered else 'mocap', **parameters}
         args = ['--ros-args', '--log-level', 'fatal', '-r', f'__node:={name}']
         for key, value in parameters.items():
             args += ['-p', f'{key}:={value}']
@@ -125,8 +127,8 @@ def rig(monkeypatch, tmp_path):
         peer = rclpy.create_node('peer', context=context)
         r = SimpleNamespace(peer=peer, context=context, points=[], temperatures=[], node=None)
         made.append(r)
-        peer.create_subscription(PointStamped, 'optitrack/marker', r.points.append, 10)
-        peer.create_subscription(Temperature, 'optitrack/temperature', r.temperatures.append, 10)
+        peer.create_subscription(PointStamped, f'{place}/marker', r.points.append, 10)
+        peer.create_subscription(Temperature, f'{place}/temperature', r.temperatures.append, 10)
         peer_executor = SingleThreadedExecutor(context=context)
         peer_executor.add_node(peer)
         r.node = SensorNode(own_name)
@@ -141,7 +143,7 @@ def rig(monkeypatch, tmp_path):
                 peer_executor.spin_once(timeout_sec=0.01)
 
         def measure():
-            client = peer.create_client(Trigger, 'gauge/measure')
+            client = peer.create_client(Trigger, 'laser_tracker/measure')
             wait(client.service_is_ready, 'the service')
             future = client.call_async(Trigger.Request())
             wait(future.done, 'the answer')
@@ -149,7 +151,7 @@ def rig(monkeypatch, tmp_path):
 
         r.wait, r.measure, r.driver = wait, measure, r.node.driver
         r.values = lambda: r.node._summary()[2]
-        wait(lambda: peer.count_publishers('optitrack/marker'), 'the match')
+        wait(lambda: peer.count_publishers(f'{place}/marker'), 'the match')
         return r
 
     yield start
@@ -232,10 +234,10 @@ def test_a_measurement_is_published_before_its_answer(rig, monkeypatch):
 
 
 def test_the_driver_is_given_the_expected_place(rig):
-    """Marker sir lies 0.1 m along x of the tool; the sensor stands 2 m along x, not turned."""
+    """Marker smr lies -0.1 m along x of the tool; the sensor stands 2 m along x, not turned."""
     r = rig(Probe)
     r.wait(lambda: r.values()['ready'] == 'yes', 'the connection')
-    registration = TransformStamped(child_frame_id='mocap')
+    registration = TransformStamped(child_frame_id='tracker')
     registration.transform.translation.x = 2.0
     registration.transform.rotation.w = 1.0
     pose = PoseStamped()
@@ -253,7 +255,7 @@ def test_the_driver_is_given_the_expected_place(rig):
         return r.driver.expected is not None
 
     r.wait(expected, 'the place')
-    np.testing.assert_allclose(r.driver.expected, [-1.9, 0.0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(r.driver.expected, [-2.1, 0.0, 0.5], atol=1e-12)
 
 
 def test_the_name_of_the_node_chooses_the_driver(rig):
@@ -270,6 +272,14 @@ def test_a_node_that_hears_commands_is_named_so_that_the_bridge_can_tell(rig):
         rig(LookingProbe, name='faro', own_name='gauge')
 
 
-def test_a_sensor_that_is_not_in_the_cell_is_refused(rig):
-    with pytest.raises(InputError, match=r"sensor is 'sonar'; the cell has mocap, tracker"):
-        rig(Stream, sensor='sonar')
+@pytest.mark.parametrize(
+    ('driver', 'sensor', 'words'),
+    [
+        (Stream, 'sonar', r"sensor is 'sonar'; the cell has mocap, tracker"),
+        (Stream, 'tracker', 'tracker of demo has single_shot true, but a gauge streams'),
+        (Probe, 'mocap', 'mocap of demo has single_shot false, but a gauge measures on request'),
+    ],
+)
+def test_a_sensor_that_is_not_so_in_the_cell_is_refused(rig, driver, sensor, words):
+    with pytest.raises(InputError, match=words):
+        rig(driver, name=f'gauge_{driver.__name__}_{sensor}', sensor=sensor)
