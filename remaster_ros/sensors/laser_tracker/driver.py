@@ -6,7 +6,7 @@ begins where the reflector should be and is narrow.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,15 +25,12 @@ from remaster_ros.types import FloatArray
 
 
 @dataclass(frozen=True)
-class Parameters(SensorParameters):
+class Parameters(LaserTrackerSettings, SensorParameters):
     """Parameters of the laser tracker's node."""
 
     sensor: str = parameter('tracker', "the tracker's name among the cell's sensors")
     host: str = parameter('192.168.0.1', 'address of the instrument')
     port: int = parameter(700, 'TCP port of the instrument', low=1, high=65535)
-    integration_s: float = parameter(
-        1.0, 'averaging time of one measurement', unit='s', low=0.05, high=60.0
-    )
     first_search_radius_m: float = parameter(
         0.6,
         'how far about where it points the tracker searches before it is registered',
@@ -41,14 +38,6 @@ class Parameters(SensorParameters):
         low=1e-3,
         high=5.0,
     )
-    search_radius_m: float = parameter(
-        0.05,
-        'how far about the expected place it searches afterwards',
-        unit='m',
-        low=1e-3,
-        high=5.0,
-    )
-    search_timeout_s: float = parameter(20.0, 'longest search', unit='s', low=0.1, high=600.0)
     attempts: int = parameter(3, 'searches and measurements tried for one request', low=1, high=20)
     max_deviation_m: float = parameter(
         0.05,
@@ -67,11 +56,7 @@ class LaserTrackerDriver(TriggeredDriver):
 
     def __init__(self, parameters: Parameters, clock: SensorClock) -> None:
         self.p = parameters
-        settings = LaserTrackerSettings(
-            search_radius_m=self.p.first_search_radius_m,
-            search_timeout_s=self.p.search_timeout_s,
-            integration_s=self.p.integration_s,
-        )
+        settings = replace(self.p, search_radius_m=self.p.first_search_radius_m)
         self.tracker = LaserTrackerClient(
             self.p.host, self.p.port, settings=settings, now=clock.now, sleep=clock.sleep
         )
