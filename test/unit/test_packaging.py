@@ -23,6 +23,7 @@ EXECUTABLES = {
     'robot_bridge',
     'optitrack_markers',
     'laser_tracker_markers',
+    'sensor_markers',
     'recorder',
     'optimizer',
     'replay',
