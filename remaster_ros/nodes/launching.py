@@ -128,12 +128,7 @@ def real_nodes(
                 f'section /**/{" or /**/".join(DRIVERS)} with "sensor: {sensor}", or leave it '
                 'out with sensors:='
             )
-<<<<<<< HEAD
-        nodes.append(start(kind, node, **own))
-=======
-        executable = kind if kind in SENSORS else GENERIC
-        nodes.append(NodeToStart(executable, node, (params, own), remappings))
->>>>>>> d06089e3d69a236a39247c567aea98a29a958b17
+        nodes.append(start(kind if kind in SENSORS else GENERIC, node, **own))
     return nodes
 
 
@@ -173,11 +168,7 @@ def read_sections(params: str, namespace: str = '') -> dict[str, Mapping[str, An
             continue
         if place == '/**' or place.strip('/') == space:
             found[name] = values
-<<<<<<< HEAD
-        elif name.startswith(ALL_NODES):
-=======
         elif name.startswith((*CORE, *DRIVERS, *FAKES)):
->>>>>>> d06089e3d69a236a39247c567aea98a29a958b17
             raise InputError(
                 f'{path}: section {key} is not for the nodes{_where(namespace)}, which would run '
                 f'on their defaults; call it /**/{name}'
