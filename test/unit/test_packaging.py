@@ -135,7 +135,7 @@ def test_package_xml_names_every_requirement_or_how_to_get_it(
 ) -> None:
     """What rosdep cannot install stands in a comment, as one command."""
     text = (ROOT / 'package.xml').read_text(encoding='utf-8')
-    command = re.search(r'pip install -c constraints-ros\.txt ([A-Za-z ]+)', text)
+    command = re.search(r'pip install -c constraints-ros\.txt ([A-Za-z\s-]+)', text)
     assert command is not None
     by_pip = {normal(name) for name in command[1].split()}
     depends = {
@@ -149,7 +149,7 @@ def test_package_xml_names_every_requirement_or_how_to_get_it(
     assert by_pip | by_rosdep == required
     assert not by_pip & by_rosdep
     checks = (ROOT / 'test' / 'conftest.py').read_text(encoding='utf-8')
-    assert {normal(n) for n in re.findall(r"^    '(\w+)': '\w+',$", checks, re.M)} == by_pip
+    assert {normal(n) for n in re.findall(r"^    '([\w-]+)': '\w+',$", checks, re.M)} == by_pip
 
 
 BLOCKER = """
