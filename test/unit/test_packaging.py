@@ -23,7 +23,6 @@ EXECUTABLES = {
     'robot_bridge',
     'optitrack_markers',
     'laser_tracker_markers',
-    'sensor_markers',
     'recorder',
     'optimizer',
     'replay',
@@ -124,10 +123,7 @@ def test_every_import_is_declared(setup_arguments: dict[str, Any]) -> None:
     optional = {normal(line) for line in setup_arguments['extras_require']['natnetclient']}
     root = ElementTree.parse(ROOT / 'package.xml').getroot()
     depends = {element.text for element in root.findall('exec_depend')}
-    # The launch files alone need these, which come with ROS and not with pip.
-    launch = {'launch', 'launch_ros'}
-    assert 'ros2launch' in depends
-    for module in imported(ROOT / 'remaster_ros') - WITH_RCLPY - launch:
+    for module in imported(ROOT / 'remaster_ros') - WITH_RCLPY:
         name = normal(DISTRIBUTION.get(module, module))
         assert name in declared | ros | optional, f'{module} is imported but not required'
         if name in ros:
@@ -139,7 +135,7 @@ def test_package_xml_names_every_requirement_or_how_to_get_it(
 ) -> None:
     """What rosdep cannot install stands in a comment, as one command."""
     text = (ROOT / 'package.xml').read_text(encoding='utf-8')
-    command = re.search(r'pip install -c constraints-ros\.txt ([A-Za-z\s-]+)\(', text)
+    command = re.search(r'pip install -c constraints-ros\.txt ([A-Za-z\s-]+)', text)
     assert command is not None
     by_pip = {normal(name) for name in command[1].split()}
     depends = {
