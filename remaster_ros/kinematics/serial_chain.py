@@ -115,15 +115,15 @@ class SerialChain:
 
         first_moments, masses = _carried_masses(model, moving)
         with_mass = np.where(masses > 0.0, masses, 1.0)
-        limits = [_limits(joint) for joint in moving]
+        lower, upper, velocity_limits = np.transpose([_limits(joint) for joint in moving])
         return cls(
             name=model.name,
             joint_names=tuple(joint.name for joint in moving),
             base_link=base_link,
             tip_link=tip_link,
-            lower=np.array([lower for lower, _, _ in limits]),
-            upper=np.array([upper for _, upper, _ in limits]),
-            velocity_limits=np.array([velocity for _, _, velocity in limits]),
+            lower=lower,
+            upper=upper,
+            velocity_limits=velocity_limits,
             T_fixed=np.array(T_fixed),
             axes=np.array([joint.axis for joint in moving]),
             masses=masses,

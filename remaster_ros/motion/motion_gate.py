@@ -11,7 +11,7 @@ Nothing is published that is not `Admitted`, and only this module makes those.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -184,14 +184,10 @@ class MotionGate:
 
 
 def _way_out_limits(limits: MotionLimits) -> MotionLimits:
-    return MotionLimits(
-        limits.names,
-        limits.lower,
-        limits.upper,
-        WAY_OUT_SPEED * limits.velocity,
-        limits.acceleration,
-        min(limits.tool_speed, WAY_OUT_TOOL_SPEED),
-        limits.margin,
+    return replace(
+        limits,
+        velocity=WAY_OUT_SPEED * limits.velocity,
+        tool_speed=min(limits.tool_speed, WAY_OUT_TOOL_SPEED),
     )
 
 
