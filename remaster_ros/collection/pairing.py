@@ -172,7 +172,7 @@ class Pairing:
             Sensors that are not there at all now: a required one is waited for, and the time is
             not counted; another one is left out.
         words
-            How often each sensor's node has been heard (`Presence.words`); without it, or for a
+            How often each sensor's node has been heard (`Liveness.reports`); without it, or for a
             sensor that is not in it, silence means nothing.
         """
         passed = max(now_s - self._looked_s, 0.0)

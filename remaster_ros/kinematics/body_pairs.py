@@ -76,7 +76,7 @@ class BodyPairs:
     most_kept
         The largest clearance of each pair, m, (P,).
     left_out
-        What is not checked, or only for contact, and why, in words.
+        The pairs that are not checked, or only for contact, and why.
     """
 
     def __init__(
@@ -248,7 +248,7 @@ class BodyPairs:
         )
         levers = np.where(self._between[pairs], levers, 0.0)
         kept = self.margin + self.unknown_offset * np.linalg.norm(levers, axis=1)
-        # At most what the bound says: the capsule around a body is wider than the body.
+        # Not above the bound: the capsule around a body is wider than the body.
         return np.minimum(kept, self.most_kept[pairs])
 
     def on_top(self, extra: float) -> FloatArray:
@@ -283,7 +283,7 @@ class BodyPairs:
     ) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
         """Return what may be too near: rows, pairs, what is kept, and whether it is decided.
 
-        What needs no coal is measured; of that only what is too near is returned.
+        Pairs that need no coal are measured at once, and returned only if they are too near.
         """
         on_top = self.on_top(extra)
         may = bounds < self.most_kept + on_top

@@ -26,7 +26,7 @@ _POINT_COST = 0.2  # of looking at one configuration, in segments
 WAY_OUT_STEP_M = 0.004
 """No point of the arm moves more in a step of a way out."""
 WAY_OUT_STEPS = 120
-"""Steps of a way out at most: half a metre. Whoever is further in is freed by hand."""
+"""Steps of a way out at most: half a metre. An arm that is deeper inside is freed by hand."""
 
 
 def free_path(

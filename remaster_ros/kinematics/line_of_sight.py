@@ -1,8 +1,7 @@
-"""Does the arm hide a marker from a sensor? Capsules around the links answer.
+"""Whether the arm hides a marker from a sensor, with a capsule around each link.
 
 A link is the set of points within ``radius`` of the straight line from its joint to the next one,
-which any URDF gives; meshes are not needed. Whether the arm hits something is another question,
-answered in `collision`.
+which any URDF gives; meshes are not needed. Collisions are checked in `collision`.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ class LinkCapsules:
         return points
 
     def hides(self, q: ArrayLike, marker_T: ArrayLike, sensor_R: ArrayLike) -> BoolArray:
-        """Tell whether a link stands between a marker and a sensor.
+        """Return whether a link stands between a marker and a sensor.
 
         The last segment carries the marker and is left out: which way the marker faces decides
         there.

@@ -71,8 +71,8 @@ class SerialChain:
     ) -> SerialChain:
         """Read the chain from URDF text.
 
-        Joints off the chain (a gripper's fingers, say) count as fixed at zero: their masses hang
-        on the link that carries them.
+        Joints off the chain (such as a gripper's fingers) count as fixed at zero: their masses
+        belong to the link that carries them.
 
         Parameters
         ----------
@@ -152,7 +152,7 @@ class SerialChain:
         )
 
     def within_limits(self, q: ArrayLike, tolerance: float = 0.0) -> BoolArray:
-        """Tell whether all joints of q (..., k) are within limits (+ tolerance, rad), (...)."""
+        """Return whether all joints of q (..., k) are within limits (+ tolerance, rad), (...)."""
         q = np.asarray(q, dtype=float)
         inside = (q >= self.lower - tolerance) & (q <= self.upper + tolerance)
         return np.all(inside, axis=-1)

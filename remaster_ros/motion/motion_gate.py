@@ -1,11 +1,11 @@
-"""The gate: the last thing before a command leaves for the controller.
+"""The gate: the last check before a command is published to the controller.
 
-A move passes if everything that the controller will make of it is allowed: it joins the present
-state and the waypoints by cubics, and each of these is looked at for itself, whatever planned it.
-A stop is not planned at all. It is taken from the move that was admitted last, as another timing
-of the rest of its line, so it is never refused and never a target of its own.
+A move passes if everything that the controller will make of it is allowed: the controller joins
+the present state and the waypoints by cubics, and each cubic is checked by itself, independently
+of the planning. A stop is another timing of the rest of the line of the move that was admitted
+last, so that it is never refused and never has a target of its own.
 
-Nothing is published that is not `Admitted`, and only this module makes those.
+Only what is `Admitted` is published, and only this module makes those objects.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Which paths are free, and how fast the fastest point of arm and tool moves on them.
+"""Paths that were found free, and how fast the fastest point of arm and tool moves on them.
 
-This takes milliseconds to seconds: it runs beside the callbacks that serve a stop, never in them.
+This takes milliseconds to seconds: it never runs in the callbacks that serve a stop.
 """
 
 from __future__ import annotations
