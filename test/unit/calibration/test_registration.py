@@ -8,7 +8,7 @@ from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.kinematics.transforms import (
     apply,
     inverse,
-    rotation_angle,
+    matrix_to_rotation_vector,
     rotation_vector_to_matrix,
     transform,
 )
@@ -38,7 +38,9 @@ def test_noise_is_averaged_and_reported():
     assert rms == pytest.approx(noise * np.sqrt(3 * (1 - 6 / 1200)), rel=0.1)
     left = inverse(T_R_N) @ found
     # Six sigma of the angle over points 0.5 m wide; the translation lies up to 5 m from them.
-    assert rotation_angle(left[:3, :3]) < 6 * noise / (0.29 * np.sqrt(400))
+    assert np.linalg.norm(matrix_to_rotation_vector(left[:3, :3])) < 6 * noise / (
+        0.29 * np.sqrt(400)
+    )
     center = points_R.mean(axis=0)
     moved = apply(found, apply(inverse(T_R_N), center)) - center
     assert np.linalg.norm(moved) < 6 * noise / np.sqrt(400)

@@ -202,7 +202,7 @@ def test_all_joints_or_none_may_be_applied(fit_result, known):
     assert ('left_out' in parameters) != known
     text = texts['remaster.txt']
     assert ('drive to, deg' in text) == known
-    assert ('these data tell no offset' in text) != known
+    assert ('these data determine no offset' in text) != known
     assert ('Left out' in text) != known
     urdf = texts['robot_calibrated.urdf']
     chain = SerialChain.from_urdf(urdf, result.chain.base_link, result.chain.tip_link)
