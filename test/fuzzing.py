@@ -123,7 +123,7 @@ def model_definition() -> ModelDefinition:
         (
             MarkerSetDescription('tool', ('a', 'b', 'c')),
             body,
-            SkeletonDescription('hand', 2, (dataclasses.replace(body, name='bone'),)),
+            SkeletonDescription('hand', 2, (body._replace(name='bone'),)),
         )
     )
 
