@@ -22,23 +22,6 @@ FARTHEST_M = 200.0
 
 
 @dataclass(frozen=True)
-class JointSolution:
-    """One joint solution of a Cartesian pose.
-
-    Attributes
-    ----------
-    q
-        Joint positions, base to tip, rad, shape (k,).
-    position_error_m, rotation_error_rad
-        What forward kinematics leaves against the wanted pose.
-    """
-
-    q: FloatArray
-    position_error_m: float
-    rotation_error_rad: float
-
-
-@dataclass(frozen=True)
 class MarkerReading:
     """One marker position measured by one sensor, in the sensor's own frame N.
 

@@ -43,7 +43,7 @@ from remaster_ros.nodes.triggered_sensors import TriggeredSensors
 from remaster_ros.nodes.watching import Watching
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.session.session_journal import SessionJournal
-from remaster_ros.session.session_writer import ExitStatus
+from remaster_ros.session.session_yaml import ExitStatus
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray, MarkerReading, Measurements, Session
 
@@ -335,7 +335,7 @@ class Recorder(RemasterNode):
         self._check_files()
         if self._taking is not None:
             self._shots.look(self._taking.pairing, absent)
-            self._taking.pairing.give_up(self._now, absent, self._liveness.words)
+            self._taking.pairing.give_up(self._now, absent, self._liveness.reports)
             self._finish_if_complete()
         self._look_again()
         self._take_next()

@@ -232,7 +232,7 @@ class RobotBridge(RemasterNode):
         try:
             q = self._order.positions(message)
         except InputError as error:
-            self._do(self.supervisor.unreadable(str(error), now))
+            self._do(self.supervisor.doubt(str(error), now))
             return
         report = JointReport(seconds(message.header.stamp), q, self.now_s(), now)
         self._do(self.supervisor.report(report))

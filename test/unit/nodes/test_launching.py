@@ -167,6 +167,8 @@ def test_the_launch_files(name, monkeypatch):
     }
     for module, members in stand_ins.items():
         monkeypatch.setitem(sys.modules, module, types.SimpleNamespace(**members))
+    # It imports launch.
+    monkeypatch.delitem(sys.modules, 'remaster_ros.nodes.launch_actions', raising=False)
     path = ROOT / 'launch' / f'{name}.launch.py'
     *declared, (_, on_exit), start = runpy.run_path(str(path))['generate_launch_description']()
     arguments = dict(declared)
@@ -181,6 +183,9 @@ def test_the_launch_files(name, monkeypatch):
         assert node['namespace'] == '/left'
         assert node['respawn']
         assert 0 < node['respawn_max_retries'] < 20
+        # An enclave of config/sros2/policy.xml, which has none for the fakes.
+        enclave = ['--enclave', f'/remaster/{node["executable"]}']
+        assert node['ros_arguments'] == (enclave if name == 'real' else None)
     ended = types.SimpleNamespace(returncode=2, process_name='recorder')
     assert on_exit(ended, None) == [
         ('emit', ('shutdown', 'recorder ended with status 2')),
