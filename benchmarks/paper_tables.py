@@ -29,7 +29,7 @@ from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import FitResult, fit_session
 from remaster_ros.calibration.sampling import sample_posterior
 from remaster_ros.kinematics.transforms import inverse, rotation_vector_to_matrix, transform
-from remaster_ros.simulation.session_simulator import SessionTruth
+from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.types import FloatArray, Session
 
 SENSORS = {'mocap': 'Motion Capture', 'tracker': 'Laser Tracker'}
@@ -159,10 +159,8 @@ def table_ii(cases: Cases, chains: Mapping[str, FitResult]) -> Iterator[str]:
         for noise in NOISES:
             found = cases[sensor, noise].fit.noise[sensor]
             text = f'{1e3 * found.sigma_m:.3f} ± {1e3 * found.std_m:.3f} per point'
-            if found.pose_sigma_m is not None and found.pose_sigma_std_m is not None:
-                text += (
-                    f', {1e3 * found.pose_sigma_m:.3f} ± {1e3 * found.pose_sigma_std_m:.3f} common'
-                )
+            if found.pose_sigma_m is not None and found.pose_std_m is not None:
+                text += f', {1e3 * found.pose_sigma_m:.3f} ± {1e3 * found.pose_std_m:.3f} common'
             cells.append(text)
         rows.append(('sigma (mm)', title, f'{mean:.3f} ± {std:.3f}', *cells))
     yield '## Table II: corrections of the registration, and the noise'
