@@ -69,7 +69,7 @@ class NatNetClientTarget:
     """The client's thread without its sockets: receive, decode, order, find, hand on, report.
 
     What comes out is looked at: a reading is finite and of the marker that is followed, every
-    datagram is accounted for, and status and diagnosis can always be told.
+    datagram is accounted for, and status and diagnosis can always be given.
     """
 
     SERVER, STRANGER = '127.0.0.1', '127.0.0.9'
