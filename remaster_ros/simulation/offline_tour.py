@@ -35,15 +35,15 @@ def plan_tour(
     rng
         Source of randomness.
     without_meshes
-        Take capsules in place of meshes: nobody stands beside a simulated arm, and its meshes may
-        be on another machine.
+        Take capsules in place of meshes: a simulated arm can hurt no one, and its meshes may be on
+        another machine.
 
     Raises
     ------
     InputError
         No closed form for this robot, or no pose to fit that it can take.
     """
-    scene = cell.scene(chain, without_meshes=without_meshes)
+    scene = cell.planning_scene(chain, without_meshes=without_meshes)
     sensors_R = scene.rough_R
     if places is not None:
         sensors_R = {name: T_R_N[:3, 3] for name, T_R_N in places.items()}
