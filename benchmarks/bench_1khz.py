@@ -4,7 +4,7 @@ A process of its own sends the frames on schedule (late ones at once after it), 
 computer does; the client decodes every frame, finds its marker and hands the reading on; and busy
 processes, two for each core, compete for the processor with both. Lost is every frame that was
 sent and not seen. `--buffer` shows what smaller socket buffers would do: Linux allows 212992 bytes
-unless net.core.rmem_max says otherwise.
+unless net.core.rmem_max allows more.
 
 Run: python benchmarks/bench_1khz.py [--seconds 60] [--load 4] [--buffer 2097152]
 """
@@ -37,7 +37,7 @@ _TIMESTAMP_FROM_END = 38
 
 
 def serve(pipe: Connection, frames: int) -> None:
-    """Answer CONNECT, then send the frames; tell the port first and the latest delay last."""
+    """Answer CONNECT, then send the frames; return the port first and the latest delay last."""
     info = natnet.ServerInfo(
         'bench', (3, 0, 0, 0), VERSION, natnet.Connection(10_000_000, 1511, False, '0.0.0.0')
     )
@@ -48,7 +48,7 @@ def serve(pipe: Connection, frames: int) -> None:
         pipe.send(server.getsockname()[1])
         _request, client = server.recvfrom(65536)
         server.sendto(welcome, client)
-        pipe.recv()  # the client knows us
+        pipe.recv()  # the client has its answer
         begin, latest = time.monotonic() + 0.1, 0.0
         for number in range(1, frames + 1):
             due = begin + number / RATE_HZ

@@ -95,7 +95,7 @@ def main() -> int:
     print(
         f'{states} crash states in {time.monotonic() - began:.0f} s: '
         f'{len(failures)} lost or changed something acknowledged, or did not settle; '
-        f'{total["dropped"]} dropped what was being written, and said so'
+        f'{total["dropped"]} dropped what was being written, and reported it'
     )
     return 1 if failures or states < args.states else 0
 

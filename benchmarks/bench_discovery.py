@@ -10,7 +10,7 @@ benchmark can be stopped and goes on where it was; figures are printed as they c
     python benchmarks/bench_discovery.py --session single-backlash-3    one again, in full
 
 Single effects are drawn with sizes between half and eight times the one at which the best possible
-test, which knows what to look for and the noise, finds them in 90 % of sessions at 2 % false
+test, which is given the effect and the noise, finds them in 90 % of sessions at 2 % false
 alarms. Judged by test/hidden_judge.py: right is who names exactly what was hidden.
 """
 

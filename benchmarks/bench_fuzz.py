@@ -1,10 +1,10 @@
-"""Ten million spoilt NatNet datagrams and a million emScon packets: no crash, hang or growth.
+"""Ten million damaged NatNet datagrams and a million emScon packets: no crash, hang or growth.
 
-Valid messages of every version are flipped, cut, spliced, flooded, given absurd counts and
-numbers that are none (test/fuzzing.py), and thrown at the bare decoders and at the clients as
-their threads run them, everything but the socket. The work is cut into blocks of known seed; a
-block that is done is written down, so that the next run goes on where this one stopped. A failure
-is written down with its input and ends the run with status 1.
+In valid messages of every version bits are flipped, parts cut, spliced and repeated, counts made
+absurd and numbers replaced by NaN or infinity (test/fuzz_messages.py). The bare decoders and the
+clients, all but their sockets, receive them. The work is cut into blocks of known seed; a finished
+block is recorded, so that the next run continues where this one stopped. A failure is recorded
+with its input and ends the run with status 1.
 
 `--atheris N` first lets Google's coverage-guided fuzzer (pip install atheris; CPython 3.11 to
 3.13) look N times for inputs that reach new code; what it finds joins the valid messages.
@@ -29,6 +29,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / 'test'))
 
+import fuzz_messages  # noqa: E402
 import fuzzing  # noqa: E402
 
 BLOCK = 50_000
@@ -48,11 +49,11 @@ def work(job: tuple[str, int, int, Path]) -> dict[str, Any]:
     result: dict[str, Any] = {'kind': kind, 'block': number, 'inputs': inputs}
     try:
         if kind == 'natnet':
-            version = fuzzing.VERSIONS[number % len(fuzzing.VERSIONS)]
+            version = fuzz_messages.VERSIONS[number % len(fuzz_messages.VERSIONS)]
             client = fuzzing.NatNetClientTarget(rng, version)
-            with fuzzing.silent_natnet_driver():
+            with fuzzing.silent_natnet_client():
                 outcome = fuzzing.run(
-                    fuzzing.natnet_mutator(rng, version, more),
+                    fuzz_messages.natnet_mutator(rng, version, more),
                     [fuzzing.decode_as_any_version(rng), client],
                     inputs,
                 )
@@ -60,7 +61,7 @@ def work(job: tuple[str, int, int, Path]) -> dict[str, Any]:
         else:
             tracker = fuzzing.TrackerClientTarget(rng)
             outcome = fuzzing.run(
-                fuzzing.emscon_mutator(rng, more),
+                fuzz_messages.emscon_mutator(rng, more),
                 [fuzzing.read_from_both_sides(rng), tracker],
                 inputs,
             )

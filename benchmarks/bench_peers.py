@@ -36,7 +36,7 @@ from paper_model import rigid_fit
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.types import FloatArray, Session
 
-# What pip is told, step by step; every version is pinned in a file beside the peer's script.
+# Arguments of pip, step by step; every version is pinned in a file beside the peer's script.
 PEERS = {
     'pybotics': [[]],
     'figaroh': [

@@ -2,7 +2,7 @@
 
 Prints the mean error on the held-out poses, nothing refitted, and what an independent fit of
 others reached with registration, marker and zero-offsets. Then how much of what is held out lies
-where the posterior says it should: the share of errors inside their 95 % regions (ellipsoids of
+where the posterior predicts it: the share of errors inside their 95 % regions (ellipsoids of
 the noise plus the spread of the prediction over the draws), point by point, pose by pose (the mean
 error of a pose's points), and for what is left of a point after its pose's mean. Last how the
 errors of two solutions of a pose hang together, which the model takes as zero or positive.

@@ -142,7 +142,7 @@ def paper(model: PaperModel, posterior: FloatArray, chains: int, steps: int) -> 
             progress(f"the paper's chains: {100 * step / steps:.0f} %")
     progress('')
     error = np.mean((total / steps - posterior.mean(axis=0)) ** 2, axis=0)
-    # More than one effective sample each is measured, fewer cannot be told from one.
+    # More than one effective sample each is measured, fewer cannot be distinguished from one.
     each = np.maximum(posterior.var(axis=0) / error, 1.0)
     worst = int(np.argmin(each))
     note = (
@@ -291,7 +291,7 @@ def _ratio(alone: Speed, other: Speed, wanted: float | None) -> str:
     if ratio >= wanted:
         verdict = 'yes'
     else:
-        verdict = 'longer chains would tell' if other.at_most else 'NO'
+        verdict = 'longer chains would show' if other.at_most else 'NO'
     least = 'at least ' if other.at_most else ''
     return f'**{least}{ratio:.3g} times** (wanted {wanted:g}: {verdict})'
 

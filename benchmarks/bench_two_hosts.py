@@ -160,7 +160,7 @@ def environment() -> dict[str, str]:
 
 
 def conduct() -> None:
-    """Start the collection and print what the planner and the recorder say, a JSON line each."""
+    """Start the collection and print the messages of planner and recorder, a JSON line each."""
     import rclpy
     from std_srvs.srv import Trigger
 

@@ -1,8 +1,8 @@
 """Judge the tests of the code that limits motion: coverage of lines and branches, and mutants.
 
 Copies the modules and their tests into a temporary folder, where coverage.py counts what the tests
-reach and mutmut changes the code in every way it knows, one change at a time: the tests must fail
-for each. Ends with status 1 where a line or branch is not reached or a mutant survives that
+reach and mutmut changes the code in all its ways, one change at a time: the tests must fail for
+each. Ends with status 1 where a line or branch is not reached or a mutant survives that
 `motion_mutants.yaml` does not explain.
 
     python benchmarks/check_motion_code.py            (pip install coverage mutmut)

@@ -140,7 +140,7 @@ def report_confusion(lines: list[dict[str, Any]]) -> None:
             if not line['named']:
                 counts['(nothing)'] += 1
             elif line['named_right'] and line['forgiven']:
-                counts['look-alike, said so'] += 1
+                counts['look-alike, listed'] += 1
             elif line['first_right']:
                 counts['right' if line['named_right'] else 'right, and more'] += 1
             else:

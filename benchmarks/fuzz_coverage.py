@@ -14,16 +14,17 @@ import atheris
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test'))
 
-with atheris.instrument_imports(include=['remaster_ros.protocols', 'remaster_ros.drivers']):
+with atheris.instrument_imports(include=['remaster_ros.sensors']):
+    import fuzz_messages
     import fuzzing
 
 
 def natnet_target(data: bytes) -> None:
     """Decode as every version in turn; the first byte chooses."""
     if data:
-        version = fuzzing.VERSIONS[data[0] % len(fuzzing.VERSIONS)]
-        with contextlib.suppress(fuzzing.natnet.ProtocolError):
-            fuzzing.natnet.decode_message(data[1:], version)
+        version = fuzz_messages.VERSIONS[data[0] % len(fuzz_messages.VERSIONS)]
+        with contextlib.suppress(fuzz_messages.natnet.ProtocolError):
+            fuzz_messages.natnet.decode_message(data[1:], version)
 
 
 def main() -> None:
@@ -35,12 +36,12 @@ def main() -> None:
     if kind == 'natnet':
         messages = [
             bytes([index]) + data
-            for index, version in enumerate(fuzzing.VERSIONS)
-            for data in fuzzing.natnet_seeds(version)
+            for index, version in enumerate(fuzz_messages.VERSIONS)
+            for data in fuzz_messages.natnet_seeds(version)
         ]
         target = natnet_target
     else:
-        messages = fuzzing.emscon_seeds()
+        messages = fuzz_messages.emscon_seeds()
         target = fuzzing.read_from_both_sides(random.Random(0))
     for index, data in enumerate(messages):
         (seeds / f'{index:04d}').write_bytes(data)

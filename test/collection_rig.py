@@ -16,7 +16,7 @@ SEED = 11
 
 
 class Cell:
-    """A small collection of real nodes on fake devices, and what they say."""
+    """A small collection of real nodes on fake devices, and what they publish."""
 
     def __init__(self, start, client, folder, require, sensors, candidates=2, reference_every=0):
         from remaster_ros.nodes.status import listen

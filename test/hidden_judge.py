@@ -1,11 +1,11 @@
 """Was the hidden effect found: its name, its joint, its size?
 
-The judge is strict. Right is who names exactly what was hidden, no less and no more. One thing
-alone is forgiven: naming a look-alike that this session's data cannot tell from the truth, and
-saying so. "Cannot tell" is decided by the oracle, which knows the noise: the best test between
-the two, with everything else fitted, must have a noncentrality below `INDISTINGUISHABLE`, so that
-it would not be sure at two standard deviations. "Saying so" means that ``confusable_with`` has
-the truth.
+The judge is strict. A result is right if it names exactly what was hidden, no less and no more.
+One exception is allowed: a look-alike that this session's data cannot distinguish from the truth,
+if its ``confusable_with`` lists the truth. Whether they can be distinguished is decided by the
+oracle, which has the true noise: the best test between the two, with everything else fitted, must
+have a noncentrality of at least `INDISTINGUISHABLE`; below, it is not sure at two standard
+deviations.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Judgement:
     hidden, named
         Causes.
     named_right
-        All of the hidden ones and nothing else were named, or look-alikes as said above.
+        All of the hidden ones and nothing else were named, or look-alikes as described above.
     forgiven
         Look-alikes were involved.
     first_right
@@ -210,7 +210,7 @@ def _marker_deviations(
 ) -> dict[str, float]:
     """Compare height and distance from the last joint's axis, the z axis of the tool here.
 
-    Where the marker is round that axis trades with the last zero-offset: nobody can tell.
+    Where the marker is round that axis trades with the last zero-offset, and cannot be determined.
     """
     deviations = {}
     for name, nominal in world.nominal_markers.items():

@@ -1,7 +1,8 @@
 """The best possible test: it is given the noise, and the effect to look for.
 
 It uses the rows to fit without the gross errors, the noise's true covariance, and the effect's
-true response. What registration, offsets and marker can take up it must not count, as nobody can.
+true response. What registration, offsets and marker can take up does not count, as no
+method can detect it.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ class Recipe:
 
 @dataclass(frozen=True, eq=False)
 class HiddenSession:
-    """A session, the world it was made in, and what only judges may know.
+    """A session, the world it was made in, and the truth, which is for the judges alone.
 
     ``best_size_m`` is the size at which the best possible test finds each effect in 90 %.
     """
@@ -83,7 +83,7 @@ def hidden_session(recipe: Recipe) -> HiddenSession:
         held_out_outliers=recipe.held_out_outliers,
     )
     noise_seed = [recipe.seed, 8]
-    # The noise of the session itself, so that the oracle knows which rows are gross errors.
+    # The noise of the session itself, so that the oracle leaves out the gross errors.
     _, plain = hidden.measure((), noise, np.random.default_rng(noise_seed))
     oracle = Oracle(hidden, plain)
     effects, best = [], []

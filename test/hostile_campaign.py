@@ -170,7 +170,7 @@ class Campaign:
         silent_from = scene.silent_from
         if outcome.halted:
             silent_from = silent_from or bench.seen.halt_time(shown_from)
-            # No word of a node ends a halt.
+            # No message of a node ends a halt.
             bench.plan_state('paused')
             time.sleep(0.15)
             bench.plan_state('running')

@@ -88,7 +88,7 @@ class Spoiler:
 
 
 def check_read(read: Callable[[], object], measure_memory: bool = False) -> bool:
-    """Read once; tell whether it was taken, and fail on anything but `InputError`.
+    """Read once; return whether it was accepted, and fail on anything but `InputError`.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """What can go wrong between a bridge and its arm, at random moments of a move under way.
 
-Each injection is a function of the scene; it returns from when on the arm must hear nothing more
+Each injection is a function of the scene; it returns from when on the arm must receive nothing
 (`SILENT`), where that is so. What is expected of the bridge stands beside it: `halt`, `go on`
 (a control, or something that must not disturb) or `any` (both are right; what is commanded
 is judged as always).

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import time
 
+import fuzz_messages
 import fuzzing
 import pytest
 
@@ -22,7 +23,7 @@ def test_no_datagram_harms_the_optitrack_client(rng, version):
     client = fuzzing.NatNetClientTarget(rng, version)
     with fuzzing.silent_natnet_client():
         fuzzing.run(
-            fuzzing.natnet_mutator(rng, version),
+            fuzz_messages.natnet_mutator(rng, version),
             [fuzzing.decode_as_any_version(rng), client],
             5000,
         )
@@ -32,24 +33,26 @@ def test_no_datagram_harms_the_optitrack_client(rng, version):
 
 def test_no_packet_harms_the_laser_tracker_client(rng):
     client = fuzzing.TrackerClientTarget(rng)
-    fuzzing.run(fuzzing.emscon_mutator(rng), [fuzzing.read_from_both_sides(rng), client], 5000)
+    fuzzing.run(
+        fuzz_messages.emscon_mutator(rng), [fuzzing.read_from_both_sides(rng), client], 5000
+    )
     assert client.readings > 20
     assert client.errors > 20
 
 
 def test_every_valid_message_is_taken():
     """The seeds of the fuzzer are what they claim to be."""
-    for version in fuzzing.VERSIONS:
-        for datagram in fuzzing.natnet_seeds(version)[:5]:
-            fuzzing.natnet.decode_message(datagram, version)
-    for packet in fuzzing.emscon_seeds():
+    for version in fuzz_messages.VERSIONS:
+        for datagram in fuzz_messages.natnet_seeds(version)[:5]:
+            fuzz_messages.natnet.decode_message(datagram, version)
+    for packet in fuzz_messages.emscon_seeds():
         taken = 0
         for side in ('client', 'server'):
-            reader = fuzzing.emscon.PacketReader(side)
+            reader = fuzz_messages.emscon.PacketReader(side)
             reader.receive_data(packet)
             try:
-                taken += reader.next_event() is not fuzzing.emscon.NEED_DATA
-            except fuzzing.emscon.ProtocolError:
+                taken += reader.next_event() is not fuzz_messages.emscon.NEED_DATA
+            except fuzz_messages.emscon.ProtocolError:
                 continue
         assert taken, packet
 
@@ -59,7 +62,7 @@ def test_the_fuzzer_itself_finds_a_crash_and_a_hang(rng, monkeypatch):
         if len(data) % 7 == 0:
             raise KeyError('found')
 
-    make = fuzzing.natnet_mutator(rng, (3, 1))
+    make = fuzz_messages.natnet_mutator(rng, (3, 1))
     with pytest.raises(fuzzing.FuzzError, match=r"KeyError: 'found'; input [0-9a-f]"):
         fuzzing.run(make, [crash], 1000)
 

@@ -10,7 +10,8 @@ import time
 
 import numpy as np
 import pytest
-from fuzzing import DatagramSource, full_frame
+from fuzz_messages import full_frame
+from fuzzing import DatagramSource
 from optitrack_world import RATE, SENSOR, MarkerWorld, eventually, free_port, open_descriptors
 
 from remaster_ros.errors import DeviceError

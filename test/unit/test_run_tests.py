@@ -1,0 +1,69 @@
+"""tools/run-tests: every test is in one group, and a failure in any of them is a failure."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+GROUPS = ('motion', 'nodes', 'integration', 'unit')
+# In place of Python: notes its arguments, and ends with the status that is set for its group.
+STUB = """#!/bin/bash
+group=$(grep -o 'pytest_cache/[a-z]*' <<< "$*")
+group=${group#*/}
+echo "$@" > "$(dirname "$0")/$group.arguments"
+exit "$(cat "$(dirname "$0")/$group" 2>/dev/null || echo 0)"
+"""
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Return a function that runs the script with a status for each group."""
+
+    def run_with(*arguments, **statuses):
+        stub = tmp_path / 'python'
+        stub.write_text(STUB, encoding='utf-8')
+        stub.chmod(0o755)
+        for group, status in statuses.items():
+            (tmp_path / group).write_text(str(status), encoding='utf-8')
+        done = subprocess.run(
+            [ROOT / 'tools' / 'run-tests', stub, *arguments], timeout=60, check=False
+        )
+        return done.returncode
+
+    return run_with
+
+
+def arguments_of(tmp_path):
+    return {path.stem: path.read_text().split() for path in tmp_path.glob('*.arguments')}
+
+
+def test_each_test_file_is_in_one_group(run, tmp_path):
+    assert run('-k', 'name') == 0
+    groups = arguments_of(tmp_path)
+    assert set(groups) == set(GROUPS)
+    assert all(arguments[-2:] == ['-k', 'name'] for arguments in groups.values())
+    motion = {word for word in groups['motion'] if word.startswith('test/')}
+    left_out = {word.split('=')[1] for word in groups['nodes'] if word.startswith('--ignore=')}
+    assert motion == left_out
+    assert all((ROOT / path).is_file() for path in motion)
+    paths = {group: [w for w in groups[group] if w.startswith('test/')] for group in GROUPS}
+    assert paths['nodes'] == ['test/system']
+    assert paths['integration'] == ['test/integration']
+    assert paths['unit'] == ['test/unit']
+
+
+@pytest.mark.parametrize('group', GROUPS)
+def test_a_failure_in_any_group_is_a_failure(run, group):
+    assert run(**{group: 1}) == 1
+
+
+def test_a_group_without_a_test_of_the_name_is_none(run):
+    """Pytest ends with 5 where it has selected no test."""
+    assert run(motion=5, nodes=5, integration=5, unit=0) == 0
+    assert run(motion=5, nodes=5, integration=5, unit=5) == 5
+
+
+def test_files_that_are_named_run_alone(run, tmp_path):
+    assert run('test/unit/test_run_tests.py', '-x', chosen=3) == 3
+    assert set(arguments_of(tmp_path)) == {'chosen'}
