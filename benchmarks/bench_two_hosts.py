@@ -29,7 +29,6 @@ from typing import Any
 
 import numpy as np
 
-from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.workcell import config_path, read_cell
@@ -270,11 +269,8 @@ def judge(folder: Path, world: World, planned: int) -> list[str]:
         faults.append(f'exit status {session.exit_status}')
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     for index, name in enumerate(session.sensor_names):
-        rows, truth = m.sensor == index, world.truth.sensors[name]
-        expected = transforms.apply(
-            transforms.inverse(truth.T_R_N),
-            chain.positions(m.q[rows], truth.marker, world.truth.joint_offsets),
-        )
+        rows = m.sensor == index
+        expected = world.truth.without_noise(chain, name, m.q[rows])
         worst = np.linalg.norm(m.position[rows] - expected, axis=1).max()
         if worst > TOLERANCE_M[name]:
             faults.append(f'{name}: a reading {worst * 1e3:.2f} mm from where the marker was')

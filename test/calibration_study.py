@@ -16,7 +16,7 @@ from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.sampling import sample_posterior
 from remaster_ros.kinematics.transforms import inverse
-from remaster_ros.simulation.session_simulator import SessionTruth
+from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.types import FloatArray
 
 SENSORS = (('mocap',), ('tracker',), ('mocap', 'tracker'))

@@ -18,7 +18,8 @@ import numpy as np
 from hidden_arm import PinocchioArm
 
 from remaster_ros.simulation.hidden_effects import HiddenEffect
-from remaster_ros.simulation.world_model import Round, StagedSensor, WorldModel
+from remaster_ros.simulation.truth import SimulatedSensor
+from remaster_ros.simulation.world_model import Round, WorldModel
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements, Session
 
 MARKER_STD_M = 0.5e-3
@@ -124,7 +125,7 @@ class HiddenWorld(WorldModel):
         self,
         urdf: str,
         visits: Visits,
-        sensors: Mapping[str, StagedSensor],
+        sensors: Mapping[str, SimulatedSensor],
         markers: Mapping[str, FloatArray],
         rng: np.random.Generator,
     ) -> None:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.sensors.optitrack.diagnosis import require_group
 from remaster_ros.sensors.optitrack.protocol import natnet
 from remaster_ros.sensors.optitrack.protocol.frames import Frame
 from remaster_ros.sensors.optitrack.protocol.natnet import (
@@ -27,6 +26,7 @@ from remaster_ros.sensors.optitrack.protocol.natnet import (
     Version,
 )
 from remaster_ros.sensors.optitrack.protocol.wire import require_supported
+from remaster_ros.sensors.optitrack.settings import require_group
 from remaster_ros.sensors.optitrack.sockets import open_socket
 from remaster_ros.simulation.optitrack_faults import FrameFaults
 from remaster_ros.simulation.optitrack_scene import CLOCK_HZ, OptiTrackBehaviour, OptiTrackScene
@@ -133,7 +133,6 @@ class FakeOptiTrackServer:
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
         self._latest: Frame | None = None
-        self.frames_sent = 0
 
     @property
     def command_port(self) -> int:
@@ -207,7 +206,6 @@ class FakeOptiTrackServer:
             self._latest = frame
             for message in self._spoiler.spoil(frame, self._world.faults(self._sensor)):
                 self._distribute(message)
-            self.frames_sent += 1
 
     def _distribute(self, frame: Frame | bytes) -> None:
         if self._data is not None:

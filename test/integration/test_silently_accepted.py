@@ -14,7 +14,8 @@ from command_line import ROOT, refusal, remaster
 
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.session.reader import read_chain, read_session, write_session
-from remaster_ros.simulation.session_simulator import SimulatedSensor, simulate_session
+from remaster_ros.simulation.session_simulator import simulate_session
+from remaster_ros.simulation.truth import SimulatedSensor
 
 
 def cell_with(folder: Path, *changes: tuple[str, str]) -> Path:

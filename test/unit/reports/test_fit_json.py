@@ -171,7 +171,7 @@ def test_the_offset_layer_is_a_ros_parameter_file(fit_result):
     assert parameters['left_out'] == names[~known].tolist()
 
 
-def test_the_instructions_say_minus_the_offset(fit_result):
+def test_the_instructions_are_for_minus_the_offset(fit_result):
     text = remaster_text(fit_result)
     table, _, notes = text.partition('Left out of all three')
     for i, joint in enumerate(fit_result.joint_names):
