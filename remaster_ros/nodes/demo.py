@@ -316,7 +316,7 @@ def output_folder(path: Path) -> Path:
 
 
 def free_ports(*kinds: int) -> list[int]:
-    """Return a port on loopback for each kind of socket, all different and used by nobody now.
+    """Return a port on loopback for each kind of socket, all different and unused now.
 
     They lie above the ports that Linux gives to sockets without one (32768 to 60999): nine
     processes open dozens of these before the ports found here are bound.

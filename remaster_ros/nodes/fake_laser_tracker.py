@@ -27,7 +27,7 @@ class Parameters:
 
 
 class FakeLaserTrackerNode(RemasterNode):
-    """Serve until told to stop."""
+    """Serve until stopped."""
 
     def __init__(self) -> None:
         super().__init__('fake_laser_tracker')

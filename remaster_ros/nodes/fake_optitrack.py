@@ -33,7 +33,7 @@ class Parameters:
 
 
 class FakeOptiTrackNode(RemasterNode):
-    """Serve until told to stop."""
+    """Serve until stopped."""
 
     def __init__(self) -> None:
         super().__init__('fake_optitrack')

@@ -55,7 +55,7 @@ def _action(node: NodeToStart) -> Node:
         namespace=node.namespace,
         parameters=list(node.parameters),
         remappings=list(node.remappings),
-        ros_arguments=list(node.ros_arguments),
+        ros_arguments=list(node.ros_arguments) or None,
         output='screen',
         respawn=True,
         respawn_delay=RESPAWN_DELAY_S,

@@ -3,7 +3,7 @@
 The reported joint positions x follow a reference r by x'' + 2 ζ ω x' + ω² x = ω² r. Each piece
 of the reference is a polynomial, so x lags while moving, overshoots a little and settles. The
 solution is a polynomial plus a decaying oscillation: exact at any time, without integration, and
-therefore the same in every process that knows the trajectories.
+therefore the same in every process that has read the trajectories.
 """
 
 from __future__ import annotations

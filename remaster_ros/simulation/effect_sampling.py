@@ -237,7 +237,7 @@ class EffectSpec:
 def hide(
     stage: WorldModel, requests: Sequence[EffectSpec], rng: np.random.Generator
 ) -> tuple[HiddenEffect, ...]:
-    """Draw what was asked for.
+    """Draw the requested effects.
 
     Raises
     ------
@@ -251,7 +251,7 @@ def hide(
             kind = str(rng.choice(tuple(NAMED)))
         size_m = request.size_m
         if size_m is None:
-            # A marker is known to half a millimetre: a smaller offset could not be told from that.
+            # A marker is known to half a millimetre: a smaller offset would be lost in that.
             scale = 10.0 if kind == 'marker_offset' else 1.0
             size_m = scale * rng.uniform(*USUAL_M)
         effects.append(draw_effect(stage, kind, rng, size_m, request.joint))

@@ -139,7 +139,7 @@ class HiddenEffect:
         return replace(self, values=factor * self.values)
 
     def add_to(self, deviation: Deviation, c: Circumstances) -> None:
-        """Deviate as the rule says."""
+        """Add what the rule of this effect makes of the circumstances."""
         (NAMED | UNNAMED)[self.kind].rule(self, deviation, c)
 
     def __str__(self) -> str:

@@ -29,7 +29,7 @@ from remaster_ros.simulation.laser_tracker_settings import TrackerBehaviour
 from remaster_ros.types import FloatArray
 
 if TYPE_CHECKING:
-    from remaster_ros.simulation.world import WorldView
+    from remaster_ros.simulation.world import World
 
 _POLL_WALL_S = 0.005
 """How often the instrument goes on in time; this sets its latency, not its results."""
@@ -44,7 +44,7 @@ class FakeLaserTracker:
     Parameters
     ----------
     world
-        See `WorldView`.
+        The hidden world.
     sensor
         The tracker's name in the world.
     rng
@@ -59,7 +59,7 @@ class FakeLaserTracker:
 
     def __init__(
         self,
-        world: WorldView,
+        world: World,
         sensor: str,
         rng: np.random.Generator,
         *,
@@ -137,7 +137,7 @@ class FakeLaserTracker:
             self._listener = None
 
     def break_beam(self) -> None:
-        """Interrupt the beam, as somebody who walks through it does."""
+        """Interrupt the beam, as a person who walks through it does."""
         with self._lock:
             self._send(self._instrument.break_beam())
 

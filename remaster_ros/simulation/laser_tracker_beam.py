@@ -17,7 +17,7 @@ from remaster_ros.simulation.laser_tracker_settings import TrackerBehaviour
 from remaster_ros.types import FloatArray
 
 if TYPE_CHECKING:
-    from remaster_ros.simulation.world import WorldView
+    from remaster_ros.simulation.world import World
 
 STEP_S = 0.1
 """World time between two looks at the world."""
@@ -43,7 +43,7 @@ class Beam:
 
     def __init__(
         self,
-        world: WorldView,
+        world: World,
         sensor: str,
         rng: np.random.Generator,
         behaviour: TrackerBehaviour,

@@ -38,7 +38,7 @@ from remaster_ros.simulation.laser_tracker_settings import (
 from remaster_ros.types import FloatArray
 
 if TYPE_CHECKING:
-    from remaster_ros.simulation.world import WorldView
+    from remaster_ros.simulation.world import World
 
 _LONGEST_CATCH_UP_S = 5.0
 
@@ -63,12 +63,12 @@ class TrackerInstrument:
         See `TrackerBehaviour`.
     aim
         Where it points at first, in its own frame, m, (3,); None: where the reflector is, as
-        somebody who sets up the instrument leaves it.
+        a person who sets up the instrument leaves it.
     """
 
     def __init__(
         self,
-        world: WorldView,
+        world: World,
         sensor: str,
         rng: np.random.Generator,
         switched_on_s: float,
@@ -102,7 +102,7 @@ class TrackerInstrument:
         return Readiness.READY if self.locked else Readiness.NOT_READY
 
     def greeting(self) -> list[Event]:
-        """Return what a client is told when it connects."""
+        """Return the first packets for a client that connects."""
         return [self._readiness_change()]
 
     def handle(self, request: Request) -> list[Event]:
@@ -140,7 +140,7 @@ class TrackerInstrument:
             self._out.append(self._readiness_change())
 
     def break_beam(self) -> list[Event]:
-        """Lose the reflector, as somebody who walks through the beam does."""
+        """Lose the reflector, as when a person walks through the beam."""
         self._lose()
         return self._sent()
 

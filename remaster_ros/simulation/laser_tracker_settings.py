@@ -18,7 +18,7 @@ REFLECTORS = {1: (1, 0.01905, 'CCR 1.5in'), 2: (1, 0.00635, 'CCR 0.5in')}
 
 
 class Setting(NamedTuple):
-    """The command that reads a setting, what a client is told of a change, the first values."""
+    """The command that reads a setting, what is sent when it changes, the first values."""
 
     get: Command
     change: Change

@@ -35,8 +35,8 @@ def plan_tour(
     rng
         Source of randomness.
     without_meshes
-        Take capsules in place of meshes: nobody stands beside a simulated arm, and its meshes may
-        be on another machine.
+        Take capsules in place of meshes: a simulated arm can hurt no one, and its meshes may be on
+        another machine.
 
     Raises
     ------

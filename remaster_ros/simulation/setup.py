@@ -131,7 +131,7 @@ def make_world(
     warming = Warming(rng.uniform(2.0, 6.0), rng.uniform(300.0, 1500.0), START_S)
     truth = SessionTruth(joint_offsets, markers, sensors, warming)
     if hidden:
-        # Effects have the sizes asked for on a tour like the one that will be visited.
+        # Effects get the requested sizes on a tour like the one that will be visited.
         rng = np.random.default_rng([seed, 2])
         places = {name: sensor.T_R_N for name, sensor in sensors.items()}
         counts = dict.fromkeys(('optimization', 'validation'), candidates)

@@ -76,7 +76,7 @@ def simulate_workcell(
     InputError
         No closed form for this robot, or no pose that it can take.
     """
-    # One stream each: less noise, say, leaves the poses and the offsets as they were.
+    # One stream each: other noise, for instance, leaves the poses and the offsets as they were.
     placement, planning, drawing, hiding = rng.spawn(4)
     middle = (0.0, 0.0, sum(cell.poses.height_m) / 2)
     sensors = {

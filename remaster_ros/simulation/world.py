@@ -18,7 +18,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, TextIO
+from typing import TextIO
 
 import numpy as np
 
@@ -37,34 +37,6 @@ START_S = 100.0
 """World time at the beginning, s; ROS reads a time of 0 as "no time yet"."""
 WORLD_FILE = 'world.json'
 MOTION_FILE = 'motion.jsonl'
-
-
-class WorldView(Protocol):
-    """What a fake sensor uses of the World."""
-
-    def now(self) -> float:
-        """World time, s."""
-
-    def sleep(self, seconds: float) -> None:
-        """Wait that much world time."""
-
-    def marker_in_sensor(self, sensor: str, t: float) -> FloatArray:
-        """True position of the sensor's marker in the sensor's frame at time t, m, (3,)."""
-
-    def is_moving(self, t: float) -> bool:
-        """Whether any joint moves at time t."""
-
-    def joint_speed(self, t: float) -> float:
-        """Largest joint speed at time t, rad/s."""
-
-    def line_of_sight(self, sensor: str, t: float) -> bool:
-        """Whether the sensor sees its marker at time t."""
-
-    def warming_k(self, t: float) -> float:
-        """How much warmer than at the beginning it is at time t, K."""
-
-    def faults(self, device: str) -> Numbers:
-        """Faults of the device now, see `remaster_ros.simulation.faults`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +75,9 @@ class WorldContent:
 class World:
     """The true arm in front of the true sensors.
 
-    Make one with `create` (the demo) or `open` (a fake); see the module's text.
+    Make one with `create` (the demo) or `open` (a fake); see the module's text. A fake sensor uses
+    `now`, `sleep`, `faults`, `marker_in_sensor`, `line_of_sight`, `warming_k`, `is_moving` and
+    `joint_speed` alone, so that its tests need no arm.
     """
 
     def __init__(self, folder: Path, content: WorldContent) -> None:

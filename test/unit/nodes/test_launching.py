@@ -185,7 +185,7 @@ def test_the_launch_files(name, monkeypatch):
         assert 0 < node['respawn_max_retries'] < 20
         # An enclave of config/sros2/policy.xml, which has none for the fakes.
         enclave = ['--enclave', f'/remaster/{node["executable"]}']
-        assert node['ros_arguments'] == (enclave if name == 'real' else [])
+        assert node['ros_arguments'] == (enclave if name == 'real' else None)
     ended = types.SimpleNamespace(returncode=2, process_name='recorder')
     assert on_exit(ended, None) == [
         ('emit', ('shutdown', 'recorder ended with status 2')),
