@@ -9,6 +9,7 @@ import pytest
 # Distribution -> module, of what package.xml cannot name: rosdep has no Debian package for these.
 PIP_ONLY = {
     'EAIK': 'eaik',
+    'arviz-stats': 'arviz_stats',
     'mcap': 'mcap',
     'msgspec': 'msgspec',
     'plotly': 'plotly',

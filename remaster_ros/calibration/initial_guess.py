@@ -1,7 +1,7 @@
-"""A first solution that a few gross outliers and badly known markers cannot spoil.
+"""A first solution, robust against a few gross outliers and badly known markers.
 
 Closed-form starts (registration by points; registration and markers together as one linear
-problem), each refined by damped Gauss–Newton steps on a Cauchy cost; the best of them wins.
+problem), each refined by damped Gauss–Newton steps on a Cauchy cost; the best one is returned.
 """
 
 from __future__ import annotations
@@ -24,12 +24,11 @@ from remaster_ros.types import FloatArray, IntArray, Measurements
 MEDIAN_CHI3 = 1.5382
 # Errors beyond this many robust standard deviations lose their weight in the start.
 CAUCHY_WIDTH = 2.5
-# What the linear start expects of a robot out of the box, against which it weighs the nominal
-# marker positions.
+# Error of an uncalibrated robot, by which the linear start weighs the nominal marker positions.
 UNCALIBRATED_ERROR_M = 5e-3
-# Rows of a sensor that the start looks at.
+# Rows of a sensor that the start uses at most.
 LARGEST_START = 5000
-# A model that leaves more of the points' extent than this describes another robot, or none.
+# With larger errors than this share of the points' extent, the model is that of another robot.
 LARGEST_RELATIVE_ERROR = 0.1
 
 
@@ -46,7 +45,7 @@ def robust_start(
     Parameters
     ----------
     model
-        Only its chain and names matter here.
+        Only its chain and names are used.
     measurements, rows
         The observations, and which of them to fit.
     nominal_markers, marker_std_m
@@ -125,7 +124,7 @@ def referenced(
 
 
 def _require_likeness(model: Model, rows: Rows, errors: FloatArray) -> None:
-    """Refuse data that have nothing to do with the robot: wrong units, joints, markers."""
+    """Refuse data that do not fit the robot at all: wrong units, joints or markers."""
     spread = robust_spread(errors, rows)
     for error, (sensor, span) in zip(spread, rows.spans, strict=True):
         extent = np.median(np.linalg.norm(rows.target[span] - model.centroid[sensor], axis=1))

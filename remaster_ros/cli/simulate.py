@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--robot',
         metavar='NAME|URDF',
-        help="lwr4plus, iiwa7, iiwa14, or any URDF file (default: the cell's robot)",
+        help="a shipped robot such as lwr4plus, or any URDF file (default: the cell's robot)",
     )
     parser.add_argument('--base-link', metavar='LINK', help='frame R (default: the root link)')
     parser.add_argument('--tip-link', metavar='LINK', help='frame T (default: the only end)')

@@ -24,8 +24,8 @@ from numpy.typing import ArrayLike
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.kinematics.transforms import inverse, rotation_angle, twist_logarithm
-from remaster_ros.types import FloatArray, JointSolution
+from remaster_ros.kinematics.transforms import inverse, twist_logarithm
+from remaster_ros.types import FloatArray
 
 FREE_JOINTS = 6
 
@@ -124,18 +124,6 @@ class InverseKinematics:
             return q
         q = self._towards_middle(q)
         return q[self.chain.within_limits(q, tolerance=1e-9)]
-
-    def solve(self, T: ArrayLike) -> list[JointSolution]:
-        """Return the joint solutions within limits, each with what forward kinematics leaves."""
-        T = np.asarray(T, dtype=float)
-        q = self.solutions(T)
-        left = inverse(self.chain.forward(q)) @ T
-        position_error = np.linalg.norm(left[:, :3, 3], axis=-1)
-        rotation_error = rotation_angle(left[:, :3, :3])
-        return [
-            JointSolution(row, float(position), float(rotation))
-            for row, position, rotation in zip(q, position_error, rotation_error, strict=True)
-        ]
 
     def _require_mobility(self) -> None:
         """Refuse held joints that leave the tool fewer than six ways to move, wherever it is.

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
 
 import numpy as np
 
@@ -80,6 +81,18 @@ class UrdfModel:
         parents = {joint.parent for joint in self.parent_joint.values()}
         return [name for name in self.links if name not in parents]
 
+    def carrier(self, link: str, moving: Container[str]) -> tuple[str, FloatArray]:
+        """Return what carries a link, and T_carrier_link (4, 4), all joints between at zero.
+
+        That is the nearest link of `moving` on the way to the root, itself included; else the
+        root.
+        """
+        T = np.eye(4)
+        while link not in moving and link in self.parent_joint:
+            joint = self.parent_joint[link]
+            link, T = joint.parent, joint.origin @ T
+        return link, T
+
 
 def parse_urdf(text: str) -> UrdfModel:
     """Read URDF text.
@@ -136,7 +149,12 @@ def parse_urdf(text: str) -> UrdfModel:
     if len(roots) != 1:
         found = ', '.join(roots) if roots else 'none, the links form a loop'
         raise InputError(f'URDF: a robot is a tree with one root link; found {found}')
-    _refuse_loops(links, roots[0], parent_joint)
+    parents = {link: (joint.parent,) for link, joint in parent_joint.items()}
+    try:
+        TopologicalSorter(parents).prepare()
+    except CycleError as error:
+        link = min(error.args[1])
+        raise InputError(f"URDF: link '{link}' is part of a loop; a robot is a tree") from None
     return UrdfModel(robot.get('name', ''), roots[0], links, parent_joint)
 
 
@@ -145,19 +163,6 @@ def _is_xacro(element: ElementTree.Element) -> bool:
     # Comments have a function for their tag.
     tag = element.tag if isinstance(element.tag, str) else ''
     return tag.startswith('{') and tag.partition('}')[0].endswith('xacro')
-
-
-def _refuse_loops(links: Iterable[str], root: str, parent_joint: Mapping[str, UrdfJoint]) -> None:
-    """Refuse links whose ancestors form a loop apart from the root."""
-    hanging = {root}
-    for link in links:
-        here, path = link, {link}
-        while here not in hanging:
-            here = parent_joint[here].parent
-            if here in path:
-                raise InputError(f"URDF: link '{link}' is part of a loop; a robot is a tree")
-            path.add(here)
-        hanging |= path
 
 
 def _link(element: ElementTree.Element) -> UrdfLink:

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from remaster_ros.motion.actions import SupervisorRules
+from remaster_ros.motion.actions import Settled, SupervisorRules
 from remaster_ros.motion.following import Following, Seen
 from remaster_ros.motion.settling import SettleDetector
 from remaster_ros.motion.trajectory import Trajectory
@@ -77,6 +77,13 @@ class Visit:
         if seen.time > self.deadline:
             return 'failed', 'did not come to rest at its target in time'
         return UNDER_WAY
+
+    def settled_at(self, seen: Seen) -> Settled:
+        """Return the action that reports the arm as settled, by the report that completed it."""
+        still_since = self.detector.still_since
+        assert still_since is not None
+        motion_s, settle_s = still_since - self.sent_stamp, seen.stamp - still_since
+        return Settled(self.solution, seen.stamp, self.detector.mean, motion_s, settle_s)
 
     def judge_settled(self, seen: Seen, *, recorder_waits: bool) -> Outcome:
         """Say what becomes of an arm that must stand until the recorder answers."""

@@ -44,7 +44,7 @@ from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import read_fit
 from remaster_ros.session.files import cannot_write
 from remaster_ros.session.session_journal import is_complete
-from remaster_ros.session.session_writer import JOURNAL
+from remaster_ros.session.session_opening import JOURNAL
 from remaster_ros.session.workcell import config_path, read_cell
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.setup import make_world

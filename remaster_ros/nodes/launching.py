@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from remaster_ros.errors import InputError
+from remaster_ros.sensors.registry import DRIVERS, GENERIC, kind_of
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.safe_yaml import YamlError, load_yaml
 from remaster_ros.session.workcell import YAML_LIMIT, read_cell
 
 CORE = ('pose_planner', 'robot_bridge', 'recorder', 'optimizer')
 SENSORS = ('optitrack_markers', 'laser_tracker_markers')
+"""The sensors that have a fake and an executable of their own."""
 FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
 ALL_NODES = (*FAKES, *CORE, *SENSORS)
 ALL = 'all'
@@ -119,14 +121,14 @@ def real_nodes(
     nodes = [start(name, name, **values.get(name, {})) for name in CORE]
     for sensor in wanted:
         node = by_sensor.get(sensor, '')
-        kind = next((kind for kind in SENSORS if node.startswith(kind)), '')
+        kind = kind_of(node)
         if not kind:
             raise InputError(
                 f'{params}: no node for the sensor {sensor!r}{_where(namespace)}; give it a '
-                f'section /**/{" or /**/".join(SENSORS)} with "sensor: {sensor}", or leave it '
+                f'section /**/{" or /**/".join(DRIVERS)} with "sensor: {sensor}", or leave it '
                 'out with sensors:='
             )
-        nodes.append(start(kind, node, **own))
+        nodes.append(start(kind if kind in SENSORS else GENERIC, node, **own))
     return nodes
 
 
@@ -166,7 +168,7 @@ def read_sections(params: str, namespace: str = '') -> dict[str, Mapping[str, An
             continue
         if place == '/**' or place.strip('/') == space:
             found[name] = values
-        elif name.startswith(ALL_NODES):
+        elif name.startswith((*CORE, *DRIVERS, *FAKES)):
             raise InputError(
                 f'{path}: section {key} is not for the nodes{_where(namespace)}, which would run '
                 f'on their defaults; call it /**/{name}'

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.sensors.optitrack.diagnosis import require_group
 from remaster_ros.sensors.optitrack.protocol import natnet
 from remaster_ros.sensors.optitrack.protocol.frames import Frame
 from remaster_ros.sensors.optitrack.protocol.natnet import (
@@ -27,6 +26,7 @@ from remaster_ros.sensors.optitrack.protocol.natnet import (
     Version,
 )
 from remaster_ros.sensors.optitrack.protocol.wire import require_supported
+from remaster_ros.sensors.optitrack.settings import require_group
 from remaster_ros.sensors.optitrack.sockets import open_socket
 from remaster_ros.simulation.optitrack_faults import FrameFaults
 from remaster_ros.simulation.optitrack_scene import CLOCK_HZ, OptiTrackBehaviour, OptiTrackScene

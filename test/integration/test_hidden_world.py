@@ -10,14 +10,19 @@ import pytest
 
 pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
+from discovery_scenes import residuals_of
 from hidden_arm import PinocchioArm
+from hidden_judge import part_of
 from hidden_oracle import Oracle
 from hidden_tours import robot, visits, world
 from hidden_world import HiddenWorld, Noise
 from scipy.stats import chi2
 
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.simulation.effect_sampling import DRAWS, draw_effect
+from remaster_ros.simulation.expected_findings import true_parameters
 from remaster_ros.simulation.hidden_effects import (
     ARC_MINUTE,
     NAMED,
@@ -167,6 +172,33 @@ def test_every_effect_has_the_size_asked_for(kind: str, iiwa: HiddenWorld) -> No
     # Twice the values, twice the error: the tests against an oracle rely on it.
     double = iiwa.response(effect.scaled(2.0))
     np.testing.assert_allclose(double, 2.0 * iiwa.response(effect), rtol=0, atol=2e-5)
+
+
+@pytest.fixture(scope='module')
+def context(iiwa: HiddenWorld) -> Context:
+    session, _ = iiwa.measure((), Noise(), np.random.default_rng(11))
+    return residuals_of(session).context
+
+
+@pytest.mark.parametrize('kind', NAMED)
+def test_true_values_have_the_names_that_discovery_gives_them(
+    kind: str, iiwa: HiddenWorld, context: Context
+) -> None:
+    """A value without a name, or with another, would not be compared with its estimate."""
+    cells = EFFECTS[kind].cells(context)
+    effect = draw_effect(iiwa, kind, np.random.default_rng(11), 0.3e-3)
+    true = true_parameters(effect)
+    if kind in ('joint_error_curve', 'marker_offset'):
+        assert not true, 'hidden_judge compares these two by their displacements'
+        return
+    assert true
+    assert set(true) <= {name for cell in cells for name in cell.parameters}
+    for name in true:
+        part = part_of(name)
+        assert part is not None, f'hidden_judge has no pattern for {name}'
+        # Waves of any order are hidden by one rule.
+        assert part.kind == ('encoder_eccentricity' if kind == 'gear_periodic' else kind)
+        assert part.joints in ((), *((joint,) for joint in effect.joints))
 
 
 def test_noise_is_what_was_asked_for() -> None:

@@ -18,7 +18,8 @@ from remaster_ros.simulation.truth import SessionTruth, from_plain
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(420)]
 
-SEED = 7
+SEED = 10
+"""Of few configurations: 11 of four poses to fit, 8 of two to validate."""
 
 
 @pytest.fixture(scope='module')
@@ -37,7 +38,7 @@ def demo(ros_environment, tmp_path_factory):
             '--seed',
             str(SEED),
             '--candidates',
-            '6',
+            '5',
         ],
         env={**ros_environment, 'COLUMNS': '200'},
         capture_output=True,

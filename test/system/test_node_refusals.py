@@ -141,4 +141,6 @@ def test_a_link_where_the_fakes_meet(start, ros_environment, tmp_path, monkeypat
     assert not list(victim.iterdir())
     (tmp_path / name).unlink()
     (tmp_path / name).mkdir(mode=0o755)
+    # Without it the node would wait for somebody to make it.
+    (tmp_path / name / 'world.yaml').touch()
     assert 'open to other users' in refuse(start, 'fake_optitrack')

@@ -31,7 +31,7 @@ def saved(tmp_path_factory):
     return found, folder
 
 
-def test_discovery_json_has_what_the_contract_asks(saved):
+def test_discovery_json_keeps_its_contract(saved):
     found, folder = saved
     content = json.loads((folder / 'discovery.json').read_text())
     assert content['format'] == 'remaster-discovery/1'
@@ -49,7 +49,7 @@ def test_discovery_json_has_what_the_contract_asks(saved):
     assert read_discovery(folder / 'discovery.json') == content
 
 
-def test_the_report_needs_nothing_else_and_says_the_cause(saved):
+def test_the_report_needs_nothing_else_and_names_the_cause(saved):
     found, folder = saved
     page = (folder / 'report.html').read_text()
     assert not re.findall(r'(?:src|href)="(?!#)[^"]', page)
