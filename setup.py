@@ -24,7 +24,7 @@ JAZZY = [
     )
 ]
 
-# What judges in the tests: clients and readers of others, and their statistics and kinematics.
+# What judges in the tests: clients and readers of others, and their distances between bodies.
 JUDGES = [
     'NatNetClient==0.8.3',
     'natnet==0.3.0',

@@ -80,7 +80,7 @@ class Hosts:
 
 
 def run(*command: str) -> None:
-    """Run a command; say what it said where it fails."""
+    """Run a command; if it fails, raise an error with its output."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f'{" ".join(command)}: {done.stderr.strip()}')
@@ -208,7 +208,7 @@ class Watch:
         os.set_blocking(self._lines.fileno(), False)  # type: ignore[union-attr]
 
     def look(self) -> None:
-        """Take in what has been said."""
+        """Read the new lines of output."""
         while line := self._lines.readline():  # type: ignore[union-attr]
             if line.startswith('{'):
                 values = json.loads(line)
@@ -230,7 +230,7 @@ class Watch:
             time.sleep(0.1)
 
     def progress(self) -> str:
-        """Return how far the planner is, and what everyone says."""
+        """Return how far the planner is, and the last message of every node."""
         planner = self.said.get('pose_planner', {})
         done, planned = planner.get('configurations_done'), planner.get('configurations')
         messages = {name: values['message'] for name, values in self.said.items()}

@@ -132,7 +132,7 @@ def pinned_truth(model: Model, truth: SessionTruth) -> FloatArray:
 
 
 def cramer_rao_std(found: Estimate, truth: SessionTruth) -> FloatArray:
-    """Return the bound of the model's pinned parameters, (size,); NaN where nothing tells."""
+    """Return the bound of the model's pinned parameters, (size,); NaN where there is none."""
     model = found.model
     rows = Rows.of(found.problem.measurements, found.problem.fitted, model.reference)
     z = pinned_truth(model, truth)

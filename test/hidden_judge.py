@@ -94,7 +94,7 @@ def _claimed(effect: Any) -> list[Cause]:
 def _forgiven(
     oracle: Oracle, missing: dict[Cause, HiddenEffect], extra: dict[Cause, list[Any]]
 ) -> bool:
-    """Whether what was named instead of the missing cannot be told from them, and says so."""
+    """Whether the causes named in place of missing ones are look-alikes, and listed as such."""
     if len(missing) != len(extra):
         return False
     rivals = [rival for claims in extra.values() for claim in claims for rival in _parts(claim)]

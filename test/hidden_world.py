@@ -3,7 +3,7 @@
 Its kinematics and gravity are pinocchio's (`hidden_arm`); the effects and the least squares that
 measure them are those of the fakes (`remaster_ros.simulation.hidden_effects`, `.world_model`),
 which share no code with what estimates either. Only `hidden_tours`, which chooses the
-configurations, asks the robot's own software, as a real cell does.
+configurations, uses the package's planning, as a real cell does.
 
 A world predicts what every sensor sees of an arm with any effects. `measure` adds noise and
 returns the session, with no more in it than a recorded one, and the truth, for the judges alone.

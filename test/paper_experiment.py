@@ -38,10 +38,10 @@ def sensor_frames() -> dict[str, FloatArray]:
 
 @cache
 def pose_pool(candidates: int = 600, seed: int = 0) -> tuple[FloatArray, ...]:
-    """Return joint solutions (m, k), m >= 2, of poses planned as section III of the paper says."""
+    """Return joint solutions (m, k), m >= 2, of poses planned as in section III of the paper."""
     rng = np.random.default_rng(seed)
     places = {name: frame[:3, 3] for name, frame in sensor_frames().items()}
-    plan = CELL.scene(CHAIN).plan(candidates, places, rng)
+    plan = CELL.planning_scene(CHAIN).plan(candidates, places, rng)
     return tuple(pose.solutions for pose in plan.poses if len(pose.solutions) > 1)
 
 

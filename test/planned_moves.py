@@ -26,7 +26,7 @@ def tours(
             T_R_N[name] = np.eye(4)
             T_R_N[name][:3, 3] = sensor.rough_position_m
         start = time.thread_time()
-        planner = TourPlanner(cell.scene(chain), counts, seed)
+        planner = TourPlanner(cell.planning_scene(chain), counts, seed)
         tour = planner.collection(T_R_N)
         planning.append(time.thread_time() - start)
         dropped.update(tour.dropped_solutions)

@@ -152,18 +152,15 @@ def _linear_markers(
     """
     sensors, markers = int(sensor.max()) + 1, len(nominal)
     design = np.zeros((len(measured), 3, 12 * sensors + 3 * markers))
-    rotations = tool[:, :3, :3]
     for index in range(sensors):
-        mine = sensor == index
+        mine, start = sensor == index, 12 * index
         centred = measured[mine] - measured[mine].mean(axis=0)
-        for axis in range(3):
-            start = 12 * index + 3 * axis
-            design[mine, axis, start : start + 3] = -centred
-            design[mine, axis, 12 * index + 9 + axis] = -1.0
+        turned = np.einsum('ab,nc->nabc', -np.eye(3), centred)
+        design[mine, :, start : start + 9] = turned.reshape(-1, 3, 9)
+        design[mine, :, start + 9 : start + 12] = -np.eye(3)
     for index in range(markers):
-        start = 12 * sensors + 3 * index
-        mine = marker == index
-        design[mine, :, start : start + 3] = rotations[mine]
+        mine, start = marker == index, 12 * sensors + 3 * index
+        design[mine, :, start : start + 3] = tool[mine, :3, :3]
     # Unknown marker = nominal + shift, the shift known to be small.
     target = -apply(tool, nominal[marker])
     root = np.ones(len(measured))
@@ -191,11 +188,12 @@ def _refined(
     extension stays where it was linearised.
     """
     free = np.setdiff1d(np.arange(model.core), (0, model.joints - 1))
-    damping = 1e-6
+    least_damping = 1e-6
+    sizes = [span.stop - span.start for _, span in rows.spans]
     errors = rows.target - model.predict(z, rows)
     spread = robust_spread(errors, rows)
     for _ in range(60):
-        scale = np.repeat(spread, [span.stop - span.start for _, span in rows.spans])
+        scale = np.repeat(spread, sizes)
         weight = 1.0 / (1.0 + _squares(errors) / (CAUCHY_WIDTH * scale) ** 2) / scale**2
         derivative = model.jacobian(z, rows)[:, :, free]
         residual, by_z = prior_rows(model, priors, z)
@@ -204,24 +202,20 @@ def _refined(
         g = weighted.T @ errors.ravel() - by_z[:, free].T @ residual
         diagonal = np.diag(H) + 1e-9 * np.max(np.diag(H))
         cost = _cost(errors, scale, residual)
-        improved = False
-        for _ in range(12):
-            trial = z.copy()
+        for damping in least_damping * 10.0 ** np.arange(12):
             step = np.linalg.solve(H + damping * np.diag(diagonal), g)
+            trial = z.copy()
             trial[free] += step
             trial_errors = rows.target - model.predict(trial, rows)
             if _cost(trial_errors, scale, prior_rows(model, priors, trial)[0]) < cost:
-                improved = True
                 break
-            damping *= 10.0
-        if not improved:
+        else:
             break
-        z, errors, damping = trial, trial_errors, max(damping / 10.0, 1e-12)
+        z, errors, least_damping = trial, trial_errors, max(damping / 10.0, 1e-12)
         before, spread = spread, robust_spread(errors, rows)
         settled = np.all(np.abs(spread - before) < 1e-3 * before)
         if settled and np.sqrt(step @ H @ step) < 1e-2 * np.sqrt(len(step)):
             break
-    sizes = [span.stop - span.start for _, span in rows.spans]
     return z, float(np.dot(sizes, np.log(spread)))
 
 

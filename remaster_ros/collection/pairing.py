@@ -175,7 +175,7 @@ class Pairing:
             Sensors that are not there at all now: a required one is waited for, and the time is
             not counted; another one is left out.
         message_counts
-            How many messages each sensor's node has sent (`Presence.words`); without it, or for
+            How many messages each sensor's node has sent (`Liveness.reports`); without it, or for
             a sensor that is not in it, a time without messages is not counted.
         """
         passed = max(now_s - self._looked_s, 0.0)

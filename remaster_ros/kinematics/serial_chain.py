@@ -71,8 +71,8 @@ class SerialChain:
     ) -> SerialChain:
         """Read the chain from URDF text.
 
-        Joints off the chain (a gripper's fingers, say) count as fixed at zero: their masses hang
-        on the link that carries them.
+        Joints off the chain (such as a gripper's fingers) count as fixed at zero: their masses
+        belong to the link that carries them.
 
         Parameters
         ----------
@@ -115,15 +115,15 @@ class SerialChain:
 
         first_moments, masses = _carried_masses(model, moving)
         with_mass = np.where(masses > 0.0, masses, 1.0)
-        limits = [_limits(joint) for joint in moving]
+        lower, upper, velocity_limits = np.transpose([_limits(joint) for joint in moving])
         return cls(
             name=model.name,
             joint_names=tuple(joint.name for joint in moving),
             base_link=base_link,
             tip_link=tip_link,
-            lower=np.array([lower for lower, _, _ in limits]),
-            upper=np.array([upper for _, upper, _ in limits]),
-            velocity_limits=np.array([velocity for _, _, velocity in limits]),
+            lower=lower,
+            upper=upper,
+            velocity_limits=velocity_limits,
             T_fixed=np.array(T_fixed),
             axes=np.array([joint.axis for joint in moving]),
             masses=masses,
@@ -152,7 +152,7 @@ class SerialChain:
         )
 
     def within_limits(self, q: ArrayLike, tolerance: float = 0.0) -> BoolArray:
-        """Tell whether all joints of q (..., k) are within limits (+ tolerance, rad), (...)."""
+        """Return whether all joints of q (..., k) are within limits (+ tolerance, rad), (...)."""
         q = np.asarray(q, dtype=float)
         inside = (q >= self.lower - tolerance) & (q <= self.upper + tolerance)
         return np.all(inside, axis=-1)

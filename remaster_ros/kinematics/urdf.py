@@ -1,7 +1,7 @@
 """A strict reader of URDF text: the links, joints, limits and masses, nothing else.
 
-Meshes, materials and the like are passed over. What does not fit is refused with one line that
-names the joint or link; nothing is guessed.
+Meshes, materials and the like are ignored. Text that is wrong is refused with one line that names
+the joint or link; nothing is guessed.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def parse_urdf(text: str) -> UrdfModel:
 
 
 def _is_xacro(element: ElementTree.Element) -> bool:
-    """Tell an element of xacro's namespace, of which there are several spellings."""
+    """Return whether an element is of xacro's namespace, of which there are several spellings."""
     # Comments have a function for their tag.
     tag = element.tag if isinstance(element.tag, str) else ''
     return tag.startswith('{') and tag.partition('}')[0].endswith('xacro')
@@ -195,7 +195,7 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
     for key in ('lower', 'upper', 'velocity'):
         written = None if limit is None else limit.get(key)
         limits[key] = None if written is None else _number(written, f'{key} of {where}', _NO_LIMIT)
-    _check_what_is_passed_over(element, where)
+    _check_unused_numbers(element, where)
     return UrdfJoint(
         name=name,
         kind=kind,
@@ -210,8 +210,8 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
     )
 
 
-def _check_what_is_passed_over(element: ElementTree.Element, where: str) -> None:
-    """Refuse numbers that are none where this reader needs none, but a calibrated copy does."""
+def _check_unused_numbers(element: ElementTree.Element, where: str) -> None:
+    """Refuse text that is no number where only `compensation.export` needs the number."""
     for tag, keys in (
         ('mimic', ('multiplier', 'offset')),
         ('safety_controller', ('soft_lower_limit', 'soft_upper_limit')),
@@ -255,11 +255,11 @@ def attribute(element: ElementTree.Element, key: str, where: str) -> str:
 
 def numbers(text: str, count: int, what: str) -> FloatArray:
     """Return so many numbers, (count,); `what` names them in messages."""
-    words = text.split()
-    if len(words) != count:
+    parts = text.split()
+    if len(parts) != count:
         needed = 'three numbers are needed' if count == 3 else f'{count} is needed'
         raise InputError(f"URDF: {what} is '{text}'; {needed}")
-    return np.array([_number(word, what) for word in words])
+    return np.array([_number(part, what) for part in parts])
 
 
 def _number(text: str, what: str, largest: float = _LARGEST) -> float:

@@ -377,14 +377,14 @@ class ArmSupervisor:
 
     def _halt(self, reason: str, stop_wall_s: float | None = None) -> list[Action]:
         """Halt; with a time the arm is stopped first, where it is known to follow its path."""
-        actions: list[Action] = []
+        stops: list[Stop] = []
         seen = self._seen
         if stop_wall_s is not None and seen is not None and self._motion.is_moving:
             known = not self._motion.lost(seen, stop_wall_s)
-            actions += self._motion.stop(reason, seen, stop_wall_s, self._rate) if known else []
+            stops = self._motion.stop(reason, seen, stop_wall_s, self._rate) if known else []
         self.halted = reason
         self._motion.visit, self._queue.pending = None, None
-        return [*actions, Halted(reason)]
+        return [*stops, Halted(reason)]
 
     def _stop(self, reason: str, wall_s: float) -> list[Action]:
         """Stop an arm that is on its way; the configuration is commanded again later.

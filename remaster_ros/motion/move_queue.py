@@ -113,6 +113,6 @@ class MoveQueue:
 
 
 def _probe(q: FloatArray, limits: MotionLimits) -> FloatArray:
-    """Return a place a micrometre away: no measurement comes back to it to the bit."""
+    """Return a place a microradian away: a measurement does not agree with it to the last bit."""
     low, high = np.clip((limits.lower, limits.upper), -1e3, 1e3)
     return q + np.where(2 * q > low + high, -PROBE_RAD, PROBE_RAD)

@@ -108,7 +108,7 @@ class PosePlanner(RemasterNode):
             'validation': self.p.validation_candidates,
             REGISTRATION: self.p.registration_candidates,
         }
-        scene = self.cell.scene(self.chain, np.deg2rad(self.p.limit_margin_deg))
+        scene = self.cell.planning_scene(self.chain, np.deg2rad(self.p.limit_margin_deg))
         self._tours = TourPlanner(scene, counts, self.p.seed, self.p.reference_every)
         self._planning = PlanningThread()
         model = self._tours.model

@@ -79,7 +79,7 @@ class PreflightMonitor:
         read_age_s = float(self._values('recorder').get(f'read_age_s_{name}', 'inf'))
         return SensorFacts(
             name=name,
-            said_age_s=self._age_s(key),
+            node_age_s=self._age_s(key),
             ready=self._values(key).get('ready') == 'yes',
             message=self._values(key).get('trouble', ''),
             read_age_s=0.0 if seen_before else read_age_s + self._age_s('recorder'),

@@ -335,7 +335,7 @@ class Recorder(RemasterNode):
         self._check_files()
         if self._taking is not None:
             self._shots.look(self._taking.pairing, absent)
-            self._taking.pairing.give_up(self._now, absent, self._liveness.words)
+            self._taking.pairing.give_up(self._now, absent, self._liveness.reports)
             self._finish_if_complete()
         self._look_again()
         self._take_next()

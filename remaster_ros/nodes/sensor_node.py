@@ -105,7 +105,8 @@ class SensorNode(RemasterNode):
                 else:
                     self._open()
         except Exception as error:
-            self.failure = fault_of_this_program(error)
+            if not self._ending.is_set():
+                self.failure = fault_of_this_program(error)
 
     def _open(self) -> None:
         """Try to open the device; the first time until the start time-out."""

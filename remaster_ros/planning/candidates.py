@@ -115,8 +115,8 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Scene:
-    """An arm before its sensors: all that poses are planned from.
+class PlanningScene:
+    """All that poses are planned from: an arm, what it can hit, and the sensors before it.
 
     Attributes
     ----------

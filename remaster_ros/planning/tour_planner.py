@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from remaster_ros.errors import InsufficientDataError
-from remaster_ros.planning.candidates import Plan, PlannedPose, Scene, order_solutions
+from remaster_ros.planning.candidates import Plan, PlannedPose, PlanningScene, order_solutions
 from remaster_ros.planning.free_order import free_way
 from remaster_ros.planning.reference_choice import choose_references
 from remaster_ros.planning.tour_order import (
@@ -28,7 +28,7 @@ class TourPlanner:
     Parameters
     ----------
     scene
-        The arm before its sensors.
+        The arm, what it can hit, and the sensors.
     counts
         Candidate poses of each split, the registration's among them.
     seed
@@ -43,7 +43,7 @@ class TourPlanner:
     """
 
     def __init__(
-        self, scene: Scene, counts: Mapping[str, int], seed: int, reference_every: int = 0
+        self, scene: PlanningScene, counts: Mapping[str, int], seed: int, reference_every: int = 0
     ) -> None:
         self._scene, self._counts, self._seed = scene, counts, seed
         self._every = reference_every

@@ -308,6 +308,8 @@ def checked(content: Mapping[str, Any], schema: type[Content]) -> Content:
 def _plain(values: Any) -> Any:
     if isinstance(values, np.ndarray | np.generic):
         return values.tolist()
+    if isinstance(values, Mapping):
+        return dict(values)
     raise NotImplementedError(f'no JSON for {type(values)}')
 
 

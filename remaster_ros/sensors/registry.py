@@ -18,8 +18,8 @@ GENERIC = 'sensor_markers'
 
 
 def kind_of(node_name: str) -> str:
-    """Return the key of `DRIVERS` with which a node's name begins; '' for none."""
-    return next((kind for kind in DRIVERS if node_name.startswith(kind)), '')
+    """Return the longest key of `DRIVERS` with which a node's name begins; '' for none."""
+    return max((kind for kind in DRIVERS if node_name.startswith(kind)), key=len, default='')
 
 
 def load_driver(node_name: str) -> type[Driver]:

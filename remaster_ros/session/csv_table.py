@@ -81,14 +81,9 @@ class Table:
         result = np.empty((self.rows, len(columns)))
         for i, column in enumerate(columns):
             cells = self.cells[column]
-            empty = 0
+            empty, blank = (cells.count(''), 'nan') if optional else (0, '')
             try:
-                if optional:
-                    values = [float(cell) if cell else math.nan for cell in cells]
-                    empty = cells.count('')
-                else:
-                    values = list(map(float, cells))
-                result[:, i] = values
+                result[:, i] = [float(cell or blank) for cell in cells]
             except ValueError:
                 raise self._not_a_number(column, optional) from None
             # float() also reads nan, inf, 1_000, blanks and other scripts' digits.

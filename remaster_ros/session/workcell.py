@@ -18,7 +18,12 @@ from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_rpy, transform
 from remaster_ros.kinematics.urdf_geometry import MeshReader, chain_bodies
-from remaster_ros.planning.candidates import LIMIT_MARGIN_RAD, LineOfSight, PoseRanges, Scene
+from remaster_ros.planning.candidates import (
+    LIMIT_MARGIN_RAD,
+    LineOfSight,
+    PlanningScene,
+    PoseRanges,
+)
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.meshes import mesh_reader
 from remaster_ros.session.reader import URDF_LIMIT
@@ -229,13 +234,13 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
             link_radius=self.link_radius_m,
         )
 
-    def scene(
+    def planning_scene(
         self,
         chain: SerialChain,
         limit_margin_rad: float = LIMIT_MARGIN_RAD,
         *,
         without_meshes: bool = False,
-    ) -> Scene:
+    ) -> PlanningScene:
         """Return what the poses of this cell are planned from; arguments and errors as above."""
         sights = [
             LineOfSight(
@@ -247,7 +252,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
             )
             for name, sensor in self.sensors.items()
         ]
-        return Scene(
+        return PlanningScene(
             InverseKinematics(chain, self.held(chain)),
             self.collision_model(chain, without_meshes=without_meshes),
             self.poses.ranges(),

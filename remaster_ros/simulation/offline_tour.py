@@ -43,7 +43,7 @@ def plan_tour(
     InputError
         No closed form for this robot, or no pose to fit that it can take.
     """
-    scene = cell.scene(chain, without_meshes=without_meshes)
+    scene = cell.planning_scene(chain, without_meshes=without_meshes)
     sensors_R = scene.rough_R
     if places is not None:
         sensors_R = {name: T_R_N[:3, 3] for name, T_R_N in places.items()}

@@ -164,7 +164,7 @@ def test_an_error_of_a_joint_turns_the_marker_about_its_axis(iiwa: HiddenWorld) 
 
 
 @pytest.mark.parametrize('kind', [*NAMED, *UNNAMED])
-def test_every_effect_has_the_size_asked_for(kind: str, iiwa: HiddenWorld) -> None:
+def test_every_effect_has_the_given_size(kind: str, iiwa: HiddenWorld) -> None:
     seed = 11
     print(f'seed {seed}')
     effect = draw_effect(iiwa, kind, np.random.default_rng(seed), 0.3e-3)
@@ -201,7 +201,7 @@ def test_true_values_have_the_names_that_discovery_gives_them(
         assert part.joints in ((), *((joint,) for joint in effect.joints))
 
 
-def test_noise_is_what_was_asked_for() -> None:
+def test_noise_has_the_given_size_and_shape() -> None:
     hidden = world('lwr4plus', np.random.default_rng(13))
     noise = Noise(0.2e-3, 0.4e-3, depth_ratio=3.0, range_power=2.0, outlier_share=0.03)
     session, truth = hidden.measure((), noise, np.random.default_rng(17))
@@ -238,7 +238,7 @@ def test_every_effect_of_the_table_can_be_drawn() -> None:
     assert set(DRAWS) == set(NAMED) | set(UNNAMED)
 
 
-def test_the_oracle_finds_what_it_says_it_finds() -> None:
+def test_the_oracle_has_the_power_that_it_computes() -> None:
     """At its size for 90 % the best test finds 90 %, and 2 % where nothing is.
 
     Of 200 sessions each; four binomial standard deviations are allowed (2e-4 to fail).

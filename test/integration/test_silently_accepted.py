@@ -93,7 +93,7 @@ def test_ten_degrees_are_not_simulated(tmp_path: Path) -> None:
     assert '--offset-std-deg: 10 is more than 2 deg' in line
 
 
-def test_ten_degrees_that_a_fit_finds_are_said_loudly(tmp_path: Path) -> None:
+def test_offsets_of_ten_degrees_lead_to_a_warning(tmp_path: Path) -> None:
     robot = robot_descriptions.ur5e()
     chain = read_chain(robot.urdf, tmp_path, robot.base_link, robot.tip_link)
     rng = np.random.default_rng(3)
@@ -216,7 +216,7 @@ def test_a_robot_that_the_links_do_not_fit_is_named(tmp_path: Path) -> None:
 def test_seven_joints_of_which_the_wrong_one_is_held(
     robot: str, held: str, tmp_path: Path
 ) -> None:
-    """The error says which may be; with one of those there is a session."""
+    """The error lists what is allowed; with one of those there is a session."""
     description = {'panda': robot_descriptions.panda, 'xarm7': robot_descriptions.xarm7}[robot]()
     (tmp_path / 'arm.urdf').write_text(description.urdf, encoding='utf-8')
 

@@ -226,6 +226,6 @@ def test_a_replay_at_ten_times_the_speed_gives_the_same_session_and_fit(
 
 
 def test_nothing_the_estimate_saw_holds_the_truth(demo):
-    """Neither the session nor what the nodes were told names the hidden World."""
+    """Neither the session nor the parameters of the nodes name the hidden world."""
     assert 'joint_offsets' not in (demo[0] / 'session' / 'session.yaml').read_text()
     assert not [path for path in (demo[0] / 'session').rglob('*') if 'world' in path.name]

@@ -310,7 +310,7 @@ def test_a_fault_of_natnetclient_never_becomes_a_reading(monkeypatch, fault):
     assert client.status().accepted == 0
 
 
-def test_the_natnetclient_backend_says_when_the_package_is_missing(monkeypatch):
+def test_the_natnetclient_backend_reports_a_missing_package(monkeypatch):
     monkeypatch.setitem(sys.modules, 'natnetclient', None)
     with pytest.raises(InputError, match='pip install natnetclient'):
         NatNetClientBackend(NatNetSettings(transport='unicast'), print)

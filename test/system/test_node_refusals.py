@@ -1,4 +1,4 @@
-"""A node that cannot work says so in one line and ends with status 2."""
+"""A node that cannot work ends with one error line and status 2."""
 
 import socket
 import subprocess
@@ -116,7 +116,7 @@ sys.exit(run(Busy, threads=2))
 """
 
 
-def test_a_node_that_ends_while_callbacks_are_queued_says_nothing(ros_environment):
+def test_a_node_that_ends_while_callbacks_are_queued_prints_nothing(ros_environment):
     done = subprocess.run(
         [sys.executable, '-c', QUEUED],
         env=ros_environment,

@@ -1,7 +1,7 @@
-"""A sensor's node with a simulated clock that nobody publishes yet says so, and stamps nothing.
+"""A sensor's node reports a simulated clock that is not published yet, and stamps nothing.
 
-A node that is started again in a running simulation hears the clock late; what it measured until
-then would be stamped with the beginning of time.
+A node that is started again in a running simulation receives the clock late; what it measured
+until then would be stamped with the beginning of time.
 """
 
 import signal
@@ -62,7 +62,7 @@ def until_it_says(client, said, node, ready, words, turn=lambda: None):
 
 
 def follow_the_clock(client, said, node):
-    """Check what a node says before there is a clock, and when there is one."""
+    """Check what a node reports before there is a clock, and when there is one."""
     from rosgraph_msgs.msg import Clock
 
     until_it_says(client, said, node, 'no', 'who publishes /clock?')

@@ -1,4 +1,4 @@
-"""Two complete cells in two namespaces of one DDS domain: neither ever hears the other."""
+"""Two complete cells in two namespaces of one DDS domain: neither affects the other."""
 
 import socket
 
@@ -119,7 +119,7 @@ def test_two_cells_in_one_domain(start, client, tmp_path, ros_environment):
         lambda: all(cell.says('recorder', 'exit_status') == 'complete' for cell in cells),
         'both to be complete',
     )
-    # What nodes of one cell publish or subscribe to, nobody of the other does.
+    # No topic has publishers or subscribers of both cells.
     for topic, kinds in client.get_topic_names_and_types():
         if topic in ('/rosout', '/parameter_events'):
             continue

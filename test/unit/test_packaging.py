@@ -23,7 +23,6 @@ EXECUTABLES = {
     'robot_bridge',
     'optitrack_markers',
     'laser_tracker_markers',
-    'sensor_markers',
     'recorder',
     'optimizer',
     'replay',
@@ -139,7 +138,7 @@ def test_package_xml_names_every_requirement_or_how_to_get_it(
 ) -> None:
     """What rosdep cannot install stands in a comment, as one command."""
     text = (ROOT / 'package.xml').read_text(encoding='utf-8')
-    command = re.search(r'pip install -c constraints-ros\.txt ([A-Za-z\s-]+)\(', text)
+    command = re.search(r'pip install -c constraints-ros\.txt ([A-Za-z\s-]+)', text)
     assert command is not None
     by_pip = {normal(name) for name in command[1].split()}
     depends = {

@@ -388,7 +388,7 @@ def test_a_recorder_that_does_not_answer_loses_the_configuration_and_not_the_run
     settled = rig.t
     rig.run(40.0, lambda: rig.said(Failed))
     assert rig.last(Failed).solution == 0
-    assert rig.last(Failed).reason == 'the recorder did not say what became of it'
+    assert rig.last(Failed).reason == 'the recorder did not answer in time'
     assert RULES.answer_timeout_s < rig.t - settled < RULES.answer_timeout_s + 0.1
     rig.run(20.0, lambda: len(rig.said(Settled)) == 2)
     assert not rig.said(Halted, Stop)

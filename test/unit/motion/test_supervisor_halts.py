@@ -724,7 +724,7 @@ def test_a_recorder_that_does_not_answer_is_no_failure_of_the_robot(rig):
     """However often: each configuration was reached."""
     rig.plan(*([0.1 * i, 0.3] for i in range(5)))
     rig.run(150.0, lambda: len(rig.said(Failed)) == 4)
-    assert {f.reason for f in rig.said(Failed)} == {'the recorder did not say what became of it'}
+    assert {f.reason for f in rig.said(Failed)} == {'the recorder did not answer in time'}
     assert [f.solution for f in rig.said(Failed)] == [0, 1, 2, 3]
     assert not rig.said(Halted)
 

@@ -258,10 +258,14 @@ def test_the_driver_is_given_the_expected_place(rig):
     np.testing.assert_allclose(r.driver.expected, [-2.1, 0.0, 0.5], atol=1e-12)
 
 
-def test_the_name_of_the_node_chooses_the_driver(rig):
+def test_the_name_of_the_node_chooses_the_driver(rig, monkeypatch):
     with pytest.raises(InputError, match='leica: the name of the node chooses its driver'):
         rig(Probe, name='leica')
     assert registry.kind_of('laser_tracker_markers_left') == 'laser_tracker_markers'
+    monkeypatch.setitem(registry.DRIVERS, 'laser', 'laser.driver:Laser')
+    assert registry.kind_of('laser_tracker_markers') == 'laser_tracker_markers'
+    assert registry.kind_of('laser_2') == 'laser'
+    monkeypatch.delitem(registry.DRIVERS, 'laser')
     for kind in registry.DRIVERS:
         if kind != 'gauge':
             assert issubclass(registry.load_driver(kind), StreamDriver | TriggeredDriver)

@@ -9,7 +9,6 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics import body_pairs
 from remaster_ros.kinematics.collision import CollisionModel, arm_bodies
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
-from remaster_ros.kinematics.line_of_sight import LinkCapsules
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning import candidates
 from remaster_ros.planning.candidates import (
@@ -150,7 +149,7 @@ def test_a_link_in_the_line_of_sight_drops_the_solution(ik):
     T = ik.chain.forward(q)
     marker = np.array([0.1, 0, 0.02])
     arm = capsules(ik.chain)
-    elbow = LinkCapsules(ik.chain).points(q)[4]
+    elbow = ik.chain.frames(q)[3, :3, 3]
     at = ik.chain.positions(q, marker)
     sight = LineOfSight('mocap', at + 3 * (elbow - at), marker, max_angle_rad=np.pi)
     plan = plan_poses(ik, arm, T[None], [sight])
