@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from math import nan
 from typing import Any, Literal
 
 import numpy as np
@@ -30,10 +31,13 @@ class MarkerReading:
         Time of capture, s.
     position
         Marker position in N, m, shape (3,).
+    temperature_c
+        Of the air, by the sensor's own thermometer; NaN where it has none.
     """
 
     stamp_s: float
     position: FloatArray
+    temperature_c: float = nan
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from remaster_ros.simulation.simulated_workcell import (
     choose_robot,
     choose_sensors,
     simulate_workcell,
-    truth_to_dict,
 )
+from remaster_ros.simulation.truth import truth_to_dict
 
 TRUTH_FILE = 'truth.json'
 
@@ -113,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
             measuring=lambda: progress('measuring', 0.9),
         )
         write_session(args.out, made.session)
-        truth = truth_to_dict(made.truth, chain, args.seed, made.hidden)
+        truth = truth_to_dict(made.truth, chain, args.seed)
         write_atomically(args.out / TRUTH_FILE, json.dumps(truth, indent=2) + '\n')
     say(args.quiet, made.tour.describe())
     say(args.quiet, f'written: {args.out}, {len(made.session.measurements)} observations')

@@ -31,13 +31,14 @@ from std_srvs.srv import Trigger
 from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
 from remaster_ros.nodes.messages import JointOrder, transform_array
 from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.planning_thread import PlanningThread
 from remaster_ros.nodes.pose_publisher import PEERS, PosePublisher
 from remaster_ros.nodes.preflight_monitor import PreflightMonitor
 from remaster_ros.nodes.run_token import LivingRun, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, Event, NodeStatus, listen
-from remaster_ros.nodes.tour_planner import PlanningThread, TourPlanner
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, PoseVisit
+from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanJournal
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
@@ -107,10 +108,8 @@ class PosePlanner(RemasterNode):
             'validation': self.p.validation_candidates,
             REGISTRATION: self.p.registration_candidates,
         }
-        margin = np.deg2rad(self.p.limit_margin_deg)
-        self._tours = TourPlanner(
-            self.cell, self.chain, counts, self.p.seed, margin, self.p.reference_every
-        )
+        scene = self.cell.planning_scene(self.chain, np.deg2rad(self.p.limit_margin_deg))
+        self._tours = TourPlanner(scene, counts, self.p.seed, self.p.reference_every)
         self._planning = PlanningThread()
         model = self._tours.model
         self.journal = PlanJournal(Path(self.p.session), self._settings(), self.chain, model)

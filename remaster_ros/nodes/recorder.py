@@ -43,7 +43,7 @@ from remaster_ros.nodes.triggered_sensors import TriggeredSensors
 from remaster_ros.nodes.watching import Watching
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.session.session_journal import SessionJournal
-from remaster_ros.session.session_writer import ExitStatus
+from remaster_ros.session.session_yaml import ExitStatus
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray, MarkerReading, Measurements, Session
 

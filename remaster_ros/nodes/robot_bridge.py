@@ -47,6 +47,7 @@ from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import LEASED, RELIABLE, Event, NodeStatus, listen
 from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
+from remaster_ros.sensors.registry import kind_of
 from remaster_ros.session.halt_file import HaltFile
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
@@ -71,8 +72,8 @@ KNOWN_OFFSET_RAD = float(np.deg2rad(0.1))
 """What may still be wrong with a joint whose offset is in use, for the clearance of paths."""
 OFFSET_STDS = 3.0
 """Or so many standard deviations of the offset that is known least."""
-LISTENERS = ('robot_bridge', 'recorder', 'laser_tracker_markers')
-"""Nodes of ours that listen to what a controller is told."""
+LISTENERS = ('robot_bridge', 'recorder')
+"""Nodes of ours that listen to what a controller is told; those of sensors do so as well."""
 
 
 class RobotBridge(RemasterNode):
@@ -277,7 +278,8 @@ class RobotBridge(RemasterNode):
     def _controller_is_listed(self) -> bool:
         """Whether somebody else than nodes of ours listens to the commands."""
         found = self.get_subscriptions_info_by_topic(self.resolve_topic_name(COMMANDS))
-        return any(info.node_name not in LISTENERS for info in found)
+        names = [info.node_name for info in found]
+        return any(name not in LISTENERS and not kind_of(name) for name in names)
 
     # What goes out
 

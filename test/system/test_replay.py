@@ -16,7 +16,7 @@ NAMES = list(read_cell('demo').chain().joint_names)
 
 @pytest.fixture(params=[pytest.param('old', marks=pytest.mark.qualify), 'new'])
 def bag(request, tmp_path):
-    """Two seconds of an arm and of what it was told, as bags have held it before, and do now."""
+    """Two seconds of an arm and its commands, as older bags hold them and as bags do now."""
     from rclpy.serialization import serialize_message
     from sensor_msgs.msg import JointState
     from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -79,7 +79,7 @@ def test_commands_are_left_out(start, client, bag):
 
 
 @pytest.mark.parametrize('more', [(), ('--with-commands',)])
-def test_a_controller_that_listens_is_never_told(start, client, bag, more):
+def test_a_controller_that_subscribes_receives_no_command(start, client, bag, more):
     from trajectory_msgs.msg import JointTrajectory
 
     heard = []
@@ -91,7 +91,7 @@ def test_a_controller_that_listens_is_never_told(start, client, bag, more):
 
 
 @pytest.mark.qualify
-def test_a_controller_that_comes_later_is_never_told(start, client, old_bag):
+def test_a_controller_that_subscribes_later_receives_no_command(start, client, old_bag):
     """Not one message reaches it: who is matched is looked at before each command."""
     from sensor_msgs.msg import JointState
     from trajectory_msgs.msg import JointTrajectory
@@ -154,7 +154,7 @@ def test_a_recorder_only_listens_and_writes_commands_under_another_name(
 
 @pytest.mark.qualify
 def test_another_namespace_is_another_graph(start, client, old_bag):
-    """A robot in /left does not keep a replay in /right from playing, nor hears it."""
+    """A robot in /left neither prevents a replay in /right nor receives its messages."""
     from sensor_msgs.msg import JointState
 
     heard = {'left': [], 'right': []}

@@ -15,7 +15,6 @@ from remaster_ros.planning.candidates import (
     LineOfSight,
     PoseRanges,
     candidate_poses,
-    order_by_proximity,
     order_solutions,
     plan_poses,
 )
@@ -164,12 +163,6 @@ def test_a_link_in_the_line_of_sight_drops_the_solution(ik):
 def test_no_candidates_make_an_empty_plan(ik):
     plan = plan_poses(ik, capsules(ik.chain), np.empty((0, 4, 4)), SIGHTS)
     assert (plan.poses, plan.dropped, plan.dropped_solutions) == ((), {}, {})
-
-
-def test_order_by_proximity_goes_to_the_nearest_that_is_left():
-    points = np.array([[0, 0, 0], [5, 0, 0], [1, 0, 0], [2.5, 0, 0], [-9, 0, 0]])
-    assert order_by_proximity(points, [1.2, 0, 0]).tolist() == [2, 0, 3, 1, 4]
-    assert order_by_proximity(np.empty((0, 3)), [0, 0, 0]).tolist() == []
 
 
 def test_order_solutions_is_by_travel_time_of_the_slowest_joint():
