@@ -178,14 +178,14 @@ class InverseKinematics:
         """Correct candidates (m, k) on the true model; return those that reach T."""
         missing = self._missing(q, T)
         for _ in range(NEWTON_STEPS):
-            wrong = np.max(_norms(missing), axis=0) > 0.01 * CERTIFIED
-            if not wrong.any():
+            wrong = np.flatnonzero(_size(missing) > 0.01 * CERTIFIED)
+            if not len(wrong):
                 break
             jacobian = self._jacobian(q[wrong])[..., self._free]
             step = np.linalg.pinv(jacobian, rcond=SINGULAR) @ missing[wrong, :, None]
-            q[np.ix_(wrong, self._free)] += step[..., 0]
+            q[wrong[:, None], self._free] += step[..., 0]
             missing[wrong] = self._missing(q[wrong], T)
-        return _wrapped(q[np.max(_norms(missing), axis=0) < CERTIFIED])
+        return _wrapped(q[_size(missing) < CERTIFIED])
 
     def _missing(self, q: FloatArray, T: FloatArray) -> FloatArray:
         """Return the screw motions in R that bring the tool at q (m, k) to T, (m, 6).
@@ -296,9 +296,9 @@ def _trial_values(chain: SerialChain, joint: int) -> list[float]:
     return [middle, *(v for v in (middle + np.pi / 6, middle - np.pi / 6) if low <= v <= high)]
 
 
-def _norms(twists: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the lengths of translation, m, and rotation, rad, each (m,)."""
-    return np.linalg.norm(twists[:, :3], axis=1), np.linalg.norm(twists[:, 3:], axis=1)
+def _size(twists: FloatArray) -> FloatArray:
+    """Return the larger of translation, m, and rotation, rad, of twists (m, 6), (m,)."""
+    return np.max(np.linalg.norm(twists.reshape(-1, 2, 3), axis=-1), axis=-1)
 
 
 def _wrapped(angles: FloatArray) -> FloatArray:

@@ -191,10 +191,10 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
         ends[end] = attribute(child, 'link', f'<{end}> of {where}')
     kind = attribute(element, 'type', where)
     limit = element.find('limit')
-    limits: dict[str, float | None] = {}
-    for key in ('lower', 'upper', 'velocity'):
-        written = None if limit is None else limit.get(key)
-        limits[key] = None if written is None else _number(written, f'{key} of {where}', _NO_LIMIT)
+    lower, upper, velocity = (
+        None if limit is None else _optional_number(limit, key, where)
+        for key in ('lower', 'upper', 'velocity')
+    )
     _check_unused_numbers(element, where)
     return UrdfJoint(
         name=name,
@@ -203,9 +203,9 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
         child=ends['child'],
         origin=origin_of(element, where),
         axis=_axis(element, kind, where),
-        lower=limits['lower'],
-        upper=limits['upper'],
-        velocity=limits['velocity'],
+        lower=lower,
+        upper=upper,
+        velocity=velocity,
         mimic=element.find('mimic') is not None,
     )
 
@@ -218,8 +218,7 @@ def _check_unused_numbers(element: ElementTree.Element, where: str) -> None:
     ):
         for found in element.findall(tag):
             for key in keys:
-                if (text := found.get(key)) is not None:
-                    _number(text, f'{key} of {where}', _NO_LIMIT)
+                _optional_number(found, key, where)
 
 
 def _axis(element: ElementTree.Element, kind: str, where: str) -> FloatArray:
@@ -260,6 +259,11 @@ def numbers(text: str, count: int, what: str) -> FloatArray:
         needed = 'three numbers are needed' if count == 3 else f'{count} is needed'
         raise InputError(f"URDF: {what} is '{text}'; {needed}")
     return np.array([_number(part, what) for part in parts])
+
+
+def _optional_number(element: ElementTree.Element, key: str, where: str) -> float | None:
+    text = element.get(key)
+    return None if text is None else _number(text, f'{key} of {where}', _NO_LIMIT)
 
 
 def _number(text: str, what: str, largest: float = _LARGEST) -> float:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics.bodies import Body, Shape, box, cylinder, hull, sphere
+from remaster_ros.kinematics.bodies import Body, Shape, box, capsule, cylinder, hull, sphere
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import inverse
 from remaster_ros.kinematics.urdf import attribute, numbers, origin_of, parse_urdf
@@ -56,14 +56,11 @@ def link_shapes(text: str, read_mesh: MeshReader) -> list[LinkShape]:
             try:
                 shape = _shape(geometry[0], where, read_mesh)
             except InputError as error:
-                raise InputError(_with_place(str(error), where)) from None
+                place = '' if where in str(error) else f'URDF: {where}: '
+                raise InputError(f'{place}{error}') from None
             if shape is not None:
                 found.append(LinkShape(name, origin_of(element, where), shape))
     return found
-
-
-def _with_place(message: str, where: str) -> str:
-    return message if where in message else f'URDF: {where}: {message}'
 
 
 def _shape(element: ElementTree.Element, where: str, read_mesh: MeshReader) -> Shape | None:
@@ -74,12 +71,10 @@ def _shape(element: ElementTree.Element, where: str, read_mesh: MeshReader) -> S
     if element.tag in ('cylinder', 'capsule'):
         radius = numbers(attribute(element, 'radius', where), 1, f'the radius of {where}')
         length = numbers(attribute(element, 'length', where), 1, f'the length of {where}')
-        if element.tag == 'cylinder':
-            return cylinder(radius[0], length[0])
+        core = cylinder(radius[0], length[0])
         # The few programs that write capsules mean the length without the round ends.
-        ends = np.array([[0, 0, -length[0] / 2], [0, 0, length[0] / 2]])
-        cylinder(radius[0], length[0])  # refuses sizes that are none
-        return Shape('capsule', ends, ball=float(radius[0]))
+        low, high = core.points
+        return core if element.tag == 'cylinder' else capsule(low, high, core.disc)
     if element.tag == 'mesh':
         vertices = read_mesh(attribute(element, 'filename', where))
         if vertices is None:

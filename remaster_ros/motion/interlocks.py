@@ -1,22 +1,22 @@
-"""What must be right before an arm may move: who is alive, what is observed, a person's word."""
+"""What must be right before an arm may move: live nodes, observations, a person's consent."""
 
 from __future__ import annotations
 
 import numpy as np
 
 NAMES = ('planner', 'recorder', 'robot')
-"""Who must be alive; their reasons not to move count in this order."""
+"""The nodes that must be live; their reasons not to move count in this order."""
 OBSERVED = ('safety_link', 'controller', 'clock', 'rivals')
 """What else must be right."""
 KNOWN_S = 1.0
-"""A planner's run that is met this soon after its first summary may be an old one: summaries that
-were under way while this process started come all at once, s of wall time."""
+"""A planner's run that appears this soon after its first summary may be an old one, because the
+summaries that were under way while this process started arrive together, s of wall time."""
 OWN_PAUSE_S = 0.5
-"""Between two looks at the clock passes less, s of wall time, or this process was paused."""
+"""If more passes between two looks at the clock, this process was paused, s of wall time."""
 
 
 class Interlocks:
-    """Reasons not to move, each by its origin, and when everybody was last heard.
+    """Reasons not to move, each by its origin, and when each origin last gave a sign of life.
 
     Parameters
     ----------
@@ -39,11 +39,11 @@ class Interlocks:
         self._looked_wall: float | None = None
 
     def note_alive(self, name: str, reason: str, wall_s: float) -> None:
-        """Take a sign of life, and why the arm must not move; '' if it may."""
+        """Process a sign of life, and why the arm must not move; '' if it may."""
         self._seen[name], self._reasons[name] = wall_s, reason
 
     def planner(self, reason: str, run: str, wall_s: float) -> bool:
-        """Take the planner's state; return whether another collection was begun.
+        """Process the planner's state; return whether another collection was begun.
 
         What `must_collect` waits for is another run than the last one, not a pause: a summary from
         before may come late.
@@ -70,32 +70,32 @@ class Interlocks:
         return began_another
 
     def set(self, name: str, reason: str) -> None:
-        """Take why the arm must not move; '' if it may."""
+        """Process why the arm must not move; '' if it may."""
         self._reasons[name] = reason
 
     def reason(self, name: str) -> str:
-        """Return what stands against a motion by one origin; ''."""
+        """Return why the arm must not move, by one origin; ''."""
         return self._reasons.get(name, '')
 
     def was_right(self, name: str) -> bool:
-        """Whether an origin was heard of and nothing stood against a motion."""
+        """Whether an origin was observed, and gave no reason against a motion."""
         return self._reasons.get(name) == ''
 
     def look(self, wall_s: float) -> None:
-        """Shift what was last heard where this process was paused: nobody else was silent."""
+        """Shift the last signs of life by a pause of this process: the others were not silent."""
         last, self._looked_wall = self._looked_wall, wall_s
         if last is None or wall_s - last <= OWN_PAUSE_S:
             return
         pause = wall_s - last
-        # Who was heard since is no exception, and nobody was heard in the future.
+        # Signs of life since then are shifted too, but not into the future.
         self._seen = {name: min(seen + pause, wall_s) for name, seen in self._seen.items()}
 
     def silence_s(self, name: str, wall_s: float) -> float:
-        """Return how long somebody was not heard, s; infinite if never."""
+        """Return the time since the last sign of life, s; infinite if there was none."""
         return wall_s - self._seen[name] if name in self._seen else np.inf
 
     def fell_silent(self, name: str, wall_s: float) -> str:
-        """Return in words that somebody who was heard is silent now; ''."""
+        """Return that an origin which gave signs of life is silent now; '' if it is not."""
         if name in self._seen and self.silence_s(name, wall_s) > self._heartbeat_s:
             return f'no sign of {name} for {self._heartbeat_s:g} s'
         return ''
