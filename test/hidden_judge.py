@@ -20,8 +20,9 @@ from hidden_oracle import Oracle
 from hidden_world import HiddenTruth, HiddenWorld
 from scipy.interpolate import BSpline
 
-from remaster_ros.simulation.expected_findings import Cause, causes, named_cause, true_parameters
-from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.simulation.expected_findings import Cause, causes, named_cause
+from remaster_ros.simulation.hidden_effect import HiddenEffect
+from remaster_ros.simulation.hidden_effects import true_parameters
 from remaster_ros.types import FloatArray
 
 INDISTINGUISHABLE = 4.0

@@ -9,12 +9,8 @@ from rich.console import Console
 from rich.table import Table
 
 from remaster_ros.nodes.status import Event
-from remaster_ros.simulation.expected_findings import (
-    causes,
-    describe,
-    named_cause,
-    true_parameters,
-)
+from remaster_ros.simulation.expected_findings import causes, describe, named_cause
+from remaster_ros.simulation.hidden_effects import true_parameters
 from remaster_ros.simulation.truth import SessionTruth
 
 

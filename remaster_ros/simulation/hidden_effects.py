@@ -3,151 +3,29 @@
 Nothing here is shared with the code that estimates (`discovery.effects`). An effect is linear in
 its values: `HiddenEffect.values` times what its rule adds to a `Deviation`. A rule reads the
 `Circumstances` of every configuration. `NAMED` are the effects with a name, `UNNAMED` are cells
-without one.
+without one. Compliance and thermal growth are drawn with the sign of physics.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
-from typing import Any
-
 import numpy as np
 
+from remaster_ros.simulation.hidden_effect import (
+    Circumstances,
+    Deviation,
+    DrawContext,
+    HiddenEffect,
+    HiddenKind,
+    at_some_time,
+    named,
+    no_joint,
+    of_sensor,
+    one_value,
+    two_joints,
+)
 from remaster_ros.types import FloatArray
 
 ARC_MINUTE = np.deg2rad(1.0 / 60.0)
-# A joint that moved less than this, rad, keeps the flank of its gears that it had.
-SLACK_RAD = 2e-4
-
-
-@dataclass(frozen=True, eq=False)
-class Circumstances:
-    """What effects may depend on at n configurations of k joints.
-
-    Attributes
-    ----------
-    q, move
-        Reported joint angles, and how far each joint came by its last move, rad, (n, k).
-    approach
-        Direction of each joint's last move that was a move at all, -1, 0 or 1, (n, k).
-    time_s, warming_k
-        Since the first measurement, (n,); the arm's temperature above its first, K, (n,).
-    torque, base_moment
-        Gravity's torque about each joint, (n, k), and about the base, N m, (n, 3).
-    segments
-        From each joint to the next, in the frame between, m, (k + 1, 3).
-    axes
-        Axis of each joint in its own frame, (k, 3).
-    tool
-        Rotation of the tool, (n, 3, 3).
-    """
-
-    q: FloatArray
-    move: FloatArray
-    approach: FloatArray
-    time_s: FloatArray
-    warming_k: FloatArray
-    torque: FloatArray
-    base_moment: FloatArray
-    segments: FloatArray
-    axes: FloatArray
-    tool: FloatArray
-
-
-@dataclass(eq=False)
-class Deviation:
-    """How the true arm and sensors differ from their drawings at n configurations.
-
-    Attributes
-    ----------
-    sensors
-        Names of the sensors.
-    angle
-        Added to the true joint angles, rad, (n, k).
-    shift
-        Added to each segment, in the frame after its joint (0: the base), m, (n, k + 1, 3).
-    tilt
-        Turns each joint's frame before its own turn, rad, (n, k, 3).
-    base
-        Turns the base about its origin, axes of R, rad, (n, 3).
-    marker
-        Added to the marker in the tool frame, m, (n, 3).
-    beside, scale, radial
-        What each sensor (s of them) adds to a point p that it measures, in its frame N: beside,
-        m, (n, s, 3), scale p, (n, s, 3), and radial r² (x, y, 0), 1/m², (n, s, 1).
-    """
-
-    sensors: tuple[str, ...]
-    angle: FloatArray
-    shift: FloatArray
-    tilt: FloatArray
-    base: FloatArray
-    marker: FloatArray
-    beside: FloatArray
-    scale: FloatArray
-    radial: FloatArray
-
-    @classmethod
-    def none(cls, n: int, k: int, sensors: tuple[str, ...] = ()) -> Deviation:
-        """Return an arm and sensors as drawn."""
-        shapes = ((k,), (k + 1, 3), (k, 3), (3,), (3,))
-        per_sensor = ((len(sensors), 3), (len(sensors), 3), (len(sensors), 1))
-        return cls(sensors, *(np.zeros((n, *shape)) for shape in (*shapes, *per_sensor)))
-
-    def map(self, change: Callable[..., FloatArray], *others: Deviation) -> Deviation:
-        """Apply a function to every array of this and other deviations."""
-        names = [spec.name for spec in fields(self) if spec.name != 'sensors']
-        changed: dict[str, Any] = {
-            name: change(getattr(self, name), *(getattr(other, name) for other in others))
-            for name in names
-        }
-        return replace(self, **changed)
-
-    def measured(self, sensor: str, points: FloatArray) -> FloatArray:
-        """Return what a sensor makes of points p in its frame N, m, (n, 3)."""
-        s = self.sensors.index(sensor)
-        across = points * (1.0, 1.0, 0.0)
-        square = np.sum(across**2, axis=1, keepdims=True)
-        added = self.scale[:, s] * points + self.radial[:, s] * square * across
-        return points + self.beside[:, s] + added
-
-
-@dataclass(frozen=True, eq=False)
-class HiddenEffect:
-    """One effect of a certain size.
-
-    Attributes
-    ----------
-    kind
-        Key of `NAMED` or `UNNAMED`.
-    joints
-        Numbers from 1: the joints whose angle, link or axis is wrong.
-    values
-        Its parameters in SI units, (m,); their meaning is in the rule's text.
-    detail
-        What else the rule needs: an order, a direction, another joint, a sensor.
-    """
-
-    kind: str
-    joints: tuple[int, ...]
-    values: FloatArray
-    detail: Mapping[str, Any] = field(default_factory=dict)
-
-    def scaled(self, factor: float) -> HiddenEffect:
-        """Return the same effect, so many times as large."""
-        return replace(self, values=factor * self.values)
-
-    def add_to(self, deviation: Deviation, c: Circumstances) -> None:
-        """Add what the rule of this effect makes of the circumstances."""
-        (NAMED | UNNAMED)[self.kind].rule(self, deviation, c)
-
-    def __str__(self) -> str:
-        shown = {key: value for key, value in self.detail.items() if np.ndim(value) < 1}
-        detail = ''.join(f', {key} {value}' for key, value in shown.items())
-        values = ' '.join(f'{value:.3g}' for value in self.values)
-        return f'{self.kind} {list(self.joints)} = [{values}]{detail}'
-
 
 # Rules: true = drawn + what stands here
 
@@ -285,40 +163,222 @@ def _after(e: HiddenEffect, c: Circumstances) -> FloatArray:
     return (c.time_s > e.detail['moment_s']).astype(float)
 
 
-@dataclass(frozen=True)
-class HiddenKind:
-    """Where an effect enters, what drives it, its form, and its rule."""
+# Draws of effects that need more than a size and a sign
 
-    place: str
-    driver: str
-    form: str
-    rule: Callable[[HiddenEffect, Deviation, Circumstances], None]
+
+def _draw_compliance(kind: str, context: DrawContext) -> HiddenEffect:
+    loaded = 1 + np.flatnonzero(np.ptp(context.circumstances.torque, axis=0) > 0.5)
+    count = min(int(context.rng.choice((1, 1, 2))), len(loaded))
+    joints = np.sort(context.rng.choice(loaded, count, replace=False))
+    values = 4e-4 * context.rng.uniform(0.5, 1.0, count)
+    return HiddenEffect(kind, tuple(int(j) for j in joints), values)
+
+
+def _draw_eccentricity(kind: str, context: DrawContext) -> HiddenEffect:
+    orders = ((1,), (2,), (1, 2))[context.rng.integers(3)]
+    values = 20 * ARC_MINUTE * context.direction(2 * len(orders))
+    return HiddenEffect(kind, context.joint(), values, {'orders': orders})
+
+
+def _draw_gear(kind: str, context: DrawContext) -> HiddenEffect:
+    # Twice the ratio of a strain wave gear of 50 to 160.
+    order = int(2 * context.rng.integers(50, 161))
+    values = 10 * ARC_MINUTE * context.direction(2)
+    return HiddenEffect(kind, context.joint(), values, {'orders': (order,)})
+
+
+def _draw_curve(kind: str, context: DrawContext) -> HiddenEffect:
+    orders = np.arange(4, 25)
+    # Weights of a Gaussian bell: waves shorter than its width hardly occur.
+    weight = np.exp(-0.5 * (orders * np.deg2rad(context.rng.uniform(4.0, 10.0))) ** 2)
+    amplitudes = weight * np.abs(context.rng.standard_normal(len(orders)))
+    amplitudes /= np.sqrt(0.5 * np.sum(amplitudes**2))
+    phases = context.rng.uniform(0, 2 * np.pi, len(orders))
+    detail = {'orders': orders, 'amplitudes': amplitudes, 'phases': phases}
+    return HiddenEffect(kind, context.joint(), np.array([8 * ARC_MINUTE]), detail)
+
+
+def _draw_link(kind: str, context: DrawContext) -> HiddenEffect:
+    joint = int(context.rng.integers(1, context.joints))
+    segment = context.circumstances.segments[joint]
+    length = np.linalg.norm(segment)
+    axis = str(context.rng.choice(('x', 'y', 'z')))
+    # Offsets of a link are as likely as a wrong length, where it has one.
+    if length > 0.02 and (
+        context.rng.random() < 0.5 or abs(segment['xyz'.index(axis)]) > 0.1 * length
+    ):
+        axis = 'along'
+    return HiddenEffect(kind, (joint,), np.array([5e-3 * context.sign()]), {'axis': axis})
+
+
+def _draw_tilt(kind: str, context: DrawContext) -> HiddenEffect:
+    (joint,) = context.joint(2)
+    across = np.cross(context.circumstances.axes[joint - 1], context.rng.standard_normal(3))
+    return HiddenEffect(kind, (joint,), 0.01 * across / np.linalg.norm(across))
+
+
+def _draw_marker(kind: str, context: DrawContext) -> HiddenEffect:
+    return HiddenEffect(kind, (), 10e-3 * context.direction(3))
+
+
+# Parameters whose names or values depend on more than a template.
+
+
+def _compliances(effect: HiddenEffect) -> dict[str, float]:
+    return {f'compliance_{j}': float(v) for j, v in zip(effect.joints, effect.values, strict=True)}
+
+
+def _waves(effect: HiddenEffect) -> dict[str, float]:
+    orders = effect.detail['orders']
+    names = [f'{wave}{order}_{{j}}' for order in orders for wave in ('sin', 'cos')]
+    return named(*names)(effect)
+
+
+def _couplings(effect: HiddenEffect) -> dict[str, float]:
+    if effect.detail['form'] == 'linear':
+        return named('coupling_{j}_by_{by}')(effect)
+    return named('sin_{j}_by_{by}', 'cos_{j}_by_{by}')(effect)
+
+
+def _length(effect: HiddenEffect) -> dict[str, float]:
+    along = effect.detail['axis'] == 'along'
+    return named('length_{j}' if along else 'offset_{axis}_{j}')(effect)
+
+
+def _tilts(effect: HiddenEffect) -> dict[str, float]:
+    found = named('tilt_x_{j}', 'tilt_y_{j}', 'tilt_z_{j}')(effect)
+    return {name: value for name, value in found.items() if abs(value) > 1e-12}
+
+
+def _scales(effect: HiddenEffect) -> dict[str, float]:
+    depth = effect.detail['form'] == 'depth'
+    return named('scale_z_{sensor}' if depth else 'scale_{sensor}')(effect)
 
 
 NAMED = {
-    'joint_compliance': HiddenKind('joint_angle', 'gravity_torque', 'linear', _compliance),
-    'encoder_eccentricity': HiddenKind('joint_angle', 'joint_angle', 'sin/cos', _eccentricity),
-    'encoder_scale': HiddenKind('joint_angle', 'joint_angle', 'linear', _scale),
-    'gear_periodic': HiddenKind('joint_angle', 'joint_angle', 'sin/cos', _eccentricity),
-    'joint_error_curve': HiddenKind('joint_angle', 'joint_angle', 'free', _curve),
-    'backlash': HiddenKind('joint_angle', 'approach', 'step', _backlash),
-    'settling': HiddenKind('joint_angle', 'last_move', 'linear', _settling),
-    'joint_coupling': HiddenKind('joint_angle', 'other_joint', 'linear or sin/cos', _coupling),
-    'link_length': HiddenKind('link_translation', 'constant', 'constant', _link_length),
-    'joint_axis_tilt': HiddenKind('link_rotation', 'constant', 'constant', _tilt),
-    'marker_offset': HiddenKind('marker', 'constant', 'constant', _marker),
-    'thermal_growth': HiddenKind('link_translation', 'temperature', 'linear', _thermal),
-    'base_compliance': HiddenKind('base_rotation', 'gravity_moment', 'linear', _base),
-    'registration_drift': HiddenKind('sensor_frame', 'time', 'linear', _drift),
-    'sensor_scale': HiddenKind('sensor_frame', 'position', 'linear', _sensor_scale),
-    'sensor_distortion': HiddenKind('sensor_frame', 'position', 'quadratic, radial', _distortion),
+    'joint_compliance': HiddenKind(
+        'joint_angle', 'gravity_torque', 'linear', _compliance, _draw_compliance, _compliances
+    ),
+    'encoder_eccentricity': HiddenKind(
+        'joint_angle', 'joint_angle', 'sin/cos', _eccentricity, _draw_eccentricity, _waves
+    ),
+    'encoder_scale': HiddenKind(
+        'joint_angle', 'joint_angle', 'linear', _scale, one_value(5e-3), named('scale_{j}')
+    ),
+    'gear_periodic': HiddenKind(
+        'joint_angle', 'joint_angle', 'sin/cos', _eccentricity, _draw_gear, _waves
+    ),
+    'joint_error_curve': HiddenKind('joint_angle', 'joint_angle', 'free', _curve, _draw_curve),
+    'backlash': HiddenKind(
+        'joint_angle',
+        'approach',
+        'step',
+        _backlash,
+        one_value(15 * ARC_MINUTE),
+        named('half_backlash_{j}', factor=0.5),
+    ),
+    'settling': HiddenKind(
+        'joint_angle', 'last_move', 'linear', _settling, one_value(3e-3), named('settling_{j}')
+    ),
+    'joint_coupling': HiddenKind(
+        'joint_angle',
+        'other_joint',
+        'linear or sin/cos',
+        _coupling,
+        two_joints(5e-3, ('linear', 'sin/cos')),
+        _couplings,
+    ),
+    'link_length': HiddenKind(
+        'link_translation', 'constant', 'constant', _link_length, _draw_link, _length
+    ),
+    'joint_axis_tilt': HiddenKind(
+        'link_rotation', 'constant', 'constant', _tilt, _draw_tilt, _tilts
+    ),
+    'marker_offset': HiddenKind('marker', 'constant', 'constant', _marker, _draw_marker),
+    'thermal_growth': HiddenKind(
+        'link_translation', 'temperature', 'linear', _thermal, no_joint(2e-4), named('growth')
+    ),
+    'base_compliance': HiddenKind(
+        'base_rotation',
+        'gravity_moment',
+        'linear',
+        _base,
+        no_joint(1e-4),
+        named('base_compliance'),
+    ),
+    'registration_drift': HiddenKind(
+        'sensor_frame',
+        'time',
+        'linear',
+        _drift,
+        of_sensor(1e-6, 3),
+        named('drift_x_{sensor}', 'drift_y_{sensor}', 'drift_z_{sensor}'),
+    ),
+    'sensor_scale': HiddenKind(
+        'sensor_frame',
+        'position',
+        'linear',
+        _sensor_scale,
+        of_sensor(1e-2, 1, ('all', 'depth')),
+        _scales,
+    ),
+    'sensor_distortion': HiddenKind(
+        'sensor_frame',
+        'position',
+        'quadratic, radial',
+        _distortion,
+        of_sensor(0.2),
+        named('radial_{sensor}'),
+    ),
 }
 UNNAMED = {
-    'foreign_torque': HiddenKind('joint_angle', 'gravity_torque', 'linear', _foreign_torque),
-    'creeping_joint': HiddenKind('joint_angle', 'time', 'linear', _creep),
-    'slipped_joint': HiddenKind('joint_angle', 'time', 'step', _slip),
-    'warm_joint': HiddenKind('joint_angle', 'temperature', 'linear', _warm_joint),
-    'bent_coupling': HiddenKind('joint_angle', 'angle', 'quadratic', _bent_coupling),
-    'sagging_tool': HiddenKind('marker', 'gravity', 'linear', _sagging_tool),
-    'bumped_sensor': HiddenKind('sensor_frame', 'time', 'step', _bumped_sensor),
+    'foreign_torque': HiddenKind(
+        'joint_angle',
+        'gravity_torque',
+        'linear',
+        _foreign_torque,
+        two_joints(4e-4),
+        named('joint_{j}_by_gravity_torque_of_joint_{by}'),
+    ),
+    'creeping_joint': HiddenKind(
+        'joint_angle', 'time', 'linear', _creep, one_value(1e-6, 2), named('joint_{j}_by_time')
+    ),
+    'slipped_joint': HiddenKind(
+        'joint_angle',
+        'time',
+        'step',
+        _slip,
+        at_some_time(one_value(15 * ARC_MINUTE, 2)),
+        named('joint_{j}_by_time'),
+    ),
+    'warm_joint': HiddenKind(
+        'joint_angle',
+        'temperature',
+        'linear',
+        _warm_joint,
+        one_value(5e-4, 2),
+        named('joint_{j}_by_temperature'),
+    ),
+    'bent_coupling': HiddenKind(
+        'joint_angle', 'angle', 'quadratic', _bent_coupling, two_joints(3e-3)
+    ),
+    'sagging_tool': HiddenKind('marker', 'gravity', 'linear', _sagging_tool, no_joint(3e-3)),
+    'bumped_sensor': HiddenKind(
+        'sensor_frame', 'time', 'step', _bumped_sensor, at_some_time(of_sensor(3e-3, 3))
+    ),
 }
+KINDS = NAMED | UNNAMED
+
+
+def add_effect(effect: HiddenEffect, deviation: Deviation, c: Circumstances) -> None:
+    """Add what the rule of an effect makes of the circumstances to a deviation."""
+    KINDS[effect.kind].rule(effect, deviation, c)
+
+
+def true_parameters(effect: HiddenEffect) -> dict[str, float]:
+    """Return an effect's true parameters, SI units, under the names that discovery gives them.
+
+    Empty where there is none to compare: a curve, a marker (of which only parts can be seen), and
+    cells without a name that are more than a line.
+    """
+    return KINDS[effect.kind].parameters(effect)

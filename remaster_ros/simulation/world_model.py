@@ -15,12 +15,8 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from remaster_ros.simulation.hidden_effects import (
-    SLACK_RAD,
-    Circumstances,
-    Deviation,
-    HiddenEffect,
-)
+from remaster_ros.simulation.hidden_effect import SLACK_RAD, Circumstances, Deviation, HiddenEffect
+from remaster_ros.simulation.hidden_effects import add_effect
 from remaster_ros.simulation.truth import SimulatedSensor
 from remaster_ros.types import FloatArray
 
@@ -128,7 +124,7 @@ def deviation(
     n, k = c.q.shape
     together = Deviation.none(n, k, sensors)
     for effect in effects:
-        effect.add_to(together, c)
+        add_effect(effect, together, c)
     return together
 
 

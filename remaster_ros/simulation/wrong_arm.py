@@ -10,7 +10,7 @@ import numpy as np
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.simulation.hidden_arm import ChainArm
-from remaster_ros.simulation.hidden_effects import Deviation
+from remaster_ros.simulation.hidden_effect import Deviation
 from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.simulation.world_model import Round, circumstances, deviation, measured
 from remaster_ros.types import FloatArray
