@@ -168,7 +168,7 @@ def causes(discovery: Discovery) -> Figure:
     return figure
 
 
-def _driver(context: Context, cell: Cell) -> tuple[str, FloatArray]:
+def _driver(context: Context, cell: Cell, features: FloatArray) -> tuple[str, FloatArray]:
     """Return label and value of what drives a cause at a joint's angle, (n,)."""
     joint = cell.joints[-1] - 1
     if cell.driver == 'own_angle' or cell.driver.startswith('angle_of'):
@@ -181,7 +181,10 @@ def _driver(context: Context, cell: Cell) -> tuple[str, FloatArray]:
         return f'last move of joint {joint + 1} (°)', np.degrees(context.last_move[:, joint])
     if cell.driver == 'temperature':
         return 'temperature above the first (K)', context.warming
-    return 'time (h)', context.elapsed_s / 3600.0
+    if cell.driver == 'time':
+        return 'time (h)', context.elapsed_s / 3600.0
+    # A driver that has no unit here is drawn by what it adds per unit of its first parameter.
+    return f'{cell.driver.replace("_", " ")} (per unit of {cell.parameters[0]})', features[:, 0]
 
 
 def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
@@ -193,10 +196,10 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     fitted = np.ones(len(context), dtype=bool)
     if whole:
         fitted = np.isin(np.arange(len(context)), data.rows.source)
-    label, x = _driver(context, cell)
     where = dict(zip(solution.cells, solution.slices(), strict=True))[cell]
     columns = cell.columns(context)
     assert columns.at is not None
+    label, x = _driver(context, cell, columns.values)
     index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
     chosen = [index[name] for name in cell.parameters]
     draws = discovery.fit.theta_draws[..., chosen].reshape(-1, len(chosen))
