@@ -19,6 +19,7 @@ from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
+from remaster_ros.collection.events import ShotMeasured
 from remaster_ros.errors import DeviceError
 from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.messages import stamp_of, temperature_topic, transform_array
@@ -242,7 +243,7 @@ class LaserTrackerMarkers(SensorNode):
         self._trouble = ''
         self._publish_temperature(reading)
         # What the instrument took is not the software's time.
-        self.status.event('measured', 'measured', instrument_wall_s=f'{took:.6f}')
+        self.status.event(ShotMeasured(took))
         self.publish_reading(reading.position, reading.stamp_s)
         response.success, response.message = True, 'measured'
         return response

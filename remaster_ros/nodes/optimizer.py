@@ -28,7 +28,7 @@ from remaster_ros.calibration.fit import (
 from remaster_ros.errors import RemasterError
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import LATCHED, NodeStatus
+from remaster_ros.nodes.status import LATCHED, NodeStatus, Summary
 from remaster_ros.reports.fit_json import FIT_FILE, prepare_folder, read_fit, save_fit
 from remaster_ros.session.priors import read_priors
 from remaster_ros.session.reader import read_session
@@ -170,8 +170,8 @@ class Optimizer(RemasterNode):
         """End a fit under way at its next step."""
         self._ending = True
 
-    def _summary(self) -> tuple[str, str, dict[str, Any]]:
-        return 'ok', self._state, {'session': self.p.session, 'out': self.p.out}
+    def _summary(self) -> Summary:
+        return Summary('ok', self._state, {'session': self.p.session, 'out': self.p.out})
 
 
 def main(args: list[str] | None = None) -> int:

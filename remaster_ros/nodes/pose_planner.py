@@ -28,14 +28,32 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
+from remaster_ros.collection.events import (
+    ArmHalted,
+    BridgeState,
+    ConfigurationEnded,
+    EventRecord,
+    PlannerState,
+    RecorderState,
+    SetupChanged,
+    SolutionFailed,
+    TourPlanned,
+)
 from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
 from remaster_ros.nodes.messages import JointOrder, transform_array
 from remaster_ros.nodes.parameters import declare, parameter
-from remaster_ros.nodes.pose_publisher import PEERS, PosePublisher
+from remaster_ros.nodes.pose_publisher import PosePublisher
 from remaster_ros.nodes.preflight_monitor import PreflightMonitor
 from remaster_ros.nodes.run_token import LivingRun, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, Event, NodeStatus, listen
+from remaster_ros.nodes.status import (
+    JOINT_STATES,
+    LATCHED,
+    RELIABLE,
+    NodeStatus,
+    Summary,
+    listen,
+)
 from remaster_ros.nodes.tour_planner import PlanningThread, TourPlanner
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, PoseVisit
 from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanJournal
@@ -126,9 +144,9 @@ class PosePlanner(RemasterNode):
         self.create_service(Trigger, 'remaster/collect', self._on_collect)
         self.create_service(Trigger, 'remaster/pause', self._on_pause, callback_group=at_once)
         self.create_service(Trigger, 'remaster/stop', self._on_stop, callback_group=at_once)
-        self.status = NodeStatus(self, self._summary)
+        self.status = NodeStatus(self, self._summary, Path(self.cell.robot.urdf).stem)
         self._preflight, self._cleared = PreflightMonitor(self, self.cell), False
-        listen(self, self._on_event, self._on_summary)
+        listen(self, self._on_record)
         self.create_timer(0.05, self._step, clock=self.status.steady)
 
     def _settings(self) -> dict[str, Any]:
@@ -174,23 +192,23 @@ class PosePlanner(RemasterNode):
         Somebody may stand beside an arm that has not moved for a while.
         """
         passed_s = silence_s(self._left)
+        bridge, recorder = self._poses.bridge, self._poses.recorder
         why = ''
         if passed_s is None:
             why = 'its run was in another boot of this computer, or was ended'
         elif passed_s > self.p.resume_within_s:
             why = f'its run has been without a planner for {passed_s:.0f} s'
-        elif not all(self._poses.value(name, 'started') for name in PEERS):
+        elif bridge is None or recorder is None:
             self._why = 'waiting for robot_bridge and recorder to confirm the run'
             return
         else:
-            value = self._poses.value
-            other = [name for name in PEERS if value(name, 'run') != self._left]
+            other = [peer.sender for peer in (bridge, recorder) if peer.run != self._left]
             if other:
                 why = f'{" and ".join(other)} did not take part in its run'
-            elif halted := value('robot_bridge', 'halted'):
-                why = f'the arm is halted: {halted}'
-            elif value('recorder', 'changed_run') in (self._left, 'unknown'):
-                why = value('recorder', 'changed')
+            elif bridge.halted:
+                why = f'the arm is halted: {bridge.halted}'
+            elif recorder.changed_run in (self._left, ''):
+                why = recorder.changed
         with self._lock:
             left, self._left = self._left, ''
             if left and not why:
@@ -216,19 +234,18 @@ class PosePlanner(RemasterNode):
         if self.state in ('complete', 'failed'):
             response.message = f'the collection is {self.state}: {self._why or "start anew"}'
             return response
-        if halted := self._poses.value('robot_bridge', 'halted'):
+        bridge, recorder = self._poses.bridge, self._poses.recorder
+        if bridge is not None and bridge.halted:
+            halted = bridge.halted
             response.message = f'the arm is halted: {halted}; /remaster/clear_halt, then collect'
             return response
-        if self._poses.value('recorder', 'exit_status') == 'complete':
+        if recorder is not None and recorder.exit_status == 'complete':
             response.message = "the recorder's session is complete; give it a new folder"
             return response
-        if self._poses.value('recorder', 'changed_run') == 'unknown':
+        if recorder is not None and recorder.changed_run == '':
             response.message = 'the recorder was started just now; try again in a second'
             return response
-        if self.state != 'running' and self._poses.value('recorder', 'changed_run') not in (
-            '',
-            'none',
-        ):
+        if self.state != 'running' and recorder is not None and recorder.changed_run:
             # A person has looked: how things are from now on is measured first.
             self.journal.ask_round()
         if self.state != 'running' and self._joint_states is None:
@@ -297,51 +314,47 @@ class PosePlanner(RemasterNode):
     def _on_registration(self, message: TransformStamped) -> None:
         self.T_R_N[message.child_frame_id] = transform_array(message)
 
-    def _on_event(self, event: Event) -> None:
-        if (event.node, event.event) == ('robot_bridge', 'halted') and self.state == 'running':
-            # It goes on when somebody has looked at the arm and calls /remaster/collect.
-            self._set_state('paused', event.message, only_from='running')
+    def _on_record(self, record: EventRecord) -> None:
+        self._preflight.take(record.body)
+        self._poses.take(record)
+        match record.body:
+            case ArmHalted(reason=why) | BridgeState(halted=why) if why:
+                # It goes on when somebody has looked at the arm and calls /remaster/collect.
+                self._set_state('paused', why, only_from='running')
+            case SetupChanged(stops=True, text=why):
+                self._set_state('paused', why, only_from='running')
+            case ConfigurationEnded() as end:
+                self._on_end(end.stamp, end.solution, end.result, end.registered)
+            case SolutionFailed() as end:
+                self._on_end(end.stamp, end.solution, 'failed', False)
+            case RecorderState() as recorder:
+                self._on_recorder(recorder)
+
+    def _on_end(self, stamp: str, number: int, result: str, registered: bool) -> None:
+        """Take what became of a solution of an announcement."""
+        ids = self._poses.ids(stamp)
+        if ids is None or self.journal.stop is None or number >= len(ids):
             return
-        if (event.node, event.event) == ('recorder', 'changed'):
-            if event.values.get('stops') == 'yes':
-                self._set_state('paused', event.message, only_from='running')
-            return
-        final = (event.node, event.event) in (
-            ('recorder', 'configuration'),
-            ('robot_bridge', 'failed'),
-        )
-        ids = self._poses.ids(event.values.get('stamp', '')) if final else None
-        number = event.values.get('solution', '')
-        if ids is None or self.journal.stop is None or number not in map(str, range(len(ids))):
-            return
-        solution = ids[int(number)]
-        result = event.values.get('result', 'failed')
-        outdated = event.values['stamp'] != self._poses.stamp
-        if outdated and result not in ('recorded', 'partial'):
+        if stamp != self._poses.stamp and result not in ('recorded', 'partial'):
             # It was announced again meanwhile, and will be visited again.
             return
-        if solution in self.journal.stop.ids:
-            self._registered = event.values.get('registered') == 'yes'
-            self.journal.outcome(solution, result)
+        if ids[number] in self.journal.stop.ids:
+            self._registered = registered
+            self.journal.outcome(ids[number], result)
             self._step()
 
-    def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
-        self._preflight.on_summary(node, message, values)
-        self._poses.take_summary(node, values)
-        if node == 'robot_bridge' and values.get('halted'):
-            self._set_state('paused', values['halted'], only_from='running')
-        run = self._run
-        if node == 'recorder' and run is not None and values.get('changed_run') == run.token:
-            # Said while this planner was not there; collect begins another run.
-            self._set_state('paused', values.get('changed', ''), only_from='running')
-        stop = self.journal.stop
-        if node != 'recorder' or stop is None or self.state in ('complete', 'failed'):
+    def _on_recorder(self, recorder: RecorderState) -> None:
+        run, stop = self._run, self.journal.stop
+        if run is not None and recorder.changed_run == run.token:
+            # Found while this planner was not there; collect begins another run.
+            self._set_state('paused', recorder.changed, only_from='running')
+        decided = recorder.decided
+        if stop is None or decided is None or self.state in ('complete', 'failed'):
             return
-        if values.get('plan') == self.journal.id:
-            # What became of a configuration may have been said while this planner was not there.
-            pose, _, solutions = values.get('decided', '').partition(': ')
-            for solution in map(int, solutions.split()):
-                if pose == str(stop.pose) and solution in stop.ids:
+        if recorder.plan == self.journal.id and decided.pose == stop.pose:
+            # A configuration may have been recorded while this planner was not there.
+            for solution in decided.solutions:
+                if solution in stop.ids:
                     self.journal.outcome(solution, 'recorded')
                     self._poses.stamp = ''
 
@@ -425,12 +438,12 @@ class PosePlanner(RemasterNode):
 
     def _check_session(self) -> None:
         """Refuse to add another plan's poses to a session."""
-        theirs = self._poses.value('recorder', 'plan')
-        observations = self._poses.value('recorder', 'observations')
-        if theirs not in ('', self.journal.id) and observations != '0':
-            session = self._poses.value('recorder', 'session')
+        recorder = self._poses.recorder
+        if recorder is None or recorder.plan in ('', self.journal.id):
+            return
+        if recorder.observations:
             raise InputError(
-                f'the session {session} holds observations of another plan than '
+                f'the session {recorder.session} holds observations of another plan than '
                 f'{self.journal.path}; give the planner the same session folder as the recorder, '
                 'or begin a new session'
             )
@@ -488,9 +501,10 @@ class PosePlanner(RemasterNode):
         proposed = self._propose(q)
         if proposed == (None,):
             assert self.journal.tour is not None
+            assert self._poses.recorder is not None
             raise InsufficientDataError(
                 f'no registration of {", ".join(missing)} after {self.journal.tour.visited} poses '
-                f'({self._poses.value("recorder", "registration")}); the recorder counts why '
+                f'({self._poses.recorder.registration}); the recorder counts why '
                 'readings were rejected'
             )
         return None if proposed is None else proposed[0]
@@ -499,7 +513,7 @@ class PosePlanner(RemasterNode):
         tour = self.journal.tour
         if tour is not None and self.phase != REGISTRATION and not self._described:
             self._described = True
-            self.status.event('planned', tour.describe())
+            self.status.event(TourPlanned(tour.describe()))
         with self._lock:
             # Paused or stopped while the pose was chosen and written: collect announces it.
             if self.state == 'running':
@@ -510,7 +524,7 @@ class PosePlanner(RemasterNode):
                 )
                 self._poses.announce(stop, self.journal.id, self.status, last)
 
-    def _summary(self) -> tuple[str, str, dict[str, Any]]:
+    def _summary(self) -> Summary:
         tour, outcomes, run = self.journal.tour, dict(self.journal.outcomes), self._run
         full = (
             f'waiting for room on the disk: {self.journal.trouble}' if self.journal.trouble else ''
@@ -520,7 +534,6 @@ class PosePlanner(RemasterNode):
         solutions = Counter(tour.dropped_solutions if tour and collecting else {})
         solutions['no free path'] = outcomes.get(NO_FREE_PATH, 0)
         values = {
-            'state': 'held' if full and self.state == 'running' else self.state,
             'phase': self.phase,
             'robot': 'silent' if self._q is None else 'heard',
             'poses_done': tour.poses_begun if tour else 0,
@@ -530,7 +543,6 @@ class PosePlanner(RemasterNode):
             'references': tour.references if tour else 0,
             'references_done': self.journal.references.total(),
             'plan': self.journal.id,
-            'run': '' if run is None else run.token,
             # Whether it may still go on by itself.
             'resuming': 'yes' if self._left else 'no',
             **{f'outcome_{name}': count for name, count in sorted(outcomes.items())},
@@ -539,7 +551,11 @@ class PosePlanner(RemasterNode):
         }
         why = full or self._why
         level = 'error' if self.state == 'failed' else 'warn' if why else 'ok'
-        return level, why or self.state, values
+        state = PlannerState(
+            state='held' if full and self.state == 'running' else self.state,
+            run='' if run is None else run.token,
+        )
+        return Summary(level, why or self.state, values, state)
 
     def close(self) -> None:
         """Tell the bridge to stop: nobody plans any more."""

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 
 from geometry_msgs.msg import PoseStamped
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from remaster_ros.collection.events import (
+    BridgeState,
+    EventRecord,
+    PoseAnnounced,
+    RecorderState,
+)
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.messages import duration_of, stamp_key
@@ -16,19 +21,10 @@ from remaster_ros.nodes.running import RemasterNode
 from remaster_ros.nodes.status import LEASED, NodeStatus
 from remaster_ros.planning.tour_order import PoseVisit
 
-PEERS = ('robot_bridge', 'recorder')
 ANNOUNCE_WALL_S = 5.0
 """Who does not know an announcement so long after it has missed it, wall time."""
 MATCH_WALL_S = 0.5
 """The other side of a match comes so much later than ours at most, wall time."""
-
-
-@dataclass(frozen=True)
-class _Peer:
-    """The last summary of a node that must know the pose under way."""
-
-    last_seen_wall: float
-    values: dict[str, str]
 
 
 class PosePublisher:
@@ -50,7 +46,10 @@ class PosePublisher:
         self._solutions = node.create_publisher(
             JointTrajectory, 'remaster/joint_solutions', LEASED
         )
-        self._peers: dict[str, _Peer] = {}
+        # The last states of those that must know the pose under way, and when they came.
+        self.bridge: BridgeState | None = None
+        self.recorder: RecorderState | None = None
+        self._seen: dict[str, tuple[float, str, str]] = {}
         # Stamp of each announcement of the open pose -> its solutions, in the order announced.
         self._ids: dict[str, tuple[int, ...]] = {}
         self.stamp, self._published_wall = '', 0.0
@@ -58,19 +57,20 @@ class PosePublisher:
         self._told: dict[str, str] = {}
         self._matched_wall: float | None = None
 
-    def take_summary(self, node: str, values: dict[str, str]) -> None:
-        """Take the summary of a node."""
-        if node in PEERS:
-            self._peers[node] = _Peer(time.monotonic(), values)
-
-    def value(self, node: str, key: str) -> str:
-        """Return a value of a peer's last summary; '' where it is not there."""
-        peer = self._peers.get(node)
-        return peer.values.get(key, '') if peer else ''
+    def take(self, record: EventRecord) -> None:
+        """Take a state of bridge or recorder."""
+        match record.body:
+            case BridgeState() as state:
+                self.bridge = state
+            case RecorderState() as state:
+                self.recorder = state
+            case _:
+                return
+        self._seen[state.sender] = time.monotonic(), record.started, state.pose
 
     def matched(self) -> bool:
         """Whether bridge and recorder are there for the next pose; DDS takes its time to match."""
-        if self._solutions.get_subscription_count() < 2 or len(self._peers) < len(PEERS):
+        if self._solutions.get_subscription_count() < 2 or len(self._seen) < 2:
             self._matched_wall = None
             return False
         if self._matched_wall is None:
@@ -94,15 +94,12 @@ class PosePublisher:
         """Whether the open pose is to be announced (again): somebody does not know it."""
         if not self.stamp:
             return True
-        if self.value('recorder', 'state') == 'measuring':
+        if self.recorder is not None and self.recorder.state == 'measuring':
             return False
         missed_wall = self._published_wall + ANNOUNCE_WALL_S
         return any(
-            peer.values.get('pose') != self.stamp
-            and (
-                peer.values.get('started') != self._told[node] or peer.last_seen_wall > missed_wall
-            )
-            for node, peer in self._peers.items()
+            pose != self.stamp and (started != self._told.get(node) or seen_wall > missed_wall)
+            for node, (seen_wall, started, pose) in self._seen.items()
         )
 
     def announce(self, stop: PoseVisit, plan: str, status: NodeStatus, last: bool = False) -> None:
@@ -116,18 +113,17 @@ class PosePublisher:
         stamp = self._node.get_clock().now().to_msg()
         self.stamp, self._published_wall = stamp_key(stamp), time.monotonic()
         self._ids[self.stamp] = stop.ids
-        self._told = {node: peer.values.get('started', '') for node, peer in self._peers.items()}
+        self._told = {node: started for node, (_, started, _) in self._seen.items()}
         # The event goes first: the recorder must know the pose before the arm gets there.
         status.event(
-            'pose',
-            f'pose {stop.pose} ({stop.split}): {len(stop.solutions)} solutions',
-            stamp=self.stamp,
-            pose=stop.pose,
-            split=stop.split,
-            solutions=len(stop.solutions),
-            ids=' '.join(map(str, stop.ids)),
-            plan=plan,
-            last='yes' if last else 'no',
+            PoseAnnounced(
+                stamp=self.stamp,
+                pose=stop.pose,
+                split=stop.split,
+                ids=tuple(stop.ids),
+                plan=plan,
+                last=last,
+            )
         )
         pose = PoseStamped()
         pose.header.stamp, pose.header.frame_id = stamp, self._chain.base_link

@@ -2,43 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from remaster_ros.collection.events import PoseAnnounced
 from remaster_ros.errors import InputError
 from remaster_ros.nodes.messages import duration_of, stamp_key
 from remaster_ros.planning.tour_order import PoseVisit, nearest_solution
 from remaster_ros.types import FloatArray
-
-
-@dataclass(frozen=True)
-class PublishedPose:
-    """A pose under way.
-
-    Attributes
-    ----------
-    pose, split
-        As in the session.
-    ids
-        The planner's own numbers of the joint solutions, in the order published.
-    plan
-        The plan that both are numbered by.
-    stamp
-        Names this announcement; the same pose announced again has another one.
-    last
-        Whether it is the last reference of a round.
-    """
-
-    pose: int
-    split: str
-    ids: tuple[int, ...]
-    plan: str
-    stamp: str = ''
-    last: bool = False
 
 
 def waypoints_message(
@@ -111,26 +85,18 @@ class PoseTracker:
     ----------
     joint_names
         The wanted order of joints.
+
+    Attributes
+    ----------
+    announced
+        The planner's last announcement; to be set.
     """
 
     def __init__(self, joint_names: Sequence[str]) -> None:
         self._joint_names = tuple(joint_names)
-        self._said: PublishedPose | None = None
+        self.announced: PoseAnnounced | None = None
         self._solutions: FloatArray | None = None
         self._stamp = ''
-
-    def take_pose(self, values: Mapping[str, str]) -> None:
-        """Take the values of the planner's event ``pose``."""
-        # Bags of the first version have neither ids nor plan.
-        ids = values.get('ids', ' '.join(map(str, range(int(values['solutions'])))))
-        self._said = PublishedPose(
-            int(values['pose']),
-            values['split'],
-            tuple(map(int, ids.split())),
-            values.get('plan', ''),
-            values['stamp'],
-            values.get('last') == 'yes',
-        )
 
     def take_solutions(self, message: JointTrajectory) -> None:
         """Take /remaster/joint_solutions; without points it takes the pose back."""
@@ -142,10 +108,10 @@ class PoseTracker:
             self._stamp, self._solutions = stamp_key(message.header.stamp), points[:, columns]
 
     @property
-    def now(self) -> PublishedPose | None:
-        """The pose under way; None where either topic has not said it."""
-        said = self._said
-        return said if said is not None and said.stamp == self._stamp else None
+    def now(self) -> PoseAnnounced | None:
+        """The pose under way; None where the event or the solutions have not come."""
+        announced = self.announced
+        return announced if announced is not None and announced.stamp == self._stamp else None
 
     def which(self, q: FloatArray) -> int | None:
         """Return which of the solutions the arm stands at, rad, (k,); None at none."""

@@ -17,28 +17,39 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
 from sensor_msgs.msg import JointState, Temperature
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
+from remaster_ros.collection.events import (
+    ArmStopped,
+    ConfigurationEnded,
+    EventRecord,
+    Outcome,
+    PlannerState,
+    PoseAnnounced,
+    RecorderBegan,
+    RecorderState,
+    SensorReport,
+    SetupChanged,
+)
 from remaster_ros.collection.pairing import PairedReading, Pairing, Rejection
 from remaster_ros.collection.plausibility import Plausibility
 from remaster_ros.errors import DiskError, InputError
 from remaster_ros.motion.liveness import Liveness
-from remaster_ros.nodes.bagging import BEGAN, BagRecorder
+from remaster_ros.nodes.bagging import BagRecorder
 from remaster_ros.nodes.messages import JointOrder, seconds, temperature_topic
 from remaster_ros.nodes.parameters import declare
-from remaster_ros.nodes.pose_tracker import PoseTracker, PublishedPose
+from remaster_ros.nodes.pose_tracker import PoseTracker
 from remaster_ros.nodes.recorder_parameters import Parameters, sensor_rules
 from remaster_ros.nodes.registering import Registrar
 from remaster_ros.nodes.retrying_writer import RetryingWriter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import JOINT_STATES, Event, NodeStatus, receiver, run_after
-from remaster_ros.nodes.status import TOPIC as STATUS
+from remaster_ros.nodes.status import EVENTS, JOINT_STATES, NodeStatus, Summary, receiver
 from remaster_ros.nodes.triggered_sensors import TriggeredSensors
 from remaster_ros.nodes.watching import Watching
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
@@ -65,7 +76,7 @@ class _Taking:
 
     pairing: Pairing
     solution: int
-    pose: PublishedPose
+    pose: PoseAnnounced
     from_q: FloatArray | None
     future: Future | None = None
 
@@ -107,7 +118,7 @@ class Recorder(RemasterNode):
         self._trouble = self._restored = ''
         self._pose_tracker = PoseTracker(self.chain.joint_names)
         self._taking: _Taking | None = None
-        self._due: deque[tuple[FloatArray, float, int, PublishedPose]] = deque(maxlen=100)
+        self._due: deque[tuple[FloatArray, float, int, PoseAnnounced]] = deque(maxlen=100)
         # Topics come in no common order: what belongs to a dwell may be here before /settled is.
         self._recent_joints: deque[tuple[float, FloatArray]] = deque(maxlen=4000)
         self._recent_readings: deque[tuple[str, MarkerReading]] = deque(maxlen=4000)
@@ -158,7 +169,7 @@ class Recorder(RemasterNode):
             if sensor.single_shot and sensor.measure_service and self.p.call_measure:
                 clients[name] = self.create_client(Trigger, sensor.measure_service)
         self._shots = TriggeredSensors(clients)
-        bag.subscribe(DiagnosticArray, STATUS, receiver(self._on_event, self._on_summary))
+        bag.subscribe(String, EVENTS, receiver(self, self._on_record))
         bag.subscribe_rest()
 
     # What comes in
@@ -205,43 +216,48 @@ class Recorder(RemasterNode):
         known = [item for item in self._temperatures if 0.0 <= stamp_s - item[0] < TEMPERATURE_S]
         return max(known)[1] if known else None
 
-    def _on_event(self, event: Event) -> None:
-        if (event.node, event.event) == ('pose_planner', 'pose'):
-            self._pose_tracker.take_pose(event.values)
-            if event.values['split'] not in (REFERENCE, REGISTRATION):
-                self._say_change(self._watching.leave(self.registrar.T_R_N))
-            if not self._disk.full and not self.journal.closed:
-                # Before the arm gets there: it is held where there is no room.
-                self._disk.write(partial(self.journal.follow, event.values.get('plan', '')))
-        elif (event.node, event.event) == ('recorder', BEGAN):
-            # From a bag: that recorder was started anew here, and knew of no reading under way.
-            self._taking = None
-            self._due.clear()
-        elif (event.node, event.event) == ('robot_bridge', 'stopped'):
-            # On its way: nobody knows what it will come from next.
-            self._from_q = None
+    def _on_record(self, record: EventRecord) -> None:
+        match record.body:
+            case PoseAnnounced() as pose:
+                self._on_pose(pose)
+            case PlannerState() as planner:
+                self._on_planner(planner)
+            case SensorReport() as sensor:
+                self._liveness.node_reports(
+                    sensor.sensor,
+                    sensor.ready,
+                    sensor.message,
+                    time.monotonic(),
+                    record.started,
+                    hidden=sensor.hidden,
+                )
+            case RecorderBegan():
+                # From a bag: that recorder was started again here, with no reading under way.
+                self._taking = None
+                self._due.clear()
+            case ArmStopped():
+                # On its way: where it will come from next is not known.
+                self._from_q = None
 
-    def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
-        if 'sensor' in values:
-            self._liveness.node_reports(
-                values['sensor'],
-                values.get('ready') == 'yes',
-                message,
-                time.monotonic(),
-                values.get('started', ''),
-                hidden=values.get('fault') == 'marker',
-            )
-        if node == 'pose_planner':
-            self._run = run_after(self._run, values)
-            self._follow_stop(values.get('state', ''))
-        if node == 'pose_planner' and not self._busy() and not self._due:
-            state = values.get('state')
-            if state == 'complete':
-                self._disk.write(partial(self._close, 'complete'))
-            elif state == 'stopped' and self.journal.observations:
-                self._disk.write(partial(self._close, 'stopped'))
-            elif state == 'running' and self.journal.closed == 'stopped':
-                self._disk.write(self._reopen)
+    def _on_pose(self, pose: PoseAnnounced) -> None:
+        self._pose_tracker.announced = pose
+        if pose.split not in (REFERENCE, REGISTRATION):
+            self._say_change(self._watching.leave(self.registrar.T_R_N))
+        if not self._disk.full and not self.journal.closed:
+            # Before the arm gets there: it is held where there is no room.
+            self._disk.write(partial(self.journal.follow, pose.plan))
+
+    def _on_planner(self, planner: PlannerState) -> None:
+        self._run = planner.run_held(self._run)
+        self._follow_stop(planner.state)
+        if self._busy() or self._due:
+            return
+        if planner.state == 'complete':
+            self._disk.write(partial(self._close, 'complete'))
+        elif planner.state == 'stopped' and self.journal.observations:
+            self._disk.write(partial(self._close, 'stopped'))
+        elif planner.state == 'running' and self.journal.closed == 'stopped':
+            self._disk.write(self._reopen)
 
     # A configuration
 
@@ -291,16 +307,21 @@ class Recorder(RemasterNode):
             known = self.journal.result(pose.pose, pose.ids[solution])
             if known:
                 self._report(
-                    pose.stamp, solution, known, 'recorded before', registered=self._registered()
+                    ConfigurationEnded(
+                        stamp=pose.stamp,
+                        solution=solution,
+                        result=known,
+                        reason='recorded before',
+                        registered=self._registered(),
+                    )
                 )
                 continue
             self._take(q, settled_s, solution, pose)
 
-    def _registered(self) -> str:
-        """Whether every sensor that the arm waits for is registered, in a word."""
+    def _registered(self) -> bool:
+        """Whether every sensor that the arm waits for is registered."""
         known = [name in self.registrar.T_R_N for name in self._wanted()]
-        enough = any(known) if self.p.require == 'any' else all(known)
-        return 'yes' if enough else 'no'
+        return any(known) if self.p.require == 'any' else all(known)
 
     def _wanted(self) -> list[str]:
         """Return the sensors that the arm waits for, or for one of them."""
@@ -315,7 +336,7 @@ class Recorder(RemasterNode):
         q: FloatArray,
         settled_s: float,
         solution: int,
-        pose: PublishedPose,
+        pose: PoseAnnounced,
         future: Future | None = None,
     ) -> None:
         pairing = Pairing(settled_s, q, self.rules, self.p.motion_tolerance, self.p.require)
@@ -383,7 +404,7 @@ class Recorder(RemasterNode):
         """Write what became of a configuration; then, and only then, say it."""
         why = '; '.join(f'{r.sensor}: {r.reason}: {r.detail}' for r in bad)
         missed = [item for item in bad if item.reason not in ('not_waited', 'absent')]
-        result = 'rejected' if not good else 'partial' if missed else 'recorded'
+        result: Outcome = 'rejected' if not good else 'partial' if missed else 'recorded'
         number = self._write(good, taking, result, why)
         if taking.pose.split == REGISTRATION:
             self.registrar.add(good)
@@ -396,13 +417,15 @@ class Recorder(RemasterNode):
             return
         last = max((reading.stamp_s for reading in good), default=self._now)
         self._report(
-            taking.pose.stamp,
-            taking.solution,
-            result,
-            why,
-            registered=self._registered(),
-            measuring_s=f'{last - taking.pairing.settled_stamp_s:.6f}',
-            **{f'waited_s_{name}': f'{waited:.3f}' for name, waited in waited_s.items()},
+            ConfigurationEnded(
+                stamp=taking.pose.stamp,
+                solution=taking.solution,
+                result=result,
+                reason=why,
+                registered=self._registered(),
+                measuring_s=last - taking.pairing.settled_stamp_s,
+                waited_s=dict(waited_s),
+            )
         )
         self._take_next()
 
@@ -429,18 +452,9 @@ class Recorder(RemasterNode):
             temperatures_c=[self._temperature_c(taking.pairing.settled_stamp_s)] * len(good),
         )
 
-    def _report(self, stamp: str, solution: int, result: str, why: str, **values: str) -> None:
-        self.counts[f'configurations_{result}'] += 1
-        self.status.event(
-            'configuration',
-            why or result,
-            level='ok' if result == 'recorded' else 'warn',
-            stamp=stamp,
-            solution=solution,
-            result=result,
-            reason=why,
-            **values,
-        )
+    def _report(self, end: ConfigurationEnded) -> None:
+        self.counts[f'configurations_{end.result}'] += 1
+        self.status.event(end)
 
     # The references
 
@@ -453,13 +467,9 @@ class Recorder(RemasterNode):
         if stops:
             watching.stopped_run = self._run
         self.get_logger().error(text)
+        change = watching.change
         self.status.event(
-            'changed',
-            text,
-            level='error' if stops else 'warn',
-            stops='yes' if stops else 'no',
-            cause=watching.change.kind,
-            size_m=f'{watching.change.size_m:.6f}',
+            SetupChanged(stops=stops, text=text, cause=change.kind, size_m=change.size_m)
         )
         self.status.publish()
 
@@ -501,7 +511,7 @@ class Recorder(RemasterNode):
             response.message = f'the session is closed ({self.journal.closed})'
             return response
         future: Future = Future()
-        pose = PublishedPose(BY_HAND, REGISTRATION, (0,), '')
+        pose = PoseAnnounced(stamp='', pose=BY_HAND, split=REGISTRATION, ids=(0,))
         self._take(self._q, self._now, 0, pose, future)
         good, why = await future
         response.success = bool(good)
@@ -510,37 +520,39 @@ class Recorder(RemasterNode):
 
     # State
 
-    def _summary(self) -> tuple[str, str, dict[str, Any]]:
+    def _summary(self) -> Summary:
         state = 'closed' if self.journal.closed else 'measuring' if self._busy() else 'waiting'
         now, sensors = time.monotonic(), self.cell.sensors
         waiting_for = self._waiting_for(self._absent())
         trouble = self._trouble or (f'waiting for {waiting_for}' if waiting_for else '')
         trouble = trouble or self.journal.beyond_repair or self._restored
         trouble = trouble or self._watching.describe()
-        pose, stopped = self._pose_tracker.now, self._watching.stopped_run
+        pose = self._pose_tracker.now
+        ages_s = {name: self._liveness.read_age_s(name, now) for name in sensors}
         values = {
-            'state': state,
-            'exit_status': self.journal.closed,
-            'session': self.p.session,
-            'observations': self.journal.observations,
-            # By these the planner, or one that was started again, takes up where this one is.
-            'pose': '' if pose is None else pose.stamp,
-            'plan': self.journal.plan_id,
-            'run': self._run,
-            'decided': self.journal.decided(),
-            'registration': self.registrar.describe(),
-            'require': self.p.require,
-            'waiting_for': waiting_for,
             **{f'waited_s_{name}': f'{s:.1f}' for name, s in self._waited_s.items()},
-            **{f'read_age_s_{n}': f'{self._liveness.read_age_s(n, now):.1f}' for n in sensors},
             'bag_dropped': self._bag.dropped,
             'restored': self._restored,
-            'changed': self._watching.describe(),
-            'changed_run': 'none' if stopped is None else stopped or 'unknown',
             'reference_rounds': self._watching.rounds,
             **dict(sorted(self.counts.items())),
         }
-        return ('warn' if trouble else 'ok'), trouble or state, values
+        report = RecorderState(
+            state=state,
+            exit_status=self.journal.closed,
+            session=self.p.session,
+            observations=self.journal.observations,
+            pose='' if pose is None else pose.stamp,
+            plan=self.journal.plan_id,
+            run=self._run,
+            decided=self.journal.decided(),
+            registration=self.registrar.describe(),
+            require=self.p.require,
+            waiting_for=waiting_for,
+            read_age_s={n: age_s if np.isfinite(age_s) else None for n, age_s in ages_s.items()},
+            changed=self._watching.describe(),
+            changed_run=self._watching.stopped_run,
+        )
+        return Summary('warn' if trouble else 'ok', trouble or state, values, report)
 
     # The disk
 

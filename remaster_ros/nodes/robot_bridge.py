@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,19 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from remaster_ros.collection.events import (
+    ArmHalted,
+    ArmStopped,
+    BridgeState,
+    ConfigurationEnded,
+    EventRecord,
+    HaltCleared,
+    PlannerState,
+    RecorderState,
+    SolutionCommanded,
+    SolutionFailed,
+    SolutionSettled,
+)
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.actions import (
@@ -45,7 +59,7 @@ from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.pose_tracker import waypoints_by_solution
 from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import LEASED, RELIABLE, Event, NodeStatus, listen
+from remaster_ros.nodes.status import LEASED, RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
 from remaster_ros.session.halt_file import HaltFile
 from remaster_ros.session.workcell import read_cell
@@ -114,7 +128,7 @@ class RobotBridge(RemasterNode):
         # Since when a controller listens; a command before that would be lost.
         self._listened_wall: float | None = None
         self._settled = self.create_publisher(JointState, 'remaster/settled', RELIABLE)
-        self.status = NodeStatus(self, self._summary)
+        self.status = NodeStatus(self, self._summary, Path(cell.robot.urdf).stem)
         self.create_subscription(JointState, JOINTS, self._on_joint_state, NEWEST_STATES)
         self.create_subscription(JointTrajectory, WAYPOINTS, self._on_waypoints, RELIABLE)
         self.create_subscription(JointTrajectory, SOLUTIONS, self._on_solutions, RELIABLE)
@@ -131,7 +145,7 @@ class RobotBridge(RemasterNode):
             )
         ]
         self.create_service(Trigger, 'remaster/clear_halt', self._on_clear_halt)
-        listen(self, self._on_event, self._on_summary)
+        listen(self, self._on_record)
         self.create_timer(WATCH_WALL_S, self._watch, clock=self.status.steady)
         if self.supervisor.halted:
             self.get_logger().error(f'halted: {self.supervisor.halted}')
@@ -177,23 +191,18 @@ class RobotBridge(RemasterNode):
 
     # What comes in
 
-    def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
+    def _on_record(self, record: EventRecord) -> None:
         now = time.monotonic()
-        if node == 'pose_planner':
-            state = values.get('state', 'unknown')
-            if state == 'running':
-                # By it a planner that is started again sees that this bridge was there all along.
-                self._run = values.get('run', '')
-            self._do(self.supervisor.planner_is(state, now, values.get('run', '')))
-        elif node == 'recorder':
-            self._do(self.supervisor.recorder_waits(values.get('waiting_for', ''), now))
-
-    def _on_event(self, event: Event) -> None:
-        if (event.node, event.event) != ('recorder', 'configuration'):
-            return
-        solution = event.values.get('solution', '')
-        if event.values.get('stamp') == self._pose_stamp and solution.isdecimal():
-            self._do(self.supervisor.answered(int(solution), time.monotonic()))
+        match record.body:
+            case PlannerState(state=state, run=run):
+                if state == 'running':
+                    # By it a planner that is started again sees that this bridge was there.
+                    self._run = run
+                self._do(self.supervisor.planner_is(state, now, run))
+            case RecorderState(waiting_for=waiting_for):
+                self._do(self.supervisor.recorder_waits(waiting_for, now))
+            case ConfigurationEnded(stamp=self._pose_stamp, solution=solution):
+                self._do(self.supervisor.answered(solution, now))
 
     def _on_waypoints(self, message: JointTrajectory) -> None:
         self._waypoints = message
@@ -245,7 +254,7 @@ class RobotBridge(RemasterNode):
         response.message = refusal or 'cleared; /remaster/collect goes on'
         if not refusal:
             self._disk.submit(self._halt_file.clear, self._on_written)
-            self._event('halt_cleared', 'the halt was cleared by a person')
+            self.status.event(HaltCleared(stamp=self._pose_stamp))
             self.status.publish()
         return response
 
@@ -298,16 +307,18 @@ class RobotBridge(RemasterNode):
                 case Stop(admitted, reason):
                     self._publish(admitted)
                     self.counts['stopped'] += 1
-                    self._event('stopped', reason, 'warn')
+                    self.status.event(ArmStopped(stamp=self._pose_stamp, reason=reason))
                     self.get_logger().info(f'stopping the arm: {reason}')
                 case Settled():
                     self._announce(action)
                 case Failed(solution, reason):
                     self.counts['failed'] += 1
-                    self._event('failed', reason, 'warn', solution=solution, reason=reason)
+                    self.status.event(
+                        SolutionFailed(stamp=self._pose_stamp, solution=solution, reason=reason)
+                    )
                 case Halted(reason):
                     self._disk.submit(partial(self._halt_file.write, reason), self._on_written)
-                    self._event('halted', reason, 'error')
+                    self.status.event(ArmHalted(stamp=self._pose_stamp, reason=reason))
                     self.status.publish()
                     self.get_logger().error(f'halted: {reason}')
 
@@ -330,11 +341,12 @@ class RobotBridge(RemasterNode):
         if solution < 0:
             return
         self.counts['commanded'] += 1
-        self._event(
-            'commanded',
-            f'solution {solution} commanded',
-            solution=solution,
-            since_settled_wall_s=f'{time.monotonic() - self._settled_wall:.6f}',
+        self.status.event(
+            SolutionCommanded(
+                stamp=self._pose_stamp,
+                solution=solution,
+                since_settled_wall_s=time.monotonic() - self._settled_wall,
+            )
         )
 
     def _on_path(self, number: int, answer: PathAnswer | Exception) -> None:
@@ -353,35 +365,35 @@ class RobotBridge(RemasterNode):
         message = JointState(name=list(self.chain.joint_names), position=settled.q.tolist())
         message.header.stamp = stamp_of(settled.stamp_s)
         self._settled.publish(message)
-        self._event(
-            'settled',
-            f'solution {settled.solution} settled',
-            solution=settled.solution,
-            motion_s=f'{settled.motion_s:.6f}',
-            settle_s=f'{settled.settle_s:.6f}',
+        self.status.event(
+            SolutionSettled(
+                stamp=self._pose_stamp,
+                solution=settled.solution,
+                motion_s=settled.motion_s,
+                settle_s=settled.settle_s,
+            )
         )
 
-    def _event(self, event: str, message: str, level: str = 'ok', **values: Any) -> None:
-        self.status.event(event, message, level=level, stamp=self._pose_stamp, **values)
-
-    def _summary(self) -> tuple[str, str, dict[str, Any]]:
+    def _summary(self) -> Summary:
         supervisor, now = self.supervisor, time.monotonic()
         blocked = supervisor.blocked(now)
         text = 'moving or measuring' if supervisor.busy else 'waiting for a pose'
         refused = supervisor.reports.refused
         values = {
             **self.counts,
-            'halted': supervisor.halted,
-            'joints_age_s': f'{supervisor.report_age_s(now):.1f}',
-            'joints_trouble': supervisor.trouble,
             **{f'joints_refused_{reason}': count for reason, count in sorted(refused.items())},
             'moves_refused': supervisor.gate.refused,
-            # By it the planner sees whether a bridge that was started again knows the pose.
-            'pose': self._pose_stamp,
-            'run': self._run,
         }
+        age_s = supervisor.report_age_s(now)
+        state = BridgeState(
+            halted=supervisor.halted,
+            pose=self._pose_stamp,
+            run=self._run,
+            joints_age_s=age_s if np.isfinite(age_s) else None,
+            joints_trouble=supervisor.trouble,
+        )
         level = 'error' if supervisor.halted else 'warn' if blocked else 'ok'
-        return level, blocked or text, values
+        return Summary(level, blocked or text, values, state)
 
     def close(self) -> None:
         """Leave the arm standing still."""

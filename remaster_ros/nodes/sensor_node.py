@@ -13,10 +13,11 @@ from typing import Any
 
 from geometry_msgs.msg import PointStamped
 
+from remaster_ros.collection.events import SensorReport
 from remaster_ros.errors import InputError
 from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.running import RemasterNode
-from remaster_ros.nodes.status import RELIABLE, NodeStatus
+from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary
 from remaster_ros.session.workcell import Workcell, read_cell
 from remaster_ros.types import FloatArray
 
@@ -85,7 +86,7 @@ class SensorNode(RemasterNode):
 
     def open_status(self) -> None:
         """Begin to publish the state; last of all in a node's constructor."""
-        self.status = NodeStatus(self, self._summary)
+        self.status = NodeStatus(self, self._summary, self.sensor)
 
     @abstractmethod
     def state(self) -> SensorState:
@@ -108,16 +109,17 @@ class SensorNode(RemasterNode):
         self._readings.publish(message)
         self.published += 1
 
-    def _summary(self) -> tuple[str, str, dict[str, Any]]:
+    def _summary(self) -> Summary:
         state = self.state()
         trouble = self.clock_trouble or state.trouble
+        report = SensorReport(
+            sensor=self.sensor,
+            ready=state.ready and not self.clock_trouble,
+            trouble=trouble,
+            message=trouble or state.message,
+            hidden=state.values.get('fault') == 'marker',
+        )
         level = 'error' if self.clock_trouble else state.level
-        ready = state.ready and not self.clock_trouble
-        values = {
-            'sensor': self.sensor,
-            'ready': 'yes' if ready else 'no',
-            'trouble': trouble,
-            'published': self.published,
-            **state.values,
-        }
-        return level, trouble or state.message, values
+        return Summary(
+            level, report.message, {'published': self.published, **state.values}, report
+        )
