@@ -61,7 +61,7 @@ BEFORE = (
     'rclpy.node',
     'remaster_ros.kinematics.free_paths',
     'remaster_ros.motion.arm_supervisor',
-    'remaster_ros.nodes.pose_tracker',
+    'remaster_ros.nodes.waypoints',
     'remaster_ros.nodes.parameters',
     'remaster_ros.nodes.running',
     'remaster_ros.nodes.status',

@@ -16,9 +16,9 @@ from remaster_ros.collection.events import (
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.messages import duration_of, stamp_key
-from remaster_ros.nodes.pose_tracker import waypoints_message
 from remaster_ros.nodes.running import RemasterNode
 from remaster_ros.nodes.status import LEASED, NodeStatus
+from remaster_ros.nodes.waypoints import waypoints_message
 from remaster_ros.planning.tour_order import PoseVisit
 
 ANNOUNCE_WALL_S = 5.0

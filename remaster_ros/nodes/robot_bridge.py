@@ -54,12 +54,19 @@ from remaster_ros.motion.path_search import PathSearch
 from remaster_ros.nodes.background import Background
 from remaster_ros.nodes.bridge_parameters import Parameters
 from remaster_ros.nodes.emergency_link import EmergencyLink
-from remaster_ros.nodes.messages import JointOrder, duration_of, seconds, stamp_key, stamp_of
+from remaster_ros.nodes.messages import (
+    JointOrder,
+    duration_of,
+    seconds,
+    solutions_of,
+    stamp_key,
+    stamp_of,
+)
 from remaster_ros.nodes.parameters import declare
-from remaster_ros.nodes.pose_tracker import waypoints_by_solution
 from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import LEASED, RELIABLE, NodeStatus, Summary, listen
+from remaster_ros.nodes.waypoints import waypoints_by_solution
 from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
 from remaster_ros.session.halt_file import HaltFile
 from remaster_ros.session.workcell import read_cell
@@ -209,7 +216,7 @@ class RobotBridge(RemasterNode):
 
     def _on_solutions(self, message: JointTrajectory) -> None:
         try:
-            targets = self._targets(message)
+            targets = solutions_of(message, self.chain.joint_names)
             belongs = self._waypoints.header.stamp == message.header.stamp
             names = self.chain.joint_names
             waypoints = waypoints_by_solution(self._waypoints, names) if belongs else {}
@@ -218,19 +225,6 @@ class RobotBridge(RemasterNode):
             return
         self._pose_stamp = stamp_key(message.header.stamp)
         self._do(self.supervisor.plan(targets, time.monotonic(), waypoints))
-
-    def _targets(self, message: JointTrajectory) -> FloatArray:
-        """Return the solutions by the names of the cell's joints, rad, (m, k)."""
-        names, given = self.chain.joint_names, list(message.joint_names)
-        if not message.points:
-            # A stop, whatever joints it names.
-            return np.empty((0, len(names)))
-        if not set(names) <= set(given):
-            raise InputError(f'they are for {", ".join(given)}, the cell has {", ".join(names)}')
-        if any(len(point.positions) != len(given) for point in message.points):
-            raise InputError(f'a point has not as many positions as joints, {len(given)}')
-        columns = [given.index(name) for name in names]
-        return np.array([point.positions for point in message.points])[:, columns]
 
     def _on_joint_state(self, message: JointState) -> None:
         now = time.monotonic()

@@ -10,8 +10,8 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.errors import InputError
-from remaster_ros.nodes.pose_tracker import waypoints_by_solution, waypoints_message
 from remaster_ros.nodes.tour_planner import PlanningThread
+from remaster_ros.nodes.waypoints import waypoints_by_solution, waypoints_message
 from remaster_ros.planning.tour_order import PoseVisit
 
 NAMES = ('a', 'b', 'c')

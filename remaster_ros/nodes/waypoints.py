@@ -1,4 +1,4 @@
-"""What the planner announced: the pose under way and its joint solutions, from two topics."""
+"""Between the ways to joint solutions and remaster/joint_waypoints."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import numpy as np
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from remaster_ros.collection.events import PoseAnnounced
 from remaster_ros.errors import InputError
-from remaster_ros.nodes.messages import duration_of, stamp_key
-from remaster_ros.planning.tour_order import PoseVisit, nearest_solution
+from remaster_ros.nodes.messages import duration_of
+from remaster_ros.planning.tour_order import PoseVisit
 from remaster_ros.types import FloatArray
 
 
@@ -76,45 +75,3 @@ def waypoints_by_solution(
         last = index
         found.setdefault(index, []).append(positions[columns])
     return {index: np.array(points) for index, points in found.items()}
-
-
-class PoseTracker:
-    """Bring the two together; the last announcement counts.
-
-    Parameters
-    ----------
-    joint_names
-        The wanted order of joints.
-
-    Attributes
-    ----------
-    announced
-        The planner's last announcement; to be set.
-    """
-
-    def __init__(self, joint_names: Sequence[str]) -> None:
-        self._joint_names = tuple(joint_names)
-        self.announced: PoseAnnounced | None = None
-        self._solutions: FloatArray | None = None
-        self._stamp = ''
-
-    def take_solutions(self, message: JointTrajectory) -> None:
-        """Take /remaster/joint_solutions; without points it takes the pose back."""
-        self._stamp, self._solutions = '', None
-        names = list(message.joint_names)
-        if message.points and set(self._joint_names) <= set(names):
-            columns = [names.index(name) for name in self._joint_names]
-            points = np.array([point.positions for point in message.points])
-            self._stamp, self._solutions = stamp_key(message.header.stamp), points[:, columns]
-
-    @property
-    def now(self) -> PoseAnnounced | None:
-        """The pose under way; None where the event or the solutions have not come."""
-        announced = self.announced
-        return announced if announced is not None and announced.stamp == self._stamp else None
-
-    def which(self, q: FloatArray) -> int | None:
-        """Return which of the solutions the arm stands at, rad, (k,); None at none."""
-        if self.now is None or self._solutions is None:
-            return None
-        return nearest_solution(self._solutions, q)
