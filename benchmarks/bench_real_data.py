@@ -69,9 +69,10 @@ def coverage(folder: Path) -> Coverage:
     measurements = found.problem.measurements
     rows = Rows.of(measurements, np.flatnonzero(measurements.is_validation), model.reference)
     predicted = model.predict(posterior.parameters(points), rows)
+    noise = posterior.noise_model.sensor_noise(posterior.noise(points[:, len(posterior.free) :]))
     sigma, pose_sigma = (
         np.sqrt(np.mean(part**2, axis=0))[rows.group_sensor]
-        for part in posterior.sensor_noise(points[:, len(posterior.free) :])
+        for part in (noise.sigma, noise.pose_sigma)
     )
     group, size = rows.group_of_row, rows.group_size
     errors = rows.target - predicted.mean(axis=0)

@@ -167,7 +167,7 @@ class PaperModel:
 def product_mode(session: Session) -> Mode:
     """Return the product's posterior of the same model: no common part, the marker as known."""
     found = estimate(Problem.of(replace(session, marker_std_m=KNOWN_MARKER_M)))
-    return find_mode(replace(found.posterior, separable=()))
+    return find_mode(found.posterior.without_pose_sigma())
 
 
 def product_states(model: PaperModel, mode: Mode, points: FloatArray) -> FloatArray:
@@ -175,7 +175,8 @@ def product_states(model: PaperModel, mode: Mode, points: FloatArray) -> FloatAr
     posterior = mode.linearisation.posterior
     arm: Model = posterior.model
     x = arm.natural(posterior.parameters(points))
-    sigma, _ = posterior.sensor_noise(points[..., len(posterior.free) :])
+    noise = posterior.noise(points[..., len(posterior.free) :])
+    sigma = posterior.noise_model.sensor_noise(noise).sigma
     return model.state_of(inverse(arm.T_R_N(x)[..., 0, :, :]), arm.offsets(x), sigma[..., 0])
 
 

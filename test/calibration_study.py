@@ -98,8 +98,8 @@ def visible_draws(found: Estimate, rng: np.random.Generator) -> tuple[list[str],
     run, _ = sample_posterior(found.mode, chains=4, draws=1000, rng=rng)
     points = run.draws.reshape(-1, run.draws.shape[-1])
     z = posterior.parameters(points)
-    sigma, pose_sigma = posterior.sensor_noise(points[:, len(posterior.free) :])
-    columns = np.concatenate((z[:, visible(model)], sigma, pose_sigma), axis=1)
+    noise = posterior.noise_model.sensor_noise(posterior.noise(points[:, len(posterior.free) :]))
+    columns = np.concatenate((z[:, visible(model)], noise.sigma, noise.pose_sigma), axis=1)
     return visible_names(model), columns
 
 

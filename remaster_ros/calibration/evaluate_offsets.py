@@ -93,7 +93,10 @@ def accuracy_with_offsets(
             before=found.before.z,
             after=given.z,
             draws=_draws(found, given, joint_offsets_std, rng),
-            sigma=np.tile(found.posterior.total_noise(given.eta), (DRAWS, 1, 1)),
+            sigma=np.tile(
+                found.posterior.noise_model.total_noise(found.posterior.noise(given.eta)),
+                (DRAWS, 1, 1),
+            ),
         )
     accuracy = accuracy_of(
         problem.measurements,

@@ -11,7 +11,6 @@ from remaster_ros.calibration import convergence
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.extension import Extension
 from remaster_ros.calibration.paper_sampler import BURN_IN_SHARE, STEPS, fit_paper
-from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.result import FitResult, Sampled, build_result
 from remaster_ros.calibration.sampling import PRECISION, Length, Progress, sample_posterior, silent
 from remaster_ros.errors import InputError
@@ -110,12 +109,13 @@ def _fast(
     found: Estimate, chains: int, length: Length, rng: np.random.Generator, report: Progress
 ) -> Sampled:
     posterior, model = found.posterior, found.model
+    noise_model = posterior.noise_model
 
     def readable(points: FloatArray) -> FloatArray:
         natural = model.natural(posterior.parameters(points))[..., posterior.free]
-        sigma, pose_sigma = posterior.noise(points[..., len(posterior.free) :])
-        separate = pose_sigma[..., list(posterior.separable)]
-        return np.concatenate((natural, sigma, separate), axis=-1)
+        noise = posterior.noise(points[..., len(posterior.free) :])
+        separate = noise.pose_sigma[..., list(noise_model.separable)]
+        return np.concatenate((natural, noise.sigma, separate), axis=-1)
 
     run, name = sample_posterior(
         found.mode,
@@ -129,25 +129,33 @@ def _fast(
     names = tuple(model.names[index] for index in posterior.free)
     noises = tuple(
         '.'.join(filter(None, ('noise', model.sensor_names[c.sensor], c.direction)))
-        for c in posterior.channels
+        for c in noise_model.channels
     )
     names += tuple(f'{noise}.sigma' for noise in noises)
-    names += tuple(f'{noises[index]}.pose_sigma' for index in posterior.separable)
+    names += tuple(f'{noises[index]}.pose_sigma' for index in noise_model.separable)
 
-    sigma, pose_sigma = posterior.sensor_noise(run.draws[..., len(posterior.free) :])
+    noise = posterior.noise(run.draws[..., len(posterior.free) :])
+    by_sensor = noise_model.sensor_noise(noise)
     unfixed = np.isin(np.arange(model.joints), found.gauge.held)
     return Sampled(
         model=model,
         z=posterior.parameters(run.draws),
         z_mean=posterior.parameters(run.draws.reshape(-1, posterior.size).mean(axis=0)),
-        sigma=sigma,
-        pose_sigma=pose_sigma,
-        total_noise=posterior.total_noise(run.draws[..., len(posterior.free) :]),
-        by_direction=_by_direction(posterior, run.draws[..., len(posterior.free) :]),
+        sigma=by_sensor.sigma,
+        pose_sigma=by_sensor.pose_sigma,
+        total_noise=noise_model.total_noise(noise),
+        by_direction={
+            (channel.sensor, channel.direction): (
+                noise.sigma[..., index],
+                noise.pose_sigma[..., index],
+            )
+            for index, channel in enumerate(noise_model.channels)
+            if channel.direction
+        },
         trace=readable(run.trace),
         draws=readable(run.draws),
         names=names,
-        separable=tuple({posterior.channels[index].sensor for index in posterior.separable}),
+        separable=tuple({noise_model.channels[index].sensor for index in noise_model.separable}),
         name=name,
         acceptance_rate=run.acceptance_rate,
         precision=None if length.draws is not None else length.precision,
@@ -159,15 +167,3 @@ def _fast(
         z_before=found.before.z,
         left_out=found.left_out,
     )
-
-
-def _by_direction(
-    posterior: Posterior, eta: FloatArray
-) -> dict[tuple[int, str], tuple[FloatArray, FloatArray]]:
-    """Return sigma and pose_sigma, m, (chains, draws) each, along and across lines of sight."""
-    sigma, pose_sigma = posterior.noise(eta)
-    return {
-        (channel.sensor, channel.direction): (sigma[..., index], pose_sigma[..., index])
-        for index, channel in enumerate(posterior.channels)
-        if channel.direction
-    }

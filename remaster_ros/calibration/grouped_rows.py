@@ -82,6 +82,8 @@ class Rows:
 
     def of_groups(self, first: int, last: int) -> Rows:
         """Return the rows of the groups from ``first`` to before ``last``."""
+        if first == 0 and last == len(self.group_start):
+            return self
         start = int(self.group_start[first])
         stop = int(self.group_start[last - 1] + self.group_size[last - 1])
         spans = (

@@ -13,7 +13,7 @@ import numpy as np
 
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.model import Model
-from remaster_ros.calibration.posterior import RESOLUTION_M
+from remaster_ros.calibration.noise import RESOLUTION_M
 from remaster_ros.calibration.priors import TIGHTEST_PRIOR, Prior, prior_rows
 from remaster_ros.calibration.registration import register_points
 from remaster_ros.errors import InsufficientDataError

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from remaster_ros.calibration.grouped_rows import Rows
-from remaster_ros.calibration.posterior import RESOLUTION_M, Posterior
+from remaster_ros.calibration.noise import RESOLUTION_M
+from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.priors import prior_rows
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.types import FloatArray
@@ -28,14 +29,16 @@ def linearise(posterior: Posterior, z: FloatArray) -> Linearisation:
     """Return the posterior with the predictions replaced by their tangent at z (size,)."""
     model, free = posterior.model, posterior.free
 
-    def joined(rows: Rows) -> FloatArray:
+    def joined(rows: Rows, _: slice) -> FloatArray:
         # One matrix holds derivative and error: its Gram matrix holds all the products needed.
         errors = rows.target - model.predict(z, rows)
         return np.concatenate((model.jacobian(z, rows)[:, :, free], errors[:, :, None]), axis=2)
 
     residual, by_z = prior_rows(model, posterior.priors, z)
     rows = np.column_stack((-by_z[:, free], residual))
-    return Linearisation(posterior, z, posterior.gram(joined, len(free) + 1), rows.T @ rows)
+    return Linearisation(
+        posterior, z, posterior.noise_model.gram(joined, len(free) + 1), rows.T @ rows
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,20 +51,20 @@ class Linearisation:
         The one it approximates.
     z
         Pinned parameters, (size,).
-    cells
-        Gram matrix of [derivative | error] in each of the posterior's cells, (cells, f+1, f+1).
+    grams
+        Gram matrix of [derivative | error] in each error group, (error groups, f+1, f+1).
     prior
         Gram matrix of the priors, (f+1, f+1).
     """
 
     posterior: Posterior
     z: FloatArray
-    cells: FloatArray
+    grams: FloatArray
     prior: FloatArray
 
     def gram(self, eta: FloatArray) -> FloatArray:
         """Return the weighted Gram matrices (..., f+1, f+1) for noise coordinates (..., e)."""
-        return np.tensordot(1.0 / self.posterior.variances(eta), self.cells, axes=1) + self.prior
+        return np.tensordot(1.0 / self.posterior.variances(eta), self.grams, axes=1) + self.prior
 
     def conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the Gaussian of the free parameters given the noise, and the noise's density.
@@ -104,7 +107,7 @@ class Linearisation:
         factor = np.linalg.cholesky(gram / (scale[..., :, None] * scale[..., None, :]))
         factor *= scale[..., :, None]
         inner = factor[..., :f, :f]
-        log_scale = np.log(posterior.variances(eta)) @ posterior.freedom
+        log_scale = np.log(posterior.variances(eta)) @ posterior.noise_model.freedom
         log_marginal = (
             posterior.log_noise_prior(eta)
             - 0.5 * (log_scale + factor[..., f, f] ** 2)
@@ -190,19 +193,18 @@ def find_mode(posterior: Posterior, eta: FloatArray | None = None) -> Mode:
 
 def _noise_guess(posterior: Posterior) -> FloatArray:
     errors = posterior.rows.target - posterior.model.predict(posterior.reference, posterior.rows)
-    sums = posterior.sums_of_squares(errors)
+    noise = posterior.noise_model
+    sums = noise.sums_of_squares(errors)
     sigmas, ratios = [], []
-    for index in range(len(posterior.channels)):
-        mine = [i for i, cell in enumerate(posterior.cells) if cell.channel == index]
-        inner = [i for i in mine if posterior.cells[i].size == 0]
-        outer = [i for i in mine if posterior.cells[i].size > 0]
-        common = sums[outer].sum() / posterior.freedom[outer].sum()
-        variance = sums[inner].sum() / posterior.freedom[inner].sum() if inner else common
+    for index in range(len(noise.channels)):
+        mine = noise.channel_of == index
+        inner, outer = mine & (noise.size_of == 0), mine & (noise.size_of > 0)
+        common = sums[outer].sum() / noise.freedom[outer].sum()
+        variance = sums[inner].sum() / noise.freedom[inner].sum() if inner.any() else common
         sigma = np.sqrt(variance + RESOLUTION_M**2)
         sigmas.append(np.log(sigma))
-        if index in posterior.separable:
-            sizes = [posterior.cells[i].size for i in outer]
-            share = np.average(sizes, weights=posterior.freedom[outer])
+        if index in noise.separable:
+            share = np.average(noise.size_of[outer], weights=noise.freedom[outer])
             ratios.append(np.arcsinh(np.sqrt(max(common - variance, 0.0) / share) / sigma))
     return np.array(sigmas + ratios)
 
@@ -223,14 +225,14 @@ def _noise_peak(linearisation: Linearisation, start: FloatArray) -> FloatArray:
         if np.max(heights) <= value:
             break
         peak = tries[np.argmax(heights)]
-    count = len(linearisation.posterior.channels)
+    count = len(linearisation.posterior.noise_model.channels)
     return np.concatenate((peak[:count], np.abs(peak[count:])))
 
 
 def _noise_covariance(linearisation: Linearisation, peak: FloatArray) -> FloatArray:
     """Return the noise's covariance by its curvature; of a pose_sigma near zero by its spread."""
     precision = _noise_curvature(linearisation, peak)[2]
-    count = len(linearisation.posterior.channels)
+    count = len(linearisation.posterior.noise_model.channels)
     std = 1.0 / np.sqrt(np.maximum(np.diag(precision), 0.45))
     spread = {}
     for index in range(count, len(peak)):

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from remaster_ros.calibration.grouped_rows import Rows
-from remaster_ros.calibration.posterior import RESOLUTION_M
+from remaster_ros.calibration.noise import RESOLUTION_M
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.types import BoolArray, FloatArray
 

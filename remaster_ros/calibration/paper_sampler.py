@@ -198,10 +198,9 @@ def fit_paper(
     names = model.names[: len(fitted)]
     names += tuple(f'noise.{sensor}.sigma' for sensor in model.sensor_names)
     free = fitted[model.joints :]
-    flat = replace(
-        Posterior.of(model, rows, (), free, model.vector(np.zeros(model.joints), problem.markers)),
-        separable=(),
-    )
+    flat = Posterior.of(
+        model, rows, (), free, model.vector(np.zeros(model.joints), problem.markers)
+    ).without_pose_sigma()
     return Sampled(
         model=model,
         z=z,

@@ -60,7 +60,7 @@ class LaplaceProposal:
         linearisation = mode.linearisation
         centre, factor, _ = linearisation.conditional(mode.eta)
         basis: FloatArray = np.asarray(np.linalg.cholesky(mode.eta_covariance)).T
-        count = len(linearisation.posterior.channels)
+        count = len(linearisation.posterior.noise_model.channels)
         means, diagonals, lowers = [], [], []
         for direction in basis:
             # Behind the boundary of the folded coordinates the density is mirrored, not smooth.
@@ -147,11 +147,11 @@ class LaplaceProposal:
         return mean, np.clip(log_diagonal, -2.0, 2.0), u
 
     def _fold(self, eta: FloatArray) -> FloatArray:
-        count = len(self.mode.linearisation.posterior.channels)
+        count = len(self.mode.linearisation.posterior.noise_model.channels)
         return np.concatenate((eta[:, :count], np.abs(eta[:, count:])), axis=1)
 
     def _noise_density(self, eta: FloatArray) -> FloatArray:
-        count = len(self.mode.linearisation.posterior.channels)
+        count = len(self.mode.linearisation.posterior.noise_model.channels)
         folded = eta.shape[1] - count
         signs = itertools.product((1.0, -1.0), repeat=folded)
         mirrored = [eta * np.array((*(1.0,) * count, *sign)) for sign in signs]

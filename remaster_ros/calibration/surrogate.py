@@ -43,10 +43,10 @@ class _Part:
         Which free parameters the errors depend on, (l,).
     first, second
         The products that matter, as indices of free parameters, (p,) each.
-    cells
-        One of the noise model's cells for each variance; empty for priors, whose weight is 1.
+    groups
+        One of the error groups for each variance; empty for priors, whose weight is 1.
     straight
-        Products of linear with all features by variance, (cells or 1, l + 1, l + 1 + p).
+        Products of linear with all features by variance, (groups or 1, l + 1, l + 1 + p).
     strong
         Which of the products matter in products with each other too.
     curved
@@ -56,7 +56,7 @@ class _Part:
     linear: IntArray
     first: IntArray
     second: IntArray
-    cells: IntArray
+    groups: IntArray
     straight: FloatArray
     strong: IntArray
     curved: tuple[tuple[int, FloatArray], ...]
@@ -97,7 +97,8 @@ class Surrogate:
         # Features by rows: what is picked and multiplied then lies together in memory.
         step, eta = (self.centre[:f] - points[:, :f]).T.copy(), points[:, f:]
         variances = posterior.variances(eta)
-        value = posterior.log_noise_prior(eta) - 0.5 * np.log(variances) @ posterior.freedom
+        value = posterior.log_noise_prior(eta)
+        value -= 0.5 * np.log(variances) @ posterior.noise_model.freedom
         for part in self._parts:
             count = len(part.linear) + 1
             feature = np.empty((count + len(part.first), len(points)))
@@ -105,8 +106,8 @@ class Surrogate:
             np.multiply(-step[part.first], step[part.second], out=feature[count:])
             line, product = feature[:count], feature[count + part.strong]
             forms = np.einsum('cln,ln->nc', part.straight @ feature, line)
-            if len(part.cells) > 0:
-                forms /= variances[:, part.cells]
+            if len(part.groups) > 0:
+                forms /= variances[:, part.groups]
             value -= 0.5 * forms.sum(axis=1)
             for channel, gram in part.curved:
                 form = np.einsum('pn,pn->n', gram @ product, product)
@@ -128,30 +129,28 @@ def _data_parts(mode: Mode, width: FloatArray) -> list[_Part]:
     """Return the parts of the sensors."""
     posterior = mode.linearisation.posterior
     model, free, f = posterior.model, posterior.free, len(posterior.free)
+    noise = posterior.noise_model
     pairs = _bent_pairs(model, free)
     first, second = (np.searchsorted(free, [pair[side] for pair in pairs]) for side in (0, 1))
 
-    def joined(rows: Rows) -> FloatArray:
+    def joined(rows: Rows, _: slice) -> FloatArray:
         errors = rows.target - model.predict(mode.z, rows)
         straight = model.jacobian(mode.z, rows)[:, :, free]
         bent = _second_derivatives(model, mode.z, rows, pairs)
         return np.concatenate((straight, errors[:, :, None], bent), axis=2)
 
-    grams = posterior.gram(joined, f + 1 + len(pairs))
+    grams = noise.gram(joined, f + 1 + len(pairs))
     variances = posterior.variances(mode.eta)
     parts = []
     for sensor in range(len(model.sensor_names)):
-        cells = np.array(
-            [
-                index
-                for index, cell in enumerate(posterior.cells)
-                if posterior.channels[cell.channel].sensor == sensor
-            ]
+        mine = [noise.channels[channel].sensor == sensor for channel in noise.channel_of]
+        groups = np.flatnonzero(mine)
+        size = np.sum(
+            np.diagonal(grams[groups], axis1=1, axis2=2) / variances[groups, None], axis=0
         )
-        size = np.sum(np.diagonal(grams[cells], axis1=1, axis2=2) / variances[cells, None], axis=0)
         linear = np.flatnonzero(size[:f] > 0.0)
         moved = np.sqrt(size[f + 1 :]) * width[first] * width[second]
-        parts.append(_part(posterior, grams, variances, linear, first, second, moved, cells))
+        parts.append(_part(posterior, grams, variances, linear, first, second, moved, groups))
     return parts
 
 
@@ -163,29 +162,29 @@ def _part(
     first: IntArray,
     second: IntArray,
     moved: FloatArray,
-    cells: IntArray,
+    groups: IntArray,
 ) -> _Part:
-    """Cut the matrices of some cells to the features that matter, by how much they move."""
-    f = len(posterior.free)
+    """Cut the matrices of some error groups to the features that matter, by how much they move."""
+    f, noise = len(posterior.free), posterior.noise_model
     chosen = moved > NEGLIGIBLE
     strong = np.flatnonzero(moved[chosen] > NEGLIGIBLE_SQUARED)
     line = np.append(linear, f)
     bent = f + 1 + np.flatnonzero(chosen)
     straight = np.concatenate(
-        (grams[np.ix_(cells, line, line)], 2.0 * grams[np.ix_(cells, line, bent)]), axis=2
+        (grams[np.ix_(groups, line, line)], 2.0 * grams[np.ix_(groups, line, bent)]), axis=2
     )
-    # Without a part common to a pose the cells of a channel have one variance.
+    # Without a part common to a pose the error groups of a channel have one variance.
     alike: dict[tuple[int, int], list[int]] = {}
-    for place, cell in enumerate(cells):
-        channel = posterior.cells[cell].channel
-        size = posterior.cells[cell].size if channel in posterior.separable else 0
+    for place, group in enumerate(groups):
+        channel = int(noise.channel_of[group])
+        size = int(noise.size_of[group]) if channel in noise.separable else 0
         alike.setdefault((channel, size), []).append(place)
     summed = np.array([straight[places].sum(axis=0) for places in alike.values()])
-    chief = cells[[places[0] for places in alike.values()]]
+    chief = groups[[places[0] for places in alike.values()]]
     curved: dict[int, FloatArray] = {}
-    for cell in cells:
-        channel = posterior.cells[cell].channel
-        gram = grams[np.ix_([cell], bent[strong], bent[strong])][0] / variances[cell]
+    for group in groups:
+        channel = int(noise.channel_of[group])
+        gram = grams[np.ix_([group], bent[strong], bent[strong])][0] / variances[group]
         curved[channel] = curved.get(channel, 0.0) + gram
     products = tuple(curved.items()) if len(strong) > 0 else ()
     return _Part(linear, first[chosen], second[chosen], chief, summed, strong, products)

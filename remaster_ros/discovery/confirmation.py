@@ -149,8 +149,10 @@ def _left(
     left = data.full_errors - data.displaced(cells, theta)
     # What is not held again: a small step, so linear.
     columns = data.full_jacobian[:, :, joints:]
-    white = data.whitened(columns[data.rows.source], data.noise).reshape(3 * len(data), -1)
-    target = data.whitened(left[data.rows.source], data.noise).ravel()
+    white = data.noise_model.whitened(columns[data.rows.source], data.noise).reshape(
+        3 * len(data), -1
+    )
+    target = data.noise_model.whitened(left[data.rows.source], data.noise).ravel()
     scale = np.linalg.norm(white, axis=0)
     step = np.linalg.lstsq(white / scale, target, rcond=1e-9)[0] / scale
     return left - columns @ step

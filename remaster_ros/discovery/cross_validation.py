@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.evidence import Solution
-from remaster_ros.discovery.residuals import Noise, Residuals
+from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.types import FloatArray, IntArray
 
 
@@ -37,7 +38,7 @@ def held_out_error(
     """
     columns = data.columns(solution.cells)
     joined = np.concatenate((data.base, columns, data.errors[:, :, None]), axis=2)
-    white = data.whitened(joined, noise).reshape(3 * len(data), -1)
+    white = data.noise_model.whitened(joined, noise).reshape(3 * len(data), -1)
     scale = np.linalg.norm(white, axis=0)
     scale[-1] = 1.0
     scale[scale == 0.0] = 1.0

@@ -139,8 +139,8 @@ def discover_session(
     return Discovery(
         verdict=verdict,
         effects=effects,
-        gain=gain_of(findings.before, solution, fit, rng),
-        pose_common_fraction=pose_common_fraction(solution),
+        gain=gain_of(findings.before, residuals, solution, fit, rng),
+        pose_common_fraction=pose_common_fraction(residuals, solution),
         noise_by_range=noise_by_range(residuals, solution),
         outliers=fit.left_out,
         untestable=findings.untestable,

@@ -1,8 +1,7 @@
 """How well a set of cells explains the residuals: parameters, noise, smoothness, evidence.
 
-With w_s the weight (inverse variance) of stratum s of the data, which are the deviations from the
-pose means of one sensor and its pose means of one group size, everything follows from the Gram
-matrices G_s of the columns in each stratum, whatever the number of rows::
+With w_s the weight (inverse variance) of error group s of the noise model, everything follows
+from the Gram matrices G_s of the columns in each group, whatever the number of rows::
 
     H = Σ w_s G_s + Λ,   restricted log likelihood
     L = ½ Σ n_s log w_s − ½ log|H| + ½ log|Λ| − ½ (y'Wy − b'H⁻¹b)
@@ -23,10 +22,10 @@ from scipy.linalg import cho_solve
 from scipy.linalg.lapack import dpotri
 from scipy.optimize import minimize
 
-from remaster_ros.calibration.posterior import RESOLUTION_M
+from remaster_ros.calibration.noise import RESOLUTION_M, Noise, NoiseModel
 from remaster_ros.discovery.effects.base import Cell
-from remaster_ros.discovery.residuals import Noise, Residuals
-from remaster_ros.types import FloatArray, IntArray
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.types import FloatArray
 
 # Columns whose norm falls below this share when the others are projected out say nothing new.
 ABSORBED = 1e-4
@@ -35,59 +34,6 @@ STEPS = 60
 # Where the slope in these units falls below this, L is within its square of the maximum.
 SLOPE = 0.03
 _LARGE = 18.0
-
-
-@dataclass(frozen=True, eq=False)
-class Strata:
-    """Gram matrices of [columns | errors] in each stratum.
-
-    Attributes
-    ----------
-    grams
-        (strata, c + 1, c + 1).
-    sensor
-        Whose stratum, (strata,).
-    size
-        Group size of pose means; 0 for the deviations from them, (strata,).
-    count
-        Scalars in it, (strata,).
-    """
-
-    grams: FloatArray
-    sensor: IntArray
-    size: IntArray
-    count: IntArray
-
-    @classmethod
-    def of(cls, data: Residuals, columns: FloatArray) -> Strata:
-        """Compute them for columns (n, 3, c)."""
-        rows = data.rows
-        joined = np.concatenate((columns, data.errors[:, :, None]), axis=2)
-        c = joined.shape[2]
-        sums = rows.group_sum(joined.reshape(len(joined), -1), axis=0).reshape(-1, 3, c)
-        grams, sensor, size, count = [], [], [], []
-        for index, span in rows.spans:
-            flat = joined[span].reshape(-1, c)
-            within = flat.T @ flat
-            mine = rows.group_sensor == index
-            for g in np.unique(rows.group_size[mine]):
-                part = sums[mine & (rows.group_size == g)].reshape(-1, c)
-                gram = part.T @ part / g
-                within = within - gram
-                grams.append(gram)
-                sensor.append(index)
-                size.append(g)
-                count.append(len(part))
-            grams.append(within)
-            sensor.append(index)
-            size.append(0)
-            count.append(3 * int(np.sum(rows.group_size[mine] - 1)))
-        return cls(np.array(grams), np.array(sensor), np.array(size), np.array(count))
-
-    def weights(self, noise: Noise) -> FloatArray:
-        """Return the inverse variance of each stratum, 1/m², (strata,)."""
-        sigma, pose_sigma = noise.sigma[self.sensor], noise.pose_sigma[self.sensor]
-        return 1.0 / (sigma**2 + self.size * pose_sigma**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,8 +118,9 @@ def solve(
             scale[first:last] = np.max(scale[first:last]) or 1.0
     p = data.base.shape[2]
     unit = np.concatenate((np.ones(p), scale))
-    strata = Strata.of(data, np.concatenate((data.base, columns / scale), axis=2))
-    system = _System(data, strata, cells, p, unit)
+    joined = np.concatenate((data.base, columns / scale, data.errors[:, :, None]), axis=2)
+    grams = data.noise_model.gram(lambda _, where: joined[where], joined.shape[2])
+    system = _System(data.noise_model, grams, data.noise, cells, p, unit)
     if not system.visible():
         return None
     try:
@@ -187,8 +134,9 @@ def solve(
 class _System:
     """The mixed-model equations of one set of cells, in scaled columns."""
 
-    data: Residuals
-    strata: Strata
+    model: NoiseModel
+    grams: FloatArray
+    guess: Noise
     cells: tuple[Cell, ...]
     p: int
     unit: FloatArray
@@ -212,13 +160,13 @@ class _System:
         # Base first, then unpenalised, then penalised: one Cholesky holds all determinants.
         self.order = np.concatenate((np.flatnonzero(free), np.flatnonzero(~free)))
         self.unpenalised = int(free.sum())
-        self.separable = np.flatnonzero(self.data.separable)
-        # Each stratum's matrix as one row: sums and traces over strata are then products.
-        self.flat = self.strata.grams.reshape(len(self.strata.grams), -1)
+        self.separable = list(self.model.separable)
+        # Each group's matrix as one row: sums and traces over groups are then products.
+        self.flat = self.grams.reshape(len(self.grams), -1)
 
     def visible(self) -> bool:
         """Do unpenalised columns say something that the others, and the base, do not?"""
-        gram = self.strata.grams.sum(axis=0)[:-1, :-1][np.ix_(self.order, self.order)]
+        gram = self.grams.sum(axis=0)[:-1, :-1][np.ix_(self.order, self.order)]
         part = gram[: self.unpenalised, : self.unpenalised]
         try:
             root = np.linalg.cholesky(part + 1e-14 * np.eye(len(part)))
@@ -227,7 +175,7 @@ class _System:
         return bool(np.all(np.diag(root)[self.p :] > ABSORBED))
 
     def noise(self, eta: FloatArray) -> Noise:
-        count = self.data.sensors
+        count = len(self.model.channels)
         sigma = np.exp(eta[:count])
         pose_sigma = np.zeros(count)
         pose_sigma[self.separable] = np.exp(eta[count : count + len(self.separable)])
@@ -236,7 +184,7 @@ class _System:
     def evaluate(self, eta: FloatArray) -> tuple[float, FloatArray]:
         """Return −L and its gradient by eta: log sigmas, log pose sigmas, log smoothness."""
         noise = self.noise(eta)
-        weights = self.strata.weights(noise)
+        weights = 1.0 / self.model.variances(noise)
         factors = np.exp(eta[len(eta) - len(self.penalised) :])
         _, root, beta = self._solve(weights, factors)
         inverse = self._inverse(root)
@@ -244,19 +192,19 @@ class _System:
         padded = np.zeros((self.size + 1, self.size + 1))
         padded[:-1, :-1] = inverse
         trace = self.flat @ padded.ravel()
-        n = self.strata.count
+        n = self.model.freedom
         value = 0.5 * n @ np.log(weights) - np.sum(np.log(np.diag(root))) - 0.5 * weights @ rss
         by_log_weight = 0.5 * (n - weights * trace - weights * rss)
         # d log w / d log sigma = -2 sigma² w, and the same with g pose_sigma².
         slope = np.zeros(len(eta))
-        sensor, size = self.strata.sensor, self.strata.size
-        for s in range(self.data.sensors):
-            mine = sensor == s
-            slope[s] = np.sum((-2.0 * noise.sigma[s] ** 2 * weights * by_log_weight)[mine])
-        for i, which in enumerate(self.separable):
-            mine = sensor == which
-            change = -2.0 * size * noise.pose_sigma[which] ** 2 * weights * by_log_weight
-            slope[self.data.sensors + i] = np.sum(change[mine])
+        channel, count = self.model.channel_of, len(self.model.channels)
+        by_variance = -2.0 * weights * by_log_weight
+        by_sigma = np.bincount(channel, by_variance, count)
+        by_pose_sigma = np.bincount(channel, self.model.size_of * by_variance, count)
+        slope[:count] = noise.sigma**2 * by_sigma
+        slope[count : count + len(self.separable)] = (noise.pose_sigma**2 * by_pose_sigma)[
+            self.separable
+        ]
         for i, (index, penalty, factor) in enumerate(
             zip(self.penalised, self.penalties, factors, strict=True)
         ):
@@ -286,7 +234,7 @@ class _System:
         return np.tril(lower) + np.tril(lower, -1).T
 
     def _squares(self, beta: FloatArray) -> FloatArray:
-        """Return the sum of squared errors in each stratum, m², (strata,)."""
+        """Return the sum of squared errors in each error group, m², (groups,)."""
         error = np.append(-beta, 1.0)
         return self.flat @ np.outer(error, error).ravel()
 
@@ -309,7 +257,7 @@ class _System:
         )
         eta = unit * best.x
         noise = self.noise(eta)
-        weights = self.strata.weights(noise)
+        weights = 1.0 / self.model.variances(noise)
         factors = np.exp(eta[len(eta) - len(self.penalised) :])
         H, root, beta = self._solve(weights, factors)
         evidence = self._evidence(H, weights, factors, beta)
@@ -335,7 +283,7 @@ class _System:
         ordered = np.linalg.cholesky(H[np.ix_(self.order, self.order)])
         logs = np.log(np.diag(ordered))
         rss = self._squares(beta)
-        n = self.strata.count
+        n = self.model.freedom
         value = 0.5 * n @ np.log(weights) - 0.5 * weights @ rss - logs[: self.p].sum()
         value -= 0.5 * (self.unpenalised - self.p) * np.log(n.sum() - self.p)
         value -= logs[self.unpenalised :].sum()
@@ -347,14 +295,15 @@ class _System:
 
     def _curvature(self) -> FloatArray:
         """Return about what the second derivatives of −L by eta are."""
-        sensor, size, count = self.strata.sensor, self.strata.size, self.strata.count
-        rows = [2.0 * np.sum(count[sensor == s]) for s in range(self.data.sensors)]
-        poses = [0.5 * np.sum(count[(sensor == s) & (size > 0)]) for s in self.separable]
+        channel, count = self.model.channel_of, len(self.model.channels)
+        means = self.model.freedom * (self.model.size_of > 0)
+        rows = 2.0 * np.bincount(channel, self.model.freedom, count)
+        poses = 0.5 * np.bincount(channel, means, count)[self.separable]
         smooth = [len(penalty) / 6.0 for penalty in self.penalties]
         return np.array([*rows, *poses, *smooth])
 
     def _start(self, start: Solution | None) -> tuple[FloatArray, list[tuple[float, float]]]:
-        noise = self.data.noise if start is None else start.noise
+        noise = self.guess if start is None else start.noise
         sigma = np.log(np.maximum(noise.sigma, RESOLUTION_M))
         pose = np.maximum(noise.pose_sigma, 0.1 * noise.sigma)[self.separable]
         known: dict[object, float] = {}
@@ -376,5 +325,5 @@ class _System:
 
     def _typical(self, penalty: FloatArray, where: slice, noise: Noise) -> float:
         """Return the factor at which penalty and data weigh about the same."""
-        total = np.tensordot(self.strata.weights(noise), self.strata.grams, axes=1)
+        total = np.tensordot(1.0 / self.model.variances(noise), self.grams, axes=1)
         return float(np.trace(total[where, where]) / np.trace(penalty))

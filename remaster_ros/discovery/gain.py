@@ -40,11 +40,18 @@ class Gain:
     metrics: Mapping[str, Any]
 
 
-def gain_of(found: Estimate, solution: Solution, fit: FitResult, rng: np.random.Generator) -> Gain:
+def gain_of(
+    found: Estimate,
+    data: Residuals,
+    solution: Solution,
+    fit: FitResult,
+    rng: np.random.Generator,
+) -> Gain:
     """Measure the gain of the sampled fit over the fit with offsets only."""
     measurements = found.problem.measurements
     held_out = measurements.is_validation
-    variance = 3.0 * (solution.noise.sigma**2 + solution.noise.pose_sigma**2)
+    noise = data.noise_model.sensor_noise(solution.noise)
+    variance = 3.0 * (noise.sigma**2 + noise.pose_sigma**2)
     rows = held_out if held_out.any() else ~held_out
     floor = float(np.sqrt(np.mean(variance[measurements.sensor[rows]])))
     if not held_out.any():
@@ -90,10 +97,11 @@ def shares(data: Residuals, groups: Sequence[tuple[Cell, ...]], solution: Soluti
     ]
 
 
-def pose_common_fraction(solution: Solution) -> float:
+def pose_common_fraction(data: Residuals, solution: Solution) -> float:
     """Return the share of the noise's variance that rows of one pose have in common."""
-    common = np.sum(solution.noise.pose_sigma**2)
-    return float(common / (common + np.sum(solution.noise.sigma**2)))
+    noise = data.noise_model.sensor_noise(solution.noise)
+    common = np.sum(noise.pose_sigma**2)
+    return float(common / (common + np.sum(noise.sigma**2)))
 
 
 def noise_by_range(data: Residuals, solution: Solution) -> dict[str, dict[str, float]]:

@@ -36,8 +36,8 @@ def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple
     jacobian = model.natural_jacobian(x, data.rows)
     columns = data.columns(solution.cells)
     joined = np.concatenate((jacobian, columns), axis=2)
-    white = data.whitened(joined, solution.noise).reshape(3 * len(data), -1)
-    error = data.whitened(data.errors, solution.noise).ravel()
+    white = data.noise_model.whitened(joined, solution.noise).reshape(3 * len(data), -1)
+    error = data.noise_model.whitened(data.errors, solution.noise).ravel()
     std = max(problem.session.marker_std_m, 1e-6)
     effects = []
     for index, name in enumerate(problem.marker_names):

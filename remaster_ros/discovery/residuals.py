@@ -1,8 +1,7 @@
 """What the discovery works on: the residuals of the offsets model, its noise, its absorption.
 
-The noise is that of `posterior`: independent per row with sigma, plus a part common to the rows of
-one sensor at one pose with pose_sigma. What registrations, offsets and markers can absorb is
-projected out with flat priors everywhere.
+The noise is that of `calibration.noise`, with the directions that the fit told apart. What
+registrations, offsets and markers can absorb is projected out with flat priors everywhere.
 """
 
 from __future__ import annotations
@@ -10,31 +9,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.laplace import Mode
+from remaster_ros.calibration.noise import Noise, NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import BLOCK_ROWS, Context
-from remaster_ros.types import BoolArray, FloatArray, IntArray
+from remaster_ros.types import FloatArray, IntArray
 
 # Directions of the offsets model below this share of the largest are its gauge.
 ROUNDING = 1e-8
 # Bytes of displacements that are kept for the next fit; only those of large sessions are more.
 KEPT_BYTES = 1 << 28
-
-
-@dataclass(frozen=True, eq=False)
-class Noise:
-    """Standard deviations of each sensor, m, (sensors,): per row, and common to a pose."""
-
-    sigma: FloatArray
-    pose_sigma: FloatArray
 
 
 class Fit(Protocol):
@@ -73,6 +64,8 @@ class Residuals:
         Errors of every row of the session, m, (all rows, 3).
     full_jacobian
         Derivative of the prediction by the model's natural parameters, (all rows, 3, size).
+    noise_model
+        Which errors of the rows have which variance.
     noise
         A robust first estimate.
     """
@@ -84,6 +77,7 @@ class Residuals:
     full_base: FloatArray
     full_errors: FloatArray
     full_jacobian: FloatArray
+    noise_model: NoiseModel
     noise: Noise
 
     @classmethod
@@ -121,7 +115,8 @@ class Residuals:
         _, singular, vectors = np.linalg.svd(flat / scale, full_matrices=False)
         seen = singular > ROUNDING * singular[0]
         full_base = full_jacobian @ ((vectors[seen] / scale).T / singular[seen])
-        sigma, pose_sigma = robust_noise(rows, full_errors[rows.source], np.ones(len(rows), bool))
+        noise_model = NoiseModel.of(rows, model.reference, found.posterior.noise_model.split)
+        noise = robust_noise(rows, full_errors[rows.source], np.ones(len(rows), bool))
         return cls(
             context,
             rows,
@@ -130,24 +125,24 @@ class Residuals:
             full_base,
             full_errors,
             full_jacobian,
-            Noise(sigma, pose_sigma),
+            noise_model,
+            noise_model.of_sensors(*noise),
         )
 
     def only(self, source: IntArray, reference: FloatArray) -> Residuals:
         """Return the same on other rows of the session."""
         rows = Rows.of(self.context.measurements, np.sort(source), reference)
         return replace(
-            self, rows=rows, errors=self.full_errors[rows.source], base=self.full_base[rows.source]
+            self,
+            rows=rows,
+            errors=self.full_errors[rows.source],
+            base=self.full_base[rows.source],
+            noise_model=NoiseModel.of(rows, reference, self.noise_model.split),
         )
 
     def __len__(self) -> int:
         """Return the number of rows n."""
         return len(self.rows)
-
-    @property
-    def sensors(self) -> int:
-        """Number of sensors."""
-        return len(self.context.sensor_names)
 
     @cached_property
     def part(self) -> Context:
@@ -161,12 +156,6 @@ class Residuals:
     def _displacements(self) -> dict[Cell, FloatArray]:
         """What `columns` has computed so far: a search fits the same few cells again and again."""
         return {}
-
-    @cached_property
-    def separable(self) -> BoolArray:
-        """Where the pose-common part can be told apart, (sensors,)."""
-        several = self.rows.group_sensor[self.rows.group_size > 1]
-        return np.isin(np.arange(self.sensors), several)
 
     @cached_property
     def pose_of_row(self) -> IntArray:
@@ -211,17 +200,3 @@ class Residuals:
         """Return the same in the rows worked on, m, (n, 3)."""
         explained: FloatArray = self.base @ fit.base + self.columns(fit.cells) @ fit.parameters
         return self.errors - explained
-
-    def whitened(self, values: NDArray[Any], noise: Noise) -> NDArray[Any]:
-        """Return values (n, ...) in units of the noise: independent of variance 1 in all rows."""
-        rows = self.rows
-        sensor = rows.group_sensor
-        size = rows.group_size
-        root = np.sqrt(noise.sigma[sensor] ** 2 + size * noise.pose_sigma[sensor] ** 2)
-        # deviations / sigma + mean / root = values / sigma - mean (1 / sigma - 1 / root)
-        less = (1.0 / noise.sigma[sensor] - 1.0 / root) / size
-        flat = values.reshape(len(values), -1)
-        common = rows.group_sum(flat, axis=0) * less[:, None].astype(flat.dtype)
-        scale = 1.0 / noise.sigma[sensor][rows.group_of_row]
-        white = flat * scale[:, None].astype(flat.dtype) - common[rows.group_of_row]
-        return white.reshape(values.shape)

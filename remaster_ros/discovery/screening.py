@@ -23,9 +23,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.evidence import Solution
-from remaster_ros.discovery.residuals import Noise, Residuals
+from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 CHUNK = 1024
@@ -164,7 +165,7 @@ def screen(
     """
     noise = given.noise
     project = _Projection(data, given)
-    observed = project.residual(data.whitened(data.errors, noise).reshape(-1, 1))
+    observed = project.residual(data.noise_model.whitened(data.errors, noise).reshape(-1, 1))
     surrogates = observed
     if draws and rng is not None:
         surrogates = np.concatenate(
@@ -191,7 +192,7 @@ class _Projection:
     def __init__(self, data: Residuals, given: Solution) -> None:
         columns = data.columns(given.cells)
         joined = np.concatenate((data.base, columns), axis=2)
-        white = data.whitened(joined, given.noise).reshape(3 * len(data), -1)
+        white = data.noise_model.whitened(joined, given.noise).reshape(3 * len(data), -1)
         # Penalties are rows of their own, in which the candidates are zero.
         precision = given.prior_precision()
         values, vectors = np.linalg.eigh(precision) if len(precision) else (np.zeros(0), precision)
@@ -239,7 +240,7 @@ def _scores(
     columns = np.concatenate(
         [np.arange(catalogue.starts[i], catalogue.starts[i + 1]) for i in batch]
     )
-    white = data.whitened(catalogue.block(columns), noise).reshape(3 * len(data), -1)
+    white = data.noise_model.whitened(catalogue.block(columns), noise).reshape(3 * len(data), -1)
     norm = np.linalg.norm(white, axis=0).reshape(count, m)
     if cells[0].penalty is not None:
         # The penalty compares neighbours: one unit for all of a cell's splines.

@@ -13,7 +13,7 @@ from remaster_ros.calibration import laplace, sampling
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.laplace import find_mode
 from remaster_ros.calibration.metropolis import random_walk_sampler
-from remaster_ros.calibration.posterior import RESOLUTION_M
+from remaster_ros.calibration.noise import RESOLUTION_M
 from remaster_ros.calibration.priors import base_prior, marker_prior
 from remaster_ros.calibration.proposal import FactorisedProposal, LaplaceProposal
 from remaster_ros.calibration.sampling import sample_posterior
@@ -34,7 +34,8 @@ def test_density_is_that_of_correlated_normal_errors(found) -> None:
     points, _ = LaplaceProposal.of(found.mode).sample(6, rng)
     expected = []
     for point in points:
-        sigma, pose_sigma = posterior.noise(point[len(posterior.free) :])
+        noise = posterior.noise(point[len(posterior.free) :])
+        sigma, pose_sigma = noise.sigma, noise.pose_sigma
         z = posterior.parameters(point)
         errors = posterior.rows.target - model.predict(z, posterior.rows)
         value = 0.0

@@ -13,6 +13,7 @@ from remaster_ros.calibration import sampling
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.laplace import find_mode
+from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.proposal import LaplaceProposal
 from remaster_ros.calibration.sampling import sample_posterior
 from remaster_ros.calibration.surrogate import Surrogate, _bent_pairs, _second_derivatives
@@ -85,7 +86,10 @@ def test_proposals_fit_a_pose_sigma_that_is_surely_zero() -> None:
     errors = rows.target - found.model.predict(found.mode.z, rows)
     means = rows.group_sum(errors, axis=0) / rows.group_size[:, None]
     calmer = replace(rows, target=rows.target - 0.8 * means[rows.group_of_row])
-    mode = find_mode(replace(found.posterior, rows=calmer))
+    posterior = found.posterior
+    mode = find_mode(
+        Posterior.of(found.model, calmer, posterior.priors, posterior.free, posterior.reference)
+    )
     assert mode.eta[-1] < 0.01
     sampled = sample_posterior(mode, chains=4, draws=500, rng=np.random.default_rng(7))
     assert sampled.run.acceptance_rate > 0.5

@@ -8,11 +8,13 @@ import pytest
 from calibration_scenes import CHAIN
 from discovery_scenes import at_joint, residuals_of, session_with
 
+from remaster_ros.calibration.noise import NoiseModel
+from remaster_ros.calibration.outliers import robust_noise
 from remaster_ros.discovery.confirmation import confirm, in_words
 from remaster_ros.discovery.cross_validation import held_out_error
 from remaster_ros.discovery.discover import Findings, discover_session, find_causes
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import Strata, _System, solve
+from remaster_ros.discovery.evidence import _System, solve
 from remaster_ros.discovery.screening import Catalogue, screen
 from remaster_ros.errors import InputError
 from remaster_ros.types import Session
@@ -183,34 +185,21 @@ def cells_named(name: str):
     return list(EFFECTS[name].cells(residuals().context))
 
 
-def test_whitening_makes_noise_of_the_model_white():
-    data = residuals()
-    seed = 3
-    print(f'seed {seed}')
-    rng = np.random.default_rng(seed)
-    rows, noise = data.rows, data.noise
-    sensor = rows.group_sensor[rows.group_of_row]
-    common = rng.standard_normal((len(rows.group_start), 3, 400))[rows.group_of_row]
-    values = noise.pose_sigma[sensor][:, None, None] * common
-    values += noise.sigma[sensor][:, None, None] * rng.standard_normal((len(rows), 3, 400))
-    white = data.whitened(values, noise).reshape(-1, 400)
-    covariance = white @ white.T / 400
-    assert np.diag(covariance).mean() == pytest.approx(1.0, abs=0.02)
-    # Correlations within a pose are gone: what is left is chance, 1 / sqrt(400).
-    off = covariance - np.diag(np.diag(covariance))
-    assert np.sqrt(np.mean(off**2)) == pytest.approx(0.05, abs=0.005)
-
-
+@pytest.mark.parametrize('split', [(), (0,)])
 @pytest.mark.parametrize('name', ['joint_compliance', 'joint_error_curve'])
-def test_restricted_likelihood_has_the_gradient_it_says(name):
+def test_restricted_likelihood_has_the_gradient_it_says(name, split):
     data = residuals()
+    model = NoiseModel.of(data.rows, data.context.T_R_N, split)
     cells = tuple(cells_named(name)[1:3])
     columns = data.columns(cells)
     scale = np.sqrt(np.sum(columns**2, axis=(0, 1)))
     scale[scale == 0.0] = scale.max()
-    strata = Strata.of(data, np.concatenate((data.base, columns / scale), axis=2))
+    joined = np.concatenate((data.base, columns / scale, data.errors[:, :, None]), axis=2)
+    grams = model.gram(lambda _, where: joined[where], joined.shape[2])
     p = data.base.shape[2]
-    system = _System(data, strata, cells, p, np.concatenate((np.ones(p), scale)))
+    unit = np.concatenate((np.ones(p), scale))
+    noise = model.of_sensors(*robust_noise(data.rows, data.errors, np.ones(len(data), bool)))
+    system = _System(model, grams, noise, cells, p, unit)
     eta, _ = system._start(None)
     _, gradient = system.evaluate(eta)
     for i in range(len(eta)):
@@ -228,8 +217,8 @@ def test_screening_scores_agree_with_a_least_squares_fit_of_each_cell():
     empty = solve(data, ())
     assert empty is not None
     scores = screen(data, Catalogue.of(data, cells), empty).score
-    base = data.whitened(data.base, empty.noise).reshape(3 * len(data), -1)
-    errors = data.whitened(data.errors, empty.noise).ravel()
+    base = data.noise_model.whitened(data.base, empty.noise).reshape(3 * len(data), -1)
+    errors = data.noise_model.whitened(data.errors, empty.noise).ravel()
     n = 3 * len(data) - base.shape[1]
 
     def squares(columns: np.ndarray) -> float:
@@ -237,7 +226,7 @@ def test_screening_scores_agree_with_a_least_squares_fit_of_each_cell():
         return float(np.sum((errors - columns @ solution) ** 2))
 
     for cell, score in zip(cells, scores, strict=True):
-        white = data.whitened(data.columns([cell]), empty.noise)
+        white = data.noise_model.whitened(data.columns([cell]), empty.noise)
         white = white.reshape(3 * len(data), -1)
         white /= np.maximum(np.linalg.norm(white, axis=0), 1e-30)
         left = white - base @ np.linalg.lstsq(base, white, rcond=None)[0]
@@ -260,6 +249,7 @@ def test_p_values_are_uniform_where_nothing_is():
     print(f'seed {seed}')
     rng = np.random.default_rng(seed)
     sensor = data.rows.group_sensor[data.rows.group_of_row]
+    assert len(data.noise_model.channels) == len(data.context.sensor_names)
     sigma, pose_sigma = empty.noise.sigma[sensor], empty.noise.pose_sigma[sensor]
     values = []
     for _ in range(40):
@@ -284,7 +274,7 @@ def test_held_out_error_is_that_of_fits_without_the_pose():
     by_pose = held_out_error(data, fit, fit.noise, folds)
     pose = 4
     columns = np.concatenate((data.base, data.columns([cell]), data.errors[:, :, None]), axis=2)
-    white = data.whitened(columns, fit.noise)
+    white = data.noise_model.whitened(columns, fit.noise)
     out = data.pose_of_row == pose
     kept = white[~out].reshape(-1, white.shape[2])
     beta = np.linalg.lstsq(kept[:, :-1], kept[:, -1], rcond=None)[0]

@@ -1,0 +1,81 @@
+"""One noise engine for fit and discovery: sums, Gram matrices and whitening say the same."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from calibration_scenes import scene
+
+from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.noise import Noise, NoiseModel
+
+SPLITS = [(), (0,), (0, 1)]
+
+
+@cache
+def rows_of_two_sensors() -> tuple[Rows, np.ndarray]:
+    found = estimate(Problem.of(scene(61, poses=15, sensor_count=2)[0]))
+    return found.posterior.rows, found.model.reference
+
+
+def a_noise(model: NoiseModel) -> Noise:
+    """Every channel's own, so that a mistaken channel shows."""
+    count = len(model.channels)
+    sigma = 1e-4 * (1.0 + np.arange(count))
+    pose_sigma = np.where(
+        np.isin(np.arange(count), model.separable), 3e-4 / (1 + np.arange(count)), 0
+    )
+    return Noise(sigma, pose_sigma)
+
+
+@pytest.mark.parametrize('split', SPLITS)
+def test_whitening_makes_noise_of_the_model_white(split):
+    rows, reference = rows_of_two_sensors()
+    model = NoiseModel.of(rows, reference, split)
+    noise = a_noise(model)
+    seed = 3
+    print(f'seed {seed}')
+    rng = np.random.default_rng(seed)
+    values = np.zeros((len(rows), 3, 400))
+    for index, channel in enumerate(model.channels):
+        axes = slice(*channel.axes)
+        shape = (len(rows), channel.dimension, 400)
+        common = rng.standard_normal((len(rows.group_start), *shape[1:]))[rows.group_of_row]
+        drawn = noise.pose_sigma[index] * common + noise.sigma[index] * rng.standard_normal(shape)
+        mine = dict(rows.spans)[channel.sensor]
+        values[mine, axes] = drawn[mine]
+    if model.frames is not None:
+        values = np.swapaxes(model.frames, 1, 2) @ values
+    white = model.whitened(values, noise).reshape(-1, 400)
+    covariance = white @ white.T / 400
+    assert np.diag(covariance).mean() == pytest.approx(1.0, abs=0.02)
+    # Correlations within a pose are gone: what is left is chance, 1 / sqrt(400).
+    off = covariance - np.diag(np.diag(covariance))
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(0.05, abs=0.005)
+
+
+@pytest.mark.parametrize('split', SPLITS)
+def test_sums_grams_and_whitening_are_of_one_likelihood(split):
+    rows, reference = rows_of_two_sensors()
+    model = NoiseModel.of(rows, reference, split)
+    noise = a_noise(model)
+    vectors = np.random.default_rng(4).standard_normal((len(rows), 3, 5))
+    grams = model.gram(lambda _, where: vectors[where], 5)
+    sums = model.sums_of_squares(np.moveaxis(vectors, 2, 0))
+    np.testing.assert_allclose(np.einsum('gcc->cg', grams), sums, rtol=1e-9)
+    white = model.whitened(vectors, noise).reshape(-1, 5)
+    weighted = np.tensordot(1.0 / model.variances(noise), grams, axes=1)
+    np.testing.assert_allclose(white.T @ white, weighted, rtol=1e-9)
+    assert model.freedom.sum() == 3 * len(rows)
+
+
+def test_gram_matrices_do_not_depend_on_the_blocks(monkeypatch):
+    rows, reference = rows_of_two_sensors()
+    model = NoiseModel.of(rows, reference, (1,))
+    vectors = np.random.default_rng(5).standard_normal((len(rows), 3, 4))
+    whole = model.gram(lambda _, where: vectors[where], 4)
+    monkeypatch.setattr('remaster_ros.calibration.noise.GRAM_ROWS', 7)
+    np.testing.assert_allclose(model.gram(lambda _, where: vectors[where], 4), whole, rtol=1e-9)
