@@ -389,9 +389,11 @@ class Bench(BridgeProcess):
                 self.seen.summaries.append((now, status.message, values))
 
     def _on_record(self, message: String) -> None:
-        now, record = time.monotonic(), decode(message.data)
-        event = record.body
-        if record.node != '/robot_bridge' or isinstance(event, STATES):
+        now = time.monotonic()
+        if '"/robot_bridge"' not in message.data:
+            return
+        event = decode(message.data).body
+        if isinstance(event, STATES):
             return
         self.seen.events.append((now, event))
         if isinstance(event, SolutionSettled) and self.answers:

@@ -29,13 +29,18 @@ def since_boot_s() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
+def new_token() -> str:
+    """Return a token for a run that begins now."""
+    return uuid.uuid4().hex[:12]
+
+
 class LivingRun:
     """A run under way in this process; its sign of life is a file outside of every session.
 
     Parameters
     ----------
     token
-        Of the run to go on with; empty for a new one.
+        Names the run.
 
     Attributes
     ----------
@@ -43,8 +48,8 @@ class LivingRun:
         The run's name.
     """
 
-    def __init__(self, token: str = '') -> None:
-        self.token = token or uuid.uuid4().hex[:12]
+    def __init__(self, token: str) -> None:
+        self.token = token
         self._renewed = float('-inf')
         self.stay_alive()
 

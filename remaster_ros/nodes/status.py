@@ -1,7 +1,7 @@
 """How a node reports: records to the other nodes, and its state to people.
 
 `remaster/events` carries the records of `remaster_ros.collection.events`, on which the nodes act.
-`remaster/status` and `/diagnostics` show people the same states, with counts and reasons; no node
+`remaster/status` and `diagnostics` show people the same states, with counts and reasons; no node
 reads them.
 """
 
@@ -37,8 +37,8 @@ from remaster_ros.session.bag_metadata import LATCHED_DEPTH
 
 TOPIC = 'remaster/status'
 EVENTS = 'remaster/events'
-DIAGNOSTICS = '/diagnostics'
-"""Of every ROS system, whatever the namespace: aggregators and monitors look there."""
+DIAGNOSTICS = 'diagnostics'
+"""Relative like every name: a cell in a namespace has its own, for an aggregator of its own."""
 RELIABLE = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 JOINT_STATES = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Of subscribers of joint_states: it matches reliable and best-effort publishers alike, and keeps

@@ -111,6 +111,10 @@ class TourPlanner:
             raise InsufficientDataError(f'{tour.describe()}: no pose is left to fit on')
         return tour
 
+    def standing_trouble(self, q: FloatArray) -> str:
+        """Return what an arm at joint positions `q` (rad, (k,)) stands too near to; ''."""
+        return self.model.trouble(q)
+
     def _references(self, plans: Mapping[str, Plan]) -> Plan:
         """Choose references among the planned configurations, each with a way from the last."""
         poses = [
