@@ -28,19 +28,9 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
+from remaster_ros.collection import events
 from remaster_ros.collection.announcements import Announcements
 from remaster_ros.collection.collection_run import CollectionRun
-from remaster_ros.collection.events import (
-    ArmHalted,
-    BridgeState,
-    ConfigurationEnded,
-    EventRecord,
-    PlannerState,
-    RecorderState,
-    SetupChanged,
-    SolutionFailed,
-    TourPlanned,
-)
 from remaster_ros.collection.preflight_facts import PreflightFacts
 from remaster_ros.collection.tour_progress import TourProgress
 from remaster_ros.errors import InputError, RemasterError
@@ -223,21 +213,21 @@ class PosePlanner(RemasterNode):
     def _on_registration(self, message: TransformStamped) -> None:
         self.progress.T_R_N[message.child_frame_id] = transform_array(message)
 
-    def _on_record(self, record: EventRecord) -> None:
+    def _on_record(self, record: events.EventRecord) -> None:
         now = time.monotonic()
         self._facts.take(record.body, now)
         self._announcements.take(record, now)
         match record.body:
-            case ArmHalted(reason=why) | BridgeState(halted=why) if why:
+            case events.ArmHalted(reason=why) | events.BridgeState(halted=why) if why:
                 # It goes on when somebody has looked at the arm and calls /remaster/collect.
                 self._end('paused', why)
-            case SetupChanged(stops=True, text=why):
+            case events.SetupChanged(stops=True, text=why):
                 self._end('paused', why)
-            case ConfigurationEnded() as end:
+            case events.ConfigurationEnded() as end:
                 self._on_ended(end.stamp, end.solution, end.result, end.registered)
-            case SolutionFailed() as end:
+            case events.SolutionFailed() as end:
                 self._on_ended(end.stamp, end.solution, 'failed', False)
-            case RecorderState() as recorder:
+            case events.RecorderState() as recorder:
                 self._on_recorder(recorder)
 
     def _on_ended(self, stamp: str, index: int, result: str, registered: bool) -> None:
@@ -251,7 +241,7 @@ class PosePlanner(RemasterNode):
         if self.progress.ended(solution, result, registered=registered):
             self._step()
 
-    def _on_recorder(self, recorder: RecorderState) -> None:
+    def _on_recorder(self, recorder: events.RecorderState) -> None:
         if self.run.token and recorder.changed_run == self.run.token:
             # Found while this planner was not there; collect begins another run.
             self._end('paused', recorder.changed)
@@ -322,7 +312,7 @@ class PosePlanner(RemasterNode):
         tour = self.journal.tour
         if tour is not None and self.progress.phase != REGISTRATION and not self._described:
             self._described = True
-            self.status.event(TourPlanned(tour.describe()))
+            self.status.event(events.TourPlanned(tour.describe()))
         with self._lock:
             # Paused or stopped while the pose was chosen and written: collect announces it.
             if self.run.state == 'running':
@@ -361,7 +351,7 @@ class PosePlanner(RemasterNode):
         why = full or run.why
         level = 'error' if run.state == 'failed' else 'warn' if why else 'ok'
         held = full and run.state == 'running'
-        state = PlannerState(state='held' if held else run.state, run=run.token)
+        state = events.PlannerState(state='held' if held else run.state, run=run.token)
         return Summary(level, why or run.state, values, state)
 
     def close(self) -> None:

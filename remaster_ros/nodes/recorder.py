@@ -22,16 +22,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from remaster_ros.collection.events import (
-    ArmStopped,
-    ConfigurationEnded,
-    EventRecord,
-    PlannerState,
-    PoseAnnounced,
-    RecorderBegan,
-    RecorderState,
-    SensorReport,
-)
+from remaster_ros.collection import events
 from remaster_ros.collection.first_registration import FirstRegistration
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.collection.plausibility import Plausibility
@@ -160,21 +151,21 @@ class Recorder(RemasterNode):
             self.counts['settled_unknown'] += 1
             self._trouble = 'settled at no joint solution of an announced pose'
 
-    def _on_record(self, record: EventRecord) -> None:
+    def _on_record(self, record: events.EventRecord) -> None:
         match record.body:
-            case PoseAnnounced() as pose:
+            case events.PoseAnnounced() as pose:
                 self._on_pose(pose)
-            case PlannerState() as planner:
+            case events.PlannerState() as planner:
                 self._on_planner(planner)
-            case SensorReport() as sensor:
+            case events.SensorReport() as sensor:
                 self.sensors.take(record, sensor)
-            case RecorderBegan():
+            case events.RecorderBegan():
                 # From a bag: that recorder was started again here, with no reading under way.
                 self.recording.forget()
-            case ArmStopped():
+            case events.ArmStopped():
                 self.recording.take_stop()
 
-    def _on_pose(self, pose: PoseAnnounced) -> None:
+    def _on_pose(self, pose: events.PoseAnnounced) -> None:
         self.recording.announced = pose
         if pose.split not in (REFERENCE, REGISTRATION):
             self._report_change(self._changes.leave(self.registration.T_R_N))
@@ -182,7 +173,7 @@ class Recorder(RemasterNode):
             # Before the arm gets there: it is held where there is no room.
             self.keeper.write(partial(self.journal.follow, pose.plan))
 
-    def _on_planner(self, planner: PlannerState) -> None:
+    def _on_planner(self, planner: events.PlannerState) -> None:
         self._run = planner.run_held(self._run)
         accepted = self._changes.follow(planner.state, self._run)
         if accepted and not self.keeper.full and not self.journal.closed:
@@ -276,7 +267,7 @@ class Recorder(RemasterNode):
         for name in {reading.sensor for reading in readings} & self.registration.troubles.keys():
             self.get_logger().warning(self.registration.troubles[name])
 
-    def _report(self, end: ConfigurationEnded) -> None:
+    def _report(self, end: events.ConfigurationEnded) -> None:
         self.counts[f'configurations_{end.result}'] += 1
         self.status.event(end)
 
@@ -339,7 +330,7 @@ class Recorder(RemasterNode):
             **{f'{name}_not_finite': n for name, n in self.sensors.not_finite.items()},
             **dict(sorted(self.counts.items())),
         }
-        report = RecorderState(
+        report = events.RecorderState(
             state=state,
             exit_status=self.journal.closed,
             session=self.p.session,

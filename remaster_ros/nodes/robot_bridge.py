@@ -20,21 +20,8 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from remaster_ros.collection.events import (
-    ArmHalted,
-    ArmStopped,
-    BridgeState,
-    ConfigurationEnded,
-    EventRecord,
-    HaltCleared,
-    PlannerState,
-    RecorderState,
-    SolutionCommanded,
-    SolutionFailed,
-    SolutionSettled,
-)
+from remaster_ros.collection import events
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.actions import (
     Action,
     CheckPath,
@@ -47,7 +34,6 @@ from remaster_ros.motion.actions import (
 )
 from remaster_ros.motion.arm_supervisor import ArmSupervisor
 from remaster_ros.motion.joint_reports import JointReport, JointReports
-from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import Admitted, MotionGate
 from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.motion.path_search import PathSearch
@@ -67,10 +53,8 @@ from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import LEASED, RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.nodes.waypoints import waypoints_by_solution
-from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
 from remaster_ros.session.halt_file import HaltFile
 from remaster_ros.session.workcell import read_cell
-from remaster_ros.types import FloatArray
 
 COMMANDS = 'joint_trajectory_controller/joint_trajectory'
 JOINTS = 'joint_states'
@@ -88,10 +72,6 @@ longer with it, a paused process may not.
 """
 WATCH_WALL_S = 0.05
 """How often silence and the graph are looked at."""
-KNOWN_OFFSET_RAD = float(np.deg2rad(0.1))
-"""What may still be wrong with a joint whose offset is in use, for the clearance of paths."""
-OFFSET_STDS = 3.0
-"""Or so many standard deviations of the offset that is known least."""
 LISTENERS = ('robot_bridge', 'recorder', 'laser_tracker_markers')
 """Nodes of ours that listen to what a controller is told."""
 
@@ -110,16 +90,16 @@ class RobotBridge(RemasterNode):
         cell = read_cell(self.p.cell)
         self.chain = cell.chain()
         self._order = JointOrder(self.chain.joint_names)
-        offsets, unknown_rad = self._offsets(self.chain)
+        offsets, unknown_rad = self.p.known_offsets(self.chain)
         # Paths are checked where the arm is, not where its encoders put it.
         true_arm = self.chain if offsets is None else self.chain.with_offsets(offsets)
         model = cell.collision_model(true_arm, unknown_rad)
         speeds = PointSpeeds(true_arm, model.extent_points)
+        self._offsets = offsets
         self._acceleration = cell.acceleration_limits(self.chain)
-        self._limits = partial(self._make_limits, offsets)
         self._halt_file = HaltFile(self.get_fully_qualified_name())
         self.supervisor = ArmSupervisor(
-            MotionGate(self._limits(self.p), speeds),
+            MotionGate(self.p.limits(self.chain, offsets, self._acceleration), speeds),
             JointReports(self.chain.lower, self.chain.upper, self.chain.velocity_limits),
             self.p.rules(),
             self._halt_file.read(),
@@ -164,33 +144,11 @@ class RobotBridge(RemasterNode):
                 'limit the speed of the arm'
             )
 
-    def _offsets(self, chain: SerialChain) -> tuple[FloatArray | None, float | None]:
-        """Return the offsets in use, rad, (k,), and what a joint's may still be off by, rad.
-
-        What a fit could not tell counts as no offset, and as little is known of it as before: the
-        clearance of the cell file remains then (None).
-        """
-        if not self.p.offsets:
-            return None, None
-        offsets, std = joint_offsets_rad(read_fit(self.p.offsets), chain.joint_names)
-        told = std > 0.0
-        unknown = max(KNOWN_OFFSET_RAD, OFFSET_STDS * float(np.max(std))) if told.all() else None
-        return np.where(told, offsets, 0.0), unknown
-
-    def _make_limits(self, offsets: FloatArray | None, p: Parameters) -> MotionLimits:
-        return MotionLimits.of(
-            self.chain,
-            p.speed_share,
-            offsets,
-            self._acceleration,
-            p.cartesian_speed_limit_m_s or np.inf,
-            float(np.deg2rad(p.limit_margin_deg)),
-        )
-
     def _on_parameters(self, p: Parameters) -> None:
         """Go on with other speeds."""
         self.p = p
-        self._do(self.supervisor.use_limits(self._limits(p), time.monotonic()))
+        limits = p.limits(self.chain, self._offsets, self._acceleration)
+        self._do(self.supervisor.use_limits(limits, time.monotonic()))
         self.get_logger().info(
             f'speed_share is {p.speed_share:g}, cartesian_speed_limit_m_s '
             f'{p.cartesian_speed_limit_m_s:g}'
@@ -198,17 +156,17 @@ class RobotBridge(RemasterNode):
 
     # What comes in
 
-    def _on_record(self, record: EventRecord) -> None:
+    def _on_record(self, record: events.EventRecord) -> None:
         now = time.monotonic()
         match record.body:
-            case PlannerState(state=state, run=run):
+            case events.PlannerState(state=state, run=run):
                 if state == 'running':
                     # By it a planner that is started again sees that this bridge was there.
                     self._run = run
                 self._do(self.supervisor.planner_is(state, now, run))
-            case RecorderState(waiting_for=waiting_for):
+            case events.RecorderState(waiting_for=waiting_for):
                 self._do(self.supervisor.recorder_waits(waiting_for, now))
-            case ConfigurationEnded(stamp=self._pose_stamp, solution=solution):
+            case events.ConfigurationEnded(stamp=self._pose_stamp, solution=solution):
                 self._do(self.supervisor.answered(solution, now))
 
     def _on_waypoints(self, message: JointTrajectory) -> None:
@@ -248,7 +206,7 @@ class RobotBridge(RemasterNode):
         response.message = refusal or 'cleared; /remaster/collect goes on'
         if not refusal:
             self._disk.submit(self._halt_file.clear, self._on_written)
-            self.status.event(HaltCleared(stamp=self._pose_stamp))
+            self.status.event(events.HaltCleared(stamp=self._pose_stamp))
             self.status.publish()
         return response
 
@@ -301,18 +259,20 @@ class RobotBridge(RemasterNode):
                 case Stop(admitted, reason):
                     self._publish(admitted)
                     self.counts['stopped'] += 1
-                    self.status.event(ArmStopped(stamp=self._pose_stamp, reason=reason))
+                    self.status.event(events.ArmStopped(stamp=self._pose_stamp, reason=reason))
                     self.get_logger().info(f'stopping the arm: {reason}')
                 case Settled():
                     self._announce(action)
                 case Failed(solution, reason):
                     self.counts['failed'] += 1
                     self.status.event(
-                        SolutionFailed(stamp=self._pose_stamp, solution=solution, reason=reason)
+                        events.SolutionFailed(
+                            stamp=self._pose_stamp, solution=solution, reason=reason
+                        )
                     )
                 case Halted(reason):
                     self._disk.submit(partial(self._halt_file.write, reason), self._on_written)
-                    self.status.event(ArmHalted(stamp=self._pose_stamp, reason=reason))
+                    self.status.event(events.ArmHalted(stamp=self._pose_stamp, reason=reason))
                     self.status.publish()
                     self.get_logger().error(f'halted: {reason}')
 
@@ -336,7 +296,7 @@ class RobotBridge(RemasterNode):
             return
         self.counts['commanded'] += 1
         self.status.event(
-            SolutionCommanded(
+            events.SolutionCommanded(
                 stamp=self._pose_stamp,
                 solution=solution,
                 since_settled_wall_s=time.monotonic() - self._settled_wall,
@@ -360,7 +320,7 @@ class RobotBridge(RemasterNode):
         message.header.stamp = stamp_of(settled.stamp_s)
         self._settled.publish(message)
         self.status.event(
-            SolutionSettled(
+            events.SolutionSettled(
                 stamp=self._pose_stamp,
                 solution=settled.solution,
                 motion_s=settled.motion_s,
@@ -379,7 +339,7 @@ class RobotBridge(RemasterNode):
             'moves_refused': supervisor.gate.refused,
         }
         age_s = supervisor.report_age_s(now)
-        state = BridgeState(
+        state = events.BridgeState(
             halted=supervisor.halted,
             pose=self._pose_stamp,
             run=self._run,

@@ -16,7 +16,11 @@ pytestmark = pytest.mark.ros
 
 CONFIG = Path(__file__).parents[3] / 'config'
 # A node has its parameters in its own file, or in one beside it.
-BESIDE = {'bridge_parameters': 'robot_bridge', 'recorder_parameters': 'recorder'}
+BESIDE = {
+    'bridge_parameters': 'robot_bridge',
+    'planner_parameters': 'pose_planner',
+    'recorder_parameters': 'recorder',
+}
 NODES = sorted(
     BESIDE.get(path.stem, path.stem)
     for path in (Path(__file__).parents[3] / 'remaster_ros' / 'nodes').glob('*.py')
