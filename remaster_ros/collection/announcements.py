@@ -1,4 +1,4 @@
-"""Who knows the pose under way: an announcement that bridge or recorder missed is repeated.
+"""Which nodes have the pose under way: an announcement that one of them missed is repeated.
 
 Times are wall time and arguments.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from remaster_ros.collection.events import BridgeState, EventRecord, RecorderState
 
 ANNOUNCE_WALL_S = 5.0
-"""Who does not know an announcement so long after it has missed it, s."""
+"""A node that does not have an announcement so long after it has missed it, s."""
 MATCH_WALL_S = 0.5
 """The other side of a DDS match comes so much later than ours at most, s."""
 PEERS = 2
@@ -78,7 +78,7 @@ class Announcements:
         self._told = {node: started for node, (_, started, _) in self._seen.items()}
 
     def is_lost(self) -> bool:
-        """Whether the open pose is to be announced (again): somebody does not know it.
+        """Whether the open pose is to be announced (again): bridge or recorder lacks it.
 
         That is a peer that was started after the announcement, or one whose state shows another
         pose some time later. While the recorder measures nothing is announced.

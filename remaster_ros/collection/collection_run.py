@@ -25,7 +25,7 @@ class CollectionRun:
     state
         As in `events.PlannerState`, without ``held``.
     why
-        Why the planner is in that state or waits, in words; ''.
+        Why the planner is in that state or waits; ''.
     token
         Of the run under way, '' for none.
     left
@@ -44,7 +44,7 @@ class CollectionRun:
         state, token
             As it last wrote them down.
         progress
-            How far the collection is, in words.
+            How far the collection is, as text.
         """
         if state == 'complete':
             self.state = state
@@ -69,7 +69,7 @@ class CollectionRun:
         bridge, recorder
             Their last states; None before the first.
         progress
-            How far the collection is, in words.
+            How far the collection is, as text.
         """
         reason = ''
         if silence_s is None:
@@ -146,5 +146,5 @@ class CollectionRun:
 
 
 def _waits(progress: str, reason: str) -> str:
-    """Return in words that, and why, the planner does not go on by itself."""
+    """Return that, and why, the planner does not go on by itself."""
     return f'{progress}; /remaster/collect goes on{f" ({reason})" if reason else ""}'

@@ -1,11 +1,11 @@
-"""What the nodes tell each other: one record, typed and versioned, as JSON on ``remaster/events``.
+"""What the nodes act on: one record, typed and versioned, as JSON on ``remaster/events``.
 
 A record carries either the *state* of a node (twice a second and at each change, so that a node
 which starts late has it at once) or an *event* of a configuration. An event names the pose by the
 stamp of its announcement and the solution by its index there.
 
 A field without which an arm could move wrongly has no default: a record that lacks it is refused.
-Fields that this version does not know are ignored, so that fields can be added. A change of what
+Unknown fields are ignored, so that fields can be added. A change of what
 a field means, or a field that is taken away, needs another `VERSION`.
 """
 
@@ -30,7 +30,7 @@ class Body(msgspec.Struct, frozen=True, tag_field='kind'):
     Attributes
     ----------
     sender
-        The name of the only node that may say so; '' for any.
+        The name of the only node that may publish it; '' for any.
     """
 
     sender: ClassVar[str] = ''
@@ -121,7 +121,7 @@ class RecorderState(Body, frozen=True, kw_only=True, tag='recorder'):
     decided
         What is recorded of the last pose; None before the first.
     registration
-        How far the first registration of the sensors is, in words.
+        How far the first registration of the sensors is, as text.
     require
         Which sensors the arm waits for: ``all``, ``any`` or the name of one.
     read_age_s
@@ -130,7 +130,7 @@ class RecorderState(Body, frozen=True, kw_only=True, tag='recorder'):
         What has changed at the reference configurations; ''.
     changed_run
         Token of the run that this change has paused; None for none, '' for one that a recorder
-        which was started again does not know yet.
+        which was started again has not learned yet.
     """
 
     sender: ClassVar[str] = 'recorder'
@@ -175,7 +175,7 @@ class SensorReport(Body, frozen=True, kw_only=True, tag='sensor'):
 
 
 class TourPlanned(Body, frozen=True, tag='planned'):
-    """The planner has planned the collection; in words."""
+    """The planner has planned the collection; described as text."""
 
     sender: ClassVar[str] = 'pose_planner'
     description: str
@@ -292,7 +292,7 @@ class SetupChanged(Body, frozen=True, kw_only=True, tag='changed'):
     stops
         Whether the collection pauses until a person has looked.
     text, cause, size_m
-        In words; the kind of change; its size, m.
+        The message; the kind of change; its size, m.
     """
 
     sender: ClassVar[str] = 'recorder'
@@ -340,7 +340,7 @@ class EventRecord(msgspec.Struct, frozen=True, kw_only=True):
     node
         The node with its namespace, such as ``/left/recorder``.
     started, uptime_s
-        Tells one start of the node from the next; how long it has been running, s.
+        Identifies this start of the node; how long it has been running, s.
     stamp_ns
         Time of the node's clock, ns.
     """

@@ -34,7 +34,7 @@ class FirstRegistration:
     T_R_N
         What is registered: sensor -> (4, 4).
     troubles
-        Why the points of a sensor register nothing: sensor -> in words.
+        Why the points of a sensor register nothing: sensor -> message.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class FirstRegistration:
         return registered
 
     def describe(self) -> str:
-        """Return how far the registration is, in words."""
+        """Return how far the registration is, as text."""
         parts = [
             f'{name}: point {len(points)} of {POINTS}' for name, points in self._points.items()
         ]

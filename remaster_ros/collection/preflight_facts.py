@@ -1,4 +1,4 @@
-"""Gather from the states of the nodes what the preflight has to know; times are arguments."""
+"""Gather from the states of the nodes the facts of the preflight; times are arguments."""
 
 from __future__ import annotations
 

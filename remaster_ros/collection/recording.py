@@ -1,6 +1,6 @@
 """Which settled configuration is read next, by which messages, and what becomes of it.
 
-Stamps come with the messages. Nothing here knows of clocks, files or ROS: the recorder's node
+Stamps come with the messages. Nothing here uses clocks, files or ROS: the recorder's node
 hands the messages in, takes what has ended, and writes it down.
 """
 
@@ -19,7 +19,7 @@ from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, nearest_so
 from remaster_ros.types import FloatArray, MarkerReading
 
 TEMPERATURE_S = 600.0
-"""A temperature older than this tells nothing of a reading, s."""
+"""A temperature that is older than this is not used for a reading, s."""
 SET_BACK_S = 1.0
 """Stamps of joint_states that go back by more than this are those of a clock that was set, s."""
 BY_HAND = PoseAnnounced(stamp='', pose=-1_000_000, split=REGISTRATION, ids=(0,))
@@ -89,7 +89,7 @@ class EndedReading:
 
     @property
     def why(self) -> str:
-        """Why sensors have no reading, in words; ''."""
+        """Why sensors have no reading; ''."""
         return '; '.join(f'{r.sensor}: {r.reason}: {r.detail}' for r in self.rejected)
 
     def event(self, *, registered: bool) -> ConfigurationEnded:

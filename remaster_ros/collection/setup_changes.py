@@ -162,8 +162,8 @@ class SetupChanges:
         """Take what the planner does; return whether a person has seen to the change.
 
         A person has where another run has begun, as /remaster/collect does. A recorder that was
-        started again does not know which run was stopped: the one it finds running is, and after
-        a pause none.
+        started again has no record of which run was stopped: the one that it finds running is,
+        and after a pause none.
 
         Parameters
         ----------

@@ -96,7 +96,7 @@ class TourProgress:
         self.standing = ''
 
     def describe(self) -> str:
-        """Return how far the collection is, in words."""
+        """Return how far the collection is, as text."""
         tour = self._memory.tour
         poses = f'{tour.poses_begun} of {sum(tour.poses.values())}' if tour else 'none'
         done = self._memory.outcomes.total()

@@ -40,7 +40,7 @@ class BagRecorder:
     Attributes
     ----------
     notes
-        What a user should know of the bag as it was found.
+        How the bag was found, for the user.
     dropped
         Messages that found no room, neither on the disk nor in memory.
     """
@@ -48,7 +48,7 @@ class BagRecorder:
     def __init__(self, node: Node, folder: Path | None) -> None:
         self._node, self._folder = node, folder
         self._writer: BagWriter | None = None
-        # Heard while the node's clock, a simulated one, was not known: topic, type, bytes.
+        # Received while the node's clock, a simulated one, had no time: topic, type, bytes.
         self._early: list[tuple[str, str, bytes]] = []
         self.notes: list[str] = []
         self.dropped = 0

@@ -26,7 +26,7 @@ from remaster_ros.types import MarkerReading
 
 
 class CellSensors:
-    """Hand the readings of all sensors to a recording, and tell which sensors are missing.
+    """Hand the readings of all sensors to a recording, and find which sensors are missing.
 
     Parameters
     ----------

@@ -60,7 +60,7 @@ class Parameters:
 class Optimizer(RemasterNode):
     """See the module's text."""
 
-    # It moves nothing, and nobody counts on it: what fails is asked for again.
+    # It moves nothing, and no node depends on it: what fails can be called again.
     outlives_faults = True
 
     def __init__(self) -> None:
@@ -101,7 +101,7 @@ class Optimizer(RemasterNode):
         return response
 
     def _fit(self) -> tuple[Path, str]:
-        """Return what to open, and what to say in the status."""
+        """Return the file to open, and the text for the status."""
         out = Path(self.p.out)
         session = read_session(self.p.session)
         prepare_folder(out)
@@ -122,7 +122,7 @@ class Optimizer(RemasterNode):
         return report, '; '.join(('fitted', *result.implausible))
 
     def _discover(self) -> tuple[Path, str]:
-        # What takes a second to import comes when it is asked for: a node is there at once.
+        # Imported when it is needed, as it takes a second: the node is there at once.
         from remaster_ros.discovery.discover import discover_session
         from remaster_ros.reports.discovery_json import save_discovery
 

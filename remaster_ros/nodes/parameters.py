@@ -1,6 +1,6 @@
 """A node's parameters: one frozen dataclass, each field with unit, range and description.
 
-A value of the wrong type, outside its range, or a name that the node does not know is refused at
+A value of the wrong type, outside its range, or the name of no parameter is refused at
 start with one line. While the node runs, what is declared `live` can be changed, with the same
 checks; everything else is read-only, `use_sim_time` as well: what was answered "successful" and
 changed nothing would be believed.
@@ -49,7 +49,7 @@ def parameter(
     low, high
         Smallest and largest allowed value, both included.
     choices
-        The allowed words of a text parameter.
+        The allowed values of a text parameter.
     live
         Whether it can be changed while the node runs, where the node has an `on_change`.
     """

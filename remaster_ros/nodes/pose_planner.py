@@ -198,7 +198,7 @@ class PosePlanner(RemasterNode):
             self._joint_states = self._listen_to_the_arm()
 
     def _on_joint_state(self, message: JointState) -> None:
-        """Learn where the arm is before the first pose; after that /remaster/settled tells it."""
+        """Learn where the arm is before the first pose; after that by /remaster/settled."""
         self._on_settled(message)
         if self._q is not None and self._joint_states is not None:
             self.destroy_subscription(self._joint_states)
@@ -355,7 +355,7 @@ class PosePlanner(RemasterNode):
         return Summary(level, why or run.state, values, state)
 
     def close(self) -> None:
-        """Tell the bridge to stop: no more poses are planned."""
+        """Publish that the planner has stopped, on which the bridge stops the arm."""
         self._end('stopped')
         self._write_state()
         self.journal.close()

@@ -42,7 +42,7 @@ class PosePublisher:
         return int(self._solutions.get_subscription_count())
 
     def stop(self) -> None:
-        """Tell the bridge to stop."""
+        """Take the pose back, on which the bridge stops the arm."""
         self._solutions.publish(JointTrajectory(joint_names=list(self._chain.joint_names)))
 
     def announce(self, stop: PoseVisit, plan: str, status: NodeStatus, *, last: bool) -> str:
@@ -59,7 +59,7 @@ class PosePublisher:
         pose.header.stamp = self._node.get_clock().now().to_msg()
         pose.header.frame_id = self._chain.base_link
         key = stamp_key(pose.header.stamp)
-        # The event goes first: the recorder must know the pose before the arm gets there.
+        # The event goes first: the recorder must have the pose before the arm gets there.
         status.event(
             PoseAnnounced(
                 stamp=key, pose=stop.pose, split=stop.split, ids=stop.ids, plan=plan, last=last

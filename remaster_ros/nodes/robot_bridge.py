@@ -1,4 +1,4 @@
-"""Command the joint solutions of a pose one by one; tell when the arm has settled.
+"""Command the joint solutions of a pose one by one; publish when the arm has settled.
 
 Every command comes from the motion gate (`remaster_ros.motion`); this is the ROS shell of its
 rules. After a configuration has settled the arm stays until the recorder has answered what became
@@ -61,7 +61,7 @@ JOINTS = 'joint_states'
 SOLUTIONS = 'remaster/joint_solutions'
 WAYPOINTS = 'remaster/joint_waypoints'
 NEWEST_STATES = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""A bridge that is kept busy drops what is old: it has to know where the arm is now."""
+"""A bridge that is kept busy drops what is old: it needs where the arm is now."""
 MATCHED_WALL_S = 0.5
 """So much later than ours the controller's side of a DDS match may come."""
 LATE_WALL_S = {Stop: 0.1, Drive: 0.5}
@@ -73,7 +73,7 @@ longer with it, a paused process may not.
 WATCH_WALL_S = 0.05
 """How often silence and the graph are looked at."""
 LISTENERS = ('robot_bridge', 'recorder', 'laser_tracker_markers')
-"""Nodes of ours that listen to what a controller is told."""
+"""Nodes of this package that subscribe to the commands."""
 
 
 class RobotBridge(RemasterNode):

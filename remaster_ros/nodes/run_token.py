@@ -1,8 +1,8 @@
 """The token of a collection under way, and the sign of life of the planner that runs it.
 
 A planner that was killed may go on by itself only where it is certain that the same collection is
-still under way: the same boot of this computer, a short time by a clock that nobody sets, and
-recorder and bridge that hold the token in memory. Dates of files say nothing of that.
+still under way: the same boot of this computer, a short time by a clock that cannot be set, and
+recorder and bridge that hold the token in memory. Dates of files prove nothing of that.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class LivingRun:
         self.stay_alive()
 
     def stay_alive(self) -> None:
-        """Renew the sign of life, at most once a second; where it cannot be, nobody goes on."""
+        """Renew the sign of life, at most once a second; where that fails, no planner goes on."""
         now = since_boot_s()
         if now - self._renewed < ALIVE_S:
             return
@@ -67,7 +67,7 @@ class LivingRun:
             os.replace(new, path)
 
     def end(self) -> None:
-        """Let nobody go on with this run."""
+        """End the run: no planner goes on with it."""
         with contextlib.suppress(OSError):
             _path(self.token).unlink()
 

@@ -25,7 +25,7 @@ class SessionKeeper:
     Parameters
     ----------
     node
-        The node that records; its log gets what a person should know.
+        The node that records; its log gets what is for a person.
     folder
         The session's.
     header
@@ -57,7 +57,7 @@ class SessionKeeper:
 
     @property
     def waits_for(self) -> str:
-        """What has to happen before anything can be written, in words; ''."""
+        """What has to happen before anything can be written; ''."""
         return self.full if self._moved or not self.full else f'room on the disk: {self.full}'
 
     def write(self, write: Callable[[], object]) -> None:

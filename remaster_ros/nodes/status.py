@@ -107,7 +107,7 @@ class NodeStatus:
         self, node: Node, summary: Callable[[], Summary], hardware_id: str = 'none'
     ) -> None:
         self._node, self._summary, self._hardware_id = node, summary, hardware_id
-        # Tells a node that was started again from the one before it.
+        # Distinguishes a node that was started again from the one before it.
         self._started, self._started_wall = str(time.time_ns()), time.monotonic()
         self._duplicates = DuplicateNodeCheck(self._started)
         self._events = node.create_publisher(String, EVENTS, RELIABLE)

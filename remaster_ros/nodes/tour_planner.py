@@ -181,7 +181,7 @@ class PlanningThread:
         Parameters
         ----------
         what
-            Tells jobs apart: what another job, or an arm that has moved since, was asked for is
+            Identifies the job: the result of another job, or for an arm that has moved since, is
             forgotten.
         q
             Where the arm stands, rad, (k,).
