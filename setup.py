@@ -24,13 +24,12 @@ JAZZY = [
     )
 ]
 
-# What judges in the tests: clients and readers of others, and their statistics and kinematics.
+# What judges in the tests: clients and readers of others, and their distances between bodies.
 JUDGES = [
     'NatNetClient==0.8.3',
     'natnet==0.3.0',
     'CESAPI==1.1.3',
     'mcap-ros2-support>=0.5',
-    'arviz-stats>=0.4',
     'python-fcl>=0.7',
 ]
 
@@ -74,6 +73,7 @@ setup(
     install_requires=[
         'numpy>=1.26',
         'scipy>=1.11',
+        'arviz-stats>=0.4',
         'PyYAML>=6',
         'EAIK>=1.2',
         # Brings coal, which measures distances between bodies; on NumPy 1, which ROS 2 Jazzy's

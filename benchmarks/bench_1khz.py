@@ -24,9 +24,10 @@ from multiprocessing.connection import Connection
 from bench_decode import scene
 
 from remaster_ros.sensors.optitrack import sockets as natnet_sockets
-from remaster_ros.sensors.optitrack.client import NatNetClient, NatNetSettings
+from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.frame_gate import MarkerChoice, MarkerSample
 from remaster_ros.sensors.optitrack.protocol import natnet
+from remaster_ros.sensors.optitrack.settings import NatNetSettings
 
 VERSION = (3, 1)
 RATE_HZ = 1000

@@ -26,7 +26,8 @@ from common import machine, table
 from paper_experiment import CELL, CHAIN, MARKER_OF, MARKERS, sensor_frames
 
 from remaster_ros.session.reader import write_session
-from remaster_ros.simulation.session_simulator import SimulatedSensor, simulate_session
+from remaster_ros.simulation.session_simulator import simulate_session
+from remaster_ros.simulation.truth import SimulatedSensor
 
 NOISE_M = (0.1e-3, 0.2e-3)
 SOLUTIONS = 5

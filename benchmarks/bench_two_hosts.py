@@ -29,7 +29,6 @@ from typing import Any
 
 import numpy as np
 
-from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.workcell import config_path, read_cell
@@ -81,7 +80,7 @@ class Hosts:
 
 
 def run(*command: str) -> None:
-    """Run a command; say what it said where it fails."""
+    """Run a command; if it fails, raise an error with its output."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f'{" ".join(command)}: {done.stderr.strip()}')
@@ -209,7 +208,7 @@ class Watch:
         os.set_blocking(self._lines.fileno(), False)  # type: ignore[union-attr]
 
     def look(self) -> None:
-        """Take in what has been said."""
+        """Read the new lines of output."""
         while line := self._lines.readline():  # type: ignore[union-attr]
             if line.startswith('{'):
                 values = json.loads(line)
@@ -231,7 +230,7 @@ class Watch:
             time.sleep(0.1)
 
     def progress(self) -> str:
-        """Return how far the planner is, and what everyone says."""
+        """Return how far the planner is, and the last message of every node."""
         planner = self.said.get('pose_planner', {})
         done, planned = planner.get('configurations_done'), planner.get('configurations')
         messages = {name: values['message'] for name, values in self.said.items()}
@@ -270,11 +269,8 @@ def judge(folder: Path, world: World, planned: int) -> list[str]:
         faults.append(f'exit status {session.exit_status}')
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     for index, name in enumerate(session.sensor_names):
-        rows, truth = m.sensor == index, world.truth.sensors[name]
-        expected = transforms.apply(
-            transforms.inverse(truth.T_R_N),
-            chain.positions(m.q[rows], truth.marker, world.truth.joint_offsets),
-        )
+        rows = m.sensor == index
+        expected = world.truth.without_noise(chain, name, m.q[rows])
         worst = np.linalg.norm(m.position[rows] - expected, axis=1).max()
         if worst > TOLERANCE_M[name]:
             faults.append(f'{name}: a reading {worst * 1e3:.2f} mm from where the marker was')

@@ -16,7 +16,7 @@ sys.path.insert(0, str(ROOT / 'test'))
 
 
 def machine() -> str:
-    """Return one line that says where figures come from."""
+    """Return one line with the machine and versions that the figures come from."""
     threads = os.environ.get('OMP_NUM_THREADS', 'not set')
     return (
         f'{os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()}, '

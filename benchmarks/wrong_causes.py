@@ -129,7 +129,7 @@ def _named(name: str, joints: tuple[int, ...]) -> str:
 
 
 def draw(kind: str, found: Findings, path: Path) -> None:
-    """Draw what the two stories leave, against the torque, or the depth, that tells them apart."""
+    """Draw what the two causes leave, against the torque, or the depth, that separates them."""
     from matplotlib.figure import Figure
 
     data = found.residuals

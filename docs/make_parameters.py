@@ -8,6 +8,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from remaster_ros.parameters import parameter_fields
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / 'docs' / 'parameters.md'
 # The order of a run, not of the alphabet; the rest follows.
@@ -16,6 +18,7 @@ FIRST = (
     'robot_bridge',
     'optitrack_markers',
     'laser_tracker_markers',
+    'sensor_markers',
     'recorder',
     'optimizer',
     'replay',
@@ -41,7 +44,7 @@ def page() -> str:
 def section(node: str) -> str:
     """Return the heading and the table of one node."""
     kind = importlib.import_module(f'remaster_ros.nodes.{node}').Parameters
-    rows = [row(field) for field in dataclasses.fields(kind)]
+    rows = [row(field) for field in parameter_fields(kind).values()]
     return '\n'.join(
         [
             f'## {node}',

@@ -210,5 +210,4 @@ def plan(
     workcell = read_cell(os.fspath(cell))
     counts = {'optimization': poses, 'validation': validation_poses}
     rng = np.random.default_rng(seed)
-    chain, places = workcell.chain(), workcell.rough_places()
-    return plan_tour(chain, workcell, places, counts, rng, without_meshes=False)
+    return plan_tour(workcell.chain(), workcell, None, counts, rng, without_meshes=False)

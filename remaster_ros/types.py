@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from math import nan
 from typing import Any, Literal
 
 import numpy as np
@@ -21,23 +22,6 @@ FARTHEST_M = 200.0
 
 
 @dataclass(frozen=True)
-class JointSolution:
-    """One joint solution of a Cartesian pose.
-
-    Attributes
-    ----------
-    q
-        Joint positions, base to tip, rad, shape (k,).
-    position_error_m, rotation_error_rad
-        What forward kinematics leaves against the wanted pose.
-    """
-
-    q: FloatArray
-    position_error_m: float
-    rotation_error_rad: float
-
-
-@dataclass(frozen=True)
 class MarkerReading:
     """One marker position measured by one sensor, in the sensor's own frame N.
 
@@ -47,10 +31,13 @@ class MarkerReading:
         Time of capture, s.
     position
         Marker position in N, m, shape (3,).
+    temperature_c
+        Of the air, by the sensor's own thermometer; NaN where it has none.
     """
 
     stamp_s: float
     position: FloatArray
+    temperature_c: float = nan
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.sampling import sample_posterior
 from remaster_ros.kinematics.transforms import inverse
-from remaster_ros.simulation.session_simulator import SessionTruth
+from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.types import FloatArray
 
 SENSORS = (('mocap',), ('tracker',), ('mocap', 'tracker'))
@@ -132,7 +132,7 @@ def pinned_truth(model: Model, truth: SessionTruth) -> FloatArray:
 
 
 def cramer_rao_std(found: Estimate, truth: SessionTruth) -> FloatArray:
-    """Return the bound of the model's pinned parameters, (size,); NaN where nothing tells."""
+    """Return the bound of the model's pinned parameters, (size,); NaN where there is none."""
     model = found.model
     rows = Rows.of(found.problem.measurements, found.problem.fitted, model.reference)
     z = pinned_truth(model, truth)

@@ -6,7 +6,6 @@ import numpy as np
 from ros_rig import ROOT, call, node_arguments, wait_until
 
 from remaster_ros.collection.events import ConfigurationEnded
-from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.demo import free_ports
 from remaster_ros.session.journal import read_journal
@@ -102,9 +101,8 @@ class Cell:
         chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
         m, truth = session.measurements, self.world.truth
         for index, name in enumerate(session.sensor_names):
-            sensor, mine = truth.sensors[name], m.sensor == index
-            marker_R = chain.positions(m.q[mine], sensor.marker, truth.joint_offsets)
-            expected = transforms.apply(transforms.inverse(sensor.T_R_N), marker_R)
+            mine = m.sensor == index
+            expected = truth.without_noise(chain, name, m.q[mine])
             assert np.all(np.linalg.norm(m.position[mine] - expected, axis=1) < 0.4e-3), name
         pairs = list(zip(m.configuration.tolist(), m.sensor.tolist()))
         assert len(set(pairs)) == len(pairs)

@@ -1,14 +1,16 @@
-"""What every test needs is there, or one line says how to get it, instead of an error a file."""
+"""For every test: missing packages are named in one line, and a signal ends what was started."""
 
 from __future__ import annotations
 
 import importlib.util
+import signal
 
 import pytest
 
 # Distribution -> module, of what package.xml cannot name: rosdep has no Debian package for these.
 PIP_ONLY = {
     'EAIK': 'eaik',
+    'arviz-stats': 'arviz_stats',
     'mcap': 'mcap',
     'msgspec': 'msgspec',
     'plotly': 'plotly',
@@ -23,3 +25,8 @@ if _missing:
         f'pip install -c constraints-ros.txt {" ".join(_missing)}',
         returncode=2,
     )
+
+# What a shell starts in the background, as tools/run-tests does, ignores SIGINT, and so would the
+# nodes of its tests. Either signal ends a run as Ctrl-C does: with the processes that it started.
+for _number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(_number, signal.default_int_handler)

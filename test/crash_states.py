@@ -65,7 +65,7 @@ class Recorder:
             self._log('sync folder', place[0])
 
     def mark(self, what):
-        """Note that the caller was told: `what` is durable now."""
+        """Note that `what` was acknowledged to the caller: from now on it must survive."""
         self.marks.append((len(self.operations), what))
 
     def _place(self, path):

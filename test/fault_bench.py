@@ -22,7 +22,6 @@ import numpy as np
 from fault_observer import Observer
 
 from remaster_ros.collection.events import ConfigurationEnded, PoseAnnounced
-from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.demo import free_ports
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.workcell import config_path, read_cell
@@ -380,9 +379,8 @@ class Bench:
         session, truth = read_session(self.session), self.world.truth
         m, chain = session.measurements, self.world.chain
         for index, name in enumerate(session.sensor_names):
-            sensor, mine = truth.sensors[name], m.sensor == index
-            marker_R = chain.positions(m.q[mine], sensor.marker, truth.joint_offsets)
-            expected = transforms.apply(transforms.inverse(sensor.T_R_N), marker_R)
+            mine = m.sensor == index
+            expected = truth.without_noise(chain, name, m.q[mine])
             wrong = np.linalg.norm(m.position[mine] - expected, axis=1)
             assert np.all(wrong < 1e-3), (name, wrong.max())
         pairs = list(zip(m.configuration.tolist(), m.sensor.tolist()))

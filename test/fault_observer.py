@@ -1,4 +1,4 @@
-"""What a bench of real nodes observes: every command to the controller, and what is said of it.
+"""What a bench of real nodes observes: every command to the controller, and the messages about it.
 
 Commands are judged as a controller takes them: cubics from where the arm is to the first point,
 and from point to point. Where the arm is comes from the hidden World, which notes when each
@@ -37,7 +37,7 @@ SAME_WALL_S = 3.0
 UNNAMED = '_NODE_NAMESPACE_UNKNOWN_/_NODE_NAME_UNKNOWN_'
 """Of a participant that has just been found the graph has no name yet."""
 CONSEQUENCES = ('planner is ', 'the halt was cleared', 'looking for another', 'no controller')
-"""What a bridge tells that follows from the operator or from a restart, and not from the fault."""
+"""Messages of a bridge that follow from the operator or from a restart, and not from the fault."""
 STARTING_S = 4.0
 """A node that is up for less is still looking for the others, s."""
 
@@ -205,7 +205,7 @@ class Observer:
         ]
 
     def reasons(self, since_s: float, until_s: float = np.inf) -> list[str]:
-        """Return what was said of a fault, each once, bridge first, without its numbers."""
+        """Return the messages about a fault, each once, bridge first, without numbers."""
         found = {}
         for wall_s, event in list(self.events):
             if not since_s < wall_s <= until_s:

@@ -28,7 +28,7 @@ from remaster_ros.collection.events import (
 )
 
 HALT_S = 0.3
-"""A command may be on its way when a halt is said, s."""
+"""A command may be on its way when a halt is published, s."""
 TRIES = 4
 """So often at most a row is tried."""
 GOES_ON_S = 30.0
@@ -180,7 +180,7 @@ def _wait(bench: Bench, until_s: float) -> None:
 
 
 def _blocked(bench: Bench, began: float, ended: float) -> bool:
-    """Whether the bridge said for most of a second that it must not move the arm."""
+    """Whether the bridge reported for most of a second that it must not move the arm."""
     words = [
         message
         for at, node, message, _ in list(bench.observer.summaries)
@@ -445,7 +445,7 @@ def _common(name: str) -> tuple[Row, ...]:
 
 
 def spoiled(name: str, spoil: Callable, *, now: bool = False) -> Callable[[Bench], None]:
-    """Return a relay that changes what a node tells; with `now` its last word again at once."""
+    """Return a relay that changes a node's messages; with `now` it repeats the last one."""
 
     def begin(bench: Bench) -> None:
         bench.relays[name].spoil = spoil

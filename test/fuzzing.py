@@ -18,13 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient, LaserTrackerError
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
+from remaster_ros.sensors.laser_tracker.link import LaserTrackerError
 from remaster_ros.sensors.laser_tracker.protocol import codes
 from remaster_ros.sensors.laser_tracker.protocol import packets as emscon
 from remaster_ros.sensors.laser_tracker.settings import LaserTrackerSettings
 from remaster_ros.sensors.optitrack import client as natnet_client
 from remaster_ros.sensors.optitrack.client import NatNetClient
-from remaster_ros.sensors.optitrack.diagnosis import NatNetSettings
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice, MarkerSample
 from remaster_ros.sensors.optitrack.protocol import natnet
 from remaster_ros.sensors.optitrack.protocol.frames import (
@@ -44,6 +44,7 @@ from remaster_ros.sensors.optitrack.protocol.models import (
     RigidBodyDescription,
     SkeletonDescription,
 )
+from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.types import FARTHEST_M
 
 VERSIONS: tuple[natnet.Version, ...] = (
@@ -122,7 +123,7 @@ def model_definition() -> ModelDefinition:
         (
             MarkerSetDescription('tool', ('a', 'b', 'c')),
             body,
-            SkeletonDescription('hand', 2, (dataclasses.replace(body, name='bone'),)),
+            SkeletonDescription('hand', 2, (body._replace(name='bone'),)),
         )
     )
 

@@ -94,7 +94,7 @@ def _claimed(effect: Any) -> list[Cause]:
 def _forgiven(
     oracle: Oracle, missing: dict[Cause, HiddenEffect], extra: dict[Cause, list[Any]]
 ) -> bool:
-    """Whether what was named instead of the missing cannot be told from them, and says so."""
+    """Whether the causes named in place of missing ones are look-alikes, and listed as such."""
     if len(missing) != len(extra):
         return False
     rivals = [rival for claims in extra.values() for claim in claims for rival in _parts(claim)]
@@ -116,7 +116,7 @@ def _parts(claim: Any) -> list[HiddenEffect]:
     return [
         part.scaled(parameter.value)
         for parameter in claim.parameters
-        if (part := _part(parameter.name)) is not None
+        if (part := part_of(parameter.name)) is not None
     ]
 
 
@@ -141,7 +141,8 @@ _PATTERNS = {
 }
 
 
-def _part(name: str) -> HiddenEffect | None:
+def part_of(name: str) -> HiddenEffect | None:
+    """Return the effect of size 1 whose parameter discovery calls so; None where none is."""
     for pattern, kind in _PATTERNS.items():
         match = re.fullmatch(pattern, name)
         if match is None:
@@ -197,7 +198,7 @@ def _deviations(
 
 def _unseen(world: HiddenWorld, effect: HiddenEffect, name: str) -> bool:
     """Whether this component of the effect is taken up by offsets, registration or marker."""
-    part = _part(name)
+    part = part_of(name)
     if part is None:
         return False
     size = np.linalg.norm(effect.values) / np.linalg.norm(part.values)

@@ -1,4 +1,4 @@
-"""The best possible test: it knows the noise, and which effect to look for.
+"""The best possible test: it is given the noise, and the effect to look for.
 
 It uses the rows to fit without the gross errors, the noise's true covariance, and the effect's
 true response. What registration, offsets and marker can take up it must not count, as nobody can.

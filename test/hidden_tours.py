@@ -16,9 +16,10 @@ from hidden_world import HiddenWorld, Visits
 from remaster_ros.kinematics.collision import CollisionModel, arm_bodies
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import transform
 from remaster_ros.planning.candidates import LineOfSight, PoseRanges, candidate_poses, plan_poses
 from remaster_ros.planning.tour_order import Tour
-from remaster_ros.simulation.world_model import StagedSensor
+from remaster_ros.simulation.truth import SimulatedSensor
 from remaster_ros.types import FloatArray
 
 ROBOTS = Path(__file__).parent.parent / 'config/robots'
@@ -119,7 +120,8 @@ def world(
     for sensor in sensors:
         marker, place, _ = PLACES[sensor]
         origin = place + 0.05 * rng.standard_normal(3)
-        placed[sensor] = StagedSensor(_facing(origin, rng.uniform(-0.2, 0.2)), origin, marker)
+        T_R_N = transform(_facing(origin, rng.uniform(-0.2, 0.2)), origin)
+        placed[sensor] = SimulatedSensor(marker, T_R_N)
     markers = {PLACES[sensor][0]: MARKERS[PLACES[sensor][0]] for sensor in sensors}
     return HiddenWorld(robot(name), tour, placed, markers, rng)
 

@@ -3,7 +3,7 @@
 Its kinematics and gravity are pinocchio's (`hidden_arm`); the effects and the least squares that
 measure them are those of the fakes (`remaster_ros.simulation.hidden_effects`, `.world_model`),
 which share no code with what estimates either. Only `hidden_tours`, which chooses the
-configurations, asks the robot's own software, as a real cell does.
+configurations, uses the package's planning, as a real cell does.
 
 A world predicts what every sensor sees of an arm with any effects. `measure` adds noise and
 returns the session, with no more in it than a recorded one, and the truth, for the judges alone.
@@ -18,7 +18,8 @@ import numpy as np
 from hidden_arm import PinocchioArm
 
 from remaster_ros.simulation.hidden_effects import HiddenEffect
-from remaster_ros.simulation.world_model import Round, StagedSensor, WorldModel
+from remaster_ros.simulation.truth import SimulatedSensor
+from remaster_ros.simulation.world_model import Round, WorldModel
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements, Session
 
 MARKER_STD_M = 0.5e-3
@@ -124,7 +125,7 @@ class HiddenWorld(WorldModel):
         self,
         urdf: str,
         visits: Visits,
-        sensors: Mapping[str, StagedSensor],
+        sensors: Mapping[str, SimulatedSensor],
         markers: Mapping[str, FloatArray],
         rng: np.random.Generator,
     ) -> None:

@@ -1,4 +1,4 @@
-"""An arm and its controller that obey whatever they are told; no ROS, times are arguments.
+"""An arm and its controller that execute every command; no ROS, times are arguments.
 
 It stands for joint_trajectory_controller and a position-controlled arm: each trajectory is
 interpolated from where the arm is (or, in open loop, from where the last trajectory leads now)

@@ -218,7 +218,7 @@ class Judge:
         self._move = self._last = None
 
     def judge(self, command: Command, running: bool = True) -> Judgement:
-        """Judge the next command; `running` tells whether the collection ran when it arrived."""
+        """Judge the next command; `running`: whether the collection ran when it arrived."""
         if not np.all(np.isfinite(command.q)) or np.any(np.diff(command.times_s) <= 0.0):
             inf = np.inf
             return Judgement('stop', command.arrival_s, *([inf] * 7), outside_rad=inf)

@@ -1,4 +1,4 @@
-"""The demo cell as the hostile tests take it: its arm, and moves that are in nobody's way."""
+"""The demo cell as the hostile tests take it: its arm, and moves without obstacles."""
 
 from __future__ import annotations
 

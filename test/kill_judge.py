@@ -11,10 +11,10 @@ import numpy as np
 import yaml
 
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.journal import read_journal
 from remaster_ros.session.reader import read_session
+from remaster_ros.simulation.truth import SessionTruth, from_plain
 
 COUNTS = ('rows', 'planned_configurations', 'configurations', 'lost', 'twice', 'wrong')
 LARGEST_ERROR_M = {'mocap': 0.3e-3, 'tracker': 0.15e-3}
@@ -37,7 +37,7 @@ def node_processes(parent: int) -> dict[str, int]:
     return found
 
 
-def judge(out: Path, seen: set[str], truth: dict[str, Any] | None = None) -> dict[str, Any]:
+def judge(out: Path, seen: set[str], truth: SessionTruth | None = None) -> dict[str, Any]:
     """Count what was lost, twice or wrong in the folder of a demo that has ended.
 
     `seen` are the rows that were ever on the disk; `truth` is what the demo opens at its very end.
@@ -68,7 +68,7 @@ def judge(out: Path, seen: set[str], truth: dict[str, Any] | None = None) -> dic
     }
     truth_path = out / 'truth.yaml'
     if truth is None and truth_path.exists():
-        truth = yaml.safe_load(truth_path.read_text())
+        truth = from_plain(yaml.safe_load(truth_path.read_text()), SessionTruth)
     if truth is not None:
         result['wrong'] = wrong_pairs(session, truth)
     fit_path = out / 'fit' / 'fit.json'
@@ -94,16 +94,13 @@ def closest(m: Any) -> float:
     return nearest
 
 
-def wrong_pairs(session: Any, truth: dict[str, Any]) -> int:
+def wrong_pairs(session: Any, truth: SessionTruth) -> int:
     """Count the rows whose marker is not where the truth has it at these joint positions."""
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     m, wrong = session.measurements, 0
     for index, name in enumerate(session.sensor_names):
-        sensor, mine = truth['sensors'][name], m.sensor == index
-        expected = transforms.apply(
-            transforms.inverse(np.array(sensor['T_R_N'])),
-            chain.positions(m.q[mine], sensor['marker_m'], np.array(truth['joint_offsets_rad'])),
-        )
+        mine = m.sensor == index
+        expected = truth.without_noise(chain, name, m.q[mine])
         error = np.linalg.norm(m.position[mine] - expected, axis=1)
         wrong += int(np.sum(error > LARGEST_ERROR_M[name]))
     return wrong

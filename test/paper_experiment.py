@@ -8,16 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.transforms import looking_at, transform
-from remaster_ros.planning.candidates import candidate_poses, plan_poses
 from remaster_ros.session.workcell import read_cell
-from remaster_ros.simulation.offline_tour import LIMIT_MARGIN_RAD
-from remaster_ros.simulation.session_simulator import (
-    SessionTruth,
-    SimulatedSensor,
-    simulate_session,
-)
+from remaster_ros.simulation.session_simulator import simulate_session
+from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor
 from remaster_ros.types import FloatArray, Session
 
 CELL = read_cell('demo')
@@ -44,16 +38,10 @@ def sensor_frames() -> dict[str, FloatArray]:
 
 @cache
 def pose_pool(candidates: int = 600, seed: int = 0) -> tuple[FloatArray, ...]:
-    """Return joint solutions (m, k), m >= 2, of poses planned as section III of the paper says."""
+    """Return joint solutions (m, k), m >= 2, of poses planned as in section III of the paper."""
     rng = np.random.default_rng(seed)
-    frames = sensor_frames()
-    plan = plan_poses(
-        InverseKinematics(CHAIN, CELL.held(CHAIN)),
-        CELL.collision_model(CHAIN),
-        candidate_poses(candidates, CELL.poses.ranges(), frames[CELL.aim_at][:3, 3], rng),
-        CELL.lines_of_sight({name: frame[:3, 3] for name, frame in frames.items()}),
-        LIMIT_MARGIN_RAD,
-    )
+    places = {name: frame[:3, 3] for name, frame in sensor_frames().items()}
+    plan = CELL.planning_scene(CHAIN).plan(candidates, places, rng)
     return tuple(pose.solutions for pose in plan.poses if len(pose.solutions) > 1)
 
 

@@ -7,7 +7,7 @@ from collections import Counter
 
 import numpy as np
 
-from remaster_ros.nodes.tour_planner import TourPlanner
+from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import FloatArray
 
@@ -26,7 +26,7 @@ def tours(
             T_R_N[name] = np.eye(4)
             T_R_N[name][:3, 3] = sensor.rough_position_m
         start = time.thread_time()
-        planner = TourPlanner(cell, chain, counts, seed, np.deg2rad(1.0))
+        planner = TourPlanner(cell.planning_scene(chain), counts, seed)
         tour = planner.collection(T_R_N)
         planning.append(time.thread_time() - start)
         dropped.update(tour.dropped_solutions)

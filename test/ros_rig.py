@@ -1,17 +1,45 @@
 """Tests of real processes: each has a DDS domain, a ROS_HOME and processes of its own."""
 
-import itertools
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
+from collections import deque
+from collections.abc import Iterator
+from itertools import cycle
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-domains = itertools.count(110 + os.getpid() % 80)
+LAST_DOMAIN = 101
+"""The UDP ports of higher ones are those that Linux gives to any program."""
+DOMAINS_HELD = 4
+"""A test uses at most so many at a time."""
+
+
+def free_domains() -> Iterator[int]:
+    """Yield DDS domains that no other test run on this computer has.
+
+    A domain is reserved by a socket of its name, which the kernel removes with the process. The
+    last few are held; those before them are free again.
+    """
+    held = deque[socket.socket](maxlen=DOMAINS_HELD)
+    # Each run begins elsewhere: a domain that was given back a moment ago is not taken at once.
+    for domain in cycle(1 + (os.getpid() + i) % LAST_DOMAIN for i in range(LAST_DOMAIN)):
+        reservation = socket.socket(socket.AF_UNIX)
+        try:
+            reservation.bind(f'\0remaster_test_domain_{domain}')
+        except OSError:
+            reservation.close()
+            continue
+        held.append(reservation)
+        yield domain
+
+
+domains = free_domains()
 
 
 @pytest.fixture(scope='module')

@@ -13,12 +13,13 @@ import numpy as np
 from crash_states import Operation, Recorder, crash_state, materialise
 
 from remaster_ros.errors import InputError
-from remaster_ros.session import session_writer, session_yaml
+from remaster_ros.session import session_yaml
 from remaster_ros.session.journal import Journal
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.recovery import recover_session
 from remaster_ros.session.safe_yaml import load_yaml
-from remaster_ros.session.session_writer import PLAN, SessionWriter
+from remaster_ros.session.session_opening import PLAN
+from remaster_ros.session.session_writer import SessionWriter
 from remaster_ros.types import Measurements, Observation, Session
 
 JOINT = """<joint name="joint_{n}" type="revolute">
@@ -46,14 +47,11 @@ def yaml_read_once():
             known[text] = load_yaml(text)
         return copy.deepcopy(known[text])
 
-    modules = (session_yaml, session_writer)
-    for module in modules:
-        module.load_yaml = load
+    session_yaml.load_yaml = load
     try:
         yield
     finally:
-        for module in modules:
-            module.load_yaml = load_yaml
+        session_yaml.load_yaml = load_yaml
 
 
 class Life(NamedTuple):

@@ -8,7 +8,7 @@ over configurations (and draws), in mm, as in Tables III to VIII.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -89,7 +89,7 @@ def relative_errors(
 
 def accuracy_of(
     measurements: Measurements,
-    splits: Mapping[str, IntArray],
+    fitted: IntArray,
     predicted_before: FloatArray,
     predicted_after: FloatArray,
     predictive: Predictive | None,
@@ -101,8 +101,9 @@ def accuracy_of(
     ----------
     measurements
         n observations.
-    splits
-        Name -> indices of its rows; a split without rows gives None.
+    fitted
+        Indices of the optimization rows that count, those not left out. A split without rows
+        gives None, the validation rows are all of them.
     predicted_before, predicted_after
         Modelled markers in the sensors' frames with offsets at zero and as estimated, m, (n, 3).
     predictive
@@ -118,7 +119,8 @@ def accuracy_of(
         both = theoretical_distances(bare, rows, everywhere, rng)
         at_random = _theoretical(both, suffix='_random')
     result: dict[str, Any] = {}
-    for name, chosen in splits.items():
+    validation = np.flatnonzero(measurements.is_validation)
+    for name, chosen in (('optimization', fitted), ('validation', validation)):
         if len(chosen) == 0:
             result[name] = None
             continue

@@ -1,22 +1,28 @@
-"""Have the chains mixed, and how many independent draws are they worth? Arrays in, numbers out.
+"""Have the chains mixed, and how many independent draws are they worth?
 
-Rank-normalised split R-hat and effective sample sizes as defined by Vehtari, Gelman, Simpson,
-Carpenter and Bürkner (2021), "Rank-normalization, folding, and localization", Bayesian Analysis
-16(2), doi:10.1214/20-BA1221; the autocorrelation is cut by the initial monotone sequence of
-Geyer (1992). ``draws`` has the shape (chains, draws, ...) everywhere; every further index is a
-quantity of its own. A quantity that never moves has nothing to judge: its figures are NaN.
+Rank-normalised split R-hat and effective sample sizes of Vehtari, Gelman, Simpson, Carpenter and
+Bürkner (2021), "Rank-normalization, folding, and localization", Bayesian Analysis 16(2),
+doi:10.1214/20-BA1221, as arviz-stats computes them. ``draws`` has the shape (chains, draws, ...)
+everywhere; every further index is a quantity of its own. The figures of a quantity
+that never moves are NaN.
 """
 
 from __future__ import annotations
 
-from statistics import NormalDist
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from remaster_ros.calibration.metropolis import Chains
 from remaster_ros.errors import InsufficientDataError
-from remaster_ros.types import FloatArray, IntArray
+from remaster_ros.types import FloatArray
 
 MINIMUM_DRAWS = 8
+R_HAT_LIMIT = 1.01
+# Effective draws enough for two digits of a 95 % interval.
+ESS_LIMIT = 400.0
 
 
 def r_hat(draws: FloatArray) -> FloatArray:
@@ -37,102 +43,116 @@ def r_hat(draws: FloatArray) -> FloatArray:
     InsufficientDataError
         With fewer than 8 draws in a chain.
     """
-    halves = _split(draws)
-    folded = np.abs(halves - np.median(halves, axis=(0, 1)))
-    return np.maximum(
-        _split_r_hat(_rank_normalised(halves)), _split_r_hat(_rank_normalised(folded))
-    )
+    return _figures('rhat', draws)
 
 
 def ess_bulk(draws: FloatArray) -> FloatArray:
     """Return the effective sample size of the centre of the distribution, (...); see `r_hat`."""
-    return _effective_sample_size(_rank_normalised(_split(draws)))
+    return _figures('ess', draws, method='bulk')
 
 
 def ess_tail(draws: FloatArray) -> FloatArray:
     """Return the effective sample size of the tails, (...): the smaller of the 5 % and 95 %."""
-    halves = _split(draws)
-    quantiles = np.quantile(np.asarray(draws, dtype=float), (0.05, 0.95), axis=(0, 1))
-    sizes = [_effective_sample_size((halves <= limit).astype(float)) for limit in quantiles]
-    return np.minimum(*sizes)
+    return _figures('ess', draws, method='tail', prob=0.05)
 
 
-def _split(draws: FloatArray) -> FloatArray:
-    """Cut every chain into its first and its last half, (2 chains, draws // 2, ...)."""
-    draws = np.asarray(draws, dtype=float)
+def _figures(statistic: str, draws: FloatArray, **options: Any) -> FloatArray:
+    """Return a statistic of arviz-stats for every quantity, (...)."""
+    # It brings SciPy, which takes half a second: imported only where something was sampled.
+    from arviz_stats.base import array_stats
+
     length = draws.shape[1]
     if length < MINIMUM_DRAWS:
         raise InsufficientDataError(
             f'chains of {length} draws are too short to judge convergence; '
             f'draw at least {MINIMUM_DRAWS}'
         )
-    half = length // 2
-    return np.concatenate((draws[:, :half], draws[:, -half:]))
-
-
-def _rank_normalised(draws: FloatArray) -> FloatArray:
-    """Replace values by the normal scores of their ranks over all chains."""
-    pooled = draws.reshape(draws.shape[0] * draws.shape[1], -1)
-    count = len(pooled)
-    # Ranks are multiples of one half: a table holds the normal quantile of each. Blom's offsets
-    # (1958), as in eq. 14 of Vehtari et al.
-    quantile = NormalDist().inv_cdf
-    scores = np.array(
-        [quantile((half / 2.0 - 0.375) / (count + 0.25)) for half in range(2, 2 * count + 1)]
-    )
-    columns = [scores[_double_ranks(column) - 2] for column in pooled.T]
-    return np.stack(columns, axis=1).reshape(draws.shape)
-
-
-def _double_ranks(values: FloatArray) -> IntArray:
-    """Return twice the ranks of values (n,), equal ones sharing the mean of theirs."""
-    order = np.argsort(values, kind='stable')
-    ordered = values[order]
-    start = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1]))
-    size = np.diff(np.append(start, len(values)))
-    ranks = np.empty(len(values), dtype=np.int64)
-    ranks[order] = np.repeat(2 * start + size + 1, size)
-    return ranks
-
-
-def _split_r_hat(draws: FloatArray) -> FloatArray:
-    """Root of pooled over within-chain variance (eq. 1 to 4 of Vehtari et al.)."""
-    length = draws.shape[1]
-    within = draws.var(axis=1, ddof=1).mean(axis=0)
-    between = draws.mean(axis=1).var(axis=0, ddof=1)
     with np.errstate(invalid='ignore', divide='ignore'):
-        return np.sqrt((length - 1) / length + between / within)
+        figures = getattr(array_stats, statistic)(draws, chain_axis=0, draw_axis=1, **options)
+    return np.where(np.ptp(draws, axis=(0, 1)) > 0.0, figures, np.nan)
 
 
-def _effective_sample_size(draws: FloatArray) -> FloatArray:
-    """Return the number of draws over the integrated autocorrelation time (eq. 10 to 13)."""
-    chains, length = draws.shape[:2]
-    covariance = _autocovariance(draws).mean(axis=0)
-    within = covariance[0] * length / (length - 1.0)
-    pooled = covariance[0] + draws.mean(axis=1).var(axis=0, ddof=1)
-    with np.errstate(invalid='ignore', divide='ignore'):
-        correlation = 1.0 - (within - covariance) / pooled
-    correlation[0] = 1.0
-    # Sums of neighbours are positive and fall with the lag in any reversible chain: from where
-    # they do not, there is only noise. The last lags are averages of a handful of products.
-    count = (length - 2) // 2
-    pairs = correlation[0 : 2 * count : 2] + correlation[1 : 2 * count : 2]
-    kept = np.cumprod(pairs > 0.0, axis=0).astype(bool)
-    pairs = np.minimum.accumulate(np.where(kept, pairs, 0.0), axis=0)
-    # The first even lag after the cut still counts where it is positive: it lowers the variance
-    # of the estimate for chains that alternate.
-    cut = kept.sum(axis=0)
-    following = np.take_along_axis(correlation, 2 * cut[None], axis=0)[0]
-    time = -1.0 + 2.0 * pairs.sum(axis=0) + np.maximum(following, 0.0)
-    total = chains * length
-    # Alternating chains may beat independent draws, but not without bound.
-    size = total / np.maximum(time, 1.0 / np.log10(total))
-    return np.where(np.isfinite(pooled) & (pooled > 0.0), size, np.nan)
+@dataclass(frozen=True, eq=False)
+class SamplerInfo:
+    """How the draws were made and whether they are reliable.
 
+    Attributes
+    ----------
+    name
+        Which sampler it was, for the report.
+    chains, draws
+        Number of chains, and of draws kept of each.
+    acceptance_rate
+        Share of proposals taken.
+    r_hat, ess_bulk, ess_tail
+        Per parameter of `FitResult.parameter_names`, (p,).
+    precision, precision_wanted
+        Largest Monte Carlo error of a mean over its parameter's standard deviation, reached and
+        asked for; None where a number of draws was asked for instead.
+    log_density_error, checked
+        Largest difference of the density that was sampled from the exact one, on so many of the
+        draws; NaN and 0 where the exact one was sampled.
+    seconds
+        By the clock passed in; NaN without one.
+    converged
+        Every R-hat at most 1.01 and every effective sample size at least what the precision
+        takes, 400 where none was asked for.
+    message
+        The verdict with its figures, for the report.
+    """
 
-def _autocovariance(draws: FloatArray) -> FloatArray:
-    """Return the autocovariance of every chain at every lag, (chains, draws, ...)."""
-    length = draws.shape[1]
-    size = 2 ** int(np.ceil(np.log2(2 * length)))
-    spectrum = np.fft.rfft(draws - draws.mean(axis=1, keepdims=True), size, axis=1)
-    return np.fft.irfft(np.abs(spectrum) ** 2, size, axis=1)[:, :length] / length
+    name: str
+    chains: int
+    draws: int
+    acceptance_rate: float
+    r_hat: FloatArray
+    ess_bulk: FloatArray
+    ess_tail: FloatArray
+    precision: float
+    precision_wanted: float | None
+    log_density_error: float
+    checked: int
+    seconds: float
+    converged: bool
+    message: str
+
+    @classmethod
+    def of(
+        cls,
+        run: Chains,
+        names: Sequence[str],
+        *,
+        name: str,
+        wanted: float | None,
+        seconds: float,
+    ) -> SamplerInfo:
+        """Judge the chains of p named parameters; the rest as the attributes."""
+        draws = run.draws
+        figures = r_hat(draws), ess_bulk(draws), ess_tail(draws)
+        worst, least = float(np.max(figures[0])), float(np.min(figures[1:]))
+        converged = worst <= R_HAT_LIMIT and least >= (ESS_LIMIT if wanted is None else wanted**-2)
+        precision = float(1.0 / np.sqrt(least))
+        message = 'converged' if converged else 'NOT converged'
+        if not converged and wanted is not None:
+            message += f' within {draws.shape[1]} draws a chain'
+        message += (
+            f': R-hat up to {worst:.3f} ({names[int(np.argmax(figures[0]))]}), '
+            f'at least {least:.0f} effective draws, every mean within {100 * precision:.1f} % of '
+            'its standard deviation'
+        )
+        if wanted is not None:
+            message += f' ({100 * wanted:g} % wanted)'
+        return cls(
+            name,
+            draws.shape[0],
+            draws.shape[1],
+            run.acceptance_rate,
+            *figures,
+            precision,
+            wanted,
+            run.log_density_error,
+            run.checked,
+            seconds,
+            converged,
+            message,
+        )

@@ -1,8 +1,7 @@
-"""From a session to the posterior's mode: gauge fixed, gross errors named, no sampling yet."""
+"""From a session to the posterior's mode: gauge fixed, gross errors left out, nothing sampled."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,13 +12,13 @@ from remaster_ros.calibration.identifiability import Gauge, find_gauge
 from remaster_ros.calibration.initial_guess import robust_start
 from remaster_ros.calibration.laplace import Mode, find_mode
 from remaster_ros.calibration.model import Model
-from remaster_ros.calibration.outliers import Judgement, find_outliers
+from remaster_ros.calibration.noise import NoiseModel
+from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.priors import Prior, base_prior, marker_prior, offset_prior
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import (
-    BasePrior,
     BoolArray,
     FloatArray,
     IntArray,
@@ -28,11 +27,11 @@ from remaster_ros.types import (
     Session,
 )
 
-# Fewer rows of a sensor leave nothing to estimate its noise from.
+# Fewer rows of a sensor do not determine its noise.
 FEWEST_ROWS = 4
 FEWEST_POSES = 3
 # Limits of chi-squared with 1 and 2 degrees of freedom at an error rate of 1 in 1,000: so often a
-# sensor without a difference along its line of sight is given one.
+# sensor whose noise is the same in all directions gets one of its own along the line of sight.
 DIRECTION_LIMITS = {1: 10.828, 2: 13.816}
 
 
@@ -54,10 +53,8 @@ class Problem:
         Nominal positions and how well they are known, m, (markers, 3) and (markers,).
     fitted
         Indices of the optimization rows.
-    known_offsets
-        (joint index, mean, standard deviation), rad, of the offsets known beforehand.
-    known_base
-        Sensor name -> registration known beforehand.
+    priors
+        What is known beforehand of offsets and registrations.
     """
 
     session: Session
@@ -68,12 +65,11 @@ class Problem:
     markers: FloatArray
     marker_std_m: FloatArray
     fitted: IntArray
-    known_offsets: tuple[tuple[int, float, float], ...]
-    known_base: Mapping[str, BasePrior]
+    priors: Priors
 
     @classmethod
     def of(cls, session: Session, priors: Priors | None = None) -> Problem:
-        """Reduce and check a session; priors replace what it says of the same markers and sensors.
+        """Reduce and check a session; priors replace its own of the same markers and sensors.
 
         Raises
         ------
@@ -91,7 +87,7 @@ class Problem:
             )
         if len(chain) < 2:
             raise InsufficientDataError(
-                'the robot has one joint: its zero-offset cannot be told from the registration'
+                'the robot has one joint: its zero-offset and the registration cannot be separated'
             )
         fitted = np.flatnonzero(~given.is_validation)
         if len(fitted) == 0:
@@ -103,22 +99,30 @@ class Problem:
         sensor_names = tuple(session.sensor_names[index] for index in sensors)
         marker_names = tuple(session.marker_names[index] for index in markers)
         for index, name in enumerate(sensor_names):
-            count = int(np.sum(sensor[fitted] == index))
-            poses = len(np.unique(given.pose[fitted][sensor[fitted] == index]))
+            rows = fitted[sensor[fitted] == index]
+            poses = len(np.unique(given.pose[rows]))
             if poses < FEWEST_POSES:
                 raise InsufficientDataError(
                     f"sensor '{name}' saw {poses} poses to fit; at least {FEWEST_POSES} are "
                     'needed to register it, and some thirty for good zero-offsets'
                 )
-            if count < FEWEST_ROWS:
+            if len(rows) < FEWEST_ROWS:
                 raise InsufficientDataError(
-                    f"sensor '{name}' has {count} optimization rows; at least {FEWEST_ROWS} are "
-                    'needed to register it and to know its noise'
+                    f"sensor '{name}' has {len(rows)} optimization rows; at least {FEWEST_ROWS} "
+                    'are needed to register it and to estimate its noise'
                 )
         priors = Priors() if priors is None else priors
-        _require_known('joint', priors.joint_offsets, chain.joint_names)
-        _require_known('marker', priors.markers, session.marker_names)
-        _require_known('sensor', priors.base, session.sensor_names)
+        for kind, named, names in (
+            ('joint', priors.joint_offsets, chain.joint_names),
+            ('marker', priors.markers, session.marker_names),
+            ('sensor', priors.base, session.sensor_names),
+        ):
+            for name in named:
+                if name not in names:
+                    raise InputError(
+                        f"there is a prior on {kind} '{name}', but the session has "
+                        f'{", ".join(names)}; correct the name or leave it out'
+                    )
         places = [
             priors.markers.get(name, (session.markers[name], session.marker_std_m))
             for name in marker_names
@@ -132,30 +136,27 @@ class Problem:
             np.array([place for place, _ in places], dtype=float),
             np.array([std for _, std in places], dtype=float),
             fitted,
-            tuple(
-                (chain.joint_names.index(name), mean, std)
-                for name, (mean, std) in priors.joint_offsets.items()
-            ),
-            {**session.base_prior, **priors.base},
+            replace(priors, base={**session.base_prior, **priors.base}),
         )
 
     def marker_priors(self, model: Model) -> tuple[Prior, ...]:
         """Return the priors on the markers."""
         return tuple(
-            marker_prior(model, index, nominal, float(std))
-            for index, (nominal, std) in enumerate(
-                zip(self.markers, self.marker_std_m, strict=True)
-            )
+            marker_prior(model, index, self.markers[index], float(self.marker_std_m[index]))
+            for index in range(len(self.markers))
         )
 
     def other_priors(self, model: Model) -> tuple[Prior, ...]:
         """Return the priors on registrations and offsets that are known beforehand."""
         base = tuple(
-            base_prior(model, index, self.known_base[name])
+            base_prior(model, index, self.priors.base[name])
             for index, name in enumerate(self.sensor_names)
-            if name in self.known_base
+            if name in self.priors.base
         )
-        return base + tuple(offset_prior(model, *known) for known in self.known_offsets)
+        return base + tuple(
+            offset_prior(model, self.chain.joint_names.index(name), *known)
+            for name, known in self.priors.joint_offsets.items()
+        )
 
     def empty_model(self, extension: Extension | None = None) -> Model:
         """Return a model with registrations still unknown."""
@@ -179,7 +180,7 @@ class Estimate:
     problem, model
         What was fitted.
     gauge
-        What the data cannot see.
+        What the data do not determine.
     mode, before
         With offsets, and with all of them at zero (registrations and markers fitted).
     left_out
@@ -226,40 +227,44 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
     free = np.setdiff1d(np.arange(model.size), gauge.held)
     z[gauge.held[gauge.held < model.joints]] = 0.0
 
-    def kept_rows(keep: BoolArray) -> Rows:
-        return Rows.of(measurements, np.sort(rows.source[keep]), model.reference)
+    def kept_posterior(keep: BoolArray) -> Posterior:
+        kept = Rows.of(measurements, np.sort(rows.source[keep]), model.reference)
+        return Posterior.of(model, kept, priors, free, z)
 
     def refit(keep: BoolArray) -> FloatArray:
-        mode = find_mode(Posterior.of(model, kept_rows(keep), priors, free, z))
-        return rows.target - model.predict(mode.z, rows)
+        return rows.target - model.predict(find_mode(kept_posterior(keep)).z, rows)
 
     errors = rows.target - model.predict(z, rows)
     judgement = find_outliers(rows, refit, errors, model.sensor_names)
-    kept = kept_rows(~judgement.gross)
-    _require_information(kept, free, model)
-    mode = with_directions(find_mode(Posterior.of(model, kept, priors, free, z)))
+    posterior = kept_posterior(~judgement.gross)
+    _require_information(posterior.rows, free, model)
+    mode = with_directions(find_mode(posterior))
+    left_out = [
+        (int(rows.source[row]), judgement.why[row]) for row in np.flatnonzero(judgement.gross)
+    ]
     return Estimate(
         problem,
         model,
         gauge,
         mode,
         hold_offsets(mode, np.zeros(model.joints)),
-        _left_out(rows, judgement),
-        np.sort(kept.source),
+        tuple(sorted(left_out)),
+        np.sort(posterior.rows.source),
     )
 
 
 def with_directions(mode: Mode) -> Mode:
     """Return the mode with a noise along the line of sight of every sensor that shows one.
 
-    One sensor after the other by a likelihood-ratio test of the noise, the parameters integrated
-    out: where there is no difference it finds one in 1 of 1,000 cases, less often where a
-    pose_sigma is zero.
+    One sensor after the other, by a likelihood-ratio test of the noise with the parameters
+    integrated out. Where there is no difference it finds one in 1 of 1,000 cases, less often where
+    a pose_sigma is zero.
     """
     posterior = mode.linearisation.posterior
     split: list[int] = []
     for sensor in range(len(posterior.model.sensor_names)):
-        tried = replace_channels(posterior, [*split, sensor], mode.z)
+        noise_model = NoiseModel.of(posterior.rows, posterior.model.reference, [*split, sensor])
+        tried = replace(posterior, reference=mode.z, noise_model=noise_model)
         try:
             other = find_mode(tried)
         except InsufficientDataError:
@@ -270,15 +275,6 @@ def with_directions(mode: Mode) -> Mode:
         if 2.0 * (other.log_evidence - mode.log_evidence) > DIRECTION_LIMITS[more]:
             mode, split = other, [*split, sensor]
     return mode
-
-
-def replace_channels(
-    posterior: Posterior, split: Sequence[int], reference: FloatArray
-) -> Posterior:
-    """Return the posterior with a noise along the sight of these sensors, from a reference."""
-    return Posterior.of(
-        posterior.model, posterior.rows, posterior.priors, posterior.free, reference, split
-    )
 
 
 def hold_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
@@ -303,15 +299,6 @@ def hold_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
     return find_mode(held)
 
 
-def _require_known(kind: str, given: Mapping[str, object], names: Sequence[str]) -> None:
-    for name in given:
-        if name not in names:
-            raise InputError(
-                f"there is a prior on {kind} '{name}', but the session has {', '.join(names)}; "
-                'correct the name or leave it out'
-            )
-
-
 def _require_information(rows: Rows, free: IntArray, model: Model) -> None:
     needed = int(np.sum(free < model.joints + 6 * len(model.sensor_names))) + 3
     if 3 * len(rows) < needed:
@@ -319,12 +306,3 @@ def _require_information(rows: Rows, free: IntArray, model: Model) -> None:
             f'{len(rows)} observations of 3 coordinates for {len(free)} unknowns; '
             f'measure at least {-(-needed // 3)}, better ten times as many'
         )
-
-
-def _left_out(rows: Rows, judgement: Judgement) -> tuple[tuple[int, str], ...]:
-    found = [
-        (int(source), why)
-        for source, why, gross in zip(rows.source, judgement.why, judgement.gross, strict=True)
-        if gross
-    ]
-    return tuple(sorted(found))

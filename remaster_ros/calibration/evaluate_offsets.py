@@ -48,8 +48,8 @@ def accuracy_with_offsets(
     Offsets that a registration or a marker takes up, as that of joint 1, therefore do not count.
 
     The theoretical metric (section V-C of Van Wyk et al.) draws the offsets from independent
-    Gaussians about the given ones, the registrations and markers from what the session then says
-    of them. Correlations between the offsets are not in fit.json.
+    Gaussians about the given ones, the registrations and markers from their posterior given these
+    offsets. Correlations between the offsets are not in fit.json.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def accuracy_with_offsets(
     joint_offsets
         rad, (k,).
     joint_offsets_std
-        rad, (k,); 0 for joints that no data can tell, which are not drawn. Without it there is
+        rad, (k,); 0 for joints that are not identifiable, which are not drawn. Without it there is
         no theoretical metric.
     rng
         Source of all randomness.
@@ -99,15 +99,7 @@ def accuracy_with_offsets(
             ),
         )
     accuracy = accuracy_of(
-        problem.measurements,
-        {
-            'optimization': found.kept,
-            'validation': np.flatnonzero(problem.measurements.is_validation),
-        },
-        predicted_before,
-        predicted_after,
-        predictive,
-        rng,
+        problem.measurements, found.kept, predicted_before, predicted_after, predictive, rng
     )
     observation = problem.measurements.observation
     left_out = tuple((int(observation[row]), why) for row, why in found.left_out)

@@ -1,7 +1,7 @@
 """Further parameters of the model: what physical effects add, linear in each observation.
 
 An effect is what it does to each row of the measurements: it turns joints, or it displaces the
-marker. Nothing here knows which effect it is; `discovery.effects` does.
+marker. Which effects there are is defined in `discovery.effects`.
 """
 
 from __future__ import annotations

@@ -7,12 +7,12 @@ from typing import Literal
 
 import numpy as np
 
-from remaster_ros.calibration import convergence
+from remaster_ros.calibration.convergence import MINIMUM_DRAWS
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.extension import Extension
-from remaster_ros.calibration.paper_sampler import BURN_IN_SHARE, STEPS, fit_paper
-from remaster_ros.calibration.result import FitResult, Sampled, build_result
-from remaster_ros.calibration.sampling import PRECISION, Length, Progress, sample_posterior, silent
+from remaster_ros.calibration.paper import BURN_IN_SHARE, STEPS, fit_paper
+from remaster_ros.calibration.result import FitResult, Sampled, build_result, sampled_columns
+from remaster_ros.calibration.sampling import PRECISION, Progress, sample_posterior, silent
 from remaster_ros.errors import InputError
 from remaster_ros.types import FloatArray, Priors, Session
 
@@ -59,11 +59,11 @@ def fit_session(
     progress
         Called with the stage and the share of it that is done.
     clock
-        Returns seconds, to time the sampler; core has no clock of its own.
+        Returns seconds, to time the sampler.
     extension
         Further physical effects to fit; the paper's model has none.
     priors
-        What is known beforehand, instead of what the session says; the paper's model has none.
+        What is known beforehand, in place of the session's own priors; the paper's model has none.
 
     Raises
     ------
@@ -72,10 +72,9 @@ def fit_session(
     InsufficientDataError
         Data that do not allow an answer.
     """
-    if extension is not None and sampler == 'paper':
-        raise InputError("the paper's model has no further effects; use the fast sampler")
-    if priors is not None and sampler == 'paper':
-        raise InputError("the paper's model has no priors on its parameters; use the fast sampler")
+    for what, given in (('further effects', extension), ('priors on its parameters', priors)):
+        if sampler == 'paper' and given is not None:
+            raise InputError(f"the paper's model has no {what}; use the fast sampler")
     if chains < 2:
         raise InputError(f'{chains} chain(s) cannot be judged; use at least 2')
     if not FINEST_PRECISION <= precision <= COARSEST_PRECISION:
@@ -83,7 +82,7 @@ def fit_session(
             f'a precision of {precision:g} is out of range; use {FINEST_PRECISION} to '
             f'{COARSEST_PRECISION}; 0.02 for an error of 2 % of each standard deviation'
         )
-    fewest = convergence.MINIMUM_DRAWS / ((1.0 - BURN_IN_SHARE) if sampler == 'paper' else 1.0)
+    fewest = MINIMUM_DRAWS / ((1.0 - BURN_IN_SHARE) if sampler == 'paper' else 1.0)
     if draws is not None and draws < fewest:
         raise InputError(f'{draws} draws are too few; use at least {fewest:.0f}')
     report = progress if progress is not None else silent
@@ -98,71 +97,44 @@ def fit_session(
             progress=lambda share: report('sampling', share),
         )
     else:
-        sampled = _fast(
-            estimate(problem, extension), chains, Length(draws, precision), rng, report
-        )
+        sampled = _fast(estimate(problem, extension), chains, draws, precision, rng, report)
     seconds = clock() - started if clock is not None else np.nan
     return build_result(problem, sampled, seconds, rng)
 
 
 def _fast(
-    found: Estimate, chains: int, length: Length, rng: np.random.Generator, report: Progress
+    found: Estimate,
+    chains: int,
+    draws: int | None,
+    precision: float,
+    rng: np.random.Generator,
+    report: Progress,
 ) -> Sampled:
     posterior, model = found.posterior, found.model
-    noise_model = posterior.noise_model
 
-    def readable(points: FloatArray) -> FloatArray:
-        natural = model.natural(posterior.parameters(points))[..., posterior.free]
-        noise = posterior.noise(points[..., len(posterior.free) :])
-        separate = noise.pose_sigma[..., list(noise_model.separable)]
-        return np.concatenate((natural, noise.sigma, separate), axis=-1)
+    def columns(points: FloatArray) -> FloatArray:
+        x, eta = model.natural(posterior.parameters(points)), points[..., len(posterior.free) :]
+        return sampled_columns(posterior, x, eta, posterior.free)
 
     run, name = sample_posterior(
         found.mode,
         chains=chains,
         rng=rng,
-        draws=length.draws,
-        precision=length.precision,
-        quantities=readable,
+        draws=draws,
+        precision=precision,
+        quantities=columns,
         report=report,
     )
-    names = tuple(model.names[index] for index in posterior.free)
-    noises = tuple(
-        '.'.join(filter(None, ('noise', model.sensor_names[c.sensor], c.direction)))
-        for c in noise_model.channels
-    )
-    names += tuple(f'{noise}.sigma' for noise in noises)
-    names += tuple(f'{noises[index]}.pose_sigma' for index in noise_model.separable)
-
-    noise = posterior.noise(run.draws[..., len(posterior.free) :])
-    by_sensor = noise_model.sensor_noise(noise)
-    unfixed = np.isin(np.arange(model.joints), found.gauge.held)
     return Sampled(
-        model=model,
+        posterior=posterior,
         z=posterior.parameters(run.draws),
-        z_mean=posterior.parameters(run.draws.reshape(-1, posterior.size).mean(axis=0)),
-        sigma=by_sensor.sigma,
-        pose_sigma=by_sensor.pose_sigma,
-        total_noise=noise_model.total_noise(noise),
-        by_direction={
-            (channel.sensor, channel.direction): (
-                noise.sigma[..., index],
-                noise.pose_sigma[..., index],
-            )
-            for index, channel in enumerate(noise_model.channels)
-            if channel.direction
-        },
-        trace=readable(run.trace),
-        draws=readable(run.draws),
-        names=names,
-        separable=tuple({noise_model.channels[index].sensor for index in noise_model.separable}),
+        eta=run.draws[..., len(posterior.free) :],
+        z_mean=posterior.parameters(run.draws.mean(axis=(0, 1))),
+        moved=posterior.free,
+        run=run._replace(draws=columns(run.draws), trace=columns(run.trace)),
         name=name,
-        acceptance_rate=run.acceptance_rate,
-        precision=None if length.draws is not None else length.precision,
-        log_density_error=run.log_density_error,
-        checked=run.checked,
+        precision=precision if draws is None else None,
         gauge=found.gauge,
-        unfixed=unfixed,
         taken_as_known=np.zeros(model.joints),
         z_before=found.before.z,
         left_out=found.left_out,

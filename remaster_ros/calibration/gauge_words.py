@@ -1,4 +1,4 @@
-"""Directions that the data cannot see, in words."""
+"""Sentences about directions that the data do not determine."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from remaster_ros.types import FloatArray
 
 
 def in_words(model: Model, direction: FloatArray) -> str:
-    """Say which parameters change together without any effect, and what would tell them apart."""
+    """Return which parameters change together without any effect, and what would separate them."""
     joints = np.flatnonzero(direction[: model.joints])
     sensors = [
         index
@@ -32,18 +32,19 @@ def in_words(model: Model, direction: FloatArray) -> str:
                 f'{joint} offset = a rotation of the '
                 f'{listed([model.sensor_names[s] for s in sensors])} registration'
                 f'{"s" if len(sensors) > 1 else ""} about the base axis; '
-                'a known base frame (base_prior) would tell them apart'
+                'a known base frame (base_prior) would separate them'
             )
         if joints[0] == model.joints - 1 and not sensors:
+            per_degree = 1e3 * np.radians(1.0) / abs(amount)
             moved = [
                 f'marker {model.marker_names[m]} moved tangentially, '
-                f'{_per_degree(direction[model.marker(m)] / amount)} mm per degree'
+                f'{per_degree * np.linalg.norm(direction[model.marker(m)]):.3f} mm per degree'
                 for m in markers
             ]
-            return f'{joint} offset = {listed(moved)}; a measured marker would tell them apart'
+            return f'{joint} offset = {listed(moved)}; a measured marker would separate them'
     return (
         f'{together(model, direction)} change no observation; poses that are spread further and '
-        'turn the tool, or a prior on one of them, would tell them apart'
+        'turn the tool, or a prior on one of them, would separate them'
     )
 
 
@@ -55,10 +56,6 @@ def together(model: Model, direction: FloatArray) -> str:
         if value != 0.0
     ]
     return f'{listed(moved)} together'
-
-
-def _per_degree(shift: FloatArray) -> str:
-    return f'{np.radians(1.0) * np.linalg.norm(shift) * 1e3:.3f}'
 
 
 def listed(parts: Sequence[str]) -> str:

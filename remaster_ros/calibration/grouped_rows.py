@@ -1,4 +1,4 @@
-"""Observations sorted as the estimators want them: by sensor, then by pose."""
+"""Observations sorted for the estimators: by sensor, then by pose."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from remaster_ros.types import FloatArray, IntArray, Measurements
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Observations as the estimators want them: sorted by sensor, then by pose.
+    """Observations sorted by sensor, then by pose.
 
     Attributes
     ----------

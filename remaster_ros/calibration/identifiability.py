@@ -1,9 +1,9 @@
-"""Which combinations of parameters the data cannot see, in words, and what fixes each of them.
+"""Which combinations of parameters the data do not determine, and what fixes each of them.
 
 The null space of the data's Jacobian (priors left out) over every parameter group, found
 numerically for the data at hand. A direction that a proper prior resolves is left to the prior;
-any other is fixed by holding one joint at zero, and said so. Directions that the data see, but
-hardly, are named as well.
+any other is fixed by holding one joint at zero. Directions that the data determine badly are
+reported as well.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 # Singular values (of unit columns, relative to the largest) that are rounding errors.
 ROUNDING = 1e-9
-# An angle known no better than this counts as unknown: neither the data's nor a prior's linear
-# picture holds over such a range.
+# An angle with a larger standard deviation counts as unknown: over such a range neither the
+# prediction nor a prior is linear.
 UNKNOWN_ANGLE = np.radians(5.0)
-# An offset that the data tell no better than this, and this many times worse than the median one,
-# is named as hardly seen; of its direction the parts that matter at this share.
+# An offset with a standard deviation above this, and this many times that of the median one, is
+# reported as badly determined, with the parts of its direction above this share of the largest.
 WEAK_ANGLE = np.radians(0.2)
 WEAK_FACTOR = 5.0
 WEAK_SHARE = 0.1
@@ -48,7 +48,7 @@ class GaugeDirection:
         corrections of the robot's points on their way to the sensor, along the axes of R and
         about its origin (see `model`).
     why
-        The same in words.
+        The same as a sentence for the report.
     fixed_by
         What decides where on the direction the result lies.
     """
@@ -70,7 +70,8 @@ class Gauge:
         Indices of the joints held at zero and of the effects held where they were linearised,
         (h,).
     why
-        For each joint what the data cannot tell it from; '' where they can, k strings.
+        For each joint what the data do not distinguish its offset from; '' where it is determined,
+        k strings.
     """
 
     directions: tuple[GaugeDirection, ...]
@@ -96,7 +97,7 @@ def find_gauge(
     Raises
     ------
     InsufficientDataError
-        Where a registration or a marker itself cannot be told: holding a joint does not help.
+        Where a registration or a marker is not determined: holding a joint does not help.
     """
     scale, null, pivots, weak = _null_space(model, x, rows)
     _, by_x = prior_rows(model, priors, x, natural=True)
@@ -115,7 +116,7 @@ def find_gauge(
         for joint in np.flatnonzero(combination[: model.joints]):
             text = f'the data cannot see it: {words}; fixed by {fixed_by}'
             why[joint] = f'{why[joint]}; {text}' if why[joint] else text
-    directions += [_hardly_seen(model, *found, scale) for found in weak]
+    directions += [_badly_determined(model, *found, scale) for found in weak]
     return Gauge(tuple(directions), np.array(sorted(held), dtype=np.int64), tuple(why))
 
 
@@ -127,16 +128,16 @@ def _entries(model: Model, combination: FloatArray) -> dict[str, float]:
     }
 
 
-def _hardly_seen(
+def _badly_determined(
     model: Model, direction: FloatArray, joint: int, std: float, scale: FloatArray
 ) -> GaugeDirection:
-    """Name a direction along which the data tell a joint's offset only to ``std``, rad."""
+    """Describe a direction along which a joint's offset has a large ``std``, rad."""
     size = np.abs(direction * scale)
     main = np.where(size > WEAK_SHARE * size.max(), direction, 0.0)
     combination = _about_origin(model, main, scale)
     words = (
         f'{together(model, combination)} hardly change the observations; poses that are spread '
-        f'further and turn the tool, or a prior on {model.names[joint]}, would tell them apart'
+        f'further and turn the tool, or a prior on {model.names[joint]}, would separate them'
     )
     known = f'the data, though {model.names[joint]} only to {np.degrees(std):.2f} deg'
     return GaugeDirection(_entries(model, combination), words, known)
@@ -147,11 +148,11 @@ def _null_space(
 ) -> tuple[FloatArray, FloatArray, list[int], list[tuple[FloatArray, int, float]]]:
     """Return the scale of each parameter, a basis of the null space, (size, d), and its pivots.
 
-    Last come the joints that are hardly seen: direction, index and standard deviation, rad.
+    Last come the badly determined joints: direction, index and standard deviation, rad.
     """
     triangle = _triangle(model, x, rows)
     scale = np.linalg.norm(triangle, axis=0)
-    # What the data do not see at all is measured by its prior, else by what they see best.
+    # The scale of what the data do not determine is that of its prior, else the largest of all.
     unseen = np.full(model.size, scale.max())
     if model.extension is not None:
         known = np.sqrt(np.diag(model.extension.prior_precision))
@@ -159,16 +160,15 @@ def _null_space(
     scale = np.where(scale > ROUNDING * scale.max(), scale, unseen)
     triangle = triangle / scale
     _, singular, vectors = np.linalg.svd(triangle, full_matrices=True)
-    singular = np.append(singular, np.zeros(len(vectors) - len(singular)))
-    null = singular < ROUNDING * singular[0]
-
-    basis, pivots = _reduce((vectors[null] / scale).T, scale, _kinds(model))
-    # A prior on effects counts as data for what is nearly unseen: it is what keeps them apart.
+    rank = np.count_nonzero(singular >= ROUNDING * singular[0])
+    basis, pivots = _reduce(vectors[rank:].T, scale, _kinds(model))
+    # For what is badly determined a prior on effects counts as data: it separates them.
     root = np.zeros((len(model.extension_root), model.size))
     root[:, model.core :] = model.extension_root
     triangle = np.asarray(np.linalg.qr(np.concatenate((triangle, root / scale)), 'r'))
-    angles = np.array([_is_angle(model, index) for index in range(model.size)])
-    for direction, pivot, _ in _nearly_null(triangle, scale, pivots, angles, UNKNOWN_ANGLE):
+    for direction, pivot, _ in _nearly_null(
+        triangle, scale, pivots, _angles(model), UNKNOWN_ANGLE
+    ):
         basis = np.column_stack((basis, direction))
         pivots.append(pivot)
     joints = np.arange(model.size) < model.joints
@@ -203,11 +203,11 @@ def _nearly_null(
     limit: float,
     factor: float = 0.0,
 ) -> list[tuple[FloatArray, int, float]]:
-    """Return the directions along which some of the angles are seen no better than a limit, rad.
+    """Return the directions along which an angle has a standard deviation above a limit, rad.
 
-    Nor better than a factor times their median. With the pivots of the null space held the rest
-    has a covariance; its column of the worst angle is how everything moves with that angle. Then
-    that one is held too.
+    It is above a factor times the median of all angles as well. With the pivots of the null space
+    held the rest has a covariance; its column of the worst angle is how everything moves with that
+    angle. Then that one is held too.
     """
     found = []
     active = ~np.isin(np.arange(len(scale)), pivots)
@@ -226,10 +226,12 @@ def _nearly_null(
     return found
 
 
-def _is_angle(model: Model, index: int) -> bool:
-    if index >= model.core:
-        return False
-    return index < model.joints or model.names[index].rsplit('.', 1)[-1].startswith('r')
+def _angles(model: Model) -> BoolArray:
+    """Return which of the model's parameters are angles, (size,); effects are not counted."""
+    angles = np.arange(model.size) < model.joints
+    for sensor in range(len(model.sensor_names)):
+        angles[model.registration(sensor)][3:] = True
+    return angles
 
 
 def _kinds(model: Model) -> tuple[IntArray, ...]:
@@ -244,13 +246,13 @@ def _kinds(model: Model) -> tuple[IntArray, ...]:
 
 
 def _reduce(
-    null: FloatArray, scale: FloatArray, kinds: tuple[IntArray, ...]
+    work: FloatArray, scale: FloatArray, kinds: tuple[IntArray, ...]
 ) -> tuple[FloatArray, list[int]]:
-    """Bring the basis to reduced echelon form: one pivot each, 1 there and 0 in the others.
+    """Bring a basis (size, d) to reduced echelon form: one pivot each, 1 there, 0 in the others.
 
-    This is what makes directions nameable: any rotation of the basis spans the same space.
+    The basis comes in units of the scale (size,) and is returned in those of the parameters. So
+    each direction has few parameters: any rotation of the basis spans the same space.
     """
-    work = null * scale[:, None]
     pivots: list[int] = []
     for column in range(work.shape[1]):
         for kind in kinds:
@@ -262,50 +264,40 @@ def _reduce(
         pivots.append(pivot)
         work[:, [column, column + offset]] = work[:, [column + offset, column]]
         work[:, column] /= work[pivot, column]
-        for other in range(work.shape[1]):
-            if other != column:
-                work[:, other] -= work[pivot, other] * work[:, column]
+        others = work[pivot].copy()
+        others[column] = 0.0
+        work = work - np.outer(work[:, column], others)
     null = work / scale[:, None]
-    for column, pivot in enumerate(pivots):
-        null[:, column] /= null[pivot, column]
-    order = np.argsort(pivots)
-    return null[:, order], [pivots[index] for index in order]
+    null /= null[pivots, np.arange(len(pivots))]
+    return null[:, np.argsort(pivots)], sorted(pivots)
 
 
 def _unresolved(
     by_direction: FloatArray, pivots: list[int], model: Model, scale: FloatArray
 ) -> set[int]:
-    """Return the pivots that no prior resolves; all of them must be joints, to be held."""
+    """Return the pivots that no prior resolves; all of them must be joints or effects, to be held.
+
+    A pivot counts as unknown from a certain standard deviation by the priors on. For an effect, of
+    any unit, that is a million times what the data would leave it if it were alone.
+    """
+    limit = np.where(_angles(model), UNKNOWN_ANGLE, 1e3)
+    limit[model.core :] = 1e6 / scale[model.core :]
     held: set[int] = set()
     while True:
         active = [column for column, pivot in enumerate(pivots) if pivot not in held]
-        if not active:
-            return held
         std = _standard_deviations(by_direction[:, active])
-        loose = [i for i, c in enumerate(active) if std[i] > _limit(model, pivots[c], scale)]
+        loose = {pivots[c]: s for c, s in zip(active, std, strict=True) if s > limit[pivots[c]]}
         if not loose:
             return held
-        # Effects may have any unit, so all that nothing knows of are held at once.
-        effects = {pivots[active[i]] for i in loose if pivots[active[i]] >= model.core}
-        held |= effects
-        joints = [i for i in loose if pivots[active[i]] < model.joints]
-        if effects:
-            continue
-        if not joints:
-            names = ', '.join(model.names[pivots[active[i]]] for i in loose)
+        # All of the effects are held at once: their units cannot be compared.
+        effects = {pivot for pivot in loose if pivot >= model.core}
+        joints = {pivot: s for pivot, s in loose.items() if pivot < model.joints}
+        if not effects and not joints:
             raise InsufficientDataError(
-                f'the observations do not determine {names}; '
+                f'the observations do not determine {", ".join(model.names[p] for p in loose)}; '
                 'measure poses that are spread further and turn the tool'
             )
-        held.add(pivots[active[max(joints, key=lambda i: std[i])]])
-
-
-def _limit(model: Model, index: int, scale: FloatArray) -> float:
-    """Return the prior std from which on a parameter counts as unknown."""
-    if index >= model.core:
-        # Of any unit: a million times what the data would leave it if it were alone.
-        return 1e6 / float(scale[index])
-    return UNKNOWN_ANGLE if _is_angle(model, index) else 1e3
+        held |= effects or {max(joints, key=joints.__getitem__)}
 
 
 def _standard_deviations(by_direction: FloatArray) -> FloatArray:
@@ -314,7 +306,7 @@ def _standard_deviations(by_direction: FloatArray) -> FloatArray:
     held = norm > 0.0
     unit = by_direction[:, held] / norm[held]
     values, vectors = np.linalg.eigh(unit.T @ unit)
-    # Directions that only one and the same prior holds: apart they are as good as free.
+    # Directions that only one and the same prior holds are nearly free of each other.
     variance = (vectors**2) @ (1.0 / np.maximum(values, 1e-14))
     std = np.full(len(norm), np.inf)
     std[held] = np.sqrt(variance) / norm[held]
@@ -322,7 +314,7 @@ def _standard_deviations(by_direction: FloatArray) -> FloatArray:
 
 
 def _about_origin(model: Model, direction: FloatArray, scale: FloatArray) -> FloatArray:
-    """Turn corrections about the centroids into ones about the origin of R; scale, drop dust."""
+    """Turn corrections about the centroids into ones about the origin of R; scale and clean up."""
     size = np.abs(direction * scale)
     moved = np.where(size > NEGLIGIBLE * size.max(), direction, 0.0)
     for sensor, centroid in enumerate(model.centroid):

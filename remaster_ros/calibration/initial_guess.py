@@ -1,7 +1,7 @@
-"""A first solution that a few gross outliers and badly known markers cannot spoil.
+"""A first solution, robust against a few gross outliers and badly known markers.
 
 Closed-form starts (registration by points; registration and markers together as one linear
-problem), each refined by damped Gauss–Newton steps on a Cauchy cost; the best of them wins.
+problem), each refined by damped Gauss–Newton steps on a Cauchy cost; the best one is returned.
 """
 
 from __future__ import annotations
@@ -24,12 +24,11 @@ from remaster_ros.types import FloatArray, IntArray, Measurements
 MEDIAN_CHI3 = 1.5382
 # Errors beyond this many robust standard deviations lose their weight in the start.
 CAUCHY_WIDTH = 2.5
-# What the linear start expects of a robot out of the box, against which it weighs the nominal
-# marker positions.
+# Error of an uncalibrated robot, by which the linear start weighs the nominal marker positions.
 UNCALIBRATED_ERROR_M = 5e-3
-# Rows of a sensor that the start looks at.
+# Rows of a sensor that the start uses at most.
 LARGEST_START = 5000
-# A model that leaves more of the points' extent than this describes another robot, or none.
+# With larger errors than this share of the points' extent, the model is that of another robot.
 LARGEST_RELATIVE_ERROR = 0.1
 
 
@@ -46,7 +45,7 @@ def robust_start(
     Parameters
     ----------
     model
-        Only its chain and names matter here.
+        Only its chain and names are used.
     measurements, rows
         The observations, and which of them to fit.
     nominal_markers, marker_std_m
@@ -125,7 +124,7 @@ def referenced(
 
 
 def _require_likeness(model: Model, rows: Rows, errors: FloatArray) -> None:
-    """Refuse data that have nothing to do with the robot: wrong units, joints, markers."""
+    """Refuse data that do not fit the robot at all: wrong units, joints or markers."""
     spread = robust_spread(errors, rows)
     for error, (sensor, span) in zip(spread, rows.spans, strict=True):
         extent = np.median(np.linalg.norm(rows.target[span] - model.centroid[sensor], axis=1))
@@ -153,18 +152,15 @@ def _linear_markers(
     """
     sensors, markers = int(sensor.max()) + 1, len(nominal)
     design = np.zeros((len(measured), 3, 12 * sensors + 3 * markers))
-    rotations = tool[:, :3, :3]
     for index in range(sensors):
-        mine = sensor == index
+        mine, start = sensor == index, 12 * index
         centred = measured[mine] - measured[mine].mean(axis=0)
-        for axis in range(3):
-            start = 12 * index + 3 * axis
-            design[mine, axis, start : start + 3] = -centred
-            design[mine, axis, 12 * index + 9 + axis] = -1.0
+        turned = np.einsum('ab,nc->nabc', -np.eye(3), centred)
+        design[mine, :, start : start + 9] = turned.reshape(-1, 3, 9)
+        design[mine, :, start + 9 : start + 12] = -np.eye(3)
     for index in range(markers):
-        start = 12 * sensors + 3 * index
-        mine = marker == index
-        design[mine, :, start : start + 3] = rotations[mine]
+        mine, start = marker == index, 12 * sensors + 3 * index
+        design[mine, :, start : start + 3] = tool[mine, :3, :3]
     # Unknown marker = nominal + shift, the shift known to be small.
     target = -apply(tool, nominal[marker])
     root = np.ones(len(measured))
@@ -192,11 +188,12 @@ def _refined(
     extension stays where it was linearised.
     """
     free = np.setdiff1d(np.arange(model.core), (0, model.joints - 1))
-    damping = 1e-6
+    least_damping = 1e-6
+    sizes = [span.stop - span.start for _, span in rows.spans]
     errors = rows.target - model.predict(z, rows)
     spread = robust_spread(errors, rows)
     for _ in range(60):
-        scale = np.repeat(spread, [span.stop - span.start for _, span in rows.spans])
+        scale = np.repeat(spread, sizes)
         weight = 1.0 / (1.0 + _squares(errors) / (CAUCHY_WIDTH * scale) ** 2) / scale**2
         derivative = model.jacobian(z, rows)[:, :, free]
         residual, by_z = prior_rows(model, priors, z)
@@ -205,24 +202,20 @@ def _refined(
         g = weighted.T @ errors.ravel() - by_z[:, free].T @ residual
         diagonal = np.diag(H) + 1e-9 * np.max(np.diag(H))
         cost = _cost(errors, scale, residual)
-        improved = False
-        for _ in range(12):
-            trial = z.copy()
+        for damping in least_damping * 10.0 ** np.arange(12):
             step = np.linalg.solve(H + damping * np.diag(diagonal), g)
+            trial = z.copy()
             trial[free] += step
             trial_errors = rows.target - model.predict(trial, rows)
             if _cost(trial_errors, scale, prior_rows(model, priors, trial)[0]) < cost:
-                improved = True
                 break
-            damping *= 10.0
-        if not improved:
+        else:
             break
-        z, errors, damping = trial, trial_errors, max(damping / 10.0, 1e-12)
+        z, errors, least_damping = trial, trial_errors, max(damping / 10.0, 1e-12)
         before, spread = spread, robust_spread(errors, rows)
         settled = np.all(np.abs(spread - before) < 1e-3 * before)
         if settled and np.sqrt(step @ H @ step) < 1e-2 * np.sqrt(len(step)):
             break
-    sizes = [span.stop - span.start for _, span in rows.spans]
     return z, float(np.dot(sizes, np.log(spread)))
 
 

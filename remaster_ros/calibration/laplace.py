@@ -2,7 +2,7 @@
 
 Given the noise, the parameters are then Gaussian, with a mean and a precision that follow from
 a handful of Gram matrices whatever the noise: a rotation of well under a degree bends so little
-that this is nearly the exact posterior, which makes it the proposal of the exact sampler.
+that this is nearly the exact posterior, so it serves as proposal of the exact sampler.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def find_mode(posterior: Posterior, eta: FloatArray | None = None) -> Mode:
     Parameters
     ----------
     posterior
-        With ``reference`` near the mode (see `start.robust_start`).
+        With ``reference`` near the mode (see `initial_guess.robust_start`).
     eta
         Where to begin the search of the noise, (e,); from the errors at the reference where None.
 

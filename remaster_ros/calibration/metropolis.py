@@ -1,19 +1,16 @@
 """Metropolis–Hastings on any log density: independent proposals in one batch, or a random walk.
 
-Both work in logarithms, run several chains at once and repeat the state on rejection. They know
-nothing of robots; the densities come from `posterior` and `paper_mode`.
+Both work in logarithms, run several chains at once and repeat the state on rejection.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from remaster_ros.types import FloatArray, IntArray
+from remaster_ros.types import FloatArray
 
 # Proposals evaluated between two reports of progress.
 REPORTED = 2000
@@ -30,7 +27,7 @@ class Chains(NamedTuple):
     acceptance_rate
         Share of proposals taken, over all chains.
     trace
-        A thinned record from the very start, warm-up and all, (chains, records, d).
+        A thinned record from the first state on, warm-up included, (chains, records, d).
     log_density_error, checked
         Where an approximate density was sampled: its largest difference from the exact one on so
         many of the draws. NaN and 0 where the exact density was.
@@ -55,55 +52,10 @@ class Proposal(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
-class StudentT:
-    """A multivariate Student t distribution.
-
-    Attributes
-    ----------
-    mean
-        (d,).
-    factor
-        Lower Cholesky factor of the scale matrix, (d, d).
-    freedom
-        Degrees of freedom; small means heavy tails.
-    """
-
-    mean: FloatArray
-    factor: FloatArray
-    freedom: float
-
-    def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Return points (count, d) and their log density (count,)."""
-        normal = rng.standard_normal((count, len(self.mean)))
-        mixing = rng.chisquare(self.freedom, count) / self.freedom
-        points = self.mean + (normal @ self.factor.T) / np.sqrt(mixing)[:, None]
-        return points, self.log_density(points)
-
-    def log_density(self, points: FloatArray) -> FloatArray:
-        """Return the normalised log density of points (..., d), (...)."""
-        shape = points.shape
-        flat = (points - self.mean).reshape(-1, shape[-1])
-        whitened = np.linalg.solve(self.factor, flat.T).T.reshape(shape)
-        log_root = float(np.sum(np.log(np.diag(self.factor))))
-        return log_student_t(np.sum(whitened**2, axis=-1), len(self.mean), self.freedom) - log_root
-
-
-def log_student_t(square: FloatArray, d: int, freedom: float) -> FloatArray:
-    """Return the log density of a standard t in d dimensions at squared distances (...)."""
-    constant = (
-        math.lgamma(0.5 * (freedom + d))
-        - math.lgamma(0.5 * freedom)
-        - 0.5 * d * math.log(freedom * math.pi)
-    )
-    return constant - 0.5 * (freedom + d) * np.log1p(square / freedom)
-
-
 def independence_sampler(
     log_density: LogDensity,
     proposal: Proposal,
     *,
-    chains: int,
     draws: int,
     warm_up: int,
     rng: np.random.Generator,
@@ -121,7 +73,7 @@ def independence_sampler(
         Points (n, d) to log density (n,), up to a constant; -inf where there is none.
     proposal
         Heavier in the tails than the target.
-    chains, draws, warm_up
+    draws, warm_up
         Draws kept per chain, after ``warm_up`` that are not.
     rng
         Source of all randomness.
@@ -130,49 +82,33 @@ def independence_sampler(
     progress
         Called with the share done.
     """
-    length = warm_up + draws
+    chains, length = len(start), warm_up + draws
     points, log_proposal = proposal.sample(chains * length, rng)
-    log_target = np.empty(chains * length)
-    blocks = np.array_split(np.arange(chains * length), max(1, chains * length // REPORTED))
+    blocks = np.array_split(points, max(1, len(points) // REPORTED))
+    log_target = []
     for done, block in enumerate(blocks, start=1):
-        log_target[block] = log_density(points[block])
+        log_target.append(log_density(block))
         if progress is not None:
             progress(done / len(blocks))
-    points = points.reshape(chains, length, -1)
-    log_weight = (log_target - log_proposal).reshape(chains, length)
+    log_weight = (np.concatenate(log_target) - log_proposal).reshape(chains, length)
     log_uniform = np.log(rng.random((chains, length)))
     current = log_density(start) - proposal.log_density(start)
-    walks = [_walk(*chain) for chain in zip(log_weight, log_uniform, current, strict=True)]
-    index = np.array(walks)
+    index = np.array([_walk(*chain) for chain in zip(log_weight, log_uniform, current)])
     accepted = np.diff(index, axis=1, prepend=-1) != 0
-    path = np.take_along_axis(points, np.maximum(index, 0)[..., None], axis=1)
-    chain, unmoved = np.nonzero(index < 0)
-    path[chain, unmoved] = start[chain]
+    # The index -1 stands for the start: it picks the last point, which is the start here.
+    points = np.concatenate((points.reshape(chains, length, -1), start[:, None]), axis=1)
+    path = np.stack([of_chain[at] for of_chain, at in zip(points, index)])
     return Chains(path[:, warm_up:], float(accepted[:, warm_up:].mean()), path)
 
 
-def _walk(log_weight: FloatArray, log_uniform: FloatArray, current: float) -> IntArray:
-    """Return which proposal the chain is at after each step, (n,); -1 is the start.
-
-    After a step that was taken the next is judged against its neighbour, all of these at once;
-    only what follows a refusal is walked through, step by step.
-    """
-    path = np.arange(len(log_weight))
-    with np.errstate(invalid='ignore'):
-        # From nowhere to nowhere is no step.
-        taken = log_uniform < np.diff(log_weight, prepend=current)
-    weight, uniform = log_weight.tolist(), log_uniform.tolist()
-    done = 0
-    for refused in np.flatnonzero(~taken).tolist():
-        if refused < done:
-            continue
-        held = weight[refused - 1] if refused > 0 else current
-        done = refused + 1
-        while done < len(weight) and not uniform[done] < weight[done] - held:
-            done += 1
-        path[refused:done] = refused - 1
-        # The step that ended the wait was taken.
-        done += 1
+def _walk(log_weight: FloatArray, log_uniform: FloatArray, current: float) -> list[int]:
+    """Return which proposal a chain is at after each step, n indices; -1 is the start."""
+    path, here = [], -1
+    for step, (weight, limit) in enumerate(zip(log_weight.tolist(), log_uniform.tolist())):
+        # Both weights may be -inf: their difference is NaN, and the step is not taken.
+        if limit < weight - current:
+            here, current = step, weight
+        path.append(here)
     return path
 
 

@@ -1,4 +1,4 @@
-"""Chain, registrations and markers together: where each sensor should see each marker.
+"""Chain, registrations and markers together: where each sensor should measure each marker.
 
 The model of one observation (eq. 8 of Van Wyk et al., with the marker's position as a parameter)::
 
@@ -16,7 +16,7 @@ and r nearly uncorrelated. Everything is computed in the reference's base coordi
 there equal distances in N.
 
 *Pinned coordinates.* Turning joint 1 is the same as turning the registrations about its axis, and
-turning joint k the same as turning the markers about its axis: no data can tell them apart. The
+turning joint k the same as turning the markers about its axis: no data can distinguish them. The
 samplers use coordinates in which this is exact at any size: C' = C Rot_1(offset of joint 1) and
 marker' = Rot_k(offset of joint k) marker. Predictions depend on C', marker' and the inner joints;
 the outer two joints move nothing but the priors. `pinned` and `natural` convert. Displacements of
@@ -53,7 +53,7 @@ def predict_in_sensor(
     T_R_N: FloatArray,
     markers: FloatArray,
 ) -> FloatArray:
-    """Return where the sensors should see the markers.
+    """Return where the sensors should measure the markers.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ group size: the error groups. Where a sensor's noise along its line of sight dif
 across it, the two are channels with a sigma and a pose_sigma each, of dimension 1 and 2 instead
 of 3.
 
-Where a sensor has one row at every pose the two parts cannot be told apart: sigma is then their
+Where a sensor has one row at every pose the two parts cannot be distinguished: sigma is then their
 sum, and there is no pose_sigma.
 """
 
@@ -43,7 +43,7 @@ class Noise:
     sigma
         Of the part that is independent between rows.
     pose_sigma
-        Of the part that the rows of one sensor at one pose share; 0 where it cannot be told apart.
+        Of the part that the rows of one sensor at one pose share; 0 where the channel has none.
     """
 
     sigma: FloatArray
@@ -194,7 +194,7 @@ class NoiseModel:
     def total_noise(self, noise: Noise) -> FloatArray:
         """Return the noise of each sensor, both its parts together, m, (..., sensors, 2).
 
-        Along the line of sight, and per axis across it: alike where they were not told apart.
+        Along the line of sight, and per axis across it: equal where the sensor has one channel.
         """
         total = np.hypot(noise.sigma, noise.pose_sigma)
         result = np.empty((*total.shape[:-1], self.sensors, 2))
@@ -222,7 +222,7 @@ class NoiseModel:
                 total[..., group.channel] -= sums[..., index]
         for index, group in enumerate(self.error_groups):
             if group.size == 0:
-                # Cancellation may leave a hair below zero.
+                # Cancellation may leave a value just below zero.
                 sums[..., index] = np.maximum(total[..., group.channel], 0.0)
         return sums
 

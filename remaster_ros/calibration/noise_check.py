@@ -1,9 +1,9 @@
-"""Is the error that a fit leaves what noise explains? Judged without the fitted noise.
+"""Whether noise explains the error that a fit leaves, judged without the fitted noise.
 
-The fitted noise is whatever the model leaves: it takes up a tracker that was moved, a soft joint,
-a sensor of the wrong scale, and calls it noise. Two figures owe less to the model's errors: the
+The fitted noise is what the model leaves: it contains the errors of a tracker that was moved, of a
+compliant joint, of a sensor with a wrong scale. Two figures depend less on the model's errors: the
 standard deviation that the sensor states with its readings, and how far the errors of the joint
-solutions of one pose, which the sensor sees at one place, lie apart.
+solutions of one pose differ, which the sensor measures at one place.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class NoiseCheck:
     poses
         That were judged. The mean of few may lie far from that of many.
     spread
-        How many times larger noise makes the error on held-out rows, as few poses tell the
-        parameters by halves; 1 on fitted rows.
+        How many times larger noise makes the error on held-out rows, as few poses determine the
+        parameters poorly; 1 on fitted rows.
     """
 
     sensor: str
@@ -61,7 +61,7 @@ class NoiseCheck:
 
     @property
     def noise_m(self) -> float | None:
-        """Noise per axis that may be counted on, m; None where nothing tells."""
+        """Noise per axis that may be counted on, m; None where neither figure is known."""
         if self.stated_m is None or self.within_m is None:
             return self.stated_m if self.within_m is None else self.within_m
         return max(self.stated_m, min(self.within_m, SCATTER * self.stated_m))
@@ -73,7 +73,7 @@ class NoiseCheck:
 
     @property
     def explained(self) -> bool:
-        """Whether noise explains the error; not where nothing tells the noise."""
+        """Whether noise explains the error; False where the noise is unknown."""
         if self.noise_error_m is None:
             return False
         few = 1.0 + 1.0 / np.sqrt(self.poses)
@@ -140,7 +140,7 @@ def _stated(std: FloatArray) -> float | None:
     """Return the RMS of the standard deviations (n, 3), NaN where unknown."""
     known = std[np.isfinite(std)]
     rms = float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
-    # A column of zeros says that there is no figure, not that there is no noise.
+    # A column of zeros stands for an unknown figure, not for a sensor without noise.
     return rms if rms > 0.0 else None
 
 

@@ -2,11 +2,11 @@
 
 A mixture: most rows have the noise of the others, a small share has an error many times as wide;
 share and width are found by expectation maximisation (Dempster, Laird and Rubin 1977). A row is
-judged against what the other rows of its pose say (the pose-common error), a whole pose against
-the other poses. What is gross with a probability of `CERTAIN` is left out.
+compared with the other rows of its pose (the pose-common error), a whole pose with the other
+poses. What is gross with a probability of `CERTAIN` is left out.
 
-The standard deviations are robust, the larger of what the median and what the 80 % quantile of the
-errors say, so that errors with more than Gaussian tails, which real robots have, are not eaten.
+The standard deviations are robust: the larger of those by the median and by the 80 % quantile of
+the errors, so that errors with more than Gaussian tails, which real robots have, are kept.
 The mixture's limit then comes to lie between 6 and 7 of them: of Gaussian errors of known size it
 calls fewer than one in 5 million gross.
 """
@@ -25,21 +25,21 @@ from remaster_ros.types import BoolArray, FloatArray
 
 # A row is left out from this probability on.
 CERTAIN = 0.99
-# What is known of gross errors before: their share as if so many of a hundred rows had been seen,
-# and that they are at least so many standard deviations wide.
+# Prior of gross errors: their share as if so many of a hundred rows had been observed, and their
+# least width in standard deviations.
 PRIOR_GROSS = 0.1
 PRIOR_ROWS = 100.0
 NARROWEST = 20.0
-# More than this share is no accident: the model or the session is wrong.
+# Where the share is larger, the model or the session is wrong.
 LARGEST_SHARE = 0.1
 _QUANTILES = (0.5, 0.8)
 # The same quantiles of the length of a standard normal vector in three dimensions.
 _EXPECTED = np.array([1.5381722545, 2.1544437046])
-# The 80 % quantile may say this many times the median's standard deviation; more than a fifth of
-# gross errors shows in it.
+# The standard deviation by the 80 % quantile may be this many times that by the median; more than
+# a fifth of gross errors makes it larger.
 TAIL_LIMIT = 4.0
-# A sensor brings some ten unknowns. With fewer rows the robust fit follows half of them closely,
-# whatever they are, and their errors say nothing of the others'.
+# A sensor has some ten unknowns. With fewer rows the robust fit follows half of them closely,
+# whatever they are, and their errors cannot be compared with the others'.
 FEWEST_TO_JUDGE = 60
 
 
@@ -81,7 +81,8 @@ def find_outliers(
     Raises
     ------
     InsufficientDataError
-        When more than a tenth of a sensor's rows would have to go, or cannot even be told.
+        When more than a tenth of a sensor's rows would be left out, or too many are gross to
+        identify them.
     """
     _require_majority(rows, errors, sensor_names)
     gross = np.zeros(len(rows), dtype=bool)
@@ -108,7 +109,7 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
     total = rows.group_sum(errors * good[:, None], axis=0)
     sigma, pose_sigma = robust_noise(rows, errors, good)
 
-    # What the other good rows of the pose say of the error it shares.
+    # The error that the pose has in common, by its other good rows.
     others = count[group] - good
     mean = (total[group] - errors * good[:, None]) / np.maximum(others, 1.0)[:, None]
     variance, common = sigma[sensor] ** 2, pose_sigma[sensor] ** 2
@@ -215,7 +216,7 @@ def _robust_scale(lengths: FloatArray) -> float:
 
 
 def _require_majority(rows: Rows, errors: FloatArray, sensor_names: Sequence[str]) -> None:
-    """Refuse data in which gross errors are so many that the others cannot be told."""
+    """Refuse data with so many gross errors that they cannot be identified."""
     for sensor, span in rows.spans:
         if span.stop - span.start < FEWEST_TO_JUDGE:
             continue
@@ -243,5 +244,5 @@ def _mm(length: float) -> str:
 
 
 def _percent(probability: float) -> str:
-    """Return a probability in words that never say certain."""
+    """Return a probability as text, never as 100 %."""
     return f'{100.0 * probability:.1f} %' if probability < 0.999 else 'above 99.9 %'

@@ -29,8 +29,8 @@ class Posterior:
     """The density of the free parameters and the noise, given the optimization rows.
 
     A point is a flat vector (d,): the free pinned parameters, then the noise coordinates eta:
-    log sigma of every channel, and asinh(pose_sigma / sigma) >= 0 of the channels where it can be
-    told apart. The latter is as good as linear near zero and as a logarithm far from it, so the
+    log sigma of every channel, and asinh(pose_sigma / sigma) >= 0 of the channels that have
+    one. The latter is as good as linear near zero and as a logarithm far from it, so the
     posterior looks alike whether pose_sigma is nothing or nearly all; its prior is sech.
 
     Attributes

@@ -9,9 +9,9 @@ a turn of joint 1 and of the registration, or of the last joint and of the marke
 count. At visited configurations this predicts what eq. 18 measures.
 
 *The paper's.* Both places in the robot base, only the offsets differ, the marker is that of the
-estimate. Offsets that no data can tell count in full: nearly half of the paper's "Vernier" error
-is its offset of joint 1, which is a turn of the sensor. Where the fit holds such an offset at 0 it
-adds nothing; the paper's own chain lets it wander.
+estimate. Offsets that are not identifiable count in full: nearly half of the paper's "Vernier"
+error is its offset of joint 1, which is a turn of the sensor. Where the fit holds such an offset
+at 0 it adds nothing; the paper's own chain lets it wander.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Predictive:
 
     @cached_property
     def mean_offsets(self) -> FloatArray:
-        """The paper's estimate: the means of the draws, also of what nothing tells, rad, (k,)."""
+        """The paper's estimate: the means of the draws, identifiable or not, rad, (k,)."""
         return self.model.offsets(self.draws).mean(axis=0)
 
     def without_extension(self) -> Predictive:
@@ -89,8 +89,8 @@ def random_configurations(
 ) -> Measurements:
     """Return rows at joint configurations drawn uniformly within the joint limits.
 
-    Neither collisions nor lines of sight are looked at: the whole workspace counts, as in the
-    paper. The sensors take turns, each with the marker it follows in ``seen``.
+    Neither collisions nor lines of sight are checked: the whole workspace counts, as in the paper.
+    The sensors take turns, each with the marker it follows in ``seen``.
     """
     followed = [seen.marker[np.flatnonzero(seen.sensor == s)[0]] for s in np.unique(seen.sensor)]
     sensor = np.arange(count) % len(followed)
@@ -136,24 +136,20 @@ def theoretical_distances(
     per_block = min(draws, -(-PAIRS // len(rows)))
     order = rng.permutation(draws)
     blocks = np.array_split(rows, -(-len(rows) // _BLOCK_ROWS))
-    parts: tuple[list[Distances], list[Distances]] = ([], [])
+    parts = []
     for index, block in enumerate(blocks):
-        # Every block of rows meets draws of its own, so that all draws have their say.
+        # Every block of rows takes other draws, so that all draws are used.
         taken = order[(index * per_block + np.arange(per_block)) % draws]
         seen = Rows.of(measurements, block, predictive.model.reference)
-        both = _block(predictive, seen, taken, rng)
-        for part, distances in zip(parts, both, strict=True):
-            part.append(distances)
-    invariant, paper = (
-        Distances(*(np.concatenate(values) for values in zip(*part, strict=True)))
-        for part in parts
-    )
-    return invariant, paper
+        parts.append(_block(predictive, seen, taken, rng))
+    invariant, paper = np.concatenate(parts, axis=-1)
+    return Distances(*invariant), Distances(*paper)
 
 
 def _block(
     predictive: Predictive, rows: Rows, taken: IntArray, rng: np.random.Generator
-) -> tuple[Distances, Distances]:
+) -> FloatArray:
+    """Return both versions of the four `Distances` of some rows and draws, (2, 4, pairs)."""
     model, draws = predictive.model, predictive.draws[taken]
     sensor = rows.group_sensor[rows.group_of_row]
     predicted = model.predict(predictive.after, rows)
@@ -163,25 +159,20 @@ def _block(
     raw = rng.standard_normal((len(taken), len(rows), 3))
     deeper = (along - across) * np.einsum('dni,ni->dn', raw, sight)
     noise = across[..., None] * raw + deeper[..., None] * sight
-    invariant = _distances(
-        model.predict(predictive.before, rows), predicted, model.predict(draws, rows), noise
-    )
+    in_sensor = model.predict(predictive.before, rows), predicted, model.predict(draws, rows)
     markers = model.markers(model.natural(predictive.after))[rows.marker]
-    before, after = (
+    in_base = (
         model.chain.positions(rows.q, markers, offsets)
-        for offsets in (model.offsets(predictive.before), predictive.mean_offsets)
-    )
-    drawn = model.chain.positions(rows.q, markers, model.offsets(draws)[:, None, :])
-    return invariant, _distances(before, after, drawn, noise)
-
-
-def _distances(
-    before: FloatArray, after: FloatArray, drawn: FloatArray, noise: FloatArray
-) -> Distances:
-    noisy = drawn + noise
-    return Distances(
-        *(
-            np.sqrt(np.einsum('dni,dni->dn', error, error)).ravel()
-            for error in (noisy - before, drawn - before, noisy - after, drawn - after)
+        for offsets in (
+            model.offsets(predictive.before),
+            predictive.mean_offsets,
+            model.offsets(draws)[:, None, :],
         )
     )
+    distances = [
+        np.linalg.norm(place - applied, axis=-1).ravel()
+        for before, after, drawn in (in_sensor, in_base)
+        for applied in (before, after)
+        for place in (drawn + noise, drawn)
+    ]
+    return np.reshape(distances, (2, 4, -1))

@@ -1,6 +1,6 @@
 """What is known before the data: markers, base frames and offsets, Gaussian.
 
-Numpy in, numpy out; how a session or a file says so is read in `storage`.
+Numpy in, numpy out; how they are read from a session or a file is in `session`.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def prior_rows(
     """Return residuals (m,) of all priors and their derivative (m, size) at z.
 
     Numerical differences: the priors are smooth, few, and written as plain functions. ``natural``
-    says that z and the derivative are in natural, not in pinned coordinates.
+    where z and the derivative are in natural, not in pinned coordinates.
     """
     # Priors are on the core; theta's is linear, so differences would only cost.
     step, core = 1e-6 * np.eye(model.core, model.size), model.core

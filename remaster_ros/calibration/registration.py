@@ -12,11 +12,11 @@ from remaster_ros.kinematics.transforms import apply, transform
 from remaster_ros.types import FloatArray
 
 MINIMUM_POINTS = 3
-# Points that stray from their best line by less than this share of their spread along it leave
-# the turn about that line to the noise.
+# Points whose spread across their best line is less than this share of that along it do not
+# determine the turn about the line.
 MINIMUM_WIDTH = 0.02
+# Of so many points every three are tried for agreement.
 TRIED_POINTS = 20
-"""Of so many points every three are tried for agreement."""
 
 
 def register_points(points_R: ArrayLike, points_N: ArrayLike) -> tuple[FloatArray, float]:
@@ -74,10 +74,10 @@ def register_points(points_R: ArrayLike, points_N: ArrayLike) -> tuple[FloatArra
 def register_ransac(
     points_R: ArrayLike, points_N: ArrayLike, allowed_m: float
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Register by the points that agree: one may be that of a stray taken for the marker.
+    """Register by the points that agree: single ones may be of a stray taken for the marker.
 
-    Of every three points the frame is computed; that with which most points agree is refined by
-    all of these.
+    A frame is computed from every three points; the one that most points agree with is refined by
+    all of them.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def register_ransac(
         As `register_points`; and where no three points, or less than most of them, agree.
     """
     points_R, points_N = np.asarray(points_R, dtype=float), np.asarray(points_N, dtype=float)
-    # Whatever is wrong with all of them together is said as such.
+    # Raises where the shapes are wrong or all of the points lie on a line.
     register_points(points_R, points_N)
     best, best_key, closest = np.zeros(len(points_R), bool), (0, 0.0), np.inf
     for triple in combinations(range(min(len(points_R), TRIED_POINTS)), MINIMUM_POINTS):

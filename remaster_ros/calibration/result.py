@@ -9,23 +9,27 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.calibration.accuracy import accuracy_of
+from remaster_ros.calibration.convergence import SamplerInfo
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.identifiability import Gauge, GaugeDirection
+from remaster_ros.calibration.metropolis import Chains
 from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.noise import Noise
 from remaster_ros.calibration.noise_check import NoiseCheck, check_noise
+from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.predictive_accuracy import Predictive
-from remaster_ros.calibration.sampler_info import SamplerInfo
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, inverse, matrix_to_rotation_vector
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Session
 
-# An offset that a prior tells counts as known up to so many times what the data leave the others.
+# An offset that a prior determines counts as identifiable where its standard deviation is at most
+# so many times the median of those that the data determine.
 AS_GOOD_AS_SEEN = 2.0
-# A mastering is off by tenths of a degree. More is a joint that has lost it, or joints, signs or a
-# robot model that are not those of the arm that was measured.
+# A mastering is off by tenths of a degree. A larger offset is that of a joint that has lost its
+# mastering, or joints, signs or the robot model are not those of the arm that was measured.
 LARGEST_OFFSET = np.radians(5.0)
-# Of an angle that nothing is known of: uniform over the turn.
+# Of an unknown angle, uniform over the turn.
 UNKNOWN_STD = np.pi / np.sqrt(3.0)
 
 
@@ -41,7 +45,7 @@ class NoiseEstimate:
     sigma_m: float
     std_m: float
     pose_sigma_m: float | None
-    pose_sigma_std_m: float | None
+    pose_std_m: float | None
     directions: Mapping[str, NoiseEstimate] = field(default_factory=dict)
 
 
@@ -67,24 +71,24 @@ class FitResult:
         rad, (chains, draws, k); zeros where a joint is held by the gauge (paper mode holds none).
     joint_offsets, joint_offsets_std, joint_offsets_interval95
         Posterior mean and std, rad, (k,), and 95 % interval, rad, (k, 2). A joint that neither
-        data nor prior tell has mean 0, the std of a uniform turn, and the whole turn.
+        data nor prior determine has mean 0, the std of a uniform turn, and the whole turn.
     identifiable
-        False where the data cannot tell a joint's offset, (k,); true all the same where a prior
-        tells it nearly as well as the data tell the others.
+        False where the data do not determine a joint's offset, (k,); true all the same where a
+        prior determines it nearly as well as the data determine the others.
     why
-        What the data alone cannot tell it from; '' where they can, k strings.
+        What the data alone do not distinguish it from; '' where they do, k strings.
     gauge
-        Every combination of parameters that the data cannot see.
+        Every combination of parameters that the data do not determine.
     T_R_N, T_R_N_std_m, T_R_N_std_rad
         Registration of each sensor, (4, 4), with std of its translation and of its rotation
         along and about the axes of R, (3,) each; like all of the rest for offsets of 0 where
-        nothing tells them.
+        they are not identifiable.
     marker_positions, marker_std_m
         Markers in T, m, (3,) each.
     noise
         By sensor.
-    T_R_N_before, marker_positions_before
-        The same fit with all offsets held at zero.
+    T_R_N_before
+        Registrations of the same fit with all offsets held at zero.
     residuals_before, residuals_after
         Measured minus modelled position in N for every row of the session, m, (n, 3).
     accuracy
@@ -93,10 +97,10 @@ class FitResult:
         (observation, reason) of every gross error.
     noise_checks
         Of every sensor: is what the fit leaves what noise explains?
-    theta_names, theta_units
+    theta_names
         Of the extension's m parameters; empty without one.
     theta, theta_std
-        Posterior mean and std in these units, (m,).
+        Their posterior mean and std, in their units, (m,).
     theta_draws
         (chains, draws, m).
     """
@@ -122,21 +126,19 @@ class FitResult:
     noise: Mapping[str, NoiseEstimate]
     sampler: SamplerInfo
     T_R_N_before: Mapping[str, FloatArray]
-    marker_positions_before: Mapping[str, FloatArray]
     residuals_before: FloatArray
     residuals_after: FloatArray
     accuracy: Mapping[str, Any]
     left_out: tuple[tuple[int, str], ...]
     noise_checks: tuple[NoiseCheck, ...]
     theta_names: tuple[str, ...]
-    theta_units: tuple[str, ...]
     theta: FloatArray
     theta_std: FloatArray
     theta_draws: FloatArray
 
     @property
     def implausible(self) -> tuple[str, ...]:
-        """A line for each joint whose offset is told, and too large for one of mastering."""
+        """A line for each joint whose offset is identifiable and too large for a mastering."""
         return tuple(
             f'{joint}: an offset of {np.degrees(offset):.2f} degrees is more than a mastering is '
             f'off by ({np.degrees(LARGEST_OFFSET):.0f}); before it is used, check joint order, '
@@ -154,35 +156,21 @@ class Sampled:
 
     Attributes
     ----------
-    model
-        Whose parameters were sampled.
-    z
-        Pinned parameters, (chains, draws, size).
+    posterior
+        Whose parameters and noise were sampled.
+    z, eta
+        Pinned parameters, (chains, draws, size), and noise coordinates, (chains, draws, e).
     z_mean
-        Its mean, joints that nothing tells at 0, (size,).
-    sigma, pose_sigma
-        Noise of each sensor, m, (chains, draws, sensors).
-    total_noise
-        Both together, along and across the line of sight, m, (chains, draws, sensors, 2).
-    trace, draws
-        What moved, in the order of ``names`` and in readable units, (chains, ..., p).
-    names
-        p names.
-    separable
-        Sensor indices with a pose_sigma of their own.
-    name, acceptance_rate
-        Of the sampler.
-    by_direction
-        sigma and pose_sigma, m, (chains, draws) each, by sensor and 'along' or 'across'; only of
-        the sensors whose noise differs between the two.
+        Mean of z, joints that are not identifiable at 0, (size,).
+    moved
+        Indices of the sampled parameters, (m,).
+    run, name
+        The chains, in natural units and in the order of `FitResult.parameter_names`, and which
+        sampler it was.
     precision
         That was asked for; None where a number of draws was.
-    log_density_error, checked
-        See `SamplerInfo`.
     gauge
-        What the data cannot see.
-    unfixed
-        True for joints that neither the data nor a prior tell, (k,).
+        What the data do not determine.
     taken_as_known
         Standard deviation, rad, of what the sampler took as known exactly and the session does
         not, in each joint's offset, (k,); it is added to that of the draws.
@@ -192,119 +180,157 @@ class Sampled:
         (row of the measurements, reason) of the gross errors.
     """
 
-    model: Model
+    posterior: Posterior
     z: FloatArray
+    eta: FloatArray
     z_mean: FloatArray
-    sigma: FloatArray
-    pose_sigma: FloatArray
-    total_noise: FloatArray
-    trace: FloatArray
-    draws: FloatArray
-    names: tuple[str, ...]
-    separable: tuple[int, ...]
+    moved: IntArray
+    run: Chains
     name: str
-    acceptance_rate: float
+    precision: float | None
     gauge: Gauge
-    unfixed: BoolArray
     taken_as_known: FloatArray
     z_before: FloatArray
     left_out: tuple[tuple[int, str], ...]
-    by_direction: Mapping[tuple[int, str], tuple[FloatArray, FloatArray]] = field(
-        default_factory=dict
+
+
+def sampled_columns(
+    posterior: Posterior, x: FloatArray, eta: FloatArray, moved: IntArray
+) -> FloatArray:
+    """Return natural parameters x (..., size) and noise eta (..., e) as chains of a fit, (..., p).
+
+    The moved parameters, every channel's sigma, and the pose_sigma of those that have one.
+    """
+    noise = posterior.noise(eta)
+    separate = noise.pose_sigma[..., list(posterior.noise_model.separable)]
+    return np.concatenate((x[..., moved], noise.sigma, separate), axis=-1)
+
+
+def _sampled_names(posterior: Posterior, moved: IntArray) -> tuple[str, ...]:
+    """Return the names of `sampled_columns`."""
+    model, noise_model = posterior.model, posterior.noise_model
+    noises = [
+        '.'.join(filter(None, ('noise', model.sensor_names[channel.sensor], channel.direction)))
+        for channel in noise_model.channels
+    ]
+    return (
+        *(model.names[index] for index in moved),
+        *(f'{noise}.sigma' for noise in noises),
+        *(f'{noises[index]}.pose_sigma' for index in noise_model.separable),
     )
-    precision: float | None = None
-    log_density_error: float = float('nan')
-    checked: int = 0
 
 
 def build_result(
     problem: Problem, sampled: Sampled, seconds: float, rng: np.random.Generator
 ) -> FitResult:
     """Summarise the draws; ``seconds`` is how long they took, ``rng`` for section V-C."""
-    model, measurements = sampled.model, problem.measurements
-    joints = model.joints
-    # In pinned coordinates any value of a joint that nothing tells fits as well as 0.
+    posterior, gauge, measurements = sampled.posterior, sampled.gauge, problem.measurements
+    model = posterior.model
+    # In pinned coordinates any value of a joint that is not identifiable fits as well as 0.
+    unfixed = np.isin(np.arange(model.joints), gauge.held)
     z = sampled.z.copy()
-    z[..., np.flatnonzero(sampled.unfixed)] = 0.0
+    z[..., np.flatnonzero(unfixed)] = 0.0
     flat = z.reshape(-1, model.size)
     x_after, x_before = model.natural(sampled.z_mean), model.natural(sampled.z_before)
     predicted_before = predicted_rows(problem, model, sampled.z_before)
     predicted_after = predicted_rows(problem, model, sampled.z_mean)
+    mean, std, interval = _offset_summary(flat[:, : model.joints], unfixed, sampled.taken_as_known)
 
-    offset_draws = sampled.z[..., :joints]
-    pooled = flat[:, :joints]
-    mean, std = pooled.mean(axis=0), pooled.std(axis=0, ddof=1)
-    interval = np.quantile(pooled, (0.025, 0.975), axis=0).T
-    more = sampled.taken_as_known
-    std = np.hypot(std, more)
-    # 1.96 standard deviations to either side hold 95 %.
-    half = np.hypot(interval - mean[:, None], 1.96 * more[:, None])
-    interval = mean[:, None] + half * (-1.0, 1.0)
-    mean = np.where(sampled.unfixed, 0.0, mean)
-    std = np.where(sampled.unfixed, UNKNOWN_STD, std)
-    interval = np.where(sampled.unfixed[:, None], (-np.pi, np.pi), interval)
-
-    T_R_N = model.T_R_N(x_after)
+    T_R_N, markers = model.T_R_N(x_after), model.markers(x_after)
     x_draws = model.natural(flat)
     T_draws = model.T_R_N(x_draws)
     turns = matrix_to_rotation_vector(T_draws[..., :3, :3] @ np.swapaxes(T_R_N[:, :3, :3], -1, -2))
-    sensors, markers = problem.sensor_names, problem.marker_names
-    marker_draws = model.markers(x_draws)
     left_rows = np.array([row for row, _ in sampled.left_out], dtype=np.int64)
+    left_out = measurements.observation[left_rows]
     residuals_after = measurements.position - predicted_after
+    noise = posterior.noise(sampled.eta)
+    total_noise = posterior.noise_model.total_noise(noise)
+    predictive = Predictive(
+        model=model,
+        before=sampled.z_before,
+        after=sampled.z_mean,
+        draws=sampled.z.reshape(-1, model.size),
+        sigma=total_noise.reshape(-1, *total_noise.shape[2:]),
+    )
+    names = _sampled_names(posterior, sampled.moved)
+
+    def by_sensor(values: FloatArray) -> dict[str, FloatArray]:
+        return dict(zip(problem.sensor_names, values, strict=True))
+
+    def by_marker(values: FloatArray) -> dict[str, FloatArray]:
+        return dict(zip(problem.marker_names, values, strict=True))
+
     return FitResult(
         session=problem.session,
         chain=problem.chain,
         joint_names=problem.chain.joint_names,
-        parameter_names=sampled.names,
-        draws=sampled.draws,
-        trace=sampled.trace,
-        joint_offset_draws=offset_draws,
+        parameter_names=names,
+        draws=sampled.run.draws,
+        trace=sampled.run.trace,
+        joint_offset_draws=model.offsets(sampled.z),
         joint_offsets=mean,
         joint_offsets_std=std,
         joint_offsets_interval95=interval,
-        identifiable=_identifiable(sampled.gauge.why, std),
-        why=sampled.gauge.why,
-        gauge=sampled.gauge.directions,
-        T_R_N=dict(zip(sensors, T_R_N, strict=True)),
-        T_R_N_std_m=dict(zip(sensors, T_draws[..., :3, 3].std(axis=0, ddof=1), strict=True)),
-        T_R_N_std_rad=dict(zip(sensors, turns.std(axis=0, ddof=1), strict=True)),
-        marker_positions=dict(zip(markers, model.markers(x_after), strict=True)),
-        marker_std_m=dict(zip(markers, marker_draws.std(axis=0, ddof=1), strict=True)),
-        noise=_noise(sampled, sensors),
+        identifiable=_identifiable(gauge.why, std),
+        why=gauge.why,
+        gauge=gauge.directions,
+        T_R_N=by_sensor(T_R_N),
+        T_R_N_std_m=by_sensor(T_draws[..., :3, 3].std(axis=0, ddof=1)),
+        T_R_N_std_rad=by_sensor(turns.std(axis=0, ddof=1)),
+        marker_positions=by_marker(markers),
+        marker_std_m=by_marker(model.markers(x_draws).std(axis=0, ddof=1)),
+        noise=_noise(posterior, noise),
         sampler=SamplerInfo.of(
-            sampled.draws,
-            sampled.names,
-            name=sampled.name,
-            acceptance_rate=sampled.acceptance_rate,
-            wanted=sampled.precision,
-            log_density_error=sampled.log_density_error,
-            checked=sampled.checked,
-            seconds=seconds,
+            sampled.run, names, name=sampled.name, wanted=sampled.precision, seconds=seconds
         ),
-        T_R_N_before=dict(zip(sensors, model.T_R_N(x_before), strict=True)),
-        marker_positions_before=dict(zip(markers, model.markers(x_before), strict=True)),
+        T_R_N_before=by_sensor(model.T_R_N(x_before)),
         residuals_before=measurements.position - predicted_before,
         residuals_after=residuals_after,
-        accuracy=_accuracy(problem, sampled, predicted_before, predicted_after, left_rows, rng),
-        left_out=tuple((int(measurements.observation[row]), why) for row, why in sampled.left_out),
+        accuracy=accuracy_of(
+            measurements,
+            np.setdiff1d(problem.fitted, left_rows),
+            predicted_before,
+            predicted_after,
+            predictive,
+            rng,
+        ),
+        left_out=tuple(zip(left_out.tolist(), (why for _, why in sampled.left_out), strict=True)),
         noise_checks=check_noise(
             measurements,
-            sensors,
+            problem.sensor_names,
             residuals_after,
-            measurements.observation[left_rows],
-            parameters=sum(not name.startswith('noise.') for name in sampled.names),
+            left_out,
+            parameters=len(sampled.moved),
         ),
         theta_names=model.extension.names if model.extension is not None else (),
-        theta_units=model.extension.units if model.extension is not None else (),
         theta=model.theta(sampled.z_mean),
         theta_std=model.theta(flat).std(axis=0, ddof=1),
         theta_draws=model.theta(sampled.z),
     )
 
 
+def _offset_summary(
+    draws: FloatArray, unfixed: BoolArray, taken_as_known: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return mean (k,), std (k,) and 95 % interval (k, 2) of offsets (n, k), rad.
+
+    Of joints that are not identifiable, where ``unfixed`` is true, 0 and those of the whole turn.
+    """
+    mean = draws.mean(axis=0)
+    std = np.hypot(draws.std(axis=0, ddof=1), taken_as_known)
+    interval = np.quantile(draws, (0.025, 0.975), axis=0).T
+    # 1.96 standard deviations to either side hold 95 %.
+    half = np.hypot(interval - mean[:, None], 1.96 * taken_as_known[:, None])
+    interval = mean[:, None] + half * (-1.0, 1.0)
+    return (
+        np.where(unfixed, 0.0, mean),
+        np.where(unfixed, UNKNOWN_STD, std),
+        np.where(unfixed[:, None], (-np.pi, np.pi), interval),
+    )
+
+
 def _identifiable(why: tuple[str, ...], std: FloatArray) -> BoolArray:
-    """Tell which offsets (k,) the data tell, or a prior nearly as well as they tell the others."""
+    """Return which offsets (k,) the data determine, or a prior nearly as well as the others."""
     seen = np.array([not text for text in why])
     if not seen.any():
         return seen
@@ -321,50 +347,28 @@ def predicted_rows(problem: Problem, model: Model, z: FloatArray) -> FloatArray:
     return apply(inverse(model.reference)[measurements.sensor], predicted)
 
 
-def _noise(sampled: Sampled, sensors: tuple[str, ...]) -> dict[str, NoiseEstimate]:
-    noise = {}
-    for index, name in enumerate(sensors):
-        known = index in sampled.separable
-        noise[name] = replace(
-            _noise_estimate(sampled.sigma[..., index], sampled.pose_sigma[..., index], known),
-            directions={
-                direction: _noise_estimate(*draws, known)
-                for (sensor, direction), draws in sampled.by_direction.items()
-                if sensor == index
-            },
+def _noise(posterior: Posterior, by_channel: Noise) -> dict[str, NoiseEstimate]:
+    """Return the noise of every sensor from draws of that of the channels (chains, draws, …)."""
+    noise_model = posterior.noise_model
+    by_sensor = noise_model.sensor_noise(by_channel)
+    separate = {noise_model.channels[index].sensor for index in noise_model.separable}
+
+    def estimate(noise: Noise, at: int, sensor: int) -> NoiseEstimate:
+        sigma, pose_sigma = noise.sigma[..., at], noise.pose_sigma[..., at]
+        known = sensor in separate
+        return NoiseEstimate(
+            sigma_m=float(sigma.mean()),
+            std_m=float(sigma.std(ddof=1)),
+            pose_sigma_m=float(pose_sigma.mean()) if known else None,
+            pose_std_m=float(pose_sigma.std(ddof=1)) if known else None,
         )
-    return noise
 
-
-def _noise_estimate(sigma: FloatArray, pose: FloatArray, known: bool) -> NoiseEstimate:
-    return NoiseEstimate(
-        sigma_m=float(sigma.mean()),
-        std_m=float(sigma.std(ddof=1)),
-        pose_sigma_m=float(pose.mean()) if known else None,
-        pose_sigma_std_m=float(pose.std(ddof=1)) if known else None,
-    )
-
-
-def _accuracy(
-    problem: Problem,
-    sampled: Sampled,
-    predicted_before: FloatArray,
-    predicted_after: FloatArray,
-    left_rows: IntArray,
-    rng: np.random.Generator,
-) -> dict[str, Any]:
-    """Compute the metrics on the fitted rows and on all of the validation rows."""
-    predictive = Predictive(
-        model=sampled.model,
-        before=sampled.z_before,
-        after=sampled.z_mean,
-        draws=sampled.z.reshape(-1, sampled.model.size),
-        sigma=sampled.total_noise.reshape(-1, *sampled.total_noise.shape[2:]),
-    )
-    splits = {
-        'optimization': np.setdiff1d(problem.fitted, left_rows),
-        'validation': np.flatnonzero(problem.measurements.is_validation),
-    }
-    return accuracy_of(
-        problem.measurements, splits, predicted_before, predicted_after, predictive, rng
-    )
+    result = {}
+    for sensor, name in enumerate(posterior.model.sensor_names):
+        directions = {
+            channel.direction: estimate(by_channel, index, sensor)
+            for index, channel in enumerate(noise_model.channels)
+            if channel.sensor == sensor and channel.direction
+        }
+        result[name] = replace(estimate(by_sensor, sensor, sensor), directions=directions)
+    return result

@@ -1,4 +1,9 @@
-"""Draws from the exact posterior of a fit, by the cheapest sampler that works on it."""
+"""Draws from the exact posterior of a fit, by the cheapest sampler that works on it.
+
+`sample_posterior` is the one interface of the samplers: `metropolis` has the two kernels,
+`proposal` the densities that are proposed from, `surrogate` the density that costs the same for
+any number of observations.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +14,16 @@ from typing import NamedTuple
 import numpy as np
 
 from remaster_ros.calibration import convergence
+from remaster_ros.calibration.convergence import R_HAT_LIMIT
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.metropolis import (
     Chains,
     LogDensity,
     Proposal,
-    StudentT,
     independence_sampler,
     random_walk_sampler,
 )
-from remaster_ros.calibration.proposal import FactorisedProposal, LaplaceProposal
+from remaster_ros.calibration.proposal import LaplaceProposal, StudentT
 from remaster_ros.calibration.surrogate import Surrogate
 from remaster_ros.types import FloatArray
 
@@ -28,16 +33,15 @@ WARM_UP = 100
 # Monte Carlo error of every mean over its standard deviation, where nothing else is asked for:
 # 1 / 0.02² = 2500 effective draws, of the bulk and of the tails.
 PRECISION = 0.02
-R_HAT_LIMIT = 1.01
 FIRST_DRAWS = 800
-# Draws of one chain after which the sampler gives up and says so.
+# A chain is not made longer than this; the result then states that it has not converged.
 ALLOWANCE = 100_000
 # Below this share of proposals taken the proposal is adapted to a random walk's draws; should
 # that not help, a random walk is what remains.
 POOR_ACCEPTANCE = 0.15
-# Where independent draws by the interpolated proposal are worth less than this share of themselves
-# it is factorised for every draw; so many draws tell.
-POOR_WEIGHTS = 0.5
+# Where independent draws by the proposal with the mode's noise are worth less than this share of
+# themselves, it is factorised for every draw. So many draws are tried.
+POOR_WEIGHTS = 0.8
 TRIAL_DRAWS = 1000
 # In tens of dimensions a Student t of few degrees of freedom hardly ever hits the bulk.
 ADAPTED_FREEDOM = 15.0
@@ -62,36 +66,11 @@ class Sampling(NamedTuple):
     run
         Points as `Posterior` defines them.
     name
-        What was done, in words.
+        Which sampler it was, for the report.
     """
 
     run: Chains
     name: str
-
-
-@dataclass(frozen=True)
-class Length:
-    """How long to sample.
-
-    Attributes
-    ----------
-    draws
-        Of each chain; None for as many as the precision takes.
-    precision
-        Wanted Monte Carlo error of every mean, in standard deviations of that quantity.
-    """
-
-    draws: int | None = None
-    precision: float = PRECISION
-
-    @property
-    def effective(self) -> float:
-        """Effective draws that the precision takes."""
-        return self.precision**-2
-
-    def reached(self, r_hat: FloatArray, ess: FloatArray) -> bool:
-        """Tell whether chains with these figures are long enough."""
-        return bool(np.max(r_hat) <= R_HAT_LIMIT and np.min(ess) >= self.effective)
 
 
 def silent(stage: str, share: float) -> None:
@@ -115,7 +94,7 @@ def sample_posterior(
 ) -> Sampling:
     """Sample the exact posterior about its mode.
 
-    Independent proposals from the linearised posterior, judged by the second-order density
+    Independent proposals from the linearised posterior, accepted by the second-order density
     (`surrogate`); that is compared with the exact one on draws it gave, and replaced by it where
     they differ. Where too few proposals are taken they come from a Student t adapted to a pilot
     run; at last a random walk.
@@ -139,40 +118,21 @@ def sample_posterior(
         Called with the stage and the share of it that is done.
     """
     posterior = mode.linearisation.posterior
-    length = Length(draws, precision)
+    task = _Task(draws, precision, quantities, rng, report)
     surrogate = Surrogate.of(mode)
-    laplace = LaplaceProposal.of(mode)
-    factorised = _weight_share(laplace, surrogate.log_density, rng.spawn(1)[0]) < POOR_WEIGHTS
-    if factorised:
-        laplace = FactorisedProposal.of(mode)
-    starts = laplace.dispersed(chains, rng)
-
-    def independent(target: LogDensity, proposal: Proposal, start: FloatArray) -> Chains:
-        def more(start: FloatArray, count: int, warm_up: int) -> Chains:
-            return independence_sampler(
-                target,
-                proposal,
-                chains=chains,
-                draws=count,
-                warm_up=warm_up,
-                rng=rng,
-                start=start,
-                progress=lambda share: report('sampling', share),
-            )
-
-        return _long_enough(more, start, length, quantities, POOR_ACCEPTANCE)
-
-    run = independent(surrogate.log_density, laplace, starts)
+    laplace = LaplaceProposal(mode)
     name = 'independence Metropolis-Hastings, Laplace proposal'
-    if factorised:
+    if _weight_share(laplace, surrogate.log_density, rng.spawn(1)[0]) < POOR_WEIGHTS:
+        laplace = LaplaceProposal(mode, factorised=True)
         name += ' factorised for every draw'
+    starts = laplace.dispersed(chains, rng)
+    run = task.independent(surrogate.log_density, laplace, starts)
     checked = max(20, min(CHECKED_DRAWS, CHECKED_ROWS // len(posterior.rows)))
     points = run.draws.reshape(-1, posterior.size)
     points = points[rng.choice(len(points), min(checked, len(points)), replace=False)]
     error = surrogate.log_density_error(points)
     if error > DENSITY_ERROR_LIMIT or run.acceptance_rate < POOR_ACCEPTANCE:
-        run, name = _exact(mode, laplace, starts, independent, length, quantities, rng, report)
-        return Sampling(run, name)
+        return _exact(task, posterior.log_density, laplace, starts)
     return Sampling(run._replace(log_density_error=error, checked=len(points)), name)
 
 
@@ -183,30 +143,23 @@ def _weight_share(
     points, log_proposal = proposal.sample(TRIAL_DRAWS, rng)
     log_weight = log_density(points) - log_proposal
     weight = np.exp(log_weight - log_weight.max())
-    return float(np.sum(weight) ** 2 / np.sum(weight**2) / len(weight))
+    return float(np.mean(weight) ** 2 / np.mean(weight**2))
 
 
 def _exact(
-    mode: Mode,
-    laplace: LaplaceProposal,
-    starts: FloatArray,
-    independent: Callable[[LogDensity, Proposal, FloatArray], Chains],
-    length: Length,
-    quantities: Callable[[FloatArray], FloatArray],
-    rng: np.random.Generator,
-    report: Progress,
-) -> tuple[Chains, str]:
+    task: _Task, log_density: LogDensity, laplace: LaplaceProposal, starts: FloatArray
+) -> Sampling:
     """Sample by the exact density, whatever it costs."""
-    log_density = mode.linearisation.posterior.log_density
-    run = independent(log_density, laplace, starts)
+    run = task.independent(log_density, laplace, starts)
     if run.acceptance_rate >= POOR_ACCEPTANCE:
-        return run, (
+        return Sampling(
+            run,
             'independence Metropolis-Hastings on the exact density, Laplace proposal '
-            '(the density is not near enough to its second order)'
+            '(the density is not near enough to its second order)',
         )
 
-    chains = len(starts)
-    factor: FloatArray = np.asarray(np.linalg.cholesky(_point_covariance(mode)))
+    rng, chains = task.rng, len(starts)
+    factor = _factor(laplace.sample(TRIAL_DRAWS, rng)[0])
     pilot = random_walk_sampler(
         log_density,
         _gaussian_step(factor, PILOT_CHAINS),
@@ -215,38 +168,98 @@ def _exact(
         burn_in=PILOT_STEPS // 2,
         rng=rng,
         thin=10,
-        progress=lambda share: report('adapting the sampler', share),
+        progress=lambda share: task.report('adapting the sampler', share),
     ).draws
     pooled = pilot.reshape(-1, pilot.shape[-1])
-    factor = np.asarray(np.linalg.cholesky(np.cov(pooled.T)))
+    factor = _factor(pooled)
     adapted = StudentT(pooled.mean(axis=0), factor, ADAPTED_FREEDOM)
     start = pilot[rng.choice(PILOT_CHAINS, chains, replace=chains > PILOT_CHAINS), -1]
-    run = independent(log_density, adapted, start)
+    run = task.independent(log_density, adapted, start)
     if run.acceptance_rate >= POOR_ACCEPTANCE:
-        return run, (
+        return Sampling(
+            run,
             'independence Metropolis-Hastings, Student t proposal adapted to a random walk '
-            '(too few of the Laplace proposals were taken)'
+            '(too few of the Laplace proposals were taken)',
         )
 
     # All of the pilot's chains go on: a batch of them costs hardly more than a few.
-    start = pilot[:, -1] if length.draws is None else start
-    scale = _step_scale(log_density, factor, start, rng)
+    start = pilot[:, -1] if task.draws is None else start
+    run = task.walk(log_density, _step_scale(log_density, factor, start, rng) * factor, start)
+    return Sampling(run, 'random-walk Metropolis (too few independent proposals were taken)')
 
-    def walk(start: FloatArray, count: int, warm_up: int) -> Chains:
-        return random_walk_sampler(
-            log_density,
-            _gaussian_step(scale * factor, len(start)),
-            start=start,
-            steps=(count + warm_up) * WALK_STEPS_PER_DRAW,
-            burn_in=warm_up * WALK_STEPS_PER_DRAW,
-            rng=rng,
-            thin=WALK_STEPS_PER_DRAW,
-            trace_every=WALK_STEPS_PER_DRAW,
-            progress=lambda share: report('sampling by random walk', share),
-        )
 
-    run = _long_enough(walk, start, length, quantities, 0.0)
-    return run, 'random-walk Metropolis (too few independent proposals were taken)'
+@dataclass(frozen=True)
+class _Task:
+    """How long to sample, and what is the same for every sampler; see `sample_posterior`."""
+
+    draws: int | None
+    precision: float
+    quantities: Callable[[FloatArray], FloatArray]
+    rng: np.random.Generator
+    report: Progress
+
+    def independent(self, target: LogDensity, proposal: Proposal, start: FloatArray) -> Chains:
+        """Sample by independent proposals; stop early where too few are taken."""
+
+        def more(start: FloatArray, draws: int, warm_up: int) -> Chains:
+            return independence_sampler(
+                target,
+                proposal,
+                draws=draws,
+                warm_up=warm_up,
+                rng=self.rng,
+                start=start,
+                progress=lambda share: self.report('sampling', share),
+            )
+
+        return self._long_enough(more, start, POOR_ACCEPTANCE)
+
+    def walk(self, target: LogDensity, factor: FloatArray, start: FloatArray) -> Chains:
+        """Sample by a random walk with steps of this factor, (d, d)."""
+
+        def more(start: FloatArray, draws: int, warm_up: int) -> Chains:
+            return random_walk_sampler(
+                target,
+                _gaussian_step(factor, len(start)),
+                start=start,
+                steps=(draws + warm_up) * WALK_STEPS_PER_DRAW,
+                burn_in=warm_up * WALK_STEPS_PER_DRAW,
+                rng=self.rng,
+                thin=WALK_STEPS_PER_DRAW,
+                trace_every=WALK_STEPS_PER_DRAW,
+                progress=lambda share: self.report('sampling by random walk', share),
+            )
+
+        return self._long_enough(more, start, 0.0)
+
+    def _long_enough(
+        self, more: Callable[[FloatArray, int, int], Chains], start: FloatArray, poor: float
+    ) -> Chains:
+        """Sample in batches until the length is reached; give up early where acceptance is poor.
+
+        ``more`` continues from a state: (start, draws, warm-up) to chains.
+        """
+        run = more(start, self.draws or FIRST_DRAWS, WARM_UP)
+        while self.draws is None and run.acceptance_rate >= poor:
+            count = run.draws.shape[1]
+            values = self.quantities(run.draws)
+            ess = np.minimum(convergence.ess_bulk(values), convergence.ess_tail(values))
+            # What never moves has no effective draws.
+            least, wanted = float(np.min(np.nan_to_num(ess))), self.precision**-2
+            mixed = np.max(convergence.r_hat(values)) <= R_HAT_LIMIT
+            if (mixed and least >= wanted) or count >= ALLOWANCE:
+                break
+            # A tenth more than the rate so far promises, but no more than three times as many.
+            expected = 1.1 * count * wanted / max(least, 1.0)
+            batch = int(np.clip(expected - count, count // 4, 3 * count))
+            part = more(run.draws[:, -1], min(batch, ALLOWANCE - count), 0)
+            added = part.draws.shape[1]
+            run = Chains(
+                np.concatenate((run.draws, part.draws), axis=1),
+                (run.acceptance_rate * count + part.acceptance_rate * added) / (count + added),
+                np.concatenate((run.trace, part.trace[:, -added:]), axis=1),
+            )
+        return run
 
 
 def _step_scale(
@@ -271,38 +284,6 @@ def _step_scale(
     return max(STEP_SCALES, key=squared_jump)
 
 
-def _long_enough(
-    more: Callable[[FloatArray, int, int], Chains],
-    start: FloatArray,
-    length: Length,
-    quantities: Callable[[FloatArray], FloatArray],
-    poor: float,
-) -> Chains:
-    """Sample in batches until the length is reached; give up early where acceptance is poor.
-
-    ``more`` continues from a state: (start, draws, warm-up) to chains.
-    """
-    run = more(start, length.draws or FIRST_DRAWS, WARM_UP)
-    while length.draws is None and run.acceptance_rate >= poor:
-        count = run.draws.shape[1]
-        values = quantities(run.draws)
-        # What never moved has no effective draws.
-        ess = np.nan_to_num(np.minimum(convergence.ess_bulk(values), convergence.ess_tail(values)))
-        if length.reached(convergence.r_hat(values), ess) or count >= ALLOWANCE:
-            break
-        # A tenth more than the rate so far promises, but no more than three times what there is.
-        wanted = 1.1 * count * length.effective / max(float(np.min(ess)), 1.0)
-        batch = int(np.clip(wanted - count, count // 4, 3 * count))
-        part = more(run.draws[:, -1], min(batch, ALLOWANCE - count), 0)
-        taken = run.acceptance_rate * count + part.acceptance_rate * part.draws.shape[1]
-        run = Chains(
-            np.concatenate((run.draws, part.draws), axis=1),
-            taken / (count + part.draws.shape[1]),
-            np.concatenate((run.trace, part.trace[:, -part.draws.shape[1] :]), axis=1),
-        )
-    return run
-
-
 def _gaussian_step(factor: FloatArray, chains: int) -> Callable[[np.random.Generator], FloatArray]:
     """Return moves of 2.38 / sqrt(d) widths, best for Gaussians (Gelman, Roberts, Gilks 1996)."""
     d = len(factor)
@@ -310,10 +291,6 @@ def _gaussian_step(factor: FloatArray, chains: int) -> Callable[[np.random.Gener
     return lambda rng: rng.standard_normal((chains, d)) @ scaled.T
 
 
-def _point_covariance(mode: Mode) -> FloatArray:
-    """Return the covariance of parameters and noise coordinates at the mode, (d, d)."""
-    f, e = len(mode.linearisation.posterior.free), len(mode.eta)
-    covariance = np.zeros((f + e, f + e))
-    covariance[:f, :f] = mode.covariance
-    covariance[f:, f:] = mode.eta_covariance
-    return covariance
+def _factor(points: FloatArray) -> FloatArray:
+    """Return the Cholesky factor of the covariance of points (n, d), (d, d)."""
+    return np.asarray(np.linalg.cholesky(np.cov(points.T)))

@@ -12,7 +12,9 @@ order is left out. How far the result is from the exact density is measured in e
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement, product
 
 import numpy as np
 
@@ -50,7 +52,7 @@ class _Part:
     strong
         Which of the products matter in products with each other too.
     curved
-        Products of these by channel at the mode's noise, with that channel's index.
+        Products of these by channel at the mode's noise, with that channel's index; -1 for priors.
     """
 
     linear: IntArray
@@ -83,7 +85,7 @@ class Surrogate:
         """Expand about a mode."""
         posterior = mode.linearisation.posterior
         width = np.sqrt(np.diag(mode.covariance))
-        parts = [*_data_parts(mode, width), *_prior_part(mode, width)]
+        parts = [*_data_parts(mode, width), _prior_part(mode, width)]
         centre = np.concatenate((mode.z[posterior.free], mode.eta))
         return cls(posterior, centre, tuple(parts))
 
@@ -143,66 +145,26 @@ def _data_parts(mode: Mode, width: FloatArray) -> list[_Part]:
     variances = posterior.variances(mode.eta)
     parts = []
     for sensor in range(len(model.sensor_names)):
-        mine = [noise.channels[channel].sensor == sensor for channel in noise.channel_of]
-        groups = np.flatnonzero(mine)
-        size = np.sum(
-            np.diagonal(grams[groups], axis1=1, axis2=2) / variances[groups, None], axis=0
-        )
-        linear = np.flatnonzero(size[:f] > 0.0)
-        moved = np.sqrt(size[f + 1 :]) * width[first] * width[second]
-        parts.append(_part(posterior, grams, variances, linear, first, second, moved, groups))
+        # Without a part common to a pose the error groups of a channel have one variance.
+        alike: dict[tuple[int, int], list[int]] = {}
+        for group, (channel, size) in enumerate(zip(noise.channel_of, noise.size_of)):
+            if noise.channels[channel].sensor == sensor:
+                key = channel, size if channel in noise.separable else 0
+                alike.setdefault(key, []).append(group)
+        merged = np.array([grams[groups].sum(axis=0) for groups in alike.values()])
+        chief = np.array([groups[0] for groups in alike.values()])
+        channels = noise.channel_of[chief].tolist()
+        parts.append(_part(merged, variances[chief], channels, chief, first, second, width))
     return parts
 
 
-def _part(
-    posterior: Posterior,
-    grams: FloatArray,
-    variances: FloatArray,
-    linear: IntArray,
-    first: IntArray,
-    second: IntArray,
-    moved: FloatArray,
-    groups: IntArray,
-) -> _Part:
-    """Cut the matrices of some error groups to the features that matter, by how much they move."""
-    f, noise = len(posterior.free), posterior.noise_model
-    chosen = moved > NEGLIGIBLE
-    strong = np.flatnonzero(moved[chosen] > NEGLIGIBLE_SQUARED)
-    line = np.append(linear, f)
-    bent = f + 1 + np.flatnonzero(chosen)
-    straight = np.concatenate(
-        (grams[np.ix_(groups, line, line)], 2.0 * grams[np.ix_(groups, line, bent)]), axis=2
-    )
-    # Without a part common to a pose the error groups of a channel have one variance.
-    alike: dict[tuple[int, int], list[int]] = {}
-    for place, group in enumerate(groups):
-        channel = int(noise.channel_of[group])
-        size = int(noise.size_of[group]) if channel in noise.separable else 0
-        alike.setdefault((channel, size), []).append(place)
-    summed = np.array([straight[places].sum(axis=0) for places in alike.values()])
-    chief = groups[[places[0] for places in alike.values()]]
-    curved: dict[int, FloatArray] = {}
-    for group in groups:
-        channel = int(noise.channel_of[group])
-        gram = grams[np.ix_([group], bent[strong], bent[strong])][0] / variances[group]
-        curved[channel] = curved.get(channel, 0.0) + gram
-    products = tuple(curved.items()) if len(strong) > 0 else ()
-    return _Part(linear, first[chosen], second[chosen], chief, summed, strong, products)
-
-
-def _prior_part(mode: Mode, width: FloatArray) -> list[_Part]:
+def _prior_part(mode: Mode, width: FloatArray) -> _Part:
     """Return the part of the priors: their residuals to second order, by differences."""
     linearisation = mode.linearisation
     posterior = linearisation.posterior
     model, free, f = posterior.model, posterior.free, len(posterior.free)
     core = np.flatnonzero(free < model.core)
     first, second = (core[side] for side in np.triu_indices(len(core)))
-    if not posterior.priors:
-        first = second = np.zeros(0, dtype=np.int64)
-    everything = np.arange(f)
-    if len(first) == 0:
-        return [_Part(everything, first, second, first, linearisation.prior[None], first, ())]
-
     # Steps of a share of each parameter's width, at least of what differences resolve.
     h = np.maximum(width, 1e-4)
     steps = np.zeros((4, len(first), f))
@@ -210,41 +172,69 @@ def _prior_part(mode: Mode, width: FloatArray) -> list[_Part]:
     for corner, (a, b) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
         steps[corner, pair, first] += a * h[first]
         steps[corner, pair, second] += b * h[second]
-    z = np.concatenate((mode.z[free] + steps.reshape(-1, f), mode.z[free][None]))
-    x = model.natural(posterior.parameters(z))
-    values = np.concatenate([prior.residual(x) for prior in posterior.priors], axis=1)
-    corners = values[:-1].reshape(4, len(first), -1)
+    x = model.natural(posterior.parameters(mode.z[free] + steps.reshape(-1, f)))
+    residuals = [prior.residual(x) for prior in posterior.priors]
+    corners = np.concatenate([np.zeros((len(x), 0)), *residuals], axis=1)
+    corners = corners.reshape(4, len(first), corners.shape[1])
     bent = (corners[0] - corners[1] - corners[2] + corners[3]) / 4.0
     bent /= (h[first] * h[second])[:, None]
     bent[first == second] *= 0.5
-    size = np.linalg.norm(bent, axis=1) * width[first] * width[second]
-    chosen = size > NEGLIGIBLE
-    bent = -bent[chosen]
 
     # The priors of an extension are linear: they are in the linear part alone.
-    _, by_z = prior_rows(replace(model, extension=None), posterior.priors, mode.z[: model.core])
-    line = np.zeros((len(values[-1]), f + 1))
-    line[:, core] = -by_z[:, free[core]]
-    line[:, f] = values[-1]
-    straight = np.concatenate((linearisation.prior, 2.0 * line.T @ bent.T), axis=1)
+    core_model = replace(model, extension=None)
+    value, by_z = prior_rows(core_model, posterior.priors, mode.z[: model.core])
+    features = np.zeros((len(value), f + 1 + len(first)))
+    features[:, core] = -by_z[:, free[core]]
+    features[:, f] = value
+    features[:, f + 1 :] = -bent.T
+    gram = features.T @ features
+    gram[: f + 1, : f + 1] = linearisation.prior
     none = np.zeros(0, dtype=np.int64)
-    strong = np.flatnonzero(size[chosen] > NEGLIGIBLE_SQUARED)
-    curved = ((-1, bent[strong] @ bent[strong].T),) if len(strong) > 0 else ()
-    return [_Part(everything, first[chosen], second[chosen], none, straight[None], strong, curved)]
+    return _part(gram[None], np.ones(1), [-1], none, first, second, width)
+
+
+def _part(
+    grams: FloatArray,
+    variances: FloatArray,
+    channels: Sequence[int],
+    groups: IntArray,
+    first: IntArray,
+    second: IntArray,
+    width: FloatArray,
+) -> _Part:
+    """Cut Gram matrices (g, f+1+p, f+1+p), one for each variance, to the features that matter.
+
+    Features are the free parameters, the error and the products of ``first`` and ``second``;
+    ``width`` has the standard deviations of the parameters, (f,).
+    """
+    f = len(width)
+    weighted = grams / variances[:, None, None]
+    size = np.einsum('gii->i', weighted)
+    line = np.append(np.flatnonzero(size[:f] > 0.0), f)
+    moved = np.sqrt(size[f + 1 :]) * width[first] * width[second]
+    chosen = np.flatnonzero(moved > NEGLIGIBLE)
+    strong = np.flatnonzero(moved[chosen] > NEGLIGIBLE_SQUARED)
+    bent = f + 1 + chosen
+    straight = grams[:, line][:, :, np.append(line, bent)]
+    straight[:, :, len(line) :] *= 2.0
+    curved: dict[int, FloatArray] = {}
+    if len(strong) > 0:
+        for channel, gram in zip(channels, weighted[:, bent[strong]][:, :, bent[strong]]):
+            curved[channel] = curved.get(channel, 0.0) + gram
+    products = tuple(curved.items())
+    return _Part(line[:-1], first[chosen], second[chosen], groups, straight, strong, products)
 
 
 def _bent_pairs(model: Model, free: IntArray) -> list[tuple[int, int]]:
     """Return the pairs of free parameters, by model index, whose product moves a prediction."""
     inner = [i for i in range(1, model.joints - 1) if i in free]
     markers = [i for i in range(model.marker(0).start, model.core) if i in free]
-    pairs = [(i, j) for i in inner for j in inner if i <= j]
-    pairs += [(i, m) for i in inner for m in markers]
+    pairs = [*combinations_with_replacement(inner, 2), *product(inner, markers)]
     for sensor in range(len(model.sensor_names)):
         start = model.registration(sensor).start
         turns = [i for i in range(start + 3, start + 6) if i in free]
-        pairs += [(a, b) for a in turns for b in turns if a <= b]
-        pairs += [(i, a) for i in inner for a in turns]
-        pairs += [(a, m) for a in turns for m in markers]
+        pairs += combinations_with_replacement(turns, 2)
+        pairs += [*product(inner, turns), *product(turns, markers)]
     return pairs
 
 
@@ -260,11 +250,10 @@ def _second_derivatives(
     """
     pose = model.inner_pose(z, rows)
     result = np.zeros((len(rows), 3, len(pairs)))
-    index = {pair: place for place, pair in enumerate(pairs)}
     start = model.marker(0).start
     spans = dict(rows.spans)
     turned = {sensor: _rotation_derivatives(z[model.registration(sensor)][3:]) for sensor in spans}
-    for (i, j), place in index.items():
+    for place, (i, j) in enumerate(pairs):
         half = 0.5 if i == j else 1.0
         if j < model.joints:
             bent = np.cross(pose.axes[:, i], pose.by_joints[:, :, j])
@@ -297,23 +286,10 @@ def _by_marker(model: Model, tool: FloatArray, rows: Rows, index: int) -> FloatA
 def _rotation_derivatives(vector: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return exp(r), its first (3, 3, 3) and second (3, 3, 3, 3) derivatives, by differences."""
     h = 1e-4
-    unit = h * np.eye(3)
-    first = np.stack(
-        [
-            rotation_vector_to_matrix(vector + a) - rotation_vector_to_matrix(vector - a)
-            for a in unit
-        ]
-    ) / (2.0 * h)
-    second = np.array(
-        [
-            [
-                rotation_vector_to_matrix(vector + a + b)
-                - rotation_vector_to_matrix(vector + a - b)
-                - rotation_vector_to_matrix(vector - a + b)
-                + rotation_vector_to_matrix(vector - a - b)
-                for b in unit
-            ]
-            for a in unit
-        ]
-    ) / (4.0 * h**2)
-    return rotation_vector_to_matrix(vector), first, second
+    a = h * np.eye(3)
+    b = a[:, None]
+    turn = rotation_vector_to_matrix
+    first = (turn(vector + a) - turn(vector - a)) / (2.0 * h)
+    second = turn(vector + a + b) - turn(vector + a - b) - turn(vector - a + b)
+    second = (second + turn(vector - a - b)) / (4.0 * h**2)
+    return turn(vector), first, second

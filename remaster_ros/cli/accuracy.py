@@ -25,7 +25,7 @@ DESCRIPTION = (
     "('after'). In both cases registrations and markers are fitted to this session's optimization "
     'rows (to all rows where it has none) and applied to its validation rows. The theoretical '
     "error draws the offsets with the fit's standard deviations, as if independent; joints that "
-    'the fit could not tell do not count: the registration or the marker takes them up. It is '
+    'the fit could not identify do not count: the registration or the marker takes them up. It is '
     "compared in the sensor's frame and, as the source paper does, in the robot base, at the "
     'visited and at 1,000 random configurations.'
 )
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Judge the offsets, print a table, write JSON if asked to."""
+    """Judge the offsets, print a table, write JSON with --out."""
     session = read_session(args.session)
     fit = read_fit(args.offsets)
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)

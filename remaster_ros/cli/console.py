@@ -24,6 +24,6 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
 
 
 def say(quiet: bool, text: str) -> None:
-    """Print unless told to be quiet."""
+    """Print unless --quiet was given."""
     if not quiet:
         print(text)

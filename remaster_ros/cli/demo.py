@@ -83,7 +83,7 @@ def run_node(name: str, parameters: dict[str, object]) -> NoReturn:
     Raises
     ------
     InputError
-        If there is no ROS on this machine; says what to install.
+        If there is no ROS on this machine; its text names what to install.
     """
     if importlib.util.find_spec('rclpy') is None:
         raise InputError(f'remaster {name} {WITHOUT_ROS}')

@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Search, extend, measure the gain, write, and say in a few lines what came out."""
+    """Search, extend, measure the gain, write, and print a summary of a few lines."""
     session = read_session(args.session)
     other = None if args.confirm is None else read_session(args.confirm)
     if other is not None:

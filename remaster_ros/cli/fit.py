@@ -63,10 +63,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit, write, and say in a few lines what came out."""
+    """Fit, write, and print a summary of a few lines."""
     session = read_session(args.session)
     priors = read_priors(args.prior) if args.prior is not None else None
-    # An hour's chain must not end at a folder that cannot be written.
+    # Before the fit: an hour of sampling must not end at a folder that cannot be written.
     prepare_folder(args.out)
     with progress_bar(args.quiet) as progress:
         result = fit_session(
@@ -112,7 +112,7 @@ def summary(result: FitResult) -> str:
     for check in result.noise_checks:
         left = f'{1e3 * check.error_m:.3f} mm that are left'
         if check.noise_error_m is None:
-            lines.append(f'{check.sensor}: nothing tells how much of the {left} is noise')
+            lines.append(f'{check.sensor}: how much of the {left} is noise cannot be told apart')
         elif not check.explained:
             lines.append(
                 f'{check.sensor}: noise ({1e3 * check.noise_error_m:.3f} mm) does not explain the '

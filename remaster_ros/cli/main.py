@@ -23,7 +23,7 @@ VERBS = {
     'fit': 'Fit the zero-offsets of a session: fit.json, figures and report.html.',
     'discover': 'Find what the offsets leave, name the cause, extend the model, prove the gain.',
     'accuracy': 'Judge the zero-offsets of a fit on any session: the three metrics.',
-    'recover': 'Finish the files of a session whose recorder was killed; say what was lost.',
+    'recover': 'Finish the files of a session whose recorder was killed; print what was lost.',
     'replay': 'Publish a recorded session again (as `ros2 bag play` does).',
 }
 TRACEBACK = 'REMASTER_TRACEBACK'
@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             level=logging.ERROR if args.quiet else logging.WARNING,
         )
         if not os.environ.get(TRACEBACK):
-            # An overflow on the way to an error or a verdict that says the same in words.
+            # NumPy warns of overflows; the error or verdict that follows says why in words.
             warnings.simplefilter('ignore', RuntimeWarning)
         status = args.run(args)
         # Here and not at exit, where it could not be caught: the reader may have gone.

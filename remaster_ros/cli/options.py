@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
+
+Number = TypeVar('Number', int, float)
 
 
 class Parser(argparse.ArgumentParser):
@@ -21,34 +23,31 @@ class Parser(argparse.ArgumentParser):
 
 def integer(low: int) -> Callable[[str], int]:
     """Return an argument type: a whole number of at least `low`."""
-
-    def convert(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f'{text!r} is not a whole number') from None
-        if value < low:
-            raise argparse.ArgumentTypeError(f'{value} is less than {low}')
-        return value
-
-    return convert
+    return _bounded(int, 'a whole number', low)
 
 
 def number(low: float = 0.0, high: float = math.inf, unit: str = '') -> Callable[[str], float]:
     """Return an argument type: a finite number from `low` to `high`."""
+    return _bounded(float, 'a number', low, high, unit)
+
+
+def _bounded(
+    kind: type[Number], what: str, low: float, high: float = math.inf, unit: str = ''
+) -> Callable[[str], Number]:
+    """Return an argument type: a finite number of a kind from `low` to `high`."""
     unit = f' {unit}' if unit else ''
 
-    def convert(text: str) -> float:
+    def convert(text: str) -> Number:
         try:
-            value = float(text)
+            value = kind(text)
         except ValueError:
-            raise argparse.ArgumentTypeError(f'{text!r} is not a number') from None
-        if not math.isfinite(value):
+            raise argparse.ArgumentTypeError(f'{text!r} is not {what}') from None
+        if not -math.inf < value < math.inf:
             raise argparse.ArgumentTypeError(f'{text} is not a finite number')
         if value < low:
-            raise argparse.ArgumentTypeError(f'{value:g} is less than {low:g}{unit}')
+            raise argparse.ArgumentTypeError(f'{text} is less than {low:g}{unit}')
         if value > high:
-            raise argparse.ArgumentTypeError(f'{value:g} is more than {high:g}{unit}')
+            raise argparse.ArgumentTypeError(f'{text} is more than {high:g}{unit}')
         return value
 
     return convert

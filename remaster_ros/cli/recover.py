@@ -1,4 +1,4 @@
-"""Bring a session that a crash has left to rest; say what was lost."""
+"""Finish the files of a session that a crash has left; print what was lost."""
 
 from __future__ import annotations
 

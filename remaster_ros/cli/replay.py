@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--with-commands',
         action='store_true',
-        help='publish also what the controller was told; refused where a controller listens',
+        help='publish also the commands to the controller; refused where a controller subscribes',
     )
 
 

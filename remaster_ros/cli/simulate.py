@@ -18,8 +18,8 @@ from remaster_ros.simulation.simulated_workcell import (
     choose_robot,
     choose_sensors,
     simulate_workcell,
-    truth_to_dict,
 )
+from remaster_ros.simulation.truth import truth_to_dict
 
 TRUTH_FILE = 'truth.json'
 
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--robot',
         metavar='NAME|URDF',
-        help="lwr4plus, iiwa7, iiwa14, or any URDF file (default: the cell's robot)",
+        help="a shipped robot such as lwr4plus, or any URDF file (default: the cell's robot)",
     )
     parser.add_argument('--base-link', metavar='LINK', help='frame R (default: the root link)')
     parser.add_argument('--tip-link', metavar='LINK', help='frame T (default: the only end)')
@@ -113,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
             measuring=lambda: progress('measuring', 0.9),
         )
         write_session(args.out, made.session)
-        truth = truth_to_dict(made.truth, chain, args.seed, made.hidden)
+        truth = truth_to_dict(made.truth, chain, args.seed)
         write_atomically(args.out / TRUTH_FILE, json.dumps(truth, indent=2) + '\n')
     say(args.quiet, made.tour.describe())
     say(args.quiet, f'written: {args.out}, {len(made.session.measurements)} observations')

@@ -66,8 +66,8 @@ class PairedReading:
     stamp_s: float
     q: FloatArray
     position: FloatArray
-    std: FloatArray | None
-    samples: int
+    std: FloatArray | None = None
+    samples: int = 1
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Rejection:
     Attributes
     ----------
     reason
-        A word to count by: ``moving``, ``unseen``, ``clock``, ``stale``, ``too_few``,
+        A name to count by: ``moving``, ``unseen``, ``clock``, ``stale``, ``too_few``,
         ``unsteady``, ``frozen``, ``swapped``, ``device``, ``absent`` or ``not_waited``.
     detail
         One line with the numbers.
@@ -89,7 +89,7 @@ class Rejection:
 
 
 LONGEST_GAP_S = 5.0
-"""Without a report of the joints for so long nobody knows that the arm stood still, s."""
+"""Without a report of the joints for so long it is unknown whether the arm stood still, s."""
 
 CLOCK_BACK_S = 0.1
 """A report that is older than the last one by more than this comes from a clock set back, s."""
@@ -109,7 +109,7 @@ class Pairing:
     motion_tolerance
         A report further than this from `q_settled` on any joint means the arm moved, rad.
     require
-        Whom the arm waits for: ``all`` sensors, ``any`` of them, or one by its name. A sensor
+        What the arm waits for: ``all`` sensors, ``any`` of them, or one by its name. A sensor
         that is not required and has no reading by then is left out.
     """
 
@@ -131,7 +131,7 @@ class Pairing:
         self._now_s = self._looked_s = settled_stamp_s
         self._excused_s = dict.fromkeys(self.rules, 0.0)
         self._silent_s = dict.fromkeys(self.rules, 0.0)
-        self._words: dict[str, int] = {}
+        self._message_counts: dict[str, int] = {}
         self._joints: list[tuple[float, FloatArray]] = []
         self._readings: dict[str, list[MarkerReading]] = {name: [] for name in self.rules}
 
@@ -143,26 +143,29 @@ class Pairing:
         elif stamp_s > self._now_s:
             self._now_s = stamp_s
             self._joints.append((stamp_s, np.asarray(q, float)))
-            self._decide(stamp_s)
+            self._decide()
 
     def add_reading(self, sensor: str, reading: MarkerReading) -> None:
         """Take one marker reading; older than the settling, or of an unknown sensor: ignored."""
         if sensor in self._readings and reading.stamp_s > self.settled_stamp_s:
             self._readings[sensor].append(reading)
-            self._decide(reading.stamp_s)
+            self._decide()
 
     def fail(self, sensor: str, detail: str) -> None:
-        """Note that the device itself said that there is no measurement."""
+        """Note that the device itself reported that there is no measurement."""
         self._set(Rejection(sensor, 'device', detail))
 
     def give_up(
-        self, now_s: float, absent: Collection[str] = (), words: Mapping[str, int] | None = None
+        self,
+        now_s: float,
+        absent: Collection[str] = (),
+        message_counts: Mapping[str, int] | None = None,
     ) -> None:
         """Reject every sensor whose time is over at `now_s`.
 
         A cut cable shows only when the heartbeat is over, and simulated time may run faster than
-        that: a required sensor is not rejected before its node has been heard again, and if that
-        turns out to be absent, all of its silence is excused.
+        that: a required sensor is not rejected before a message of its node has come
+        again; if the node turns out to be absent, the whole time without messages is excused.
 
         Parameters
         ----------
@@ -171,9 +174,9 @@ class Pairing:
         absent
             Sensors that are not there at all now: a required one is waited for, and the time is
             not counted; another one is left out.
-        words
-            How often each sensor's node has been heard (`Presence.words`); without it, or for a
-            sensor that is not in it, silence means nothing.
+        message_counts
+            How many messages each sensor's node has sent (`Liveness.reports`); without it, or for
+            a sensor that is not in it, a time without messages is not counted.
         """
         passed = max(now_s - self._looked_s, 0.0)
         self._looked_s = now_s
@@ -183,21 +186,27 @@ class Pairing:
                 self._silent_s[name] = 0.0
             elif name in self.rules:
                 self._set(Rejection(name, 'absent', 'it is not there, and not required'))
-        self._listen(words or {}, passed, absent)
+        self._add_silence(message_counts or {}, passed, absent)
         for name, rules in self.rules.items():
             allowed = self._allowed_s(rules)
             unsure = self.is_required(name) and self._silent_s[name] > 0.0
             if now_s > self.settled_stamp_s + allowed and not unsure:
                 self._set(self._late(rules, allowed))
 
-    def _listen(self, words: Mapping[str, int], passed_s: float, absent: Collection[str]) -> None:
-        """Add up how long each sensor's node has said nothing that is not excused yet."""
+    def _add_silence(
+        self, counts: Mapping[str, int], passed_s: float, absent: Collection[str]
+    ) -> None:
+        """Add up how long each sensor's node has sent nothing, as far as not excused yet."""
         for name in self.rules:
-            if name in words and words[name] == self._words.get(name) and name not in absent:
+            if (
+                name in counts
+                and counts[name] == self._message_counts.get(name)
+                and name not in absent
+            ):
                 self._silent_s[name] += passed_s
             else:
                 self._silent_s[name] = 0.0
-        self._words = dict(words)
+        self._message_counts = dict(counts)
 
     def has_reading(self, sensor: str) -> bool:
         """Whether anything of a sensor has come."""
@@ -221,7 +230,7 @@ class Pairing:
         self._reject_rest('not_waited', f'the arm waits for {self.require}')
 
     def waited_s(self) -> dict[str, float]:
-        """How long the arm stood for whom, s: from one sensor's decision to the next one's."""
+        """How long the arm stood for each sensor, s: from one decision to the next."""
         waited, since = dict.fromkeys(self.rules, 0.0), self.settled_stamp_s
         for name, at in sorted(self._decided_s.items(), key=lambda item: item[1]):
             waited[name], since = at - since, at
@@ -251,46 +260,34 @@ class Pairing:
             rules.sensor, 'stale', f'{what} within {allowed:.1f} s after the arm settled'
         )
 
-    def _decide(self, stamp_s: float) -> None:
+    def _decide(self) -> None:
         for name, rules in self.rules.items():
-            if name in self.decided:
-                continue
-            readings = self._readings[name]
-            if rules.single_shot:
-                if not readings:
-                    continue
-                end = readings[0].stamp_s
-                used = readings[:1]
-            else:
-                dwell = self._dwell(rules, readings)
-                if dwell is None:
-                    continue
-                end, used = dwell
-            # Without a later joint state nobody knows that the arm stood still to the end.
-            if not self._joints or self._joints[-1][0] < end:
-                continue
-            self._set(self._judge(rules, used, end))
+            used = None if name in self.decided else self._used(rules)
+            # Only a joint state after the end shows that the arm stood still to the end.
+            if used and self._joints and self._joints[-1][0] >= used[0]:
+                self._set(self._judge(rules, *used))
 
-    def _dwell(
-        self, rules: SensorRules, readings: list[MarkerReading]
-    ) -> tuple[float, list[MarkerReading]] | None:
-        """End of a stream's dwell and the readings in it; None while it lasts."""
+    def _used(self, rules: SensorRules) -> tuple[float, list[MarkerReading]] | None:
+        """Return the end of a measurement and the readings in it; None while it lasts."""
+        readings = self._readings[rules.sensor]
+        if not readings:
+            return None
+        if rules.single_shot:
+            return readings[0].stamp_s, readings[:1]
         end = self.settled_stamp_s + rules.dwell_s
         # The dwell is over for this sensor once it has sent something later than its end.
-        if not readings or readings[-1].stamp_s <= end:
+        if readings[-1].stamp_s <= end:
             return None
         used = [reading for reading in readings if reading.stamp_s <= end]
-        if len(used) < rules.min_samples:
-            if len(readings) < rules.min_samples:
-                return None
-            used = readings[: rules.min_samples]
-            end = used[-1].stamp_s
-            if end > self.settled_stamp_s + self._allowed_s(rules):
-                return None
-        return end, used
+        if len(used) >= rules.min_samples:
+            return end, used
+        used = readings[: rules.min_samples]
+        end = used[-1].stamp_s
+        late = end > self.settled_stamp_s + self._allowed_s(rules)
+        return None if late or len(used) < rules.min_samples else (end, used)
 
     def _judge(
-        self, rules: SensorRules, used: list[MarkerReading], end: float
+        self, rules: SensorRules, end: float, used: list[MarkerReading]
     ) -> PairedReading | Rejection:
         stamps = np.array([stamp for stamp, _ in self._joints])
         q = np.array([joints for _, joints in self._joints])

@@ -2,7 +2,7 @@
 
 A stray that is taken for the marker (swapped) stands still or moves in a way of its own: seen from
 the tool, it is not where the marker is. A frozen instrument repeats its last reading wherever the
-arm goes. Neither can be told from the reading alone.
+arm goes. Neither can be recognised by the reading alone.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class Plausibility:
         T_R_N
             The sensor in the robot base, (4, 4); None before it is registered.
         anywhere
-            Of a reference, whose very deviation tells that something was moved: anything up to
-            `max_deviation_m`.
+            At a reference, where a deviation shows that something was moved: anything up to
+            `max_deviation_m` is taken.
         """
         name = reading.sensor
         marker_R = self._place(reading)

@@ -79,7 +79,7 @@ class PreflightFacts:
         read_s = _age_s(self._recorder.read_age_s.get(name)) + self._since_s('recorder', now)
         return SensorFacts(
             name=name,
-            said_age_s=self._since_s(f'sensor {name}', now),
+            node_age_s=self._since_s(f'sensor {name}', now),
             ready=report.ready,
             message=report.trouble,
             read_age_s=0.0 if seen_before else read_s,

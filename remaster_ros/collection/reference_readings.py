@@ -6,29 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from remaster_ros.types import FloatArray
+from remaster_ros.collection.pairing import PairedReading
 
 
-@dataclass(frozen=True)
-class ReferenceReading:
-    """A marker at a reference configuration, as recorded.
-
-    Attributes
-    ----------
-    configuration
-        Its number in the session.
-    position, std
-        In the sensor's frame N, and over the dwell (None for a single shot), m, (3,).
-    """
+@dataclass(frozen=True, kw_only=True)
+class ReferenceReading(PairedReading):
+    """A reading at a reference; `configuration` is the configuration's number in the session."""
 
     configuration: int
-    sensor: str
-    marker: str
-    q: FloatArray
-    position: FloatArray
-    stamp_s: float
-    std: FloatArray | None = None
-    samples: int = 1
 
 
 @dataclass(frozen=True)
@@ -52,7 +37,7 @@ class SetupChange:
         Configurations that it happened between: the last one that was as at first (None where it
         was so from the first) and the first one that was not.
     p_value
-        Of the round that told it.
+        Of the round that showed it.
     look_alikes
         Other subjects that explain the same readings.
     """

@@ -1,4 +1,4 @@
-"""What the references of a recorded session tell."""
+"""What has changed by the references of a recorded session."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from remaster_ros.types import FloatArray, Session
 def changes(
     session: Session, chain: SerialChain, T_R_N: Mapping[str, FloatArray]
 ) -> tuple[int, list[SetupChange]]:
-    """Return how many rounds of the references there are, and what they tell has changed.
+    """Return how many rounds of the references there are, and what has changed by them.
 
-    Each change is told once, as the last round that shows it has it.
+    Each change is returned once, as the last round that shows it has it.
     """
     m = session.references
     if m is None:
         return 0, []
     readings = [
         ReferenceReading(
-            int(m.configuration[i]),
             session.sensor_names[m.sensor[i]],
             session.marker_names[m.marker[i]],
+            float(m.stamp_s[i]),
             m.q[i],
             m.position[i],
-            float(m.stamp_s[i]),
             m.std[i] if np.all(np.isfinite(m.std[i])) else None,
             max(int(m.samples[i]), 1),
+            configuration=int(m.configuration[i]),
         )
         for i in range(len(m))
     ]

@@ -4,7 +4,7 @@ The references are measured twice at the beginning: how far the two rounds lie a
 and sensor together repeat to, the noise that every later difference is held against. Each later
 round is held against them by F tests; the probabilities of a false alarm of all rounds of a
 session, however many, add up to what is stated (alpha spending: round r spends 6 / (π r)² of it).
-Only a round that differs is then asked for its cause.
+Only for a round that differs a cause is looked for.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from collections.abc import Mapping
 import numpy as np
 from scipy import stats
 
-from remaster_ros.collection.reference_causes import Cause, Place, causes
 from remaster_ros.collection.reference_readings import (
     ReferenceReading,
     ReferenceRound,
@@ -22,22 +21,29 @@ from remaster_ros.collection.reference_readings import (
 )
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.planning.reference_choice import Cause, Place, causes
 from remaster_ros.planning.tour_order import nearest_solution
 from remaster_ros.types import FloatArray, IntArray
 
 FALSE_ALARM = 0.01
 """Probability that a session in which nothing changes has any alarm."""
 STOP_M = 0.5e-3
-"""A change of this size stops a collection where nothing else is asked for."""
+"""A change of this size stops a collection by default."""
 LEAST_STD_M = 2e-6
 """No sensor and no arm repeat better than this."""
 FEWEST_FREEDOMS = 6
 """With fewer repeated numbers a sensor's noise is not known."""
 LOOKS_ALIKE = 6.0
-"""Causes whose information criteria differ by less than this (odds of 20) are not told apart."""
+"""Causes whose information criteria differ by less than this (odds of 20) look the same."""
 UNEXPLAINED_P = 1e-4
 UNEXPLAINED_SHARE = 0.05
 """What a cause leaves of the displacements is the straight line's share of it, up to here."""
+
+
+Noise = tuple[float, int]
+"""Standard deviation per axis, m, and its degrees of freedom."""
+Displacements = Mapping[tuple[int, tuple[int, str]], FloatArray]
+"""Round, reference and sensor -> measured minus nominal marker position in R, m, (3,)."""
 
 
 class ReferenceWatch:
@@ -50,7 +56,7 @@ class ReferenceWatch:
     markers
         Nominal positions in the tool frame, m, (3,).
     stop_m
-        Two first rounds that lie further apart than this tell nothing of later changes, m.
+        Two first rounds that lie further apart than this show nothing of later changes, m.
     false_alarm
         See `FALSE_ALARM`.
 
@@ -93,7 +99,7 @@ class ReferenceWatch:
         self._rounds[-1].rows[key] = reading
 
     def begins_round(self, reading: ReferenceReading) -> bool:
-        """Tell whether `add` would take a reading for the first of another round."""
+        """Return whether `add` would take a reading for the first of another round."""
         return not self._open or self._key(reading) in self._rounds[-1].rows
 
     def _key(self, reading: ReferenceReading) -> tuple[int, str]:
@@ -126,7 +132,14 @@ class ReferenceWatch:
         number = len(self._rounds) - 1
         if number < 0 or self._rounds[number].judged:
             return self.change
-        noise = self._noise(T_R_N)
+        off = {
+            (i, key): self._off(row, T_R_N[row.sensor])
+            for i, one in enumerate(self._rounds)
+            for key, row in one.rows.items()
+            if row.sensor in T_R_N
+        }
+        found = {name: self._noise(name, off) for name in T_R_N}
+        noise = {name: level for name, level in found.items() if level is not None}
         self._rounds[number].judged = True
         if number == 1:
             return self._unsteady(noise)
@@ -134,17 +147,17 @@ class ReferenceWatch:
             return self.change
         self._tests += 1
         alpha = self._false_alarm * 6.0 / (np.pi * self._tests) ** 2
-        p_value = self._p_value(number, noise, T_R_N)
+        p_value = self._p_value(number, noise, off)
         self.change = None
         if p_value < alpha:
-            self.change = self._explain(number, noise, T_R_N, p_value)
+            self.change = self._explain(number, noise, off, p_value)
         self._rounds[number].alarmed = self.change is not None
         return self.change
 
     # Noise
 
-    def _noise(self, T_R_N: Mapping[str, FloatArray]) -> dict[str, tuple[float, int]]:
-        """Return standard deviation per axis, m, and degrees of freedom, by sensor.
+    def _noise(self, sensor: str, off: Displacements) -> Noise | None:
+        """Return the noise of a sensor; None where it is not known yet.
 
         From the differences of successive rounds in which nothing was found: of the first two, and
         of later ones as they come. A slow drift makes hardly any, so it is not taken for noise.
@@ -156,33 +169,24 @@ class ReferenceWatch:
             for i in range(1, self.rounds)
             if i == 1 or (quiet[i - 1] and quiet[i] and i not in self._begins)
         ]
-        found = {}
-        for sensor in T_R_N:
-            pairs = [
-                (self._rounds[i - 1].rows[key], row, i)
-                for i in steps
-                for key, row in self._rounds[i].rows.items()
-                if key[1] == sensor and key in self._rounds[i - 1].rows
-            ]
-            T = T_R_N[sensor]
-            apart = np.array([self._off(b, T) - self._off(a, T) for a, b, _ in pairs])
-            if apart.size < FEWEST_FREEDOMS:
-                continue
-            known = [
-                float(np.mean(row.std**2)) / max(row.samples, 1)
-                for pair in pairs
-                for row in pair[:2]
-                if row.std is not None
-            ]
-            least = float(np.mean(known)) if known else 0.0
-            variance = max(float(np.mean(apart**2)) / 2.0, least, LEAST_STD_M**2)
-            # Successive differences share readings: each further one counts two thirds.
-            own = 3 * sum(i == 1 for _, _, i in pairs)
-            freedoms = own + int((apart.size - own) * 2 / 3)
-            found[sensor] = float(np.sqrt(variance)), freedoms
-        return found
+        pairs = [
+            (i, key)
+            for i in steps
+            for key in self._rounds[i].rows
+            if key[1] == sensor and (i - 1, key) in off
+        ]
+        apart = np.array([off[i, key] - off[i - 1, key] for i, key in pairs])
+        if apart.size < FEWEST_FREEDOMS:
+            return None
+        read = [self._rounds[j].rows[key] for i, key in pairs for j in (i - 1, i)]
+        own = [np.mean(row.std**2) / max(row.samples, 1) for row in read if row.std is not None]
+        least = float(np.mean(own)) if own else 0.0
+        variance = max(float(np.mean(apart**2)) / 2.0, least, LEAST_STD_M**2)
+        # Successive differences share readings: each further one counts two thirds.
+        first = 3 * sum(i == 1 for i, _ in pairs)
+        return float(np.sqrt(variance)), first + int((apart.size - first) * 2 / 3)
 
-    def _unsteady(self, noise: Mapping[str, tuple[float, int]]) -> SetupChange | None:
+    def _unsteady(self, noise: Mapping[str, Noise]) -> SetupChange | None:
         """Return that the first two rounds lie so far apart that nothing is seen by them."""
         if not noise:
             return None
@@ -206,13 +210,16 @@ class ReferenceWatch:
         nominal = self._chain.positions(row.q, self._markers[row.marker])
         return np.asarray(transforms.apply(T_R_N, row.position) - nominal)
 
+    def _place(self, row: ReferenceReading) -> Place:
+        return Place(row.q, row.sensor, row.marker, self._markers[row.marker])
+
     # Changes
 
     def _p_value(
         self,
         number: int,
-        noise: Mapping[str, tuple[float, int]],
-        T_R_N: Mapping[str, FloatArray],
+        noise: Mapping[str, Noise],
+        off: Displacements,
     ) -> float:
         """Return the p-value that a round is as the first ones were.
 
@@ -221,21 +228,16 @@ class ReferenceWatch:
         of them, which finds a change in one direction far sooner.
         """
         first = [self._begin] if self._begin else [0, 1]
-        places, rows = [], []
+        places, stds, scaled = [], [], []
         for key, row in self._rounds[number].rows.items():
-            before = [self._rounds[i].rows.get(key) for i in first]
-            if key[1] not in noise:
-                continue
-            T = T_R_N[key[1]]
-            offs = [self._off(b, T) for b in before if b is not None]
-            if offs:
-                std = noise[key[1]][0] * np.sqrt(1.0 + 1.0 / len(offs))
-                rows.append((std, (self._off(row, T) - np.mean(offs, axis=0)) / std))
-                places.append(Place(row.q, row.sensor, row.marker, self._markers[row.marker]))
-        if not rows:
+            before = [off[i, key] for i in first if (i, key) in off]
+            if row.sensor in noise and before:
+                stds.append(noise[row.sensor][0] * np.sqrt(1.0 + 1.0 / len(before)))
+                scaled.append((off[number, key] - np.mean(before, axis=0)) / stds[-1])
+                places.append(self._place(row))
+        if not places:
             return 1.0
-        std = np.array([row[0] for row in rows])
-        z = np.array([row[1] for row in rows])
+        std, z = np.array(stds), np.array(scaled)
         whole, single = [], []
         for sensor, (_, freedoms) in noise.items():
             mine = z[[place.sensor == sensor for place in places]]
@@ -254,8 +256,8 @@ class ReferenceWatch:
     def _explain(
         self,
         number: int,
-        noise: Mapping[str, tuple[float, int]],
-        T_R_N: Mapping[str, FloatArray],
+        noise: Mapping[str, Noise],
+        displacements: Displacements,
         p_value: float,
     ) -> SetupChange:
         """Find the cause, and when it came, that explain the rounds best (by BIC)."""
@@ -272,18 +274,16 @@ class ReferenceWatch:
         at = np.array([i for i, _ in rows])
         read = [self._rounds[i].rows[keys[g]] for i, g in rows]
         scale = np.array([1.0 / noise[row.sensor][0] for row in read])[:, None]
-        off = np.array([self._off(row, T_R_N[row.sensor]) for row in read])
+        off = np.array([displacements[i, keys[g]] for i, g in rows])
         y = _centered(off, group) * scale
         stamps = np.array([row.stamp_s for row in read])
-        places = [
-            Place(row.q, row.sensor, row.marker, self._markers[row.marker])
-            for row in (self._rounds[number].rows[key] for key in keys)
-        ]
+        places = [self._place(self._rounds[number].rows[key]) for key in keys]
         steps = [i for i in rounds if i > self._begin and (i > 1 or self._begin)]
-        patterns: list[tuple[int | None, FloatArray]] = []
-        patterns += [(i, (at >= i).astype(float)) for i in steps]
+        patterns: list[tuple[int | None, FloatArray]] = [
+            (i, (at >= i).astype(float)) for i in steps
+        ]
         if len(steps) > 1:
-            # One later round cannot tell a drift from a step.
+            # With one later round a drift and a step look the same.
             span = max(float(np.ptp(stamps)), 1e-9)
             patterns.append((None, (stamps - stamps.min()) / span))
         fits: list[tuple[float, float, FloatArray, Cause, int | None]] = []
@@ -317,7 +317,7 @@ class ReferenceWatch:
             return SetupChange('unexplained', subject, False, size, None, after, before, p_value)
         alike = {
             other.subject
-            for value, _, _, other, when in fits
+            for value, _, _, other, _ in fits
             if value < score + LOOKS_ALIKE and other.subject != cause.subject
         }
         size = float(np.max(np.linalg.norm(cause.jacobian @ theta, axis=-1)))

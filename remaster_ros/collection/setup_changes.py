@@ -102,16 +102,7 @@ class SetupChanges:
         """
         new = False
         for reading in readings:
-            row = ReferenceReading(
-                configuration,
-                reading.sensor,
-                reading.marker,
-                reading.q,
-                reading.position,
-                reading.stamp_s,
-                reading.std,
-                reading.samples,
-            )
+            row = ReferenceReading(**vars(reading), configuration=configuration)
             if self._watch.rounds and self._watch.begins_round(row):
                 new |= self.judge(T_R_N)
             self._watch.add(row)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from typing import Any, Protocol, TypeVar
 
 from remaster_ros.collection.events import RecorderState
 from remaster_ros.collection.required_sensors import RequiredSensors
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, PoseVisit, Tour
+from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.types import FloatArray
 
 Result = TypeVar('Result')
@@ -37,21 +38,8 @@ class PlanMemory(Protocol):
         """Remember what became of a solution of the stop."""
 
 
-class TourMaker(Protocol):
-    """Plans tours; see `nodes.tour_planner.TourPlanner`."""
-
-    def registration(self) -> Tour:
-        """Return a tour for the first registration of the sensors."""
-
-    def collection(self, T_R_N: Mapping[str, FloatArray]) -> Tour:
-        """Return the tour before sensors that stand there."""
-
-    def standing_trouble(self, q: FloatArray) -> str:
-        """Return what an arm at `q` stands too near to; ''."""
-
-
 class Planning(Protocol):
-    """Does one thing at a time beside the callbacks; see `nodes.tour_planner.PlanningThread`."""
+    """Does one thing at a time beside the callbacks; see `nodes.planning_thread`."""
 
     def ask(self, what: object, q: FloatArray, job: Callable[[], Result]) -> tuple[Result] | None:
         """Return what a job found, in a tuple; None while it works."""
@@ -83,7 +71,7 @@ class TourProgress:
         Why the next pose cannot be planned from where the arm stands; ''.
     """
 
-    def __init__(self, memory: PlanMemory, tours: TourMaker, planning: Planning) -> None:
+    def __init__(self, memory: PlanMemory, tours: TourPlanner, planning: Planning) -> None:
         self._memory, self._tours, self._planning = memory, tours, planning
         tour = memory.tour
         self.resumed = tour is not None and tour.visited > 0
@@ -221,7 +209,7 @@ class TourProgress:
         """Open the next stop, in a tuple; None in it at the end; None while it is planned."""
         tour = self._memory.tour
         assert tour is not None
-        standing = self._tours.standing_trouble(q)
+        standing = self._tours.model.trouble(q)
         if standing:
             # The bridge halts such an arm and offers a way out; after it the arm is elsewhere.
             self.standing = f'the arm stands too near to something: {standing}'

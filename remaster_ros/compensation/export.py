@@ -3,9 +3,9 @@
 The true joint angle is the reported one plus the offset. Each way corrects all of it, so only one
 may be in use at a time.
 
-An offset that the data cannot tell is in none of the three: its mean is a choice of the fit (0, or
-where the marker's nominal place leads), and applied it would move the arm for no reason. Each file
-says which joints are left out, and why.
+An offset that the data do not determine is in none of the three: its mean is a choice of the fit
+(0, or where the marker's nominal place leads), and applied it would move the arm for no reason.
+Each file lists the joints that are left out, and why.
 """
 
 from __future__ import annotations
@@ -45,26 +45,26 @@ def exports(result: FitResult) -> dict[str, str]:
             result.session.urdf,
             result.chain,
             np.where(result.identifiable, result.joint_offsets, 0.0),
-            notes=(
-                *(f'CHECK FIRST: {line}' for line in result.implausible),
-                *(
-                    f'left out, not identifiable: {joint}: {why}'
-                    for joint, why in left_out(result).items()
-                ),
-            ),
+            _notes(result),
         ),
     }
 
 
+def _notes(result: FitResult) -> list[str]:
+    """Return the warnings for the user of a file, a line each."""
+    return [
+        *(f'CHECK FIRST: {line}' for line in result.implausible),
+        *(
+            f'left out, not identifiable: {joint}: {" ".join(why.split())}'
+            for joint, why in left_out(result).items()
+        ),
+    ]
+
+
 def left_out(result: FitResult) -> dict[str, str]:
-    """Return the joints whose offsets are not applied -> what the data cannot tell them from."""
-    return {
-        joint: why
-        for joint, known, why in zip(
-            result.joint_names, result.identifiable, result.why, strict=True
-        )
-        if not known
-    }
+    """Return the joints whose offsets are not applied, and why."""
+    unknown = np.flatnonzero(~result.identifiable)
+    return {result.joint_names[i]: result.why[i] for i in unknown}
 
 
 def remaster_text(result: FitResult) -> str:
@@ -91,9 +91,9 @@ def remaster_text(result: FitResult) -> str:
             f'2. An offset layer between planner and controller: {LAYER_FILE}.',
             f'3. A corrected robot model for planner and controller: {URDF_FILE}.',
             '',
-            *((head, *rows) if rows else ('  No joint: these data tell no offset.',)),
-            *(('', 'Left out of all three, as the data cannot tell their offsets. Leave these',
-               'joints as they are:', *notes) if notes else ()),
+            *((head, *rows) if rows else ('  No joint: these data determine no offset.',)),
+            *(('', 'Left out of all three, as the data do not determine their offsets. Leave',
+               'these joints as they are:', *notes) if notes else ()),
             '',
             'Afterwards measure a few poses again and run "remaster accuracy": it shows whether',
             'the offsets are in use.',
@@ -110,22 +110,18 @@ def layer_text(result: FitResult) -> str:
         '#   angle to the planner      = reported angle + offset\n'
         "# Shift the joint limits as well: the controller's limits apply to its own angles.\n"
     )  # fmt: skip
-    for line in result.implausible:
-        head += f'# CHECK FIRST: {line}\n'
-    missing = left_out(result)
-    for joint, why in missing.items():
-        head += f'# Left out, not identifiable: {joint}: {" ".join(why.split())}\n'
+    head += ''.join(f'# {note}\n' for note in _notes(result))
     known = np.flatnonzero(result.identifiable)
     lists: dict[str, list[str] | list[float]] = {
         'joint_names': [result.joint_names[i] for i in known],
         'joint_offsets': [float(result.joint_offsets[i]) for i in known],
         'joint_offsets_std': [float(result.joint_offsets_std[i]) for i in known],
-        'left_out': list(missing),
+        'left_out': list(left_out(result)),
     }
     parameters = {
         'robot': result.chain.name,
         'urdf_sha256': result.session.urdf_sha256,
-        # ROS cannot tell the type of an empty list.
+        # ROS has no type for an empty list.
         **{key: values for key, values in lists.items() if values},
     }
     return head + dump_yaml({'/**': {'ros__parameters': parameters}})
@@ -153,7 +149,7 @@ def calibrated_urdf(
     joint_offsets
         rad, (k,).
     notes
-        What else a comment in the file says, such as the joints left out.
+        Further comments in the file, such as the joints left out.
     """
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
     root = ElementTree.fromstring(urdf, parser)
@@ -194,7 +190,7 @@ def _rpy(rotation: FloatArray) -> tuple[float, float, float]:
     """Return roll, pitch, yaw of R = Rz(yaw) Ry(pitch) Rx(roll), exact at pitch ±90° too.
 
     The roll is taken after undoing the yaw, so that where the two act alike, an error in one is
-    made good by the other.
+    corrected by the other.
     """
     R = rotation
     yaw = np.arctan2(R[1, 0], R[0, 0])

@@ -188,7 +188,7 @@ def require_same_cell(session: Session, other: Session) -> None:
 
 
 def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
-    """Say how each cause did in the other session, or why that session cannot tell."""
+    """Return a sentence for each cause: how far it holds in the other session."""
     if not confirmation.same_offsets:
         least = min(confirmation.rms_before_m, confirmation.rms_after_m)
         return [
@@ -204,7 +204,7 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
 
 def _share_in_words(effect: FoundEffect, share: float) -> str:
     if not np.isfinite(share):
-        return f'{effect.cause} The other session cannot tell.'
+        return f'{effect.cause} The other session does not determine it.'
     if share > 0.5:
         return f'{effect.cause} Confirmed: {100 * share:.0f} % of its gain carries over.'
     if share > 0.1:

@@ -1,8 +1,8 @@
 """What the simulation gets wrong: its cause by name, the model extended by it, the gain measured.
 
-`discover_session` looks at what the offsets model leaves, screens every cell of place, driver and
-form, and adds what passes (`discovery_select`). Optimization rows decide; validation rows only
-measure the gain.
+`discover_session` takes the residuals of the offsets model, screens every cell (place, driver,
+form), and adds those that pass the tests of `stepwise_selection`. Optimization rows decide;
+validation rows only measure the gain.
 """
 
 from __future__ import annotations
@@ -74,7 +74,8 @@ class Discovery:
     fit
         The sampled fit, with the effects where there are any.
     thinning
-        Which part of a large session was searched, and what the rest says; None for all of it.
+        Which part of a large session was searched, and how the causes hold on the rest; None where
+        all of it was searched.
     """
 
     verdict: Verdict

@@ -27,7 +27,7 @@ from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.types import FloatArray
 
-# Columns whose norm falls below this share when the others are projected out say nothing new.
+# Columns whose norm falls below this share when the others are projected out add nothing.
 ABSORBED = 1e-4
 # Of the noise and smoothness coordinates, which are logarithms.
 STEPS = 60
@@ -91,7 +91,7 @@ def solve(
     *,
     prior: float | None = None,
 ) -> Solution | None:
-    """Fit a set of cells; None where the data cannot see one of them beside the others.
+    """Fit a set of cells; None where one of them adds nothing to the others.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def solve(
     if np.any(scale[free] == 0.0):
         return None
     # The penalty compares neighbours: one unit for all of a cell's splines, also for those at the
-    # edge, of which the data see nothing but rounding.
+    # edge, where no row has more than a rounding error.
     edges = np.cumsum([0, *(cell.size for cell in cells)])
     for cell, (first, last) in zip(cells, itertools.pairwise(edges), strict=True):
         if cell.penalty is not None:
@@ -126,7 +126,7 @@ def solve(
     try:
         return system.solution(start, log_prior_one_by_one(cells) if prior is None else prior)
     except np.linalg.LinAlgError:
-        # So nearly alike that rounding decides: they cannot be told apart.
+        # The columns agree up to rounding: they cannot be distinguished.
         return None
 
 
@@ -165,7 +165,7 @@ class _System:
         self.flat = self.grams.reshape(len(self.grams), -1)
 
     def visible(self) -> bool:
-        """Do unpenalised columns say something that the others, and the base, do not?"""
+        """Return whether the unpenalised columns add something to the others and to the base."""
         gram = self.grams.sum(axis=0)[:-1, :-1][np.ix_(self.order, self.order)]
         part = gram[: self.unpenalised, : self.unpenalised]
         try:

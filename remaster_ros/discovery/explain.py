@@ -1,4 +1,4 @@
-"""The chosen cells as causes: grouped by name, compared with their look-alikes, put in words."""
+"""The chosen cells as causes: grouped by name, compared with look-alikes, in sentences."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from remaster_ros.discovery.stepwise_selection import Selection
 
 # Look-alikes within this of the evidence are named; within the other, the leaders tie.
 CONFUSABLE = 5.0
-# Odds of twenty to one are no proof.
+# Odds of exp(3), twenty to one, do not decide between two causes.
 TIED = 3.0
 SHORTLIST = 10
 # The screening keeps the noise fixed, which costs it this much of the evidence.
@@ -71,10 +71,10 @@ class FoundEffect:
     size_m
         RMS of what it does to the marker after absorption, over the fitted rows, m.
     share
-        Of the gain on held-out poses, the causes added in their order; None where it was not the
-        residuals that told.
+        Of the gain on held-out poses, the causes added in their order; None where the cause was
+        found by how far the fit moved a marker, not in the residuals.
     tied
-        A look-alike that measurements could tell apart explains the data as well.
+        A look-alike that measurements could distinguish explains the data as well.
     """
 
     name: str
@@ -178,7 +178,7 @@ def _described(
 
 
 def _also_called(alike: Sequence[LookAlike]) -> str:
-    """Say which other names the same displacement has; '' where it has none."""
+    """Return a sentence with the other names of the same displacement; '' where it has none."""
     names = [
         f'{other.name.replace("_", " ")} of {_listed(other.joints)}'
         if other.joints
@@ -190,7 +190,7 @@ def _also_called(alike: Sequence[LookAlike]) -> str:
         return ''
     return (
         f' Exactly the same errors come from {" or ".join(names)}: no measurement of this marker '
-        'tells them apart, and either name corrects the arm.'
+        'distinguishes them, and either name corrects the arm.'
     )
 
 
@@ -234,7 +234,7 @@ def _look_alikes(
 
 
 def _same(data: Residuals, solution: Solution, cell: Cell, other: Cell) -> bool:
-    """Do two cells displace the marker alike, whatever the data's noise?"""
+    """Return whether two cells displace the marker alike in every row."""
     if cell.size != other.size or cell.driver != other.driver:
         return False
     base = data.base.reshape(3 * len(data), -1)
@@ -263,7 +263,7 @@ def _size(
 
 
 def separate_by(cell: Cell, other: Cell, same: bool) -> str:
-    """Say which measurements tell two causes apart."""
+    """Return which measurements distinguish two causes."""
     if same:
         return (
             'no pose of this marker can: both displace it alike '
@@ -277,7 +277,7 @@ def separate_by(cell: Cell, other: Cell, same: bool) -> str:
 
 
 def in_words(group: Sequence[Cell], context: Context) -> str:
-    """Return the sentence for a technician, with what the session cannot tell."""
+    """Return the sentence for a technician, with what the session leaves open."""
     first = group[0]
     joints = _joints(group)
     effect = EFFECTS[first.name]
@@ -295,7 +295,7 @@ def in_words(group: Sequence[Cell], context: Context) -> str:
     if not context.has_gravity and first.place == 'joint_angle' and 'angle' in first.driver:
         sentence += (
             ' It may be gravity that bends the arm: without link masses in the URDF '
-            'nobody can tell the two apart.'
+            'the two cannot be distinguished.'
         )
     return sentence
 

@@ -1,8 +1,8 @@
-"""Markers that are not where the session says: judged by how far the fit moved them.
+"""Markers that are not at their stated place: judged by how far the fit moved them.
 
-The offsets model fits the markers, so a wrong one leaves no residuals. With I the information of
-the data alone on a marker's position, everything else fitted, and d̂ their estimate, a marker known
-to s per axis gives u = I (d̂ − nominal) ~ N(0, I + s² I²) if the session is right.
+The offsets model fits the markers, so a wrong one leaves no residuals. Let I be the information of
+the data alone on a marker's position, everything else fitted, and d̂ their estimate. If the stated
+place is right to s per axis, then u = I (d̂ − stated) ~ N(0, I + s² I²).
 """
 
 from __future__ import annotations
@@ -19,18 +19,19 @@ from remaster_ros.discovery.explain import FoundEffect, Parameter
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.types import BoolArray, FloatArray, Priors, Session
 
-# What the prior pulled back is further off than the fit says.
+# The prior pulls the fitted marker back: its true place may be this many times further off.
 FURTHER = 3.0
 # Family-wise error over all markers.
 SIGNIFICANCE = 0.002
-# A direction counts where the data know it this many times better than the session, in variance.
+# A direction counts where the data determine it so many times better than the session states it,
+# in variance.
 KNOWN_BETTER = 4.0
-# An axis of the tool with this share in directions that the data cannot see is said to be hidden.
+# An axis of the tool with this share in directions that the data leave open is called hidden.
 HIDDEN = 0.1
 
 
 def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple[FoundEffect, ...]:
-    """Return an effect for every marker that the fit moved further than the session allows."""
+    """Return an effect for every marker that the fit moved beyond its stated accuracy."""
     model, problem = found.model, found.problem
     x = model.natural(found.mode.z)
     jacobian = model.natural_jacobian(x, data.rows)
@@ -72,7 +73,7 @@ def loosened(session: Session, moved: Sequence[FoundEffect]) -> Priors | None:
     Parameters
     ----------
     session
-        What says where they should be.
+        With their stated places.
     moved
         As `moved_markers` returns them; other effects count for nothing.
     """
@@ -86,7 +87,7 @@ def loosened(session: Session, moved: Sequence[FoundEffect]) -> Priors | None:
 
 
 def _unseen(moved: FloatArray, place: FloatArray, axes: FloatArray, seen: BoolArray) -> FloatArray:
-    """Return the covariance due to directions that the data cannot see, m², (3, 3).
+    """Return the covariance due to directions that the data leave open, m², (3, 3).
 
     A marker moves about as far in them as in the others. Around the last joint's axis it moves on
     a circle, which changes its radius at second order.
@@ -124,7 +125,7 @@ def _effect(
     if blind.any():
         unseen = ' and '.join(axis for axis, hidden in zip('xyz', blind, strict=True) if hidden)
         cause += (
-            f' How far along {unseen} of the tool these poses tell only in part: '
+            f' How far along {unseen} of the tool these poses determine only in part: '
             'around the last axis it trades with the zero-offset.'
         )
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))

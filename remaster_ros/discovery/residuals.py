@@ -1,6 +1,6 @@
 """What the discovery works on: the residuals of the offsets model, its noise, its absorption.
 
-The noise is that of `calibration.noise`, with the directions that the fit told apart. What
+The noise is that of `calibration.noise`, with the directions that the fit distinguishes. What
 registrations, offsets and markers can absorb is projected out with flat priors everywhere.
 """
 

@@ -10,9 +10,8 @@ scores as high: the family-wise error is held whatever the number of cells and t
 (Westfall & Young 1993). Surrogates of two kinds, and the larger p-value counts: signs of whole
 poses flipped at random, which holds for any symmetric noise independent between poses, of any
 spread (Winkler et al. 2014); and draws from the fitted noise, exact where that is Gaussian. A
-handful of poses has too few patterns of signs to tell anything (8 give 128, one of which is what
-was seen): there the whitened rows are flipped one by one, under the noise model's word that they
-are independent.
+few poses have too few patterns of signs (8 give 128, one of which is the observed one): there the
+whitened rows are flipped one by one, which relies on the noise model's independence.
 """
 
 from __future__ import annotations
@@ -124,8 +123,8 @@ class Screening:
     Attributes
     ----------
     score
-        Log evidence gained, with the prior probability of each cell, (cells,); -inf where the
-        data cannot see it.
+        Log evidence gained, with the prior probability of each cell, (cells,); -inf where it
+        adds nothing to the set.
     null
         Best score of any cell on each surrogate, of both kinds, (2, draws).
     """

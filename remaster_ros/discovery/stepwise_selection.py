@@ -1,11 +1,12 @@
-"""Which cells the residuals ask for: forward by the evidence, in groups, with second thoughts.
+"""Stepwise selection of cells: forward by the evidence, alone or in families, and backward.
 
 A round screens all cells beside the set found so far and tries the best of them, and every
-physical group as a whole (all joints sag, all links are off), less the members that do not pay.
+physical group as a whole (all joints compliant, all links wrong), less the members that do not
+raise the evidence.
 The proposal of the highest evidence joins if it passes two tests: its p-value over all cells
-tried, and its gain on poses left out in turn. After each round, members that no longer pay leave,
-and each is exchanged for whatever explains more in its place, since the first step sees a mixture
-of causes.
+tried, and its gain on poses left out in turn. After each round, cells that no longer raise the
+evidence are dropped, and each is swapped for what explains more in its place, because the first
+step acts on a mixture of causes.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ ROUNDS = 8
 FOLDS = 10
 # What leaves less than this share of the held-out error out is not worth a parameter.
 LEAST_GAIN = 0.01
-# The evidence must rise by this for an exchange: no to and fro between equals.
+# The evidence must rise by this for an exchange: equals are not exchanged again and again.
 HYSTERESIS = 0.5
 MOST_EXCHANGED = 6
 MOST_MERGED = 4
@@ -44,7 +45,7 @@ MOST_MERGED = 4
 WHOLE = 3
 # A member of a family has to raise the evidence by this: a free form of no size costs nothing.
 MEMBER = 1.0
-# A cell whose loss would cost this much evidence need not be tested by itself.
+# A cell whose removal would cost this much evidence is kept without a test by itself.
 BEYOND_DOUBT = 20.0
 
 
@@ -85,7 +86,7 @@ class Search:
     Attributes
     ----------
     data
-        The residuals; fewer or more rows as a better model tells gross errors better.
+        The residuals; fewer or more rows as a better model identifies gross errors better.
     cells
         All that are tried.
     rng
@@ -179,12 +180,12 @@ class Search:
         return best
 
     def _promising(self, family: tuple[str, ...], screening: Screening) -> bool:
-        """Does at least one member of a family raise the evidence by itself?"""
+        """Return whether at least one member of a family raises the evidence by itself."""
         mine = [cell.name in family for cell in self.catalogue.cells]
         return bool(np.any(screening.score[mine] > 0.0))
 
     def grown(self, solution: Solution, family: tuple[str, ...]) -> Solution | None:
-        """Return the set with all of a family that the data can see, less what does not pay."""
+        """Return the set with all of a family whose members each raise the evidence."""
         members = [
             cell
             for cell in self.catalogue.cells
@@ -257,7 +258,7 @@ class Search:
     def _best_exchange(self, solution: Solution) -> Solution | None:
         """Return the best fit with one cell, or two, replaced by one other; None if none gains."""
         best = None
-        # A family found as a whole stays one: part of it looks like many other things.
+        # A family found as a whole stays whole: a part of it resembles many other causes.
         loose = [cell for cell in solution.cells if relatives(solution.cells, cell) < WHOLE]
         removed = [{cell} for cell in loose]
         if len(loose) <= MOST_MERGED:
@@ -283,7 +284,7 @@ class Search:
         return solution
 
     def backward_elimination(self, solution: Solution) -> Solution:
-        """Drop, the weakest first, the members of families that do not pay by themselves.
+        """Drop, the weakest first, the members of families that fail the tests by themselves.
 
         A family passes its tests as a whole. Each member has still to raise the evidence, to
         predict poses left out, and to beat itself on surrogate residuals.
@@ -307,11 +308,11 @@ class Search:
             tested.add(cell)
             rest = (*solution.cells[:index], *solution.cells[index + 1 :])
             without = self.fit(rest, solution)
-            if without is not None and not self._pays(cell, without, solution):
+            if without is not None and not self._passes(cell, without, solution):
                 solution = without
 
-    def _pays(self, cell: Cell, without: Solution, solution: Solution) -> bool:
-        """Does a cell pass the tests of a step by itself?"""
+    def _passes(self, cell: Cell, without: Solution, solution: Solution) -> bool:
+        """Return whether a cell passes the tests of a step by itself."""
         if solution.log_evidence - without.log_evidence < MEMBER:
             return False
         if self.held_out_share(without, solution) <= 0.0:

@@ -1,12 +1,12 @@
-"""Large sessions: the search looks at some rows, and what it finds is held against the rest.
+"""Large sessions: part of the rows is searched, and the rest tests what was found.
 
 The search tries hundreds of causes on hundreds of surrogates, in memory that grows with the rows:
 0.1 MB each. An effect stands out of the noise with the root of their number, so beyond
 `MOST_ROWS` rows little is gained: an effect that 100,000 rows just show is a quarter of the size
 of one that 5,000 just show, a few hundredths of the noise of one reading. So the search is given
 a part of them, drawn evenly over time and sensors. Everything else works on all rows: the offsets
-before, the sampled model with the causes, the gain. And the rows that the search has not seen
-tell whether its causes, frozen, hold.
+before, the sampled model with the causes, the gain. The rows that were not
+searched test the causes with their parameters frozen.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from remaster_ros.types import FloatArray, IntArray, Measurements
 MOST_ROWS = 5_000
 """Sessions of fewer are searched whole."""
 FEWEST_POSES = 500
-"""Of the poses that the same sensors saw: rather fewer rows of each than fewer poses."""
+"""Of the poses that the same sensors measured: fewer rows of each are drawn before fewer poses."""
 FEWEST_ROWS = 2
 """Of a sensor at a pose: what is common to a pose shows in no single row."""
 
 
 @dataclass(frozen=True)
 class Thinning:
-    """What the search looked at, and what the other rows say of it.
+    """Which rows were searched, and how the causes hold on the others.
 
     Attributes
     ----------
@@ -54,8 +54,8 @@ def draw_rows(
 ) -> IntArray:
     """Return about `most` of the given rows, drawn evenly over time; all where they are fewer.
 
-    Whole poses are drawn, one of every few consecutive ones that the same sensors saw. Where that
-    would leave few poses, `FEWEST_POSES` are, with fewer rows of each.
+    Whole poses are drawn, one of every few consecutive ones that the same sensors measured. Where
+    that would leave few poses, `FEWEST_POSES` are, with fewer rows of each.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def judge_by_others(
     Parameters
     ----------
     data
-        The residuals that were searched; they know all rows.
+        The residuals that were searched; ``context`` has all rows.
     rows, searched
         Indices of the rows that could have been searched, and of those that were.
     empty, solution

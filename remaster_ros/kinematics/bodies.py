@@ -9,6 +9,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,16 +23,14 @@ from remaster_ros.types import FloatArray, IntArray
 _SIDES = 32
 # More points than this are replaced by the corners of the box around them.
 _MOST_POINTS = 60
+# Corners of a cube of edge length 2 about the origin, (8, 3).
+_CUBE = np.array(list(product((-1.0, 1.0), repeat=3)))
 _GOLDEN = (1 + 5**0.5) / 2
-# Corners of a regular dodecahedron with the unit sphere inside it, (20, 3).
-_AROUND_A_BALL = np.array(
-    [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
-    + [
-        np.roll([0, a / _GOLDEN, b * _GOLDEN], turn).tolist()
-        for a in (-1, 1)
-        for b in (-1, 1)
-        for turn in range(3)
-    ]
+_RECTANGLE = _CUBE[:4] * (0.0, 1 / _GOLDEN, _GOLDEN)
+# Corners of a regular dodecahedron with the unit sphere inside it, (20, 3): those of a cube and of
+# three rectangles.
+_AROUND_A_BALL = np.concatenate(
+    [_CUBE, *(np.roll(_RECTANGLE, turn, axis=1) for turn in range(3))]
 ) / (3**0.5 * 0.7946544722917661)
 
 
@@ -94,7 +93,7 @@ class Shape:
             volume = np.pi * radius**2 * (high - low) + 4 / 3 * np.pi * radius**3
             if volume < best[3]:
                 best = (centre + low * axis, centre + high * axis, radius, volume)
-        # A hair for rounding: the points lie on the surface.
+        # Somewhat wider, for rounding: the points lie on the surface.
         return best[0], best[1], best[2] + 1e-9
 
     @property
@@ -106,8 +105,7 @@ class Shape:
 def box(size_m: ArrayLike) -> Shape:
     """Return a box with these edge lengths along x, y, z, m, (3,)."""
     size = _positive('box', size_m, 3)
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    return Shape('box', corners * size / 2)
+    return Shape('box', _CUBE * size / 2)
 
 
 def cylinder(radius_m: float, length_m: float) -> Shape:
@@ -134,7 +132,7 @@ def hull(points: ArrayLike) -> Shape:
     Raises
     ------
     InputError
-        Points that are not finite, or that all lie in one plane: nothing can be inside.
+        Points that are not finite, or that all lie in one plane and so enclose nothing.
     """
     points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1:] != (3,) or not np.all(np.isfinite(points)):
@@ -220,6 +218,4 @@ def enclosing_points(points: FloatArray) -> FloatArray:
     if len(points) <= _MOST_POINTS:
         return points
     low, high = points.min(axis=0), points.max(axis=0)
-    return (
-        np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
-    )
+    return low + (_CUBE + 1.0) / 2 * (high - low)

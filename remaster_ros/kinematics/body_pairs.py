@@ -76,7 +76,7 @@ class BodyPairs:
     most_kept
         The largest clearance of each pair, m, (P,).
     left_out
-        What is not checked, or only for contact, and why, in words.
+        The pairs that are not checked, or only for contact, and why.
     """
 
     def __init__(
@@ -125,16 +125,10 @@ class BodyPairs:
         shapes = [body.shape for body in self.bodies]
         links = np.where(self.is_floor, 0, self._link[inner] if len(self._link) else 0)
         # A box that stands still bounds flat and long bodies better than a capsule around it.
-        self._is_box = np.array(
-            [i >= 0 and self._link[i] == 0 and shapes[i].kind == 'box' for i in inner], dtype=bool
-        )
-        self._is_exact = np.array(
-            [
-                i >= 0 and shapes[i].is_its_capsule and shapes[j].is_its_capsule
-                for i, j in zip(inner, outer)
-            ],
-            dtype=bool,
-        )
+        is_box = np.array([b.link == 0 and b.shape.kind == 'box' for b in self.bodies], dtype=bool)
+        self._is_box = ~self.is_floor & is_box[inner]
+        is_capsule = np.array([shape.is_its_capsule for shape in shapes], dtype=bool)
+        self._is_exact = ~self.is_floor & is_capsule[inner] & is_capsule[outer]
         joints = np.arange(1, len(self.chain) + 1)
         between = joints > links[:, None]
         # A first joint about the vertical moves nothing up or down.
@@ -212,10 +206,7 @@ class BodyPairs:
         frames[:, 0] = np.eye(4)
         frames[:, 1:] = self.chain.frames(q)
         own = frames[:, self._link]
-        rotation, origin = own[..., :3, :3], own[..., :3, 3]
-        a = (rotation @ self._a[:, :, None])[..., 0] + origin
-        b = (rotation @ self._b[:, :, None])[..., 0] + origin
-        return Placed(frames, a, b)
+        return Placed(frames, apply(own, self._a), apply(own, self._b))
 
     def lower_bounds(self, placed: Placed) -> FloatArray:
         """Return what each pair is apart at least, m, (n, P)."""
@@ -243,7 +234,7 @@ class BodyPairs:
     def kept(self, placed: Placed, rows: IntArray, pairs: IntArray) -> FloatArray:
         """Return the clearance of pairs (c,) at configurations (c,), m, (c,)."""
         frames = placed.frames[rows, 1:]
-        axes = (frames[..., :3, :3] @ self.chain.axes[:, :, None])[..., 0]
+        axes = self.chain.axes_in_base(frames)
         own = self.outer[pairs]
         ends = np.stack((placed.a[rows, own], placed.b[rows, own]), axis=1)
         arms = np.cross(axes[:, None], ends[:, :, None] - frames[:, None, :, :3, 3])
@@ -257,7 +248,7 @@ class BodyPairs:
         )
         levers = np.where(self._between[pairs], levers, 0.0)
         kept = self.margin + self.unknown_offset * np.linalg.norm(levers, axis=1)
-        # At most what the bound says: the capsule around a body is wider than the body.
+        # Not above the bound: the capsule around a body is wider than the body.
         return np.minimum(kept, self.most_kept[pairs])
 
     def on_top(self, extra: float) -> FloatArray:
@@ -292,7 +283,7 @@ class BodyPairs:
     ) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
         """Return what may be too near: rows, pairs, what is kept, and whether it is decided.
 
-        What needs no coal is measured; of that only what is too near is returned.
+        Pairs that need no coal are measured at once, and returned only if they are too near.
         """
         on_top = self.on_top(extra)
         may = bounds < self.most_kept + on_top

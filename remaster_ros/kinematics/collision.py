@@ -1,4 +1,4 @@
-"""Is a configuration, or the whole way between two, free of collisions, with clearance?
+"""Whether a configuration, or the whole way between two, is free of collisions, with clearance.
 
 The arm is a set of convex `bodies`; so are the obstacles, and the floor is a plane. Bounding
 capsules, all at once in NumPy, exclude most pairs; what they cannot exclude is measured by coal
@@ -100,7 +100,7 @@ class CollisionModel:
     bodies
         All bodies, by link.
     left_out
-        What is not checked, or only for contact, and why, in words.
+        The pairs that are not checked, or only for contact, and why.
     """
 
     def __init__(
@@ -133,20 +133,20 @@ class CollisionModel:
         self._pairs = BodyPairs(chain, self.bodies, floor_z, margin, unknown_offset)
         self.left_out = self._pairs.left_out
 
-    # What is asked
+    # Single configurations and paths
 
     def trouble(self, q: ArrayLike, extra: float = 0.0) -> str:
-        """Say what is too near at a configuration, rad, (k,); '' where it is free.
+        """Return what is too near at a configuration, rad, (k,); '' where it is free.
 
         `extra` is kept on top of the clearance, m.
         """
         found = self.shortfalls(np.asarray(q, dtype=float)[None], extra)
         if not found:
             return ''
-        return self.words(min(found, key=lambda short: short.distance - short.kept))
+        return self.describe(min(found, key=lambda short: short.distance - short.kept))
 
     def path_trouble(self, waypoints: ArrayLike, extra: float = 0.0) -> str:
-        """Say what is wrong on the way along configurations (n, k), straight in joint space.
+        """Return what is wrong on the way along configurations (n, k), straight in joint space.
 
         Parameters
         ----------
@@ -173,11 +173,11 @@ class CollisionModel:
         for start, end in pairwise(q):
             found = self._sweep(start, end, extra)
             if found is not None:
-                return f'on the way, {self.words(found)}'
+                return f'on the way, {self.describe(found)}'
         return ''
 
     def escape_trouble(self, waypoints: ArrayLike, *, ends_free: bool = True) -> str:
-        """Say what is wrong with a way out (n, k) of a margin or a contact; '' for nothing.
+        """Return what is wrong with a way out (n, k) of a margin or a contact; '' for nothing.
 
         What is too near at its start never comes nearer on the way (by more than 0.1 mm from one
         check to the next), everything else stays as far as is kept, the end is free (with
@@ -206,12 +206,12 @@ class CollisionModel:
         for i, now in enumerate(at):
             for pair, short in now.items():
                 if pair not in first:
-                    return f'on the way out, {self.words(short)}'
+                    return f'on the way out, {self.describe(short)}'
                 before = at[i - 1].get(pair) if i else short
                 if before is None or short.distance < before.distance - ESCAPE_TOLERANCE_M:
-                    return f'on the way out it comes nearer: {self.words(short)}'
+                    return f'on the way out it comes nearer: {self.describe(short)}'
         if ends_free and at[-1]:
-            return f'at the end of the way out, {self.words(next(iter(at[-1].values())))}'
+            return f'at the end of the way out, {self.describe(next(iter(at[-1].values())))}'
         return ''
 
     def travel(self, start: FloatArray, end: FloatArray) -> float:
@@ -240,11 +240,11 @@ class CollisionModel:
         return reasons
 
     def free_mask(self, q: ArrayLike, extra: float = 0.0) -> BoolArray:
-        """Tell which configurations (m, k) are free, (m,)."""
+        """Return which configurations (m, k) are free, (m,)."""
         return self.reasons(q, extra) == ''
 
     def hides(self, q: ArrayLike, marker_T: ArrayLike, sensor_R: ArrayLike) -> BoolArray:
-        """Tell whether a link stands between a marker and a sensor; see `LinkCapsules.hides`."""
+        """Return whether a link stands between marker and sensor; see `LinkCapsules.hides`."""
         return self._sight.hides(q, marker_T, sensor_R)
 
     @cached_property
@@ -269,8 +269,8 @@ class CollisionModel:
         """
         return self._pairs.examine(self._pairs.place(q), extra, first=first)[0]
 
-    def words(self, short: Shortfall) -> str:
-        """Put a shortfall into words."""
+    def describe(self, short: Shortfall) -> str:
+        """Return a shortfall as text."""
         inner, outer = self._pairs.names(short.pair)
         kept = f'{1e3 * short.kept:.0f} mm is kept'
         if short.distance < 0.0:
@@ -278,7 +278,7 @@ class CollisionModel:
         return f'{outer} {1e3 * short.distance:.0f} mm from {inner}, {kept}'
 
     def _limit_trouble(self, q: FloatArray) -> str:
-        """Say which waypoint (n, k) is outside the joint limits."""
+        """Return which waypoint (n, k) is outside the joint limits; '' for none."""
         chain = self.chain
         over = np.maximum(chain.lower - q, q - chain.upper)
         if np.max(over) <= _LIMIT_TOLERANCE_RAD:

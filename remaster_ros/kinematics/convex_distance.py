@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.kinematics.bodies import Shape, triangles
+from remaster_ros.kinematics.transforms import transform, with_z_along
 from remaster_ros.types import FloatArray
 
 
@@ -81,17 +82,8 @@ class ConvexDistances:
         along = end - start
         length = float(np.linalg.norm(along))
         if length < 1e-9:
-            return coal.Sphere(shape.ball), T @ _placed(start, np.eye(3))
-        z = along / length
-        x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
-        x /= np.linalg.norm(x)
-        own = T @ _placed((start + end) / 2, np.column_stack((x, np.cross(z, x), z)))
+            return coal.Sphere(shape.ball), T @ transform(np.eye(3), start)
+        own = T @ transform(with_z_along(along), (start + end) / 2)
         if shape.kind == 'capsule':
             return coal.Capsule(shape.ball, length), own
         return coal.Cylinder(shape.disc, length), own
-
-
-def _placed(origin: FloatArray, rotation: FloatArray) -> FloatArray:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation, origin
-    return T

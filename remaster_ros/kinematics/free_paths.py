@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,7 +27,7 @@ _POINT_COST = 0.2  # of looking at one configuration, in segments
 WAY_OUT_STEP_M = 0.004
 """No point of the arm moves more in a step of a way out."""
 WAY_OUT_STEPS = 120
-"""Steps of a way out at most: half a metre. Whoever is further in is freed by hand."""
+"""Steps of a way out at most: half a metre. An arm that is deeper inside is freed by hand."""
 
 
 def free_path(
@@ -100,6 +101,22 @@ def _intermediates(
         yield [between]
 
 
+class _Node(NamedTuple):
+    """A configuration of a tree, rad, (k,), and the node that it was reached from."""
+
+    q: FloatArray
+    parent: _Node | None
+
+    def branch(self) -> list[FloatArray]:
+        """Return the configurations from this one back to the root."""
+        branch = [self.q]
+        node = self.parent
+        while node is not None:
+            branch.append(node.q)
+            node = node.parent
+        return branch
+
+
 class _Search:
     """Counts the effort, and grows two trees towards each other (RRT-connect)."""
 
@@ -129,8 +146,7 @@ class _Search:
         chain = self._model.chain
         low = np.maximum(chain.lower, np.minimum(self._start, self._end) - np.pi)
         high = np.minimum(chain.upper, np.maximum(self._start, self._end) + np.pi)
-        trees = ([self._start], [self._end])
-        parents: tuple[list[int], list[int]] = ([-1], [-1])
+        trees = [_Node(self._start, None)], [_Node(self._end, None)]
         side = 0
         while not self.is_out_of_effort:
             # Half of the draws lie about the straight way, where the way around often is.
@@ -141,36 +157,30 @@ class _Search:
             if not self._model.free_mask(draw[None], self._extra)[0]:
                 self._left -= _POINT_COST
                 continue
-            new = self._extend(trees[side], parents[side], draw)
-            if new is not None:
-                met = self._reach(trees[1 - side], parents[1 - side], trees[side][new])
-                if met is not None:
-                    here = _branch(trees[side], parents[side], new)
-                    there = _branch(trees[1 - side], parents[1 - side], met)
-                    way = [*here[::-1], *there[1:]]
-                    return way if side == 0 else way[::-1]
+            new = self._extend(trees[side], draw)
+            met = None if new is None else self._reach(trees[1 - side], new.q)
+            if new is not None and met is not None:
+                way = [*new.branch()[::-1], *met.branch()[1:]]
+                return way if side == 0 else way[::-1]
             side = 1 - side
         return None
 
-    def _extend(self, tree: list[FloatArray], parents: list[int], goal: FloatArray) -> int | None:
+    def _extend(self, tree: list[_Node], goal: FloatArray) -> _Node | None:
         """Grow a tree one step towards a configuration; return the new node."""
-        distances = np.max(np.abs(np.array(tree) - goal), axis=1)
-        nearest = int(np.argmin(distances))
-        share = min(1.0, REACH_RAD / max(float(distances[nearest]), 1e-9))
-        new = tree[nearest] + share * (goal - tree[nearest])
-        if not self.is_free(tree[nearest], new):
+        distances = np.max(np.abs(np.array([node.q for node in tree]) - goal), axis=1)
+        nearest = tree[int(np.argmin(distances))]
+        share = min(1.0, REACH_RAD / max(float(np.min(distances)), 1e-9))
+        new = _Node(nearest.q + share * (goal - nearest.q), nearest)
+        if not self.is_free(nearest.q, new.q):
             return None
         tree.append(new)
-        parents.append(nearest)
-        return len(tree) - 1
+        return new
 
-    def _reach(self, tree: list[FloatArray], parents: list[int], goal: FloatArray) -> int | None:
+    def _reach(self, tree: list[_Node], goal: FloatArray) -> _Node | None:
         """Grow a tree until it is at a configuration; None where something is in the way."""
         while not self.is_out_of_effort:
-            new = self._extend(tree, parents, goal)
-            if new is None:
-                return None
-            if np.max(np.abs(tree[new] - goal)) < 1e-12:
+            new = self._extend(tree, goal)
+            if new is None or np.max(np.abs(new.q - goal)) < 1e-12:
                 return new
         return None
 
@@ -197,15 +207,6 @@ class _Search:
             if self.is_free(first, second):
                 path[i + 1 : j + 1] = [first, second]
         return np.array(path)
-
-
-def _branch(tree: list[FloatArray], parents: list[int], node: int) -> list[FloatArray]:
-    """Return a tree's nodes from this one back to its root."""
-    branch = []
-    while node >= 0:
-        branch.append(tree[node])
-        node = parents[node]
-    return branch
 
 
 def way_out(

@@ -1,10 +1,10 @@
 """All analytical inverse-kinematics solutions of a pose, certified by forward kinematics.
 
-EAIK [1]_ decomposes arms of six free joints into closed-form subproblems. It wants exact geometry
-(axes that meet or are parallel to 1e-13), and at singular or unreachable poses it answers with
-least-squares angles, some of them wrong, or zero for an angle that is not determined. So it is
-given a cleaned model of the arm; its answers are corrected on the true model by Newton's method
-and kept only where forward kinematics confirms them.
+EAIK [1]_ decomposes arms of six free joints into closed-form subproblems. It needs exact geometry
+(axes that meet or are parallel to 1e-13), and at singular or unreachable poses it returns
+least-squares angles, some of them wrong, or zero for an angle that is not determined. So it gets
+a cleaned model of the arm; its results are corrected on the true model by Newton's method and
+kept only where forward kinematics confirms them.
 
 References
 ----------
@@ -24,8 +24,8 @@ from numpy.typing import ArrayLike
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.kinematics.transforms import inverse, rotation_angle, twist_logarithm
-from remaster_ros.types import FloatArray, JointSolution
+from remaster_ros.kinematics.transforms import inverse, twist_logarithm
+from remaster_ros.types import FloatArray
 
 FREE_JOINTS = 6
 
@@ -125,18 +125,6 @@ class InverseKinematics:
         q = self._towards_middle(q)
         return q[self.chain.within_limits(q, tolerance=1e-9)]
 
-    def solve(self, T: ArrayLike) -> list[JointSolution]:
-        """Return the joint solutions within limits, each with what forward kinematics leaves."""
-        T = np.asarray(T, dtype=float)
-        q = self.solutions(T)
-        left = inverse(self.chain.forward(q)) @ T
-        position_error = np.linalg.norm(left[:, :3, 3], axis=-1)
-        rotation_error = rotation_angle(left[:, :3, :3])
-        return [
-            JointSolution(row, float(position), float(rotation))
-            for row, position, rotation in zip(q, position_error, rotation_error, strict=True)
-        ]
-
     def _require_mobility(self) -> None:
         """Refuse held joints that leave the tool fewer than six ways to move, wherever it is.
 
@@ -177,7 +165,7 @@ class InverseKinematics:
         return _distinct(q)
 
     def _closed_form(self, part: _Decomposition, T: FloatArray) -> FloatArray:
-        """Return EAIK's answers for one combination of held values, junk among them, (m, k)."""
+        """Return EAIK's results for one combination of held values, also wrong ones, (m, k)."""
         without_tool_rotation = T.copy()
         without_tool_rotation[:3, :3] = T[:3, :3] @ part.rotation.T
         free = np.reshape(part.robot.IK(without_tool_rotation).Q, (-1, FREE_JOINTS))
@@ -256,10 +244,9 @@ def _cleaned(chain: SerialChain) -> SerialChain:
 
 
 def _may_have_closed_form(axes: FloatArray, origins: FloatArray) -> bool:
-    """Tell whether three successive axes are parallel, or the first or last three meet.
+    """Return whether three successive axes are parallel, or the first or last three meet.
 
-    All of EAIK's decompositions need one of these; asking it about other arms makes it write to
-    the terminal.
+    All of EAIK's decompositions need one of these; with other arms EAIK writes to the terminal.
     """
     neighbours = np.linalg.norm(np.cross(axes[:-1], axes[1:]), axis=1) < 1e-9
     if np.any(neighbours[:-1] & neighbours[1:]):

@@ -1,8 +1,7 @@
-"""Does the arm hide a marker from a sensor? Capsules around the links answer.
+"""Whether the arm hides a marker from a sensor, with a capsule around each link.
 
 A link is the set of points within ``radius`` of the straight line from its joint to the next one,
-which any URDF gives; meshes are not needed. Whether the arm hits something is another question,
-answered in `collision`.
+which any URDF gives; meshes are not needed. Collisions are checked in `collision`.
 """
 
 from __future__ import annotations
@@ -19,9 +18,10 @@ from remaster_ros.types import BoolArray, FloatArray
 
 @dataclass(frozen=True)
 class LinkCapsules:
-    """The arm as capsules: segment i runs from the origin of joint i to that of joint i + 1.
+    """The arm as capsules, each from the origin of a joint to that of the next one.
 
-    Segment 0 starts at the base frame, the last one ends at the tool frame.
+    The first one begins at the base frame. The link after the last joint carries the marker and is
+    left out: which way the marker faces decides there.
 
     Attributes
     ----------
@@ -41,20 +41,8 @@ class LinkCapsules:
                 f'line of sight: the link radius is {self.radius} m; it must be positive'
             )
 
-    def points(self, q: ArrayLike) -> FloatArray:
-        """Return the ends of the segments in R for q (..., k): m, (..., k + 2, 3)."""
-        frames = self.chain.frames(q)
-        tip = frames[..., -1, :, :] @ self.chain.T_fixed[-1]
-        points = np.zeros((*frames.shape[:-3], len(self.chain) + 2, 3))
-        points[..., 1:-1, :] = frames[..., :3, 3]
-        points[..., -1, :] = tip[..., :3, 3]
-        return points
-
     def hides(self, q: ArrayLike, marker_T: ArrayLike, sensor_R: ArrayLike) -> BoolArray:
-        """Tell whether a link stands between a marker and a sensor.
-
-        The last segment carries the marker and is left out: which way the marker faces decides
-        there.
+        """Return whether a link stands between a marker and a sensor.
 
         Parameters
         ----------
@@ -70,11 +58,11 @@ class LinkCapsules:
         ndarray
             (...).
         """
-        points = self.points(q)[..., :-1, :]
+        ends = self.chain.frames(q)[..., :3, 3]
+        starts = np.zeros_like(ends)
+        starts[..., 1:, :] = ends[..., :-1, :]
         marker = self.chain.positions(q, marker_T)[..., None, :]
-        distances = segment_distance(
-            points[..., :-1, :], points[..., 1:, :], marker, np.asarray(sensor_R, dtype=float)
-        )
+        distances = segment_distance(starts, ends, marker, sensor_R)
         return np.any(distances < self.radius, axis=-1)
 
 

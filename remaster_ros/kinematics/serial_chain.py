@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics.transforms import apply, inverse, rotation_vector_to_matrix
+from remaster_ros.kinematics.transforms import (
+    apply,
+    inverse,
+    rotation_vector_to_matrix,
+    transform,
+    with_z_along,
+)
 from remaster_ros.kinematics.urdf import UrdfJoint, UrdfModel, parse_urdf
 from remaster_ros.types import BoolArray, FloatArray
 
@@ -65,8 +71,8 @@ class SerialChain:
     ) -> SerialChain:
         """Read the chain from URDF text.
 
-        Joints off the chain (a gripper's fingers, say) count as fixed at zero: their masses hang
-        on the link that carries them.
+        Joints off the chain (such as a gripper's fingers) count as fixed at zero: their masses
+        belong to the link that carries them.
 
         Parameters
         ----------
@@ -109,15 +115,15 @@ class SerialChain:
 
         first_moments, masses = _carried_masses(model, moving)
         with_mass = np.where(masses > 0.0, masses, 1.0)
-        limits = [_limits(joint) for joint in moving]
+        lower, upper, velocity_limits = np.transpose([_limits(joint) for joint in moving])
         return cls(
             name=model.name,
             joint_names=tuple(joint.name for joint in moving),
             base_link=base_link,
             tip_link=tip_link,
-            lower=np.array([lower for lower, _, _ in limits]),
-            upper=np.array([upper for _, upper, _ in limits]),
-            velocity_limits=np.array([velocity for _, _, velocity in limits]),
+            lower=lower,
+            upper=upper,
+            velocity_limits=velocity_limits,
             T_fixed=np.array(T_fixed),
             axes=np.array([joint.axis for joint in moving]),
             masses=masses,
@@ -146,7 +152,7 @@ class SerialChain:
         )
 
     def within_limits(self, q: ArrayLike, tolerance: float = 0.0) -> BoolArray:
-        """Tell whether all joints of q (..., k) are within limits (+ tolerance, rad), (...)."""
+        """Return whether all joints of q (..., k) are within limits (+ tolerance, rad), (...)."""
         q = np.asarray(q, dtype=float)
         inside = (q >= self.lower - tolerance) & (q <= self.upper + tolerance)
         return np.all(inside, axis=-1)
@@ -166,23 +172,14 @@ class SerialChain:
         ndarray
             T_R_link for each joint's link, (..., k, 4, 4).
         """
-        sine, cosine = self._sine_cosine(q, joint_offsets)
-        batch = sine.shape[:-1]
-        frames = np.empty((*batch, len(self), 4, 4))
-        frames[..., 3, :] = (0.0, 0.0, 0.0, 1.0)
-        rotation, origin = np.eye(3), np.zeros(3)
-        for i, fixed in enumerate(self.T_fixed[:-1]):
-            origin = origin + rotation @ fixed[:3, 3]
-            rotation = rotation @ fixed[:3, :3]
-            # Rodrigues: R(q) = I + sin(q) K + (1 - cos(q)) K^2, K the axis' cross-product matrix.
-            turn = (
-                np.eye(3)
-                + sine[..., i, None, None] * self._cross[i]
-                + (1.0 - cosine[..., i, None, None]) * self._cross_squared[i]
-            )
-            rotation = rotation @ turn
-            frames[..., i, :3, :3] = rotation
-            frames[..., i, :3, 3] = origin
+        angles = self._checked(q)
+        if joint_offsets is not None:
+            angles = angles + np.asarray(joint_offsets, dtype=float)
+        turns = rotation_vector_to_matrix(angles[..., None] * self.axes)
+        steps = self.T_fixed[:-1] @ transform(turns, np.zeros(3))
+        frames, frame = np.empty_like(steps), np.eye(4)
+        for i in range(len(self)):
+            frame = frames[..., i, :, :] = frame @ steps[..., i, :, :]
         return frames
 
     def forward(self, q: ArrayLike, joint_offsets: ArrayLike | None = None) -> FloatArray:
@@ -212,8 +209,11 @@ class SerialChain:
         ndarray
             m, (..., 3).
         """
-        sine, cosine = self._sine_cosine(q, joint_offsets)
-        points = np.asarray(points, dtype=float)
+        q, points = self._checked(q), np.asarray(points, dtype=float)
+        sine, cosine = np.sin(q), np.cos(q)
+        if joint_offsets is not None:
+            s, c = np.sin(joint_offsets), np.cos(joint_offsets)
+            sine, cosine = sine * c + cosine * s, cosine * c - sine * s
         x, y, z = (points[..., i] for i in range(3))
         for i in range(len(self), -1, -1):
             R, t = self.T_fixed_z[i, :3, :3], self.T_fixed_z[i, :3, 3]
@@ -287,46 +287,18 @@ class SerialChain:
         """Return the joint axes in R, (..., k, 3), of frames (..., k, 4, 4)."""
         return (frames[..., :3, :3] @ self.axes[:, :, None])[..., 0]
 
-    def _sine_cosine(
-        self, q: ArrayLike, joint_offsets: ArrayLike | None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return sine and cosine of q + joint_offsets, each (..., k)."""
+    def _checked(self, q: ArrayLike) -> FloatArray:
+        """Return joint angles (..., k) as an array; a ValueError where they are not so many."""
         q = np.asarray(q, dtype=float)
         if q.ndim == 0 or q.shape[-1] != len(self):
             raise ValueError(f'q has shape {q.shape}; its last size must be {len(self)}')
-        sine, cosine = np.sin(q), np.cos(q)
-        if joint_offsets is None:
-            return sine, cosine
-        offset_sine, offset_cosine = np.sin(joint_offsets), np.cos(joint_offsets)
-        return (
-            sine * offset_cosine + cosine * offset_sine,
-            cosine * offset_cosine - sine * offset_sine,
-        )
-
-    @cached_property
-    def _cross(self) -> FloatArray:
-        """Cross-product matrices of the axes, (k, 3, 3)."""
-        # Row j of the cross product is axis × e_j, which is column j of K.
-        return np.swapaxes(np.cross(self.axes[:, None, :], np.eye(3)), -1, -2)
-
-    @cached_property
-    def _cross_squared(self) -> FloatArray:
-        """Squares of the cross-product matrices, (k, 3, 3)."""
-        return self._cross @ self._cross
+        return q
 
     @cached_property
     def T_fixed_z(self) -> FloatArray:
         """`T_fixed` of the same arm with every joint frame turned so that its axis is Z."""
-        turns = np.broadcast_to(np.eye(4), (len(self) + 2, 4, 4)).copy()
-        for turn, axis in zip(turns[1:-1], self.axes, strict=True):
-            # The shortest turn from Z to the axis; which one does not matter.
-            tilt = np.cross((0.0, 0.0, 1.0), axis)
-            sine = np.linalg.norm(tilt)
-            if sine < 1e-12:
-                turn[:3, :3] = np.diag([1.0, np.sign(axis[2]), np.sign(axis[2])])
-            else:
-                rotation_vector = tilt / sine * np.arctan2(sine, axis[2])
-                turn[:3, :3] = rotation_vector_to_matrix(rotation_vector)
+        onto_axes = [np.eye(3), *map(with_z_along, self.axes), np.eye(3)]
+        turns = transform(onto_axes, np.zeros(3))
         return inverse(turns[:-1]) @ self.T_fixed @ turns[1:]
 
 
@@ -382,11 +354,7 @@ def _carried_masses(model: UrdfModel, moving: list[UrdfJoint]) -> tuple[FloatArr
     index = {joint.child: i for i, joint in enumerate(moving)}
     first_moments, masses = np.zeros((len(moving), 3)), np.zeros(len(moving))
     for link in model.links.values():
-        here, T_here_link = link.name, np.eye(4)
-        while here not in index and here in model.parent_joint:
-            joint = model.parent_joint[here]
-            T_here_link = joint.origin @ T_here_link
-            here = joint.parent
+        here, T_here_link = model.carrier(link.name, index)
         if here in index:
             i = index[here]
             masses[i] += link.mass

@@ -1,15 +1,16 @@
 """A strict reader of URDF text: the links, joints, limits and masses, nothing else.
 
-Meshes, materials and the like are passed over. What does not fit is refused with one line that
-names the joint or link; nothing is guessed.
+Meshes, materials and the like are ignored. Text that is wrong is refused with one line that names
+the joint or link; nothing is guessed.
 """
 
 from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
 
 import numpy as np
 
@@ -80,6 +81,18 @@ class UrdfModel:
         parents = {joint.parent for joint in self.parent_joint.values()}
         return [name for name in self.links if name not in parents]
 
+    def carrier(self, link: str, moving: Container[str]) -> tuple[str, FloatArray]:
+        """Return what carries a link, and T_carrier_link (4, 4), all joints between at zero.
+
+        That is the nearest link of `moving` on the way to the root, itself included; else the
+        root.
+        """
+        T = np.eye(4)
+        while link not in moving and link in self.parent_joint:
+            joint = self.parent_joint[link]
+            link, T = joint.parent, joint.origin @ T
+        return link, T
+
 
 def parse_urdf(text: str) -> UrdfModel:
     """Read URDF text.
@@ -136,28 +149,20 @@ def parse_urdf(text: str) -> UrdfModel:
     if len(roots) != 1:
         found = ', '.join(roots) if roots else 'none, the links form a loop'
         raise InputError(f'URDF: a robot is a tree with one root link; found {found}')
-    _refuse_loops(links, roots[0], parent_joint)
+    parents = {link: (joint.parent,) for link, joint in parent_joint.items()}
+    try:
+        TopologicalSorter(parents).prepare()
+    except CycleError as error:
+        link = min(error.args[1])
+        raise InputError(f"URDF: link '{link}' is part of a loop; a robot is a tree") from None
     return UrdfModel(robot.get('name', ''), roots[0], links, parent_joint)
 
 
 def _is_xacro(element: ElementTree.Element) -> bool:
-    """Tell an element of xacro's namespace, of which there are several spellings."""
+    """Return whether an element is of xacro's namespace, of which there are several spellings."""
     # Comments have a function for their tag.
     tag = element.tag if isinstance(element.tag, str) else ''
     return tag.startswith('{') and tag.partition('}')[0].endswith('xacro')
-
-
-def _refuse_loops(links: Iterable[str], root: str, parent_joint: Mapping[str, UrdfJoint]) -> None:
-    """Refuse links whose ancestors form a loop apart from the root."""
-    hanging = {root}
-    for link in links:
-        here, path = link, {link}
-        while here not in hanging:
-            here = parent_joint[here].parent
-            if here in path:
-                raise InputError(f"URDF: link '{link}' is part of a loop; a robot is a tree")
-            path.add(here)
-        hanging |= path
 
 
 def _link(element: ElementTree.Element) -> UrdfLink:
@@ -190,7 +195,7 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
     for key in ('lower', 'upper', 'velocity'):
         written = None if limit is None else limit.get(key)
         limits[key] = None if written is None else _number(written, f'{key} of {where}', _NO_LIMIT)
-    _check_what_is_passed_over(element, where)
+    _check_unused_numbers(element, where)
     return UrdfJoint(
         name=name,
         kind=kind,
@@ -205,8 +210,8 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
     )
 
 
-def _check_what_is_passed_over(element: ElementTree.Element, where: str) -> None:
-    """Refuse numbers that are none where this reader needs none, but a calibrated copy does."""
+def _check_unused_numbers(element: ElementTree.Element, where: str) -> None:
+    """Refuse text that is no number where only `compensation.export` needs the number."""
     for tag, keys in (
         ('mimic', ('multiplier', 'offset')),
         ('safety_controller', ('soft_lower_limit', 'soft_upper_limit')),
@@ -250,11 +255,11 @@ def attribute(element: ElementTree.Element, key: str, where: str) -> str:
 
 def numbers(text: str, count: int, what: str) -> FloatArray:
     """Return so many numbers, (count,); `what` names them in messages."""
-    words = text.split()
-    if len(words) != count:
+    parts = text.split()
+    if len(parts) != count:
         needed = 'three numbers are needed' if count == 3 else f'{count} is needed'
         raise InputError(f"URDF: {what} is '{text}'; {needed}")
-    return np.array([_number(word, what) for word in words])
+    return np.array([_number(part, what) for part in parts])
 
 
 def _number(text: str, what: str, largest: float = _LARGEST) -> float:

@@ -108,26 +108,16 @@ def chain_bodies(text: str, chain: SerialChain, read_mesh: MeshReader) -> list[B
     """
     model = parse_urdf(text)
     index = {
-        joint.child: chain.joint_names.index(joint.name)
+        joint.child: chain.joint_names.index(joint.name) + 1
         for joint in model.parent_joint.values()
         if joint.name in chain.joint_names
     }
-
-    def carrier(link: str) -> tuple[int, FloatArray]:
-        """Return which joint carries a link (0: none), and T_carrier_link."""
-        here, T = link, np.eye(4)
-        while here not in index and here in model.parent_joint:
-            joint = model.parent_joint[here]
-            T = joint.origin @ T
-            here = joint.parent
-        return (index[here] + 1, T) if here in index else (0, T)
-
-    # Links that no joint of the arm carries were just placed in the root's frame.
-    T_base_root = inverse(carrier(chain.base_link)[1])
+    _, T_root_base = model.carrier(chain.base_link, index)
     bodies = []
     for found in link_shapes(text, read_mesh):
-        link, T = carrier(found.link)
-        if link == 0:
-            T = T_base_root @ T
-        bodies.append(Body(found.link, link, found.shape, T @ found.T_link_shape))
+        carrier, T = model.carrier(found.link, index)
+        if carrier not in index:
+            # No joint of the arm carries it, so that this is its place in the root's frame.
+            T = inverse(T_root_base) @ T
+        bodies.append(Body(found.link, index.get(carrier, 0), found.shape, T @ found.T_link_shape))
     return bodies

@@ -1,4 +1,4 @@
-"""What the arm supervisor asks for, and the rules that it keeps."""
+"""The actions that the arm supervisor returns, and the rules that it keeps."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class CheckPath:
 
 @dataclass(frozen=True)
 class PathAnswer:
-    """What was found out.
+    """The answer to a `CheckPath`.
 
     Attributes
     ----------

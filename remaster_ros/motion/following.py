@@ -15,7 +15,7 @@ from remaster_ros.types import FloatArray
 STANDING_S = 0.25
 """An arm that has not moved for so long stands; it must before it is sent anywhere, s."""
 FRESH_S = 0.25
-"""A report older than this (wall time) no longer tells where the arm is, s."""
+"""A report older than this (wall time) does not show any more where the arm is, s."""
 ASTRAY_S = 0.3
 """An arm that is off its path for so long (wall time) is halted, s."""
 LATENCY_S = 0.1
@@ -27,7 +27,7 @@ EARLY_S = 0.1
 ON_PATH_RAD = 0.02
 """An arm is on its path that is no further from it, rad: its servo overshoots."""
 SLOWED_S, SLOWED_LONGEST_S = 0.1, 0.3
-"""Over so much at least, and so much at most, is looked whether an arm loses speed, s."""
+"""Loss of speed is judged over a time between these two, s."""
 SLOWED_RAD = 5e-3
 """Only where its path leads on by so much in this time, rad."""
 SLOWED_SHARE = 0.5
@@ -76,7 +76,7 @@ class Seen:
         return cls(q, stamp, wall, time, last.stands_at, last.stands_since, late_s)
 
     def is_fresh(self, wall_s: float) -> bool:
-        """Whether it tells where the arm is now."""
+        """Whether it shows where the arm is now."""
         return wall_s - self.wall <= FRESH_S
 
     def stands(self, wall_s: float) -> bool:
@@ -124,7 +124,7 @@ class Following:
         return time - self._sent
 
     def update(self, seen: Seen, rate: float) -> str:
-        """Take a report; return in words how the arm has been off its path for too long, ''."""
+        """Process a report; return how the arm has been off its path for too long, ''."""
         self._allowed_s = allowed_lag_s(self._rules, rate)
         elapsed = self.elapsed_s(seen.time)
         self._astray = self._look(seen, elapsed)
@@ -190,7 +190,7 @@ class Following:
         )
 
     def _is_slowed(self) -> bool:
-        """Whether the arm loses speed where its path goes on, long before its lag tells.
+        """Whether the arm loses speed where its path goes on, long before its lag shows it.
 
         Its path is the trajectory, delayed by about what it lagged a moment ago.
         """

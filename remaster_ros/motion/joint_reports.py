@@ -29,8 +29,8 @@ LATE_S = 0.15
 LATE_WALL_S = 0.1
 """And so much, s of wall time: a busy machine delays by wall time, however fast a clock runs."""
 FAST, LATE_FAST_WALL_S = 5.0, 0.5
-"""A clock that runs so many times as fast is a simulation's: nobody stands beside the arm, and a
-machine that is busy with it may delay by so much, s of wall time."""
+"""A clock that runs so many times as fast is a simulation's: no person stands beside the arm, and
+the machine, busy with the simulation, may delay by so much, s of wall time."""
 DRIFT = 2e-4
 """Two clocks may run apart by so many seconds a second."""
 SHORTEN = 0.05
@@ -39,7 +39,7 @@ SHORTEN = 0.05
 What was learned from reports that a network held up would excuse late ones afterwards.
 """
 LEARN, LEARN_WALL_S = 5, 1.0
-"""By so many reports at least, over so much wall time (s), is learned how long one takes.
+"""The usual delay is learned from so many reports at least, over so much wall time (s).
 
 The shortest counts: those that waited in a queue while this process was starting took longer.
 """
@@ -53,7 +53,7 @@ UNKNOWN_SPEED = 4.0
 
 @dataclass(frozen=True)
 class JointReport:
-    """What a message on joint_states says, and when.
+    """The content of a message on joint_states, and its times.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class JointReports:
     refused
         Reason -> number of reports that were not believed.
     trouble, kind
-        Why the last report was not believed, in words and as a word for the counts; '' where it
+        Why the last report was not believed, as text and as a key of the counts; '' where it
         was.
     late_s
         How much later than usual the last report came that was believed, s of the node's time.
@@ -135,14 +135,14 @@ class JointReports:
         self.forget()
 
     def forget(self) -> None:
-        """Learn anew what is usual: somebody has seen to the robot, or its clock was set."""
+        """Learn again what is usual: a person has attended to the robot, or its clock was set."""
         self._last: JointReport | None = None
         self._delays: list[tuple[float, float]] = []
         self._delay: float | None = None
         self.late_s = 0.0
 
     def believes(self, report: JointReport) -> bool:
-        """Judge a report; `trouble` is the reason where it is not believed."""
+        """Return whether a report is believed; `trouble` is the reason where it is not."""
         self.clock.update(report.clock_s, report.wall_s)
         self.kind, self.trouble = self._doubt(report)
         if self.kind:
@@ -155,7 +155,7 @@ class JointReports:
         return True
 
     def _doubt(self, report: JointReport) -> tuple[str, str]:
-        """Return why a report is not believed, as a word for the counts and in words."""
+        """Return why a report is not believed, as a key of the counts and as text."""
         q, last = report.q, self._last
         if not np.all(np.isfinite(q)):
             return 'not_finite', 'joint_states are not finite'
@@ -191,7 +191,7 @@ class JointReports:
         return '', ''
 
     def _learn(self, report: JointReport) -> None:
-        """Follow how long a report usually takes: at once where it takes less, else a drift."""
+        """Follow the usual delay of reports: fast where it shrinks, else as clocks drift."""
         delay = report.clock_s - report.stamp_s
         if self._delay is None:
             self._delays.append((report.wall_s, delay))

@@ -90,7 +90,7 @@ class MotionLimits:
         )
 
     def outside(self, q: FloatArray) -> str:
-        """Return which joint of `q` (rad, (k,)) lies outside, in words; '' if none does."""
+        """Return which joint of `q` (rad, (k,)) lies outside, as text; '' if none does."""
         for name, value, low, high in zip(self.names, q, self.lower, self.upper):
             if not low + self.margin <= value <= high - self.margin:
                 kept = f' less {np.rad2deg(self.margin):.2f} deg' if self.margin else ''

@@ -1,37 +1,37 @@
-"""Which sensors are there: heard from lately, and ready by their own word; times are arguments."""
+"""Which sensors are present: their nodes report, and report ready. Times are arguments."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
 UNSEEN_S = 10.0
-"""A node that has not been heard at all may still be starting for so long, s."""
+"""A node that has not reported at all may still be starting for so long, s."""
 BACK_S = 1.0
-"""What a node that was started again publishes may find its way so much later than its word, s."""
+"""Readings of a node that was started again may begin to arrive so much later than its reports."""
 
 
 class Liveness:
-    """Follow the signs of life of sensors.
+    """Follow the reports and readings of sensors.
 
     Parameters
     ----------
     sensors
         Their names.
     heartbeat_s
-        A sensor that was heard and then is silent for longer is absent, s.
+        A sensor whose node has reported, and then not for longer than this, is absent, s.
     streams
         Those that read all the time. One whose node was started (again) is absent until a reading
-        has come: what it publishes may find its way later than what it says.
+        has come: its readings may begin to arrive later than its reports.
     since_s
-        When listening began, s: for `UNSEEN_S` from then a required sensor may be there though
-        it has not been heard. As a rule, long ago.
+        When this process began to listen, s: for `UNSEEN_S` from then a required sensor counts as
+        absent until its node has reported. By default, long ago.
 
     Attributes
     ----------
     readings
         Readings received, per sensor.
-    words
-        How often each sensor's node has been heard; none where it never was.
+    reports
+        Number of reports of each sensor's node; without those that never reported.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Liveness:
         self._trouble: dict[str, str] = {}
         self._read: dict[str, float] = {}
         self.readings = dict.fromkeys(sensors, 0)
-        self.words: dict[str, int] = {}
+        self.reports: dict[str, int] = {}
 
     def node_reports(
         self,
@@ -60,25 +60,25 @@ class Liveness:
         started: str = '',
         hidden: bool = False,
     ) -> None:
-        """Take the word of a sensor's node.
+        """Process a report of a sensor's node.
 
         Parameters
         ----------
         sensor
-            Its name; a stranger's word is not heard.
+            Its name; other sensors are ignored.
         ready, message
             Whether it can measure, and what is wrong if not.
         now_s
             Now, s.
         started
-            Tells one start of the node from the next; '' where it does not say.
+            Another text after each start of the node; '' where the node gives none.
         hidden
-            It does not see its marker: no reading will come before the arm has moved on.
+            The marker is out of its sight: no reading will come before the arm has moved on.
         """
         if sensor not in self.readings:
             return
         self._seen[sensor] = now_s
-        self.words[sensor] = self.words.get(sensor, 0) + 1
+        self.reports[sensor] = self.reports.get(sensor, 0) + 1
         self._trouble[sensor] = '' if ready else message or 'not ready'
         before = self._started.get(sensor, '')
         if sensor in self._streams and started != before:
@@ -90,7 +90,7 @@ class Liveness:
             self._new.discard(sensor)
 
     def reads(self, sensor: str, now_s: float) -> None:
-        """Take note of a reading."""
+        """Process that there was a reading."""
         self.readings[sensor] += 1
         self._read[sensor] = now_s
         self._new.discard(sensor)
@@ -100,10 +100,10 @@ class Liveness:
         return now_s - self._read.get(sensor, float('-inf'))
 
     def absent(self, now_s: float, required: Collection[str] = ()) -> dict[str, str]:
-        """Return why, for each sensor that is not there.
+        """Return why each absent sensor counts as absent.
 
-        A sensor that never said anything is none of them: a bag may hold readings alone. But as
-        long as that means nothing yet, one that is ``required`` is.
+        A sensor whose node never reported is not absent, because a bag may hold readings alone.
+        One that is ``required`` is, while its node may still be starting.
         """
         why = {}
         for name in self.readings:
@@ -126,7 +126,7 @@ class Liveness:
     def _why_unsure(self, name: str, now_s: float) -> str:
         unseen = name not in self._seen and name not in self._read
         if unseen and now_s - self._since_s < UNSEEN_S:
-            return 'its node has not been heard yet'
+            return 'its node has not reported yet'
         if now_s - self._back.get(name, float('-inf')) < BACK_S:
             return 'its node has just been started again'
         return ''

@@ -1,17 +1,17 @@
-"""The gate: the last thing before a command leaves for the controller.
+"""The gate: the last check before a command is published to the controller.
 
-A move passes if everything that the controller will make of it is allowed: it joins the present
-state and the waypoints by cubics, and each of these is looked at for itself, whatever planned it.
-A stop is not planned at all. It is taken from the move that was admitted last, as another timing
-of the rest of its line, so it is never refused and never a target of its own.
+A move passes if everything that the controller will make of it is allowed: the controller joins
+the present state and the waypoints by cubics, and each cubic is checked by itself, independently
+of the planning. A stop is another timing of the rest of the line of the move that was admitted
+last, so that it is never refused and never has a target of its own.
 
-Nothing is published that is not `Admitted`, and only this module makes those.
+Only what is `Admitted` is published, and only this module makes those objects.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -184,14 +184,10 @@ class MotionGate:
 
 
 def _way_out_limits(limits: MotionLimits) -> MotionLimits:
-    return MotionLimits(
-        limits.names,
-        limits.lower,
-        limits.upper,
-        WAY_OUT_SPEED * limits.velocity,
-        limits.acceleration,
-        min(limits.tool_speed, WAY_OUT_TOOL_SPEED),
-        limits.margin,
+    return replace(
+        limits,
+        velocity=WAY_OUT_SPEED * limits.velocity,
+        tool_speed=min(limits.tool_speed, WAY_OUT_TOOL_SPEED),
     )
 
 

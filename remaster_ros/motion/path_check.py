@@ -1,6 +1,6 @@
-"""Which paths are free, and how fast the fastest point of arm and tool moves on them.
+"""Paths that were found free, and how fast the fastest point of arm and tool moves on them.
 
-This takes milliseconds to seconds: it runs beside the callbacks that serve a stop, never in them.
+This takes milliseconds to seconds: it never runs in the callbacks that serve a stop.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 
@@ -17,16 +16,6 @@ from remaster_ros.types import FloatArray
 
 PEAK_STEP_RAD = 0.02
 """The peak speed on a line is looked for every so many radians of its fastest joint."""
-
-
-class Surroundings(Protocol):
-    """What tells whether a path is free (`remaster_ros.kinematics.collision.CollisionModel`)."""
-
-    def trouble(self, q: FloatArray) -> str:
-        """Return what is wrong with one configuration, rad, (k,); '' if it is free."""
-
-    def path_trouble(self, waypoints: FloatArray) -> str:
-        """Return what is wrong with a polyline, rad, (n, k); '' if it is free."""
 
 
 class PointSpeeds:
@@ -71,6 +60,10 @@ class PointSpeeds:
         q = start + np.linspace(0.0, 1.0, count)[:, None] * way
         return float(np.max(self.fastest(q, np.broadcast_to(way, q.shape))))
 
+    def peaks_m(self, points: FloatArray) -> tuple[float, ...]:
+        """Return `peak_m` of each line of a polyline, m/s, for points (n, k), rad."""
+        return tuple(self.peak_m(start, end) for start, end in pairwise(points))
+
 
 @dataclass(frozen=True)
 class FreePath:
@@ -98,18 +91,3 @@ class FreePath:
         shares = np.sum((q - starts) * ways, axis=1) / np.where(lengths > 0.0, lengths, 1.0)
         nearest = starts + np.clip(shares, 0.0, 1.0)[:, None] * ways
         return float(np.min(np.max(np.abs(nearest - q), axis=1)))
-
-
-def free_path_along(
-    points: FloatArray, surroundings: Surroundings, speeds: PointSpeeds | None
-) -> FreePath | str:
-    """Return a polyline as a path if it is free, else what is in the way."""
-    trouble = surroundings.path_trouble(points)
-    return trouble or FreePath(points, peak_speeds(points, speeds))
-
-
-def peak_speeds(points: FloatArray, speeds: PointSpeeds | None) -> tuple[float, ...]:
-    """Return `PointSpeeds.peak_m` of each line of a polyline; none without `speeds`."""
-    if speeds is None:
-        return ()
-    return tuple(speeds.peak_m(start, end) for start, end in pairwise(points))

@@ -1,4 +1,4 @@
-"""Find a free path for the arm supervisor; slow, so it runs beside the callbacks of the node."""
+"""Find a free path for the arm supervisor; slow, and so not called by the node's callbacks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.free_paths import free_path, way_out
 from remaster_ros.motion.actions import CheckPath, PathAnswer
-from remaster_ros.motion.path_check import FreePath, PointSpeeds, peak_speeds
+from remaster_ros.motion.path_check import FreePath, PointSpeeds
 
 SEED = 20
 
@@ -44,4 +44,4 @@ class PathSearch:
         return PathAnswer(None, trouble) if found is None else PathAnswer(self._path(found))
 
     def _path(self, points: np.ndarray, *, is_way_out: bool = False) -> FreePath:
-        return FreePath(points, peak_speeds(points, self._speeds), is_way_out)
+        return FreePath(points, self._speeds.peaks_m(points), is_way_out)

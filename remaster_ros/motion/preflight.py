@@ -1,4 +1,4 @@
-"""May the arm move for the first time? What topics, sensors and nodes have to show; no clocks."""
+"""What must be right before the first motion: topics, sensors and nodes. Times are arguments."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ FRESH_S = 3.0
 
 @dataclass(frozen=True)
 class SensorFacts:
-    """What is known of a sensor now. Ages are wall time, s; infinite for what never came.
+    """The present state of a sensor. Ages are wall time, s; infinite for what never came.
 
     Attributes
     ----------
     name
         As in the cell.
-    said_age_s
-        Since its node's last word.
+    node_age_s
+        Since the last report of its node.
     ready
-        Whether the node says that its device can measure.
+        Whether its node reports that the device can measure.
     message
         The node's own diagnosis.
     read_age_s
@@ -28,7 +28,7 @@ class SensorFacts:
     """
 
     name: str
-    said_age_s: float
+    node_age_s: float
     ready: bool
     message: str
     read_age_s: float
@@ -36,7 +36,7 @@ class SensorFacts:
 
 @dataclass(frozen=True)
 class Facts:
-    """What is known before the first motion.
+    """The present state of what the first motion needs.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Facts:
     joints_message
         What is wrong with them; ''.
     bridge_age_s, recorder_age_s
-        Since the last word of the bridge and of the recorder, s.
+        Since the last report of the bridge and of the recorder, s.
     sensors
         Those that the arm waits for.
     any_sensor
@@ -77,7 +77,7 @@ def preflight(facts: Facts) -> tuple[str, ...]:
 
 
 def _trouble(sensor: SensorFacts) -> str:
-    if not sensor.said_age_s <= FRESH_S:
+    if not sensor.node_age_s <= FRESH_S:
         return f'{sensor.name}: no sign of its node: is it running in this ROS domain?'
     if not sensor.ready:
         return f'{sensor.name}: {sensor.message or "not ready"}'

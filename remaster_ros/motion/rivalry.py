@@ -1,16 +1,16 @@
 """Which of two nodes of one name ends: the one that has been running for less long.
 
 Each node publishes when it was started (an identity: text that no other start has) and for how
-long it has been running. The rule needs no common clock of two hosts. It never lets both go on;
-that both end is possible, where both were started within 1.5 s and their hosts' clocks differ.
+long it has been running. The rule needs no common clock of two hosts. Both never go on.
+Both may end, where both were started within 1.5 s and their hosts' clocks differ.
 """
 
 from __future__ import annotations
 
 LISTEN_S = 1.5
-"""A node that has heard of no rival for so long is alone, s. Summaries come twice a second."""
+"""A node without a summary of a rival for so long is alone, s. Summaries come twice a second."""
 SHORTER_S = 0.5
-"""Who has been running for less time than the rival, by more than this, ends, s."""
+"""A node that has been running for less time than its rival, by more than this, ends, s."""
 SAME_S = 1.5
 """Up to this difference the identities decide, s. Wider than `SHORTER_S`: a message that is late
 by up to half a second may make the two sides see different differences, and one still ends."""
@@ -27,37 +27,37 @@ class DuplicateNodeCheck:
     Attributes
     ----------
     alone_since_s
-        Since when no rival has been heard, s of a monotonic clock; None before this node has
-        heard itself.
+        When the last summary of a rival came, or else the first own one, s of a monotonic clock;
+        None before this node has received its own summary.
     """
 
     def __init__(self, started: str) -> None:
         self._started = started
         self.alone_since_s: float | None = None
-        # What each rival said last: how long it had been running, s.
+        # For how long each rival had been running by its last summary, s.
         self._uptimes_s: dict[str, float] = {}
 
     def update_own(self, now_s: float) -> None:
-        """Take this node's own summary, which came back: what is published here is heard here."""
+        """Process this node's own summary: that it came back shows that this node receives any."""
         if self.alone_since_s is None:
             self.alone_since_s = now_s
 
     def update_other(
         self, started: str, uptime_s: float, own_uptime_s: float, now_s: float
     ) -> bool:
-        """Take a summary of another start of this node's name.
+        """Process a summary of another node of this name.
 
         Parameters
         ----------
         started, uptime_s
-            What it says of itself.
+            The other node's identity, and for how long it has been running, s.
         own_uptime_s, now_s
             For how long this node has been running, and the time, s.
 
         Returns
         -------
         bool
-            Whether this node must end. Only from the second summary on: the last words of a
+            Whether this node must end. Only from the second summary on: the last summary of a
             process that was killed may arrive after its successor was started.
         """
         before_s = self._uptimes_s.get(started)
@@ -72,5 +72,5 @@ class DuplicateNodeCheck:
         return shorter_by_s > SHORTER_S
 
     def alone(self, now_s: float) -> bool:
-        """Whether this node has listened for long enough and heard of no rival."""
+        """Whether this node has listened for long enough without a summary of a rival."""
         return self.alone_since_s is not None and now_s - self.alone_since_s >= LISTEN_S

@@ -1,4 +1,4 @@
-"""Has the arm arrived, and has it stood still long enough? Time stamps are arguments."""
+"""Whether the arm has arrived and has stood still long enough. Time stamps are arguments."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class SettleRules:
     still_tolerance
         Largest spread (maximum - minimum) of any reported joint position while still, rad.
     max_gap_s
-        A longer silence of joint_states starts the waiting anew: nobody saw the arm then, s.
+        A longer gap in joint_states starts the waiting again: the arm was not observed then, s.
     """
 
     settle_s: float = 3.0

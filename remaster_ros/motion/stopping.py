@@ -9,9 +9,9 @@ is where
 
     x + v T/3 <= end <= min(x + 2/3 r T, 1).
 
-A stretch that reaches into the last moments of the line has no such stop: who is slow needs time,
-and who is fast would pass the end in it. The end is then put so far before the line's that nobody
-passes that, and who was fast comes back by a little.
+A stretch that reaches into the last moments of the line has no such stop: a slow arm needs time,
+in which a fast one would pass the end. The end of the stop is then put so far before that of the
+line that no arm of the stretch passes the latter; a fast one comes back by a little.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ END_OF_STOP_S = 0.1
 LONGEST_S, LONGEST_SHARE = 4.0, 6.0
 """A stop takes no longer, s; or times the stretch, where that is longer."""
 TRIED = 80
-"""So many times of a stop are tried."""
+"""Number of durations of a stop that are tried."""
 PLACES = 33
-"""On so many places of the stretch a stop is looked at, and where the speed changes besides."""
+"""A stop is checked at so many places of the stretch, and where the speed changes."""
 ROUNDS = 32
-"""So often the interval of ends is halved that nobody passes."""
+"""So often the interval is halved in which the end of such a stop is searched."""
 
 
 def stop_on_line(line: Line, low_s: float, high_s: float, limits: MotionLimits) -> Waypoint:

@@ -1,4 +1,4 @@
-"""The configuration under way, and a stop under way: what becomes of them, report by report."""
+"""The outcome of a configuration under way, and of a stop, judged report by report."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from remaster_ros.motion.actions import SupervisorRules
+from remaster_ros.motion.actions import Settled, SupervisorRules
 from remaster_ros.motion.following import Following, Seen
 from remaster_ros.motion.settling import SettleDetector
 from remaster_ros.motion.trajectory import Trajectory
@@ -16,13 +16,13 @@ from remaster_ros.types import FloatArray
 PROBE_WAIT_S = 0.5
 """After its end a robot that copies commands has copied this one, s."""
 MOVED_RAD = 0.02
-"""An arm that was moved by so much while nothing was commanded was moved by another, rad."""
+"""An arm at rest that has moved by so much was not moved by a command, rad."""
 ELSEWHERE = 'an emergency stop, or an arm less precise than arrive_tolerance?'
 ELSEWHERE_RAD = 0.05
 """An arm that stands so far from its target does not follow, rad; nearer it is inaccurate."""
 
 Outcome = tuple[Literal['', 'over', 'settled', 'failed', 'halted'], str]
-"""What became of it, and why in words; '' while it is under way."""
+"""The outcome, and why, as text; '' while it is under way."""
 UNDER_WAY: Outcome = '', ''
 
 
@@ -50,7 +50,7 @@ class Visit:
         return self.following.trajectory
 
     def judge(self, seen: Seen, rate: float) -> Outcome:
-        """Say what becomes of an arm that is on its way, by a report."""
+        """Return the outcome for an arm that is on its way, by a report."""
         detector, rules = self.detector, self.rules
         trajectory, elapsed = self.trajectory, self.following.elapsed_s(seen.time)
         settled = detector.update(seen.stamp, seen.q) == 'settled'
@@ -78,8 +78,15 @@ class Visit:
             return 'failed', 'did not come to rest at its target in time'
         return UNDER_WAY
 
+    def settled_at(self, seen: Seen) -> Settled:
+        """Return the action that reports the arm as settled, by the report that completed it."""
+        still_since = self.detector.still_since
+        assert still_since is not None
+        motion_s, settle_s = still_since - self.sent_stamp, seen.stamp - still_since
+        return Settled(self.solution, seen.stamp, self.detector.mean, motion_s, settle_s)
+
     def judge_settled(self, seen: Seen, *, recorder_waits: bool) -> Outcome:
-        """Say what becomes of an arm that must stand until the recorder answers."""
+        """Return the outcome for an arm that must stand until the recorder answers."""
         moved = float(np.max(np.abs(seen.q - self.trajectory.end)))
         if moved > MOVED_RAD:
             return 'halted', (
@@ -88,7 +95,7 @@ class Visit:
         if recorder_waits:
             self.deadline = seen.time + self.rules.answer_timeout_s
         elif seen.time > self.deadline:
-            return 'failed', 'the recorder did not say what became of it'
+            return 'failed', 'the recorder did not answer in time'
         return UNDER_WAY
 
 
@@ -100,7 +107,7 @@ class Braking:
     deadline: float
 
     def judge(self, seen: Seen) -> Outcome:
-        """See that a stop is a stop."""
+        """Return whether the arm has come to rest where its stop ends, by a report."""
         if seen.stands(seen.wall):
             if np.max(np.abs(seen.q - self.end)) <= ELSEWHERE_RAD:
                 return 'over', ''

@@ -110,7 +110,7 @@ class CellSensors:
 
     def give_up(self) -> None:
         """Reject what does not come in time."""
-        self._recording.give_up(self._absent(), self._liveness.words)
+        self._recording.give_up(self._absent(), self._liveness.reports)
 
     def _absent(self) -> dict[str, str]:
         return self._liveness.absent(time.monotonic(), self.required.names)

@@ -1,7 +1,7 @@
 """The main job on fake hardware: start every node, collect, fit, and print what was found.
 
-Real nodes in processes of their own, real DDS, real sockets; the fakes share a hidden World, and
-its truth is opened only at the very end, to be compared with the estimate.
+Real nodes in processes of their own, real DDS, real sockets; the fakes share a hidden World, whose
+truth is compared with the estimate only at the very end.
 """
 
 from __future__ import annotations
@@ -36,27 +36,20 @@ from remaster_ros.nodes.demo_summary import (
     print_offsets,
     print_times,
 )
+from remaster_ros.nodes.launching import ALL_NODES, CORE, SENSORS
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.processes import NodeProcesses
 from remaster_ros.nodes.running import report
 from remaster_ros.nodes.status import listen
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import read_fit
+from remaster_ros.session.files import cannot_write
 from remaster_ros.session.session_journal import is_complete
-from remaster_ros.session.session_writer import JOURNAL
+from remaster_ros.session.session_opening import JOURNAL
 from remaster_ros.session.workcell import config_path, read_cell
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.setup import make_world
-
-FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
-NODES = (
-    'pose_planner',
-    'robot_bridge',
-    'optitrack_markers',
-    'laser_tracker_markers',
-    'recorder',
-    'optimizer',
-)
+from remaster_ros.simulation.truth import to_plain
 
 
 @dataclass(frozen=True)
@@ -122,21 +115,20 @@ class Demo:
     def __init__(self, node: Conductor, stopping: list[int]) -> None:
         self.node, self.p, self._stopping = node, node.p, stopping
         self.console = Console(quiet=self.p.quiet)
+        # Refused before anything is written.
+        self.requests = [EffectSpec.parse(text) for text in self.p.hide.split(',') if text]
         self.out = output_folder(Path(self.p.out))
         self.session, self.fit = self.out / 'session', self.out / 'fit'
         self.discovery = self.out / 'discovery'
-        self.requests = [EffectSpec.parse(text) for text in self.p.hide.split(',') if text]
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
         self.hidden = Path(tempfile.mkdtemp(prefix='remaster_world_'))
-        (self.out / 'log').mkdir(exist_ok=True)
         self.processes = NodeProcesses(
             self.out / 'log',
             {
                 'PYTHONUNBUFFERED': '1',
                 # A halt of the fake arm is kept with its session, not with those of real arms.
                 'ROS_HOME': str((self.out / 'ros_home').resolve()),
-                **_domain_environment(),
             },
         )
 
@@ -158,26 +150,22 @@ class Demo:
         self._collect()
         self.console.print('fitting')
         self._trigger('remaster/fit', 'optimizer', timeout_s=300.0)
-        result = read_fit(self.fit / 'fit.json')
-        discovery = self._discover() if self.requests else None
+        results = [('report', self.fit, 'fit.json')]
+        if self.requests:
+            self.console.print('looking for causes')
+            self._trigger('remaster/discover', 'optimizer', timeout_s=300.0)
+            results.append(('causes', self.discovery, 'discovery.json'))
         self.processes.stop()
         print_times(self.console, self.node.times)
         # Only here, after everything that estimates has ended, is the truth opened.
-        print_offsets(self.console, result, world.truth)
-        if discovery is not None:
+        print_offsets(self.console, read_fit(self.fit / 'fit.json'), world.truth)
+        if self.requests:
+            discovery = read_discovery(self.discovery / 'discovery.json')
             print_hidden(self.console, discovery, world.truth)
-        (self.out / 'truth.yaml').write_text(yaml.safe_dump(world.truth.to_dict()))
+        (self.out / 'truth.yaml').write_text(yaml.safe_dump(to_plain(world.truth)))
         self.console.print(f'session: {self.session}')
-        name = 'report.html' if self.p.figures else 'fit.json'
-        self.console.print(f'report: {self.fit / name}')
-        if discovery is not None:
-            name = 'report.html' if self.p.figures else 'discovery.json'
-            self.console.print(f'causes: {self.discovery / name}')
-
-    def _discover(self) -> dict[str, Any]:
-        self.console.print('looking for causes')
-        self._trigger('remaster/discover', 'optimizer', timeout_s=300.0)
-        return read_discovery(self.discovery / 'discovery.json')
+        for label, folder, data in results:
+            self.console.print(f'{label}: {folder / ("report.html" if self.p.figures else data)}')
 
     def _start(self) -> None:
         common = config_path('fake.yaml')
@@ -185,29 +173,29 @@ class Demo:
             socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM
         )
         ports = {'command_port': command_port, 'data_port': data_port}
-        size = self.p.candidates
+        size, world, session = self.p.candidates, str(self.hidden), str(self.session)
         own: dict[str, dict[str, Any]] = {
-            **{name: {'world': str(self.hidden)} for name in FAKES},
+            'fake_robot': {'world': world},
+            'fake_optitrack': {'world': world, **ports},
+            'fake_laser_tracker': {'world': world, 'port': tracker_port},
             'pose_planner': {
                 'seed': self.p.seed,
-                'session': str(self.session),
+                'session': session,
                 'optimization_candidates': size,
                 'validation_candidates': size,
             },
-            'recorder': {'session': str(self.session)},
+            'recorder': {'session': session},
             'optimizer': {
-                'session': str(self.session),
+                'session': session,
                 'out': str(self.fit),
                 'discovery': str(self.discovery),
                 'seed': self.p.seed,
                 'figures': self.p.figures,
             },
-            'optitrack_markers': dict(ports),
+            'optitrack_markers': ports,
             'laser_tracker_markers': {'port': tracker_port},
         }
-        own['fake_optitrack'].update(ports)
-        own['fake_laser_tracker']['port'] = tracker_port
-        for name in (*FAKES, *NODES):
+        for name in ALL_NODES:
             self.processes.start(name, common, own.get(name, {}))
 
     def _spin(self) -> None:
@@ -215,7 +203,7 @@ class Demo:
         if self._stopping:
             raise KeyboardInterrupt
         for name in self.processes.check():
-            # What it said last is no longer so.
+            # The last summary of the killed process no longer holds.
             self.node.summaries.pop(name, None)
             self.console.print(f'{name} was killed, and is started again')
 
@@ -228,13 +216,13 @@ class Demo:
             self._spin()
 
     def _ready(self) -> bool:
-        """Whether every node is up, the robot is heard and both sensors are there."""
-        said = self.node.summaries
+        """Whether every node is up, the robot reports and both sensors measure."""
+        summaries = self.node.summaries
         return (
-            all(name in said for name in NODES)
-            and said['pose_planner']['robot'] == 'heard'
-            and said['laser_tracker_markers']['state'] == 'ready'
-            and said['optitrack_markers']['published'] != '0'
+            summaries.keys() >= {*CORE, *SENSORS}
+            and summaries['pose_planner']['robot'] == 'heard'
+            and summaries['laser_tracker_markers']['state'] == 'ready'
+            and summaries['optitrack_markers']['published'] != '0'
         )
 
     def _trigger(self, service: str, server: str, timeout_s: float = 30.0) -> None:
@@ -275,12 +263,12 @@ class Demo:
                         completed=int(planner.get('configurations_done', 0)),
                     )
                 if planner.get('state') == 'idle' and planner.get('resuming') == 'no':
-                    # It was killed, and could not be certain that its run still lives.
+                    # It was killed and waits for a person to resume its run.
                     self._trigger('remaster/collect', 'pose_planner')
                 recorder = self.node.summaries.get('recorder', {})
                 if planner.get('state') == 'paused' and recorder.get('changed'):
-                    # What a person would look at; in the demo nobody has anything to mend.
-                    self.console.print(f'the references say: {recorder["changed"]}')
+                    # A person would look at the cell first; in the demo there is nothing to mend.
+                    self.console.print(f'changed since the reference: {recorder["changed"]}')
                     self.console.print('going on, as /remaster/collect does')
                     self._trigger('remaster/collect', 'pose_planner')
                 if planner.get('state') == 'failed':
@@ -290,13 +278,15 @@ class Demo:
 
             self._wait(complete, 3600.0, 'the collection to complete')
         self.console.print(self.node.planned)
-        recorder = self.node.summaries['recorder']
-        waited = [
+        measuring = [
             f'{key.removeprefix("waited_s_")} {value} s'
-            for key, value in recorder.items()
+            for key, value in self.node.summaries['recorder'].items()
             if key.startswith('waited_s_')
         ]
-        self.console.print(f'the arm stood waiting for {", ".join(waited)} (world time)')
+        self.console.print(
+            f'the arm stood still for measuring: {", ".join(measuring)} (world time, sum of all '
+            'configurations; a sensor that measures beside a faster one counts only beyond it)'
+        )
 
     def close(self) -> None:
         """End every process and remove the hidden World."""
@@ -305,33 +295,29 @@ class Demo:
 
 
 def output_folder(path: Path) -> Path:
-    """Make a new folder, use an empty one, or that of a demo which was interrupted.
+    """Make a new folder and its log/, use an empty one, or that of an interrupted demo.
 
     Raises
     ------
     InputError
         If it holds something or cannot be written.
     """
+    session = path / 'session'
     try:
         path.mkdir(parents=True, exist_ok=True)
-        session = path / 'session'
-        if (session / JOURNAL).exists() and not is_complete(session):
-            return path
-        if any(path.iterdir()):
+        unfinished = (session / JOURNAL).exists() and not is_complete(session)
+        if any(path.iterdir()) and not unfinished:
             raise InputError(
                 f'{path} is not empty, and holds no unfinished session; give --out a new folder'
             )
-        (path / 'log').mkdir()
-        (path / 'log').rmdir()
+        (path / 'log').mkdir(exist_ok=True)
     except OSError as error:
-        raise InputError(
-            f'{path}: cannot write there ({error.strerror}); give another --out'
-        ) from None
+        raise cannot_write(path, error) from None
     return path
 
 
 def free_ports(*kinds: int) -> list[int]:
-    """Return a port on loopback for each kind of socket, all different and used by nobody now.
+    """Return a port on loopback for each kind of socket, all different and unused now.
 
     They lie above the ports that Linux gives to sockets without one (32768 to 60999): nine
     processes open dozens of these before the ports found here are bound.
@@ -349,13 +335,9 @@ def _is_free(kind: int, port: int) -> bool:
         return True
 
 
-def _domain_environment() -> dict[str, str]:
-    """Keep the demo's DDS traffic on this machine and apart from other runs."""
-    return {name: os.environ[name] for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE')}
-
-
 def main(args: list[str] | None = None) -> int:
     """Run the demo; returns its exit status."""
+    # The traffic of the demo and its nodes stays on this machine, and apart from other demos.
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     stopping: list[int] = []

@@ -23,7 +23,7 @@ from remaster_ros.simulation.expected_findings import (
     named_cause,
     true_parameters,
 )
-from remaster_ros.simulation.world import WorldTruth
+from remaster_ros.simulation.truth import SessionTruth
 
 
 class ConfigurationTimes:
@@ -31,7 +31,7 @@ class ConfigurationTimes:
 
     Motion, settle and measuring are world time. Measuring is what the slowest instrument took:
     the dwell of a stream, or search and integration of a laser tracker. Software is wall time:
-    from the bridge's word that the arm has settled to its next command, less the measuring.
+    from the bridge's report that the arm has settled to its next command, less the measuring.
 
     Parameters
     ----------
@@ -79,12 +79,19 @@ class ConfigurationTimes:
         return {**table, 'software': software}
 
 
+def _table(title: str, *headings: str, left: int = 1) -> Table:
+    """Return an empty table, its first `left` columns aligned to the left."""
+    table = Table(title=title)
+    for column, heading in enumerate(headings):
+        table.add_column(heading, justify='left' if column < left else 'right')
+    return table
+
+
 def print_times(console: Console, times: ConfigurationTimes) -> None:
     """Print the table of times per configuration."""
     columns = times.columns()
-    table = Table(title=f'time per configuration, s ({len(columns["motion"])} configurations)')
-    for heading in ('', 'median', '95 %', 'largest'):
-        table.add_column(heading, justify='left' if not heading else 'right')
+    title = f'time per configuration, s ({len(columns["motion"])} configurations)'
+    table = _table(title, '', 'median', '95 %', 'largest')
     for name, values in columns.items():
         if len(values):
             unit = 'wall' if name == 'software' else 'world time'
@@ -93,32 +100,25 @@ def print_times(console: Console, times: ConfigurationTimes) -> None:
     console.print(table)
 
 
-def print_offsets(console: Console, fit: dict[str, Any], truth: WorldTruth) -> None:
-    """Print offsets against the truth, which is opened only here, and the error on validation."""
-    table = Table(title='joint zero-offsets, degrees')
-    for heading in ('joint', 'estimate', 'std', 'hidden truth', 'off by, std'):
-        table.add_column(heading, justify='left' if heading == 'joint' else 'right')
+def print_offsets(console: Console, fit: dict[str, Any], truth: SessionTruth) -> None:
+    """Print the offsets beside the true ones, and the error on validation poses."""
+    title = 'joint zero-offsets, degrees'
+    table = _table(title, 'joint', 'estimate', 'std', 'hidden truth', 'off by, std')
     for row, true in zip(fit['joint_offsets'], np.rad2deg(truth.joint_offsets)):
         if row['identifiable']:
-            off = (row['mean_deg'] - true) / row['std_deg']
-            cells = [
-                f'{row["mean_deg"]:.4f}',
-                f'{row["std_deg"]:.4f}',
-                f'{true:.4f}',
-                f'{off:+.1f}',
-            ]
+            estimate, std = f'{row["mean_deg"]:.4f}', f'{row["std_deg"]:.4f}'
+            off = f'{(row["mean_deg"] - true) / row["std_deg"]:+.1f}'
         else:
-            # A joint that nothing tells has the spread of a whole turn: no figure to print.
+            # An offset that the data leave free has the spread of a whole turn: no useful figure.
             std = f'{row["std_deg"]:.2f}' if row['std_deg'] < 90 else 'n/a'
-            cells = ['not identifiable', std, f'{true:.4f}', '']
-        table.add_row(row['joint'], *cells)
+            estimate, off = 'not identifiable', ''
+        table.add_row(row['joint'], estimate, std, f'{true:.4f}', off)
     console.print(table)
     for row in fit['joint_offsets']:
         if not row['identifiable']:
             console.print(f'{row["joint"]}: {row["why"]}')
-    accuracy = Table(title='error on validation poses, which were never fitted, mm (mean)')
-    for heading in ('metric', 'before', 'after'):
-        accuracy.add_column(heading, justify='left' if heading == 'metric' else 'right')
+    title = 'error on validation poses, which were never fitted, mm (mean)'
+    accuracy = _table(title, 'metric', 'before', 'after')
     for metric in ('relative', 'post_registration'):
         sides = (fit['accuracy']['validation'] or {}).get(metric) or {}
         cells = [
@@ -128,21 +128,18 @@ def print_offsets(console: Console, fit: dict[str, Any], truth: WorldTruth) -> N
     console.print(accuracy)
 
 
-def print_hidden(console: Console, discovery: dict[str, Any], truth: WorldTruth) -> None:
-    """Print what was found beside what was hidden, which is opened only here, and the gain."""
+def print_hidden(console: Console, discovery: dict[str, Any], truth: SessionTruth) -> None:
+    """Print what was found beside what was hidden, and the gain."""
     found: dict[Any, list[dict[str, Any]]] = {}
     for effect in discovery['effects']:
         for cause in named_cause(effect):
             found.setdefault(cause, []).append(effect)
     hidden = [(cause, effect) for effect in truth.effects for cause in causes(effect)]
-    table = Table(title='beyond the zero-offsets')
-    for heading in ('hidden truth', 'found', 'parameter', 'estimate', 'std', 'truth', 'unit'):
-        table.add_column(
-            heading, justify='left' if heading in ('hidden truth', 'found') else 'right'
-        )
+    headings = ('hidden truth', 'found', 'parameter', 'estimate', 'std', 'truth', 'unit')
+    table = _table('beyond the zero-offsets', *headings, left=2)
     for cause, effect in hidden:
         claims = found.pop(cause, [])
-        table.add_row(describe(cause), 'yes' if claims else 'no', *[''] * 5)
+        table.add_row(describe(cause), 'yes' if claims else 'no')
         true = true_parameters(effect)
         for row in (row for claim in claims for row in claim['parameters']):
             if row['name'] in true:
@@ -151,7 +148,7 @@ def print_hidden(console: Console, discovery: dict[str, Any], truth: WorldTruth)
                     '', '', row['name'], *figures, f'{true[row["name"]]:.4g}', row['unit']
                 )
     for cause in found:
-        table.add_row('nothing of the kind', describe(cause), *[''] * 5)
+        table.add_row('nothing of the kind', describe(cause))
     console.print(table)
     for effect in discovery['effects']:
         console.print(effect['cause'])

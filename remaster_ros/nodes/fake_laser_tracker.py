@@ -1,4 +1,4 @@
-"""ROS shell of the fake laser tracker; it speaks emScon, and nothing else, to the product."""
+"""ROS shell of the fake laser tracker, whose only connection to the product is emScon."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Parameters:
 
 
 class FakeLaserTrackerNode(RemasterNode):
-    """Serve until told to stop."""
+    """Serve until stopped."""
 
     def __init__(self) -> None:
         super().__init__('fake_laser_tracker')
@@ -36,7 +36,7 @@ class FakeLaserTrackerNode(RemasterNode):
         self.tracker = FakeLaserTracker(
             world,
             p.sensor,
-            np.random.default_rng([world.truth.seed, 4]),
+            np.random.default_rng([world.seed, 4]),
             host=p.host,
             port=p.port,
             behaviour=TrackerBehaviour(warm_up_s=p.warm_up_s),

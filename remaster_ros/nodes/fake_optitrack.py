@@ -1,4 +1,4 @@
-"""ROS shell of the fake OptiTrack server; it speaks NatNet, and nothing else, to the product."""
+"""ROS shell of the fake OptiTrack server, whose only connection to the product is NatNet."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Parameters:
 
 
 class FakeOptiTrackNode(RemasterNode):
-    """Serve until told to stop."""
+    """Serve until stopped."""
 
     def __init__(self) -> None:
         super().__init__('fake_optitrack')
@@ -43,7 +43,7 @@ class FakeOptiTrackNode(RemasterNode):
         self.server = FakeOptiTrackServer(
             world,
             p.sensor,
-            np.random.default_rng([world.truth.seed, 3]),
+            np.random.default_rng([world.seed, 3]),
             version=(major, minor),
             transport='unicast' if p.transport == 'unicast' else 'multicast',
             rate_hz=p.rate,

@@ -23,7 +23,8 @@ from remaster_ros.nodes.messages import seconds, stamp_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.session.workcell import read_cell
-from remaster_ros.simulation.robot import FakeArm, TrajectoryPoint
+from remaster_ros.simulation.arm_motion import ServoPoint
+from remaster_ros.simulation.robot import FakeArm
 from remaster_ros.simulation.setup import (
     default_folder,
     make_private_folder,
@@ -66,7 +67,7 @@ class FakeRobotNode(RemasterNode):
             make_private_folder(folder)
             self._drawn = folder
             self.world = make_world(self._drawn, read_cell(self.p.cell), self.p.seed, self.p.rate)
-        rng = np.random.default_rng([self.world.truth.seed, 2])
+        rng = np.random.default_rng([self.world.seed, 2])
         self.arm = FakeArm(self.world, rng)
         reliable = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
         self._states = self.create_publisher(JointState, 'joint_states', reliable)
@@ -111,10 +112,10 @@ class FakeRobotNode(RemasterNode):
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         points = [
-            TrajectoryPoint(
+            ServoPoint(
                 point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec,
-                point.positions,
-                point.velocities,
+                np.array(point.positions),
+                np.array(point.velocities) if point.velocities else None,
             )
             for point in message.points
         ]

@@ -1,24 +1,27 @@
-"""What the launch files start: which nodes, with which parameters and names.
+"""Which nodes the launch files and the demo start, with which parameters and names.
 
-No launch in here, so that it is tested where launch is not installed; the launch files turn the
-result into its actions.
+This module does not import launch, so that it is tested where launch is not installed;
+`launch_actions` turns the result into the actions of launch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from remaster_ros.errors import InputError
+from remaster_ros.sensors.registry import DRIVERS, GENERIC, kind_of
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.safe_yaml import YamlError, load_yaml
 from remaster_ros.session.workcell import YAML_LIMIT, read_cell
 
 CORE = ('pose_planner', 'robot_bridge', 'recorder', 'optimizer')
 SENSORS = ('optitrack_markers', 'laser_tracker_markers')
+"""The sensors that have a fake and an executable of their own."""
 FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
+ALL_NODES = (*FAKES, *CORE, *SENSORS)
 ALL = 'all'
 RESPAWN_DELAY_S = 1.0
 MAX_RESPAWNS = 5
@@ -40,12 +43,18 @@ class NodeToStart:
         A parameter file, then values that override it.
     remappings
         From and to; relative names, so that they hold in a namespace.
+    namespace
+        Of the node and its names.
+    ros_arguments
+        Further ones.
     """
 
     executable: str
     name: str
     parameters: tuple[str | dict[str, Any], ...]
-    remappings: tuple[tuple[str, str], ...] = field(default=())
+    remappings: tuple[tuple[str, str], ...] = ()
+    namespace: str = ''
+    ros_arguments: tuple[str, ...] = ()
 
 
 def real_nodes(
@@ -94,41 +103,41 @@ def real_nodes(
         )
     by_sensor = {values.get('sensor'): name for name, values in sections.items()}
     own: dict[str, Any] = {'cell': str(Path(cell).resolve())}
-    # One that is not started is not to be waited for.
-    require = {'require': wanted[0]} if len(wanted) == 1 < len(known) else {}
-    remappings = tuple(
-        pair
-        for pair in (
-            (COMMANDS, f'{controller}/joint_trajectory' if controller else ''),
-            ('joint_states', joint_states),
-        )
-        if pair[1]
-    )
-    nodes = []
-    for name in CORE:
-        values = {} if name == 'optimizer' else {**own, **(require if name == 'recorder' else {})}
+    remappings = []
+    if controller:
+        remappings.append((COMMANDS, f'{controller}/joint_trajectory'))
+    if joint_states:
+        remappings.append(('joint_states', joint_states))
+
+    def start(executable: str, name: str, **values: Any) -> NodeToStart:
+        # Of config/sros2/policy.xml; without ROS_SECURITY_ENABLE it has no effect.
+        enclave = ('--enclave', f'/remaster/{executable}')
         parameters = (params, values) if values else (params,)
-        nodes.append(NodeToStart(name, name, parameters, remappings))
+        return NodeToStart(executable, name, parameters, tuple(remappings), namespace, enclave)
+
+    # The recorder does not wait for a sensor whose node is not started.
+    require = {'require': wanted[0]} if len(wanted) == 1 < len(known) else {}
+    values = {'pose_planner': own, 'robot_bridge': own, 'recorder': {**own, **require}}
+    nodes = [start(name, name, **values.get(name, {})) for name in CORE]
     for sensor in wanted:
         node = by_sensor.get(sensor, '')
-        kind = next((kind for kind in SENSORS if node.startswith(kind)), '')
+        kind = kind_of(node)
         if not kind:
             raise InputError(
                 f'{params}: no node for the sensor {sensor!r}{_where(namespace)}; give it a '
-                f'section /**/{" or /**/".join(SENSORS)} with "sensor: {sensor}", or leave it '
+                f'section /**/{" or /**/".join(DRIVERS)} with "sensor: {sensor}", or leave it '
                 'out with sensors:='
             )
-        nodes.append(NodeToStart(kind, node, (params, own), remappings))
+        nodes.append(start(kind if kind in SENSORS else GENERIC, node, **own))
     return nodes
 
 
-def fake_nodes(params: str) -> list[NodeToStart]:
+def fake_nodes(params: str, namespace: str = '') -> list[NodeToStart]:
     """Return the nodes of a fake cell and its fakes, whose clock is the namespace's own."""
     if not Path(params).is_file():
         raise InputError(f'params:={params}: there is no such file')
     return [
-        NodeToStart(name, name, (params,), (('/clock', 'clock'),))
-        for name in (*FAKES, *CORE, *SENSORS)
+        NodeToStart(name, name, (params,), (('/clock', 'clock'),), namespace) for name in ALL_NODES
     ]
 
 
@@ -159,7 +168,7 @@ def read_sections(params: str, namespace: str = '') -> dict[str, Mapping[str, An
             continue
         if place == '/**' or place.strip('/') == space:
             found[name] = values
-        elif name.startswith((*CORE, *SENSORS, *FAKES)):
+        elif name.startswith((*CORE, *DRIVERS, *FAKES)):
             raise InputError(
                 f'{path}: section {key} is not for the nodes{_where(namespace)}, which would run '
                 f'on their defaults; call it /**/{name}'
@@ -168,7 +177,7 @@ def read_sections(params: str, namespace: str = '') -> dict[str, Mapping[str, An
 
 
 def exit_ends_launch(returncode: int | None) -> bool:
-    """Return whether the end of a node ends them all: started again it would say the same."""
+    """Return whether the end of a node ends them all: started again it would end the same way."""
     return returncode == WRONG
 
 

@@ -21,47 +21,14 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 
 from remaster_ros.errors import InputError
+from remaster_ros.parameters import check, parameter, parameter_fields
+
+__all__ = ['check', 'declare', 'parameter']
 
 T = TypeVar('T')
 
 # Declared by rclpy itself, or by every node.
 _ALWAYS = ('use_sim_time', 'start_type_description_service')
-
-
-def parameter(
-    default: Any,
-    description: str,
-    *,
-    unit: str = '',
-    low: float | None = None,
-    high: float | None = None,
-    choices: tuple[str, ...] = (),
-    live: bool = False,
-) -> Any:
-    """Return a dataclass field that describes a node parameter.
-
-    Parameters
-    ----------
-    default
-        Its value where the user gives none; its type is the parameter's type.
-    description, unit
-        For the user; shown by ``ros2 param describe``.
-    low, high
-        Smallest and largest allowed value, both included.
-    choices
-        The allowed values of a text parameter.
-    live
-        Whether it can be changed while the node runs, where the node has an `on_change`.
-    """
-    metadata = {
-        'description': description,
-        'unit': unit,
-        'low': low,
-        'high': high,
-        'choices': choices,
-        'live': live,
-    }
-    return dataclasses.field(default=default, metadata=metadata)
 
 
 def declare(node: Node, kind: type[T], on_change: Callable[[T], None] | None = None) -> T:
@@ -83,7 +50,7 @@ def declare(node: Node, kind: type[T], on_change: Callable[[T], None] | None = N
         Naming the node, the parameter and what it may be.
     """
     overrides: Mapping[str, Any] = node._parameter_overrides
-    fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    fields = parameter_fields(kind)
     for name in overrides:
         if name not in fields and name not in _ALWAYS and not name.startswith('qos_overrides.'):
             known = ', '.join(sorted(fields))
@@ -129,27 +96,6 @@ def _changed(
             )
     values = {item.name: check(node_name, fields[item.name], item.value) for item in parameters}
     return dataclasses.replace(current, **values)  # type: ignore[type-var]
-
-
-def check(node_name: str, field: dataclasses.Field[Any], value: Any) -> Any:
-    """Return `value` as the field's type; refuse what does not fit with one line."""
-    where = f'{node_name}: parameter {field.name}'
-    wanted = type(field.default)
-    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if type(value) is not wanted:
-        raise InputError(f'{where} is {value!r}; it must be of type {wanted.__name__}')
-    low, high = field.metadata['low'], field.metadata['high']
-    too_low = low is not None and not value >= low
-    too_high = high is not None and not value <= high
-    if too_low or too_high:
-        unit = f' {field.metadata["unit"]}' if field.metadata['unit'] else ''
-        limits = f'{"-inf" if low is None else low} to {"inf" if high is None else high}'
-        raise InputError(f'{where} is {value}; it must lie in {limits}{unit}')
-    choices = field.metadata['choices']
-    if choices and value not in choices:
-        raise InputError(f'{where} is {value!r}; it must be one of {", ".join(choices)}')
-    return value
 
 
 def _descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:

@@ -39,6 +39,7 @@ from remaster_ros.nodes.measure_calls import MeasureCalls
 from remaster_ros.nodes.messages import JointOrder, transform_array
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.planner_parameters import Parameters
+from remaster_ros.nodes.planning_thread import PlanningThread
 from remaster_ros.nodes.pose_publisher import PosePublisher
 from remaster_ros.nodes.run_token import LivingRun, new_token, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
@@ -50,8 +51,8 @@ from remaster_ros.nodes.status import (
     Summary,
     listen,
 )
-from remaster_ros.nodes.tour_planner import PlanningThread, TourPlanner
 from remaster_ros.planning.tour_order import REGISTRATION, PoseVisit
+from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanJournal
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
@@ -75,10 +76,8 @@ class PosePlanner(RemasterNode):
             'validation': self.p.validation_candidates,
             REGISTRATION: self.p.registration_candidates,
         }
-        margin = np.deg2rad(self.p.limit_margin_deg)
-        tours = TourPlanner(
-            self.cell, self.chain, counts, self.p.seed, margin, self.p.reference_every
-        )
+        scene = self.cell.planning_scene(self.chain, np.deg2rad(self.p.limit_margin_deg))
+        tours = TourPlanner(scene, counts, self.p.seed, self.p.reference_every)
         folder = Path(self.p.session)
         self.journal = PlanJournal(
             folder, self.p.plan_settings(self.cell), self.chain, tours.model

@@ -53,7 +53,7 @@ class NodeProcesses:
         command = [sys.executable, '-m', 'remaster_ros.nodes', name, '--ros-args']
         command += ['--params-file', str(parameters_file)]
         for key, value in parameters.items():
-            # With the node's name: a bare one gives way to what the file says of that node.
+            # With the node's name: without it, the values of the file would take precedence.
             # JSON is YAML; text in double quotes stays text whatever it looks like.
             command += ['-p', f'{name}:{key}:={json.dumps(value)}']
         self._commands[name] = command
@@ -93,7 +93,7 @@ class NodeProcesses:
                 killed.append(name)
             else:
                 lines = (self._log_folder / f'{name}.log').read_text(errors='replace').split('\n')
-                last = next((line for line in reversed(lines) if line.strip()), 'it said nothing')
+                last = next((line for line in reversed(lines) if line.strip()), 'its log is empty')
                 raise DeviceError(f'{name} ended with status {status}: {last.strip()}')
         return killed
 

@@ -50,7 +50,7 @@ from remaster_ros.nodes.status import (
     receiver,
 )
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
-from remaster_ros.session.session_writer import ExitStatus
+from remaster_ros.session.session_yaml import ExitStatus
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 

@@ -1,7 +1,7 @@
 """Publish a recorded bag again, byte for byte and in its own time, as ``ros2 bag play`` does.
 
-Never onto a live graph: where somebody else publishes what robot, bridge and planner publish, or
-where a controller listens, it ends. What the arm was told is left out unless asked for.
+It never publishes onto a live graph: where other nodes publish what robot, bridge and planner
+publish, or where a controller subscribes, it ends. Commands to the arm are left out by default.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ SOURCES = (
 )
 """What robot, bridge and planner publish: with one of them there, the graph is live."""
 DISCOVERY_S = 4.0
-"""So long it is looked whether the graph is live before the first message, s: a participant
-announces itself every 3 s, and what it says at first can get lost on a busy machine."""
+"""How long the graph is checked before the first message, s: a participant announces itself every
+3 s, and its first announcement can get lost on a busy machine."""
 NEWCOMER_S = 0.5
 """How long after its first endpoint all others of a node are known, s."""
 LOOK_S = 1.0
-"""How often it is looked again whether somebody has come, s."""
+"""How often the graph is checked again for other nodes, s."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Parameters:
     )
     wait_s: float = parameter(30.0, 'how long at most', unit='s', low=0.0, high=3600.0)
     with_commands: bool = parameter(
-        False, 'publish also what the controller was told; a controller that listens is refused'
+        False, 'publish also the commands to the controller; refused where a controller subscribes'
     )
 
 
@@ -78,10 +78,10 @@ class Replay(RemasterNode):
         )
         self._ending = threading.Event()
         self._clock_sent = 0.0
-        # How many listen to each topic that moves an arm, and were looked at.
+        # Number of subscribers, when last checked, of each topic that moves an arm.
         self._listeners: dict[str, int] = {}
         self.sent = 0
-        # Before anything is published, and again when discovery has had its time.
+        # Before anything is published, and again when discovery has found the other nodes.
         self._refuse_live()
         for topic, type_name in self._reader.topics.items():
             name = live_name(topic)
@@ -125,13 +125,13 @@ class Replay(RemasterNode):
             self._ending.wait(DISCOVERY_S)
             return
         deadline = time.monotonic() + self.p.wait_s
-        # A topic of the bag is meant as it was recorded, whatever the namespace here.
+        # A recorded name stands for the topic that is published here, in any namespace.
         for recorded, publisher in self._publishers_by_topic.items():
             if live_name(recorded) == f'/{topic.lstrip("/")}':
                 topic = publisher.topic_name
         while not self._ending.is_set() and self.count_subscribers(topic) == 0:
             if time.monotonic() > deadline:
-                raise InputError(f'replay: nobody subscribed to {topic} in {self.p.wait_s:g} s')
+                raise InputError(f'replay: no subscriber of {topic} in {self.p.wait_s:g} s')
             time.sleep(0.05)
         self._ending.wait(DISCOVERY_S)
 
@@ -141,7 +141,7 @@ class Replay(RemasterNode):
         Raises
         ------
         InputError
-            Naming who is there. A node that was killed stays listed for some 20 s.
+            Naming the node. One that was killed stays listed for some 20 s.
         """
         own = self.get_name(), self.get_namespace()
         for topic in SOURCES:
@@ -160,12 +160,12 @@ class Replay(RemasterNode):
                 raise InputError(_live(info, f'listens to {name}'))
 
     def _look_who_listens(self, publisher: Publisher) -> None:
-        """Refuse a new listener of what moves an arm before the next message, if it obeys it."""
+        """Refuse a new subscriber of what moves an arm before the next message, if it obeys it."""
         count = publisher.get_subscription_count()
         known = self._listeners.get(publisher.topic_name)
         if count != known:
             if count:
-                # What else it subscribes to and publishes is known a little later.
+                # Its other endpoints are discovered a little later.
                 self._ending.wait(NEWCOMER_S)
             self._refuse_live()
             self._listeners[publisher.topic_name] = count

@@ -53,6 +53,7 @@ from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import LEASED, RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.nodes.waypoints import waypoints_by_solution
+from remaster_ros.sensors.registry import kind_of
 from remaster_ros.session.halt_file import HaltFile
 from remaster_ros.session.workcell import read_cell
 
@@ -72,8 +73,8 @@ longer with it, a paused process may not.
 """
 WATCH_WALL_S = 0.05
 """How often silence and the graph are looked at."""
-LISTENERS = ('robot_bridge', 'recorder', 'laser_tracker_markers')
-"""Nodes of this package that subscribe to the commands."""
+LISTENERS = ('robot_bridge', 'recorder')
+"""Nodes of this package that subscribe to the commands; those of sensors do so as well."""
 
 
 class RobotBridge(RemasterNode):
@@ -192,7 +193,7 @@ class RobotBridge(RemasterNode):
         try:
             q = self._order.positions(message)
         except InputError as error:
-            self._do(self.supervisor.unreadable(str(error), now))
+            self._do(self.supervisor.doubt(str(error), now))
             return
         report = JointReport(seconds(message.header.stamp), q, self.now_s(), now)
         self._do(self.supervisor.report(report))
@@ -238,7 +239,8 @@ class RobotBridge(RemasterNode):
     def _controller_is_listed(self) -> bool:
         """Whether somebody else than nodes of ours listens to the commands."""
         found = self.get_subscriptions_info_by_topic(self.resolve_topic_name(COMMANDS))
-        return any(info.node_name not in LISTENERS for info in found)
+        names = [info.node_name for info in found]
+        return any(name not in LISTENERS and not kind_of(name) for name in names)
 
     # What goes out
 

@@ -1,125 +1,189 @@
-"""What every sensor's node does: one marker's readings out, and whether it is ready.
+"""The node of any sensor: one marker's readings out, and whether the sensor is ready.
 
-A new sensor derives from `SensorNode`, calls `publish_reading` and gives `state`. Planner,
-recorder and preflight need nothing else of it.
+What is particular to a device lies in its driver (`remaster_ros.sensors`). The node opens the
+driver, tries again while that fails, publishes readings with their time of capture, and publishes
+the state that preflight, planner and recorder need.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+import threading
+import time
+from functools import partial
 
+import numpy as np
 from geometry_msgs.msg import PointStamped
 
 from remaster_ros.collection.events import SensorReport
-from remaster_ros.errors import InputError
+from remaster_ros.errors import DeviceError, InputError, RemasterError
+from remaster_ros.nodes.measure_service import MeasureService
 from remaster_ros.nodes.messages import stamp_of
-from remaster_ros.nodes.running import RemasterNode
+from remaster_ros.nodes.parameters import declare
+from remaster_ros.nodes.running import RemasterNode, fault_of_this_program, run
 from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary
-from remaster_ros.session.workcell import Workcell, read_cell
-from remaster_ros.types import FloatArray
+from remaster_ros.sensors.driver import SensorClock, StreamDriver, TriggeredDriver
+from remaster_ros.sensors.registry import kind_of, load_driver
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.types import MarkerReading
 
-
-@dataclass(frozen=True)
-class SensorState:
-    """How a sensor is now.
-
-    Attributes
-    ----------
-    ready
-        It can measure a marker that it sees. A hidden marker is no reason to say no: moving on
-        shows it again.
-    trouble
-        What is wrong, with the remedy; ''.
-    message
-        What to show a person where nothing is wrong.
-    level
-        ``ok``, ``warn`` or ``error``.
-    values
-        Counts and settings for whoever looks for the cause of something.
-    """
-
-    ready: bool
-    trouble: str = ''
-    message: str = 'ok'
-    level: str = 'ok'
-    values: Mapping[str, Any] = field(default_factory=dict)
+RETRY_S = 0.5
 
 
 class SensorNode(RemasterNode):
     """A node that publishes the marker which one of the cell's sensors follows.
 
+    Parameters
+    ----------
+    name
+        Of the node, where none is given on its command line; it chooses the driver, unless it is
+        that of no registered sensor: then the given one does.
+
     Attributes
     ----------
-    cell, sensor
-        The workcell, and the sensor's name, which is the frame of its readings.
+    kind
+        Key of the driver in `remaster_ros.sensors.registry.DRIVERS`.
+    driver
+        Of the device.
+    sensor
+        Its name in the cell, which is the frame of its readings.
     published
         Number of readings.
+    trouble
+        Why the device was not opened, or what it refused last; ''.
+    in_use
+        Held while a command of the device is under way.
     """
 
-    cell: Workcell
-    sensor: str
-
-    def open_sensor(self, cell: str, sensor: str) -> None:
-        """Read the cell and make the publisher; first of all in a node's constructor.
-
-        Parameters
-        ----------
-        cell, sensor
-            The cell file, and the name of this sensor in it.
-
-        Raises
-        ------
-        InputError
-            The cell has no such sensor.
-        """
-        self.cell, self.sensor, self.published = read_cell(cell), sensor, 0
-        if sensor not in self.cell.sensors:
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.kind = kind_of(name) or kind_of(self.get_name())
+        driver = load_driver(self.kind or self.get_name())
+        p = declare(self, driver.parameters_type)
+        cell, self.sensor = read_cell(p.cell), p.sensor
+        if self.sensor not in cell.sensors:
             raise InputError(
-                f'{self.get_name()}: parameter sensor is {sensor!r}; the cell has '
-                f'{", ".join(self.cell.sensors)}'
+                f'{self.get_name()}: parameter sensor is {self.sensor!r}; the cell has '
+                f'{", ".join(cell.sensors)}'
             )
-        topic = self.cell.sensors[sensor].topic
-        self._readings = self.create_publisher(PointStamped, topic, RELIABLE)
-
-    def open_status(self) -> None:
-        """Begin to publish the state; last of all in a node's constructor."""
+        described = cell.sensors[self.sensor]
+        triggered = issubclass(driver, TriggeredDriver)
+        if described.single_shot != triggered:
+            raise InputError(
+                f'{self.get_name()}: sensor {self.sensor} of {p.cell} has single_shot '
+                f'{str(described.single_shot).lower()}, but a {driver.device} '
+                f'{"measures on request" if triggered else "streams"}; correct single_shot'
+            )
+        self._readings = self.create_publisher(PointStamped, described.topic, RELIABLE)
+        self.published = 0
+        self.trouble = ''
+        self.in_use = threading.Lock()
+        self._ending = threading.Event()
+        self._start_by = time.monotonic() + p.start_timeout_s
+        self._started = False
+        simulated = bool(self.get_parameter('use_sim_time').value)
+        self.driver = driver(p, SensorClock(self.now_s, self._sleep, simulated))
+        if isinstance(self.driver, TriggeredDriver):
+            self._step = MeasureService(self, self.driver, cell, self._ending).step
+        elif isinstance(self.driver, StreamDriver):
+            self._step = partial(self._read, self.driver)
         self.status = NodeStatus(self, self._summary, self.sensor)
+        self._thread = threading.Thread(target=self._work, name=self.sensor, daemon=True)
+        self._thread.start()
 
-    @abstractmethod
-    def state(self) -> SensorState:
-        """Return how the sensor is now; the node's clock need not be looked at."""
+    def _sleep(self, duration_s: float) -> None:
+        """Wait on the node's clock, which may be simulated and may stand still."""
+        until = self.now_s() + duration_s
+        while self.now_s() < until and not self._ending.wait(0.002):
+            pass
 
-    def publish_reading(self, position: FloatArray, captured_s: float) -> None:
-        """Publish a measured position.
+    def _work(self) -> None:
+        """Keep the device open and serve it; the body of the thread."""
+        try:
+            while not (self._ending.is_set() or self.failure):
+                if self.driver.phase == 'ready' and self.driver.connected:
+                    self._step()
+                else:
+                    self._open()
+        except Exception as error:
+            if not self._ending.is_set():
+                self.failure = fault_of_this_program(error)
 
-        Parameters
-        ----------
-        position
-            Of the marker in the sensor's frame, m, (3,). Nothing occluded, predicted or held over.
-        captured_s
-            When it was captured, s of the node's clock.
-        """
+    def _open(self) -> None:
+        """Try to open the device; the first time until the start time-out."""
+        with self.in_use:
+            self.driver.phase = 'connecting'
+            try:
+                self.driver.open()
+            except DeviceError as error:
+                self.driver.phase = 'connecting'
+                self.trouble = str(error)
+                self.driver.close()
+                self._require_start(error)
+            else:
+                self.driver.phase, self.trouble = 'ready', ''
+                self._started = self._started or isinstance(self.driver, TriggeredDriver)
+        if self.trouble:
+            self._ending.wait(RETRY_S)
+
+    def _require_start(self, error: RemasterError) -> None:
+        """End the node with this error where the device has never worked and the time is over."""
+        over = time.monotonic() > self._start_by
+        if over and not (self._started or self._ending.is_set()):
+            self.failure = error
+
+    def _read(self, driver: StreamDriver) -> None:
+        """Publish the next reading of a stream."""
+        try:
+            reading = driver.read()
+        except DeviceError as error:
+            self.trouble, driver.phase = str(error), 'connecting'
+            driver.close()
+            self._require_start(error)
+            self._ending.wait(RETRY_S)
+            return
+        if reading is not None:
+            self._started = True
+            self.publish_reading(reading)
+        else:
+            why = driver.state().trouble or 'no reading of the marker'
+            self._require_start(DeviceError(f'{driver.device}: {why}'))
+
+    def publish_reading(self, reading: MarkerReading) -> None:
+        """Publish a measured position under its time of capture."""
         message = PointStamped()
-        message.header.stamp = stamp_of(captured_s)
+        message.header.stamp = stamp_of(reading.stamp_s)
         message.header.frame_id = self.sensor
+        position = np.asarray(reading.position, float)
         message.point.x, message.point.y, message.point.z = map(float, position)
         self._readings.publish(message)
         self.published += 1
 
     def _summary(self) -> Summary:
-        state = self.state()
-        trouble = self.clock_trouble or state.trouble
+        state = self.driver.state()
+        open_now = self.driver.phase == 'ready' and self.driver.connected
+        trouble, level = state.trouble, state.level
+        if self.trouble:
+            trouble, level = self.trouble, 'warn' if self.driver.phase == 'ready' else 'error'
+        if self.clock_trouble:
+            trouble, level = self.clock_trouble, 'error'
+        ready = open_now and state.ready and not self.clock_trouble
         report = SensorReport(
             sensor=self.sensor,
-            ready=state.ready and not self.clock_trouble,
+            ready=ready,
             trouble=trouble,
             message=trouble or state.message,
             hidden=state.values.get('fault') == 'marker',
         )
-        level = 'error' if self.clock_trouble else state.level
-        return Summary(
-            level, report.message, {'published': self.published, **state.values}, report
-        )
+        values = {'state': self.driver.phase, 'published': self.published, **state.values}
+        return Summary(level, report.message, values, report)
+
+    def close(self) -> None:
+        """Disconnect from the device."""
+        self._ending.set()
+        self.driver.close()
+        self._thread.join(2.0)
+
+
+def run_sensor(name: str, args: list[str] | None = None, threads: int = 3) -> int:
+    """Run the node of a sensor; parameters as of `SensorNode` and `run`."""
+    return run(lambda: SensorNode(name), args, threads=threads)

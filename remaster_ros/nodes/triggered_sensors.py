@@ -1,4 +1,4 @@
-"""Ask single-shot sensors for their measurement, again where the answer was lost."""
+"""Request measurements of single-shot sensors, again where the answer was lost."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from std_srvs.srv import Trigger
 from remaster_ros.collection.pairing import Pairing
 
 PATIENCE_WALL_S = 1.0
-"""What an answer says counts after so long: of a refusal the node may say meanwhile that the
-instrument is gone, and of a measurement that was made the reading is on its way."""
+"""An answer counts after so long: in this time the status of the node may show that the instrument
+is gone, and the reading of a measurement arrives."""
 MISSING_WALL_S = 5.0
 """A service that is not there counts after so long: by then a node that died is absent."""
 
 
 @dataclass
 class _Shot:
-    """A measurement that is wanted since a time, asked for, and answered at another."""
+    """A measurement: since when it is needed, the request, and when it was answered."""
 
     since_wall: float
     future: Future | None = None
@@ -43,10 +43,10 @@ class TriggeredSensors:
         self._shots: dict[str, _Shot] = {}
 
     def look(self, pairing: Pairing, absent: Mapping[str, str]) -> None:
-        """Ask whoever has not been asked for this pairing, and note who refused.
+        """Send the requests that this pairing still needs, and note the refusals.
 
-        A sensor that goes absent while it is asked is asked again when it is back, and one whose
-        reading was lost on the way too.
+        The request is sent again to a sensor that was absent meanwhile, and to one whose reading
+        was lost.
         """
         if pairing is not self._pairing:
             self._pairing, self._shots = pairing, {}

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +26,9 @@ from remaster_ros.types import BoolArray, FloatArray, IntArray
 OUT_OF_REACH = 'out of reach'
 JOINT_LIMITS = 'outside the joint limits'
 NO_LINE_OF_SIGHT = 'no line of sight to '  # the sensor's name follows
+
+LIMIT_MARGIN_RAD = np.deg2rad(1.0)
+"""Distance kept from the joint limits by default, rad."""
 
 _FULL_TURN = (0.0, 2 * np.pi)
 
@@ -73,12 +76,15 @@ class LineOfSight:
     max_angle_rad
         Largest angle between the tool's Z axis and the line to the sensor at which the marker
         is still seen; a quarter turn keeps the sensor in front of the tool plate.
+    marker
+        The marker's name.
     """
 
     sensor: str
     sensor_R: FloatArray
     marker_T: FloatArray
     max_angle_rad: float = np.pi / 2
+    marker: str = ''
 
 
 @dataclass(frozen=True)
@@ -106,6 +112,65 @@ class Plan:
     poses: tuple[PlannedPose, ...]
     dropped: Mapping[str, int] = field(default_factory=dict)
     dropped_solutions: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PlanningScene:
+    """All that poses are planned from: an arm, what it can hit, and the sensors before it.
+
+    Attributes
+    ----------
+    inverse_kinematics
+        Of the arm; its held values decide how many solutions a pose has.
+    model
+        The arm with everything that it can hit.
+    ranges
+        What the candidates are drawn from.
+    sights
+        Every sensor, at its rough place.
+    aim_at
+        The sensor that the tool faces.
+    limit_margin_rad
+        Distance to keep from the joint limits, rad.
+    """
+
+    inverse_kinematics: InverseKinematics
+    model: CollisionModel
+    ranges: PoseRanges
+    sights: Sequence[LineOfSight]
+    aim_at: str
+    limit_margin_rad: float = LIMIT_MARGIN_RAD
+
+    @property
+    def rough_R(self) -> dict[str, FloatArray]:
+        """Rough origin of each sensor in R, m, (3,)."""
+        return {sight.sensor: sight.sensor_R for sight in self.sights}
+
+    def plan(
+        self, count: int, sensors_R: Mapping[str, FloatArray], rng: np.random.Generator
+    ) -> Plan:
+        """Plan poses that face one sensor and that all of these sensors see.
+
+        Parameters
+        ----------
+        count
+            How many candidates are drawn.
+        sensors_R
+            Origin in R of each sensor that has to see its marker, m, (3,).
+        rng
+            Source of randomness.
+        """
+        # A sensor that is not required may have no registration.
+        aim = {**self.rough_R, **sensors_R}[self.aim_at]
+        sights = [
+            replace(sight, sensor_R=sensors_R[sight.sensor])
+            for sight in self.sights
+            if sight.sensor in sensors_R
+        ]
+        candidates = candidate_poses(count, self.ranges, aim, rng)
+        return plan_poses(
+            self.inverse_kinematics, self.model, candidates, sights, self.limit_margin_rad
+        )
 
 
 def candidate_poses(
@@ -217,7 +282,7 @@ def _reasons(
     arm: CollisionModel, q: FloatArray, lines_of_sight: Sequence[LineOfSight]
 ) -> np.ndarray[tuple[int], np.dtype[np.str_]]:
     """Return why each solution (m, k) is no good, or '', (m,); the first reason wins."""
-    # More than the bridge asks for: an arm that stands a little off a planned way may still move.
+    # More than the bridge requires: an arm that stands a little off a planned way may still move.
     collisions = arm.reasons(q, RESERVE_M)
     bad = [collisions != '', *(_unseen(arm, q, sight) for sight in lines_of_sight)]
     names = [NO_LINE_OF_SIGHT + sight.sensor for sight in lines_of_sight]
@@ -225,38 +290,12 @@ def _reasons(
 
 
 def _unseen(arm: CollisionModel, q: FloatArray, sight: LineOfSight) -> BoolArray:
-    """Tell where the marker faces away from the sensor, or the arm is in between, (m,)."""
+    """Return where the marker faces away from the sensor, or the arm is in between, (m,)."""
     T = arm.chain.forward(q)
     to_sensor = sight.sensor_R - arm.chain.positions(q, sight.marker_T)
     facing = np.sum(T[:, :3, 2] * to_sensor, axis=-1) / np.linalg.norm(to_sensor, axis=-1)
     turned_away = facing < np.cos(sight.max_angle_rad)
     return turned_away | arm.hides(q, sight.marker_T, sight.sensor_R)
-
-
-def order_by_proximity(points: ArrayLike, start: ArrayLike) -> IntArray:
-    """Order points (n, 3) so that each is the nearest of the rest to the one before it.
-
-    Parameters
-    ----------
-    points
-        m, (n, 3).
-    start
-        Where the tool is now, m, (3,).
-
-    Returns
-    -------
-    ndarray
-        Indices into points, (n,).
-    """
-    points, here = np.asarray(points, dtype=float), np.asarray(start, dtype=float)
-    left = np.ones(len(points), dtype=bool)
-    order = np.empty(len(points), dtype=np.int64)
-    for i in range(len(points)):
-        distances = np.where(left, np.linalg.norm(points - here, axis=-1), np.inf)
-        order[i] = np.argmin(distances)
-        left[order[i]] = False
-        here = points[order[i]]
-    return order
 
 
 def order_solutions(

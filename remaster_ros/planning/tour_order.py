@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +21,25 @@ REGISTRATION = 'registration'
 REFERENCE = 'reference'
 FIRST_ROUNDS = 2
 """The references are measured so often at the beginning: their difference is the noise."""
+
+
+class Route(NamedTuple):
+    """The way to joint solutions of one pose, in the order of the visits.
+
+    Attributes
+    ----------
+    ids
+        Which of the pose's planned solutions they are.
+    paths
+        The way to each from the one before (to the first from where the arm stands):
+        configurations to go through in between, rad, (n, k); n = 0 where the straight way is free.
+    unreached
+        The pose's other solutions that no free path leads to.
+    """
+
+    ids: Sequence[int]
+    paths: Sequence[FloatArray]
+    unreached: Sequence[int]
 
 
 @dataclass(frozen=True)
@@ -38,13 +58,9 @@ class PoseVisit:
         Joint solutions, nearest first, rad, (m, k).
     index
         Which of the poses planned for its split.
-    ids
-        Which of that pose's planned solutions each of `solutions` is.
-    paths
-        The way to each of them from the one before (to the first from where the arm stands):
-        configurations to go through in between, rad, (n, k); n = 0 where the straight way is free.
-    unreached
-        The pose's other solutions that no free path leads to.
+    ids, paths, unreached
+        Which of that pose's planned solutions each of `solutions` is, and the way there: a
+        `Route`.
     """
 
     pose: int
@@ -155,10 +171,11 @@ class Tour:
         distances = np.linalg.norm(np.array(places) - here, axis=1)
         split, index = left[0 if self.in_order else int(np.argmin(distances))]
         solutions = self.plans[split].poses[index].solutions
-        ids, paths, unreached = self._route(split, index, range(len(solutions)), q)
-        if self.references and self._since and self._since + len(ids) > self.reference_every:
+        route = self._route(split, index, range(len(solutions)), q)
+        after = self._since + len(route.ids)
+        if self.references and self._since and after > self.reference_every:
             return self._propose_reference(q)
-        return self._stop(split, index, ids, paths, unreached)
+        return self._stop(split, index, route)
 
     @property
     def poses_begun(self) -> int:
@@ -172,8 +189,7 @@ class Tour:
 
     def _propose_reference(self, q: FloatArray) -> PoseVisit:
         index = self._reference
-        ids, paths, unreached = self._route(REFERENCE, index, [0], q)
-        return self._stop(REFERENCE, index, ids, paths, unreached)
+        return self._stop(REFERENCE, index, self._route(REFERENCE, index, [0], q))
 
     def _route_to_reference(self, index: int, q: FloatArray) -> FloatArray | None:
         """Return what to go through to a reference, by way of the one before it; None for no way.
@@ -193,17 +209,23 @@ class Tour:
 
     def take(self, proposed: PoseVisit) -> PoseVisit:
         """Count a proposed stop visited and return it with its number."""
-        return self.go_to(
-            proposed.split, proposed.index, proposed.ids, proposed.paths, proposed.unreached
-        )
+        route = proposed.ids, proposed.paths, proposed.unreached
+        return self.go_to(proposed.split, proposed.index, *route)
 
     def reroute(self, stop: PoseVisit, q: FloatArray) -> PoseVisit:
         """Return a stop with the ways to its solutions, and their order, found anew from `q`."""
-        ids, paths, unreached = self._route(stop.split, stop.index, stop.ids, q)
-        solutions = self.plans[stop.split].poses[stop.index].solutions[list(ids)]
-        return replace(
-            stop, solutions=solutions, ids=tuple(ids), paths=tuple(paths), unreached=unreached
-        )
+        return self.along(stop, *self._route(stop.split, stop.index, stop.ids, q))
+
+    def along(
+        self,
+        stop: PoseVisit,
+        ids: Sequence[int],
+        paths: Sequence[FloatArray],
+        unreached: Sequence[int],
+    ) -> PoseVisit:
+        """Return a stop at the same pose with another route (see `Route`)."""
+        other = self._stop(stop.split, stop.index, Route(ids, paths, unreached))
+        return replace(other, pose=stop.pose)
 
     def go_to(
         self,
@@ -213,11 +235,11 @@ class Tour:
         paths: Sequence[FloatArray] = (),
         unreached: Sequence[int] = (),
     ) -> PoseVisit:
-        """Return the stop at one planned pose with these of its solutions, and count it visited.
+        """Return the stop at one planned pose along a route (see `Route`), and count it visited.
 
-        This is how a tour that was begun before takes up where it was: the stops so far, in order.
+        A tour that was begun before is taken up by this: the stops so far, in their order.
         """
-        stop = self._stop(split, index, ids, paths, unreached)
+        stop = self._stop(split, index, Route(ids, paths, unreached))
         if split == REFERENCE:
             self._begin_reference(index)
         else:
@@ -235,31 +257,21 @@ class Tour:
             self._reference, self._since = 0, 0
             self._rounds_due -= 1
 
-    def _stop(
-        self,
-        split: str,
-        index: int,
-        ids: Sequence[int],
-        paths: Sequence[FloatArray],
-        unreached: Sequence[int],
-    ) -> PoseVisit:
+    def _stop(self, split: str, index: int, route: Route) -> PoseVisit:
         pose = self.plans[split].poses[index]
         number = self.visited if split != REGISTRATION else -1 - self.visited
+        ids, paths, unreached = tuple(route.ids), tuple(route.paths), tuple(route.unreached)
         solutions = pose.solutions[list(ids)]
-        return PoseVisit(
-            number, split, pose.T_R_T, solutions, index, tuple(ids), tuple(paths), tuple(unreached)
-        )
+        return PoseVisit(number, split, pose.T_R_T, solutions, index, ids, paths, unreached)
 
-    def _route(
-        self, split: str, index: int, ids: Iterable[int], q: FloatArray
-    ) -> tuple[list[int], list[FloatArray], tuple[int, ...]]:
+    def _route(self, split: str, index: int, ids: Iterable[int], q: FloatArray) -> Route:
         """Order these solutions of a pose; see `free_order`."""
         ids = list(ids)
         if split == REFERENCE:
             way = self._route_to_reference(index, q) if ids else None
-            return ([], [], tuple(ids)) if way is None else (ids, [way], ())
+            return Route((), (), ids) if way is None else Route(ids, [way], ())
         solutions = self.plans[split].poses[index].solutions[ids]
-        # The same draws whenever this pose is planned: a tour can be told again.
+        # The same draws whenever this pose is planned: a tour can be repeated.
         rng = np.random.default_rng([index, *split.encode()])
         order, paths = free_order(
             self._model, q, solutions, self._chain.velocity_limits, rng, self.one_solution
@@ -267,8 +279,8 @@ class Tour:
         found = [ids[i] for i in order]
         if self.one_solution:
             # One is visited; where none can be, one is lost.
-            return found, paths, () if found else tuple(ids[:1])
-        return found, paths, tuple(number for number in ids if number not in found)
+            return Route(found, paths, () if found else ids[:1])
+        return Route(found, paths, [number for number in ids if number not in found])
 
     def describe(self) -> str:
         """Return what was planned and dropped, in a line."""

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from io import StringIO
 from typing import TYPE_CHECKING
 
-import matplotlib
 import numpy as np
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.reports.figures import AFTER, BEFORE, INK, STYLE, WIDTH_IN, log_axis
+from remaster_ros.reports.figures import AFTER, BEFORE, INK, WIDTH_IN, as_svg, error_histograms
 from remaster_ros.types import FloatArray
 
 if TYPE_CHECKING:
@@ -34,14 +31,7 @@ def draw_discovery(discovery: Discovery) -> dict[str, str]:
     figures: dict[str, Callable[[Discovery], Figure]] = {'gain': gain, 'drivers': drivers}
     if discovery.groups:
         figures['causes'] = causes
-    texts = {}
-    for name, draw in figures.items():
-        with matplotlib.rc_context({**STYLE, 'svg.hashsalt': name}):
-            out = StringIO()
-            canvas = FigureCanvasSVG(draw(discovery))
-            canvas.print_svg(out, metadata={'Date': None, 'Creator': None})
-        texts[name] = out.getvalue()
-    return texts
+    return as_svg(figures, discovery)
 
 
 def gain(discovery: Discovery) -> Figure:
@@ -51,32 +41,17 @@ def gain(discovery: Discovery) -> Figure:
     data, selection = discovery.residuals, discovery.selection
     held_out = data.context.measurements.is_validation
     rows = held_out if held_out.any() else np.isin(np.arange(len(held_out)), data.rows.source)
-    errors = [data.unexplained(fit) for fit in (selection.empty, selection.solution)]
-    lengths = [np.maximum(1e3 * np.linalg.norm(e[rows], axis=1), 1e-4) for e in errors]
-    both = np.concatenate(lengths)
-    low, high = float(np.quantile(both, 0.002)), float(both.max()) * 1.001
-    bins = np.geomspace(low, max(high, 2.0 * low), int(np.clip(3 * np.sqrt(rows.sum()), 8, 45)))
-    for values, color, when in zip(lengths, (BEFORE, AFTER), ('before', 'after'), strict=True):
-        label = f'{when}: mean {values.mean():.3f} mm'
-        left.hist(np.maximum(values, low), bins=bins.tolist(), color=color, alpha=0.5, label=label)
-        left.axvline(values.mean(), color=color, linewidth=1.3)
-    log_axis(left, 'x')
+    fits = selection.empty, selection.solution
+    lengths = [1e3 * np.linalg.norm(data.unexplained(fit)[rows], axis=1) for fit in fits]
+    error_histograms(left, *(np.maximum(values, 1e-4) for values in lengths))
     left.set_title('Held-out poses' if held_out.any() else 'Fitted poses')
-    left.set_xlabel('3-D error (mm)')
-    left.set_ylabel('observations')
-    left.yaxis.get_major_locator().set_params(integer=True)
     left.legend(loc='upper left')
 
-    parts, names = [], []
-    for sensor, name in enumerate(data.context.sensor_names):
-        names.append(name)
-        parts.append(
-            [
-                (1e3 * fit.noise.pose_sigma[sensor], 1e3 * fit.noise.sigma[sensor])
-                for fit in (selection.empty, selection.solution)
-            ]
-        )
-    values = np.array(parts)
+    names = data.context.sensor_names
+    noises = [data.noise_model.sensor_noise(fit.noise) for fit in fits]
+    # By sensor, before or after, and part: shared by a pose, or within.
+    values = 1e3 * np.array([(noise.pose_sigma, noise.sigma) for noise in noises])
+    values = values.transpose(2, 0, 1)
     x = np.arange(len(names))
     for column, (color, label) in enumerate(((BEFORE, 'before'), (AFTER, 'after'))):
         for part, shift in ((0, -0.3), (1, 0.1)):
@@ -103,21 +78,14 @@ def drivers(discovery: Discovery) -> Figure:
     """Draw, joint by joint, the errors along the joint's motion against every driver."""
     data, selection = discovery.residuals, discovery.selection
     context = data.part
-    by_joint: list[tuple[str, Callable[[int], FloatArray] | None]] = [
-        ('own angle (°)', lambda j: np.degrees(context.measurements.q[:, j])),
-        ('gravity torque (N m)', lambda j: context.gravity_torque[:, j]),
-        ('last move (°)', lambda j: np.degrees(context.last_move[:, j])),
-        ('time (h)', lambda j: context.elapsed_s / 3600.0),
-        ('temperature (K)', lambda j: context.warming),
+    candidates: list[tuple[bool, str, Callable[[int], FloatArray]]] = [
+        (True, 'own angle (°)', lambda j: np.degrees(context.measurements.q[:, j])),
+        (context.has_gravity, 'gravity torque (N m)', lambda j: context.gravity_torque[:, j]),
+        (context.has_approach, 'last move (°)', lambda j: np.degrees(context.last_move[:, j])),
+        (context.has_time, 'time (h)', lambda j: context.elapsed_s / 3600.0),
+        (context.has_temperature, 'temperature (K)', lambda j: context.warming),
     ]
-    shown = [
-        True,
-        context.has_gravity,
-        context.has_approach,
-        context.has_time,
-        context.has_temperature,
-    ]
-    kept = [pair for pair, show in zip(by_joint, shown, strict=True) if show]
+    kept = [(label, value) for known, label, value in candidates if known]
     joints = context.joints
     height = 1.05 * len(kept) + 0.6
     figure = Figure(figsize=(WIDTH_IN, height))
@@ -141,7 +109,6 @@ def drivers(discovery: Discovery) -> Figure:
         along = 1e3 * np.einsum('nij,ni->nj', motion, left) / length
         for row, (_, value) in enumerate(kept):
             for joint in range(joints):
-                assert value is not None
                 _binned(axes[row, joint], value(joint), along[:, joint], color)
     for row, (label, _) in enumerate(kept):
         for joint in range(joints):

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from remaster_ros.discovery.confirmation import Confirmation, in_words
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.reports import schemas
 from remaster_ros.reports.discovery_figures import draw_discovery
-from remaster_ros.reports.fit_json import REPORT_FILE
-from remaster_ros.reports.pages import inlined, page
-from remaster_ros.session.files import make_folder, write_atomically
+from remaster_ros.reports.pages import inlined, page, write_report
 
 # Long lists of spline coefficients are for other programs; the figure shows the curve.
 MOST_PARAMETERS = 8
@@ -21,10 +20,10 @@ MOST_PARAMETERS = 8
 def write_discovery_report(
     discovery: Discovery,
     confirmation: Confirmation | None,
-    content: dict[str, Any],
-    folder: str | os.PathLike[str],
+    content: schemas.Discovered,
+    folder: Path,
 ) -> Path:
-    """Write report.html, and the figures as SVG files under ``figures``; return its path.
+    """Write report.html and the figures of what was found; return its path.
 
     Parameters
     ----------
@@ -40,26 +39,19 @@ def write_discovery_report(
     InputError
         The folder cannot be written to.
     """
-    folder = Path(folder)
     drawings = draw_discovery(discovery)
-    make_folder(folder / 'figures')
-    for name, text in drawings.items():
-        write_atomically(folder / 'figures' / f'{name}.svg', text)
-    write_atomically(
-        folder / REPORT_FILE,
-        page(
-            'discovery.html.jinja',
-            found=content,
-            headline=headline(discovery, confirmation),
-            mood='good' if _is_proven(discovery, confirmation) else 'caution',
-            equations={name: effect.equation for name, effect in EFFECTS.items()},
-            sources={name: effect.source for name, effect in EFFECTS.items()},
-            most_parameters=MOST_PARAMETERS,
-            confirmed=in_words(discovery, confirmation) if confirmation else (),
-            drawings={name: inlined(name, text) for name, text in drawings.items()},
-        ),
+    html = page(
+        'discovery.html.jinja',
+        found=msgspec.to_builtins(content),
+        headline=headline(discovery, confirmation),
+        mood='good' if _is_proven(discovery, confirmation) else 'caution',
+        equations={name: effect.equation for name, effect in EFFECTS.items()},
+        sources={name: effect.source for name, effect in EFFECTS.items()},
+        most_parameters=MOST_PARAMETERS,
+        confirmed=in_words(discovery, confirmation) if confirmation else (),
+        drawings={name: inlined(name, text) for name, text in drawings.items()},
     )
-    return folder / REPORT_FILE
+    return write_report(folder, drawings, html)
 
 
 def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:

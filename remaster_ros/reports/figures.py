@@ -10,7 +10,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Sequence
 from io import StringIO
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import matplotlib
 import numpy as np
@@ -35,6 +35,7 @@ WIDTH_IN = 8.4
 TRACE_POINTS = 1500
 SCATTER_POINTS = 1500
 WHOLE_TURN_DEG = 359.999
+Subject = TypeVar('Subject')
 
 STYLE: Any = {
     'svg.fonttype': 'none',
@@ -78,13 +79,18 @@ def draw_figures(result: FitResult) -> dict[str, str]:
         'errors': errors_by_configuration,
         'residuals': residual_distribution,
     }
+    return as_svg(figures, result)
+
+
+def as_svg(figures: dict[str, Callable[[Subject], Figure]], subject: Subject) -> dict[str, str]:
+    """Draw figures of a fit or a discovery and return them as SVG text, by the same names."""
     texts = {}
     for name, draw in figures.items():
-        # The salt makes the same fit give the same file.
+        # The salt makes the same result give the same file.
         with matplotlib.rc_context({**STYLE, 'svg.hashsalt': name}):
-            figure = draw(result)
             out = StringIO()
-            FigureCanvasSVG(figure).print_svg(out, metadata={'Date': None, 'Creator': None})
+            canvas = FigureCanvasSVG(draw(subject))
+            canvas.print_svg(out, metadata={'Date': None, 'Creator': None})
         texts[name] = out.getvalue()
     return texts
 
@@ -96,7 +102,7 @@ def posteriors(result: FitResult) -> Figure:
     for i, ax in enumerate(axes):
         sample = draws[..., i].ravel()
         if np.ptp(sample) == 0.0:
-            _say(ax, _short(result.why[i]))
+            _write_instead(ax, _short(result.why[i]))
             continue
         color = AFTER if result.identifiable[i] else BEFORE
         ax.hist(sample, bins=60, density=True, histtype='stepfilled', color=color, alpha=0.55)
@@ -126,7 +132,7 @@ def traces(result: FitResult) -> Figure:
     columns = {name: i for i, name in enumerate(result.parameter_names)}
     for i, (joint, ax) in enumerate(zip(result.joint_names, axes, strict=True)):
         if joint not in columns:
-            _say(ax, _short(result.why[i]))
+            _write_instead(ax, _short(result.why[i]))
             continue
         values = np.degrees(result.trace[:, ::step, columns[joint]])
         for chain in range(chains):
@@ -191,28 +197,27 @@ def residual_distribution(result: FitResult) -> Figure:
     splits = _splits(result)
     figure, axes = _stacked(len(splits), height_in=2.1)
     for ax, (title, rows) in zip(axes, splits, strict=True):
-        both = np.concatenate((before[rows], after[rows]))
-        floor = max(float(np.quantile(both, 0.002)), 1e-4)
-        count = int(np.clip(3 * np.sqrt(rows.sum()), 8, 45))
-        bins = np.geomspace(floor, max(float(both.max()), 2 * floor) * 1.001, count)
-        for errors, color, when in ((before, BEFORE, 'before'), (after, AFTER, 'after')):
-            mean = float(errors[rows].mean())
-            ax.hist(
-                np.maximum(errors[rows], floor),
-                bins=bins.tolist(),
-                color=color,
-                alpha=0.5,
-                histtype='stepfilled',
-                label=f'{when}: mean {mean:.3f} mm',
-            )
-            ax.axvline(mean, color=color, linewidth=1.3)
-        log_axis(ax, 'x')
+        error_histograms(ax, before[rows], after[rows])
         ax.set_title(title)
-        ax.set_xlabel('3-D error (mm); lines: means')
-        ax.set_ylabel('observations')
-        ax.yaxis.set_major_locator(MaxNLocator(5, integer=True))
         _legend_above(ax)
     return figure
+
+
+def error_histograms(ax: Axes, before: FloatArray, after: FloatArray) -> None:
+    """Draw the distributions of 3-D errors before and after, mm, with their means."""
+    both = np.concatenate((before, after))
+    floor = max(float(np.quantile(both, 0.002)), 1e-4)
+    count = int(np.clip(3 * np.sqrt(len(before)), 8, 45))
+    bins = np.geomspace(floor, max(float(both.max()), 2 * floor) * 1.001, count).tolist()
+    for errors, color, when in ((before, BEFORE, 'before'), (after, AFTER, 'after')):
+        mean = float(errors.mean())
+        shown, label = np.maximum(errors, floor), f'{when}: mean {mean:.3f} mm'
+        ax.hist(shown, bins=bins, color=color, alpha=0.5, histtype='stepfilled', label=label)
+        ax.axvline(mean, color=color, linewidth=1.3)
+    log_axis(ax, 'x')
+    ax.set_xlabel('3-D error (mm); lines: means')
+    ax.set_ylabel('observations')
+    ax.yaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
 def _joint_panels(result: FitResult, height_in: float) -> tuple[Figure, list[Axes]]:
@@ -261,8 +266,8 @@ def _legend_entry(marker: str, color: str, name: str) -> Line2D:
     )
 
 
-def _say(ax: Axes, text: str) -> None:
-    """Turn a panel into words."""
+def _write_instead(ax: Axes, text: str) -> None:
+    """Write a text in a panel instead of a drawing."""
     ax.set_axis_off()
     lines = textwrap.fill(text, 58)
     ax.text(0.0, 0.8, lines, transform=ax.transAxes, va='top', linespacing=1.4)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,112 +32,101 @@ def fit_content(result: FitResult) -> schemas.Fit:
     """Return a fit as fit.json has it."""
     session, sampler = result.session, result.sampler
     draws = result.draws.reshape(-1, result.draws.shape[-1])
-    mean, std = draws.mean(axis=0), draws.std(axis=0, ddof=1)
-    return schemas.Fit(
-        format=schemas.FIT_FORMAT,
-        version=__version__,
-        robot=schemas.Robot(
-            name=result.chain.name,
-            urdf_sha256=session.urdf_sha256,
-            joint_names=list(result.joint_names),
-            base_link=session.base_link,
-            tip_link=session.tip_link,
+    content = {
+        'format': schemas.FIT_FORMAT,
+        'version': __version__,
+        'robot': {
+            'name': result.chain.name,
+            'urdf_sha256': session.urdf_sha256,
+            'joint_names': result.joint_names,
+            'base_link': session.base_link,
+            'tip_link': session.tip_link,
+        },
+        'session': _describe(session),
+        'joint_offsets': table_rows(
+            joint=result.joint_names,
+            mean_deg=np.degrees(result.joint_offsets),
+            std_deg=np.degrees(result.joint_offsets_std),
+            interval95_deg=np.degrees(result.joint_offsets_interval95),
+            identifiable=result.identifiable,
+            why=result.why,
         ),
-        session=_describe(session),
-        joint_offsets=[
-            schemas.JointOffset(
-                joint=joint,
-                mean_deg=float(np.degrees(result.joint_offsets[i])),
-                std_deg=float(np.degrees(result.joint_offsets_std[i])),
-                interval95_deg=np.degrees(result.joint_offsets_interval95[i]).tolist(),
-                identifiable=bool(result.identifiable[i]),
-                why=str(result.why[i]),
-            )
-            for i, joint in enumerate(result.joint_names)
-        ],
-        gauge=[
-            schemas.GaugeCombination(
-                combination={name: float(share) for name, share in seen.combination.items()},
-                why=seen.why,
-                fixed_by=seen.fixed_by,
-            )
-            for seen in result.gauge
-        ],
-        registration={
-            sensor: schemas.Registration(
-                translation_m=T_R_N[:3, 3].tolist(),
-                rotation_xyzw=quaternion_xyzw(T_R_N[:3, :3]).tolist(),
-                std_m=result.T_R_N_std_m[sensor].tolist(),
-                std_rad=result.T_R_N_std_rad[sensor].tolist(),
-            )
+        'gauge': result.gauge,
+        'registration': {
+            sensor: {
+                'translation_m': T_R_N[:3, 3],
+                'rotation_xyzw': quaternion_xyzw(T_R_N[:3, :3]),
+                'std_m': result.T_R_N_std_m[sensor],
+                'std_rad': result.T_R_N_std_rad[sensor],
+            }
             for sensor, T_R_N in result.T_R_N.items()
         },
-        markers={
-            name: schemas.Marker(
-                position_m=position.tolist(), std_m=result.marker_std_m[name].tolist()
-            )
+        'markers': {
+            name: {'position_m': position, 'std_m': result.marker_std_m[name]}
             for name, position in result.marker_positions.items()
         },
-        noise={sensor: _noise(noise) for sensor, noise in result.noise.items()},
-        sampler=schemas.Sampler(
-            name=sampler.name,
-            chains=int(sampler.chains),
-            draws=int(sampler.draws),
-            r_hat_max=finite(np.max(sampler.r_hat)),
-            ess_min=finite(np.min(np.minimum(sampler.ess_bulk, sampler.ess_tail))),
-            seconds=finite(sampler.seconds),
-            acceptance_rate=finite(sampler.acceptance_rate),
-            converged=bool(sampler.converged),
-            message=sampler.message,
-            precision=finite(sampler.precision),
-            precision_wanted=sampler.precision_wanted,
-            log_density_error_max=finite(sampler.log_density_error),
-            log_density_checked_draws=int(sampler.checked),
+        'noise': {sensor: _noise(noise) for sensor, noise in result.noise.items()},
+        'sampler': {
+            **vars(sampler),
+            'r_hat_max': np.max(sampler.r_hat),
+            'ess_min': np.min((sampler.ess_bulk, sampler.ess_tail)),
+            'log_density_error_max': sampler.log_density_error,
+            'log_density_checked_draws': sampler.checked,
+        },
+        'parameters': table_rows(
+            name=result.parameter_names,
+            mean=draws.mean(axis=0),
+            std=draws.std(axis=0, ddof=1),
+            r_hat=sampler.r_hat,
+            ess_bulk=sampler.ess_bulk,
+            ess_tail=sampler.ess_tail,
         ),
-        parameters=[
-            schemas.SampledParameter(
-                name=name,
-                mean=float(mean[i]),
-                std=float(std[i]),
-                r_hat=finite(sampler.r_hat[i]),
-                ess_bulk=finite(sampler.ess_bulk[i]),
-                ess_tail=finite(sampler.ess_tail[i]),
-            )
-            for i, name in enumerate(result.parameter_names)
-        ],
-        accuracy=schemas.Accuracy(**result.accuracy),
-        left_out=[schemas.LeftOut(int(row), why) for row, why in result.left_out],
-        explained_by_noise={
-            check.sensor: schemas.NoiseCheck(
-                explained=check.explained,
-                after_m=check.error_m,
-                noise_m=check.noise_error_m,
-                stated_std_m=check.stated_m,
-                within_pose_std_m=check.within_m,
-            )
+        'accuracy': result.accuracy,
+        'left_out': [{'observation': row, 'why': why} for row, why in result.left_out],
+        'explained_by_noise': {
+            check.sensor: {
+                'explained': check.explained,
+                'after_m': check.error_m,
+                'noise_m': check.noise_error_m,
+                'stated_std_m': check.stated_m,
+                'within_pose_std_m': check.within_m,
+            }
             for check in result.noise_checks
         },
-    )
+    }
+    return schemas.checked(content, schemas.Fit)
 
 
-def _noise(noise: NoiseEstimate) -> schemas.Noise:
-    directions: dict[str, Any] = {
+def table_rows(**columns: Iterable[Any]) -> list[dict[str, Any]]:
+    """Return equally long columns as rows."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def _noise(noise: NoiseEstimate) -> dict[str, Any]:
+    directions = {
         f'{direction}_{key}': value
         for direction, part in noise.directions.items()
-        for key, value in (
-            ('sigma_m', part.sigma_m),
-            ('std_m', part.std_m),
-            ('pose_sigma_m', part.pose_sigma_m),
-            ('pose_std_m', part.pose_sigma_std_m),
-        )
+        for key, value in vars(part).items()
     }
-    return schemas.Noise(
-        sigma_m=noise.sigma_m,
-        std_m=noise.std_m,
-        pose_sigma_m=noise.pose_sigma_m,
-        pose_std_m=noise.pose_sigma_std_m,
-        **directions,
-    )
+    return vars(noise) | directions
+
+
+def _describe(session: Session) -> dict[str, Any]:
+    m = session.measurements
+    counts = {
+        name: {
+            'observations': rows.sum(),
+            'configurations': len(np.unique(m.configuration[rows])),
+            'poses': len(np.unique(m.pose[rows])),
+        }
+        for name, rows in (('optimization', ~m.is_validation), ('validation', m.is_validation))
+    }
+    return {
+        **counts,
+        'sensors': session.sensors,
+        'created': session.created,
+        'exit_status': session.exit_status,
+    }
 
 
 def write_fit(result: FitResult, path: str | os.PathLike[str]) -> None:
@@ -210,12 +199,12 @@ def remove_report(folder: Path) -> None:
 def joint_offsets_rad(
     fit: dict[str, Any], joint_names: Sequence[str]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the offsets of a fit.json in the order of a robot's joints, and how sure they are.
+    """Return the offsets of a fit.json in the order of a robot's joints, with their std.
 
     Returns
     -------
     offsets, std
-        rad, (k,) each; the std of a joint that the data could not tell is 0.
+        rad, (k,) each; the std of a joint that is not identifiable is 0.
 
     Raises
     ------
@@ -245,7 +234,7 @@ def prepare_folder(folder: str | os.PathLike[str]) -> None:
     Raises
     ------
     InputError
-        They cannot; said before the long work, not after it.
+        They cannot. This is checked before the long work, not after it.
     """
     folder = Path(folder)
     make_folder(folder)
@@ -281,26 +270,6 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
         remove_report(folder)
         return folder / FIT_FILE
     # Matplotlib and the templates take a second to import: only where a report is made.
-    from remaster_ros.reports.report import write_report
+    from remaster_ros.reports.report import write_fit_report
 
-    return write_report(result, folder)
-
-
-def _describe(session: Session) -> schemas.MeasuredSession:
-    m = session.measurements
-    optimization, validation = (
-        schemas.Counts(
-            observations=int(rows.sum()),
-            configurations=len(np.unique(m.configuration[rows])),
-            poses=len(np.unique(m.pose[rows])),
-        )
-        for rows in (~m.is_validation, m.is_validation)
-    )
-    return schemas.MeasuredSession(
-        optimization, validation, dict(session.sensors), session.created, session.exit_status
-    )
-
-
-def finite(number: float) -> float | None:
-    """Return a number, None in place of one that JSON has not."""
-    return float(number) if np.isfinite(number) else None
+    return write_fit_report(result, folder)

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import importlib.resources
 import re
+from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
+
+from remaster_ros.reports.figures import GRID, INK, PAPER
+from remaster_ros.reports.fit_json import REPORT_FILE
+from remaster_ros.session.files import make_folder, write_atomically
 
 
 def page(template: str, **content: Any) -> str:
@@ -29,16 +34,29 @@ def _template(name: str) -> str:
 
 def inlined(name: str, svg: str) -> Markup:
     """Make a figure part of the page: its colours, its font, its width, identifiers of its own."""
-    from remaster_ros.reports.figures import GRID, INK, PAPER
-
     svg = svg[svg.index('<svg') :]
     for color, ours in ((INK, 'var(--ink)'), (GRID, 'var(--line)'), (PAPER, 'none')):
         svg = svg.replace(color, ours)
     svg = re.sub(r"'DejaVu Sans'(, [^;\"]*)?", 'var(--font)', svg)
-    svg = re.sub(r'(<svg [^>]*?) width="[^"]*"', r'\1', svg, count=1)
-    svg = re.sub(r'(<svg [^>]*?) height="[^"]*"', r'\1', svg, count=1)
+    for size in ('width', 'height'):
+        svg = re.sub(rf'(<svg [^>]*?) {size}="[^"]*"', r'\1', svg, count=1)
     svg = re.sub(r'\bid="([^"]+)"', rf'id="{name}-\1"', svg)
     return Markup(re.sub(r'(url\(#|href="#)', rf'\1{name}-', svg))
+
+
+def write_report(folder: Path, drawings: dict[str, str], html: str) -> Path:
+    """Write report.html, and the figures as SVG files under ``figures``; return its path.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to.
+    """
+    make_folder(folder / 'figures')
+    for name, text in drawings.items():
+        write_atomically(folder / 'figures' / f'{name}.svg', text)
+    write_atomically(folder / REPORT_FILE, html)
+    return folder / REPORT_FILE
 
 
 def _fixed(number: float | None, digits: int) -> str:

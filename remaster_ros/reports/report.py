@@ -1,4 +1,4 @@
-"""report.html: one self-contained page that says what the fit found and whether to believe it."""
+"""report.html: one self-contained page with what the fit found and how reliable it is."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import base64
 import gzip
 import importlib.resources
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,9 +17,8 @@ from markupsafe import Markup
 from remaster_ros.calibration.noise_check import NoiseCheck
 from remaster_ros.collection.reference_session import changes
 from remaster_ros.reports.figures import draw_figures
-from remaster_ros.reports.fit_json import REPORT_FILE, fit_content
-from remaster_ros.reports.pages import inlined, page
-from remaster_ros.session.files import make_folder, write_atomically
+from remaster_ros.reports.fit_json import fit_content
+from remaster_ros.reports.pages import inlined, page, write_report
 
 if TYPE_CHECKING:
     from remaster_ros.calibration.result import FitResult
@@ -31,7 +29,7 @@ NOTICEABLE_GAIN = 1.1
 
 
 class Headline(NamedTuple):
-    """The result in plain words.
+    """The result for somebody who did not make it.
 
     Attributes
     ----------
@@ -40,7 +38,7 @@ class Headline(NamedTuple):
     headline
         One sentence.
     points
-        What else must be known before the offsets are used.
+        What else matters before the offsets are used.
     """
 
     mood: str
@@ -48,29 +46,16 @@ class Headline(NamedTuple):
     points: list[str]
 
 
-def write_report(result: FitResult, folder: str | os.PathLike[str]) -> Path:
-    """Write report.html, and the figures as SVG files under ``figures``; return its path.
-
-    Parameters
-    ----------
-    result
-        The fit.
-    folder
-        Where to; made if missing.
+def write_fit_report(result: FitResult, folder: Path) -> Path:
+    """Write report.html and the figures of a fit to a folder, made if missing; return its path.
 
     Raises
     ------
     InputError
         The folder cannot be written to.
     """
-    folder = Path(folder)
-    make_folder(folder)
     drawings = draw_figures(result)
-    make_folder(folder / 'figures')
-    for name, text in drawings.items():
-        write_atomically(folder / 'figures' / f'{name}.svg', text)
-    write_atomically(folder / REPORT_FILE, report_html(result, drawings))
-    return folder / REPORT_FILE
+    return write_report(folder, drawings, report_html(result, drawings))
 
 
 def report_html(result: FitResult, drawings: dict[str, str]) -> str:
@@ -102,7 +87,7 @@ def _references(result: FitResult) -> tuple[int, list[str]]:
 
 
 def verdict(result: FitResult) -> Headline:
-    """Judge a fit in words: what was gained, whether the chains agree, what stays unknown."""
+    """Judge a fit: what was gained, whether the chains agree, what is not identifiable."""
     validated = result.accuracy['validation'] is not None
     split = 'validation' if validated else 'optimization'
     metrics = result.accuracy[split]['post_registration']
@@ -111,6 +96,9 @@ def verdict(result: FitResult) -> Headline:
     where = 'on poses it never fitted' if validated else 'on the fitted poses'
     change = f'{before:.3f} mm to {after:.3f} mm {where}'
     unexplained = [check for check in result.noise_checks if not check.explained]
+    changes = _references(result)[1]
+    points = [_compared(check) for check in unexplained] + changes
+    mood = 'caution'
     if not result.sampler.converged:
         mood = 'bad'
         headline = (
@@ -120,12 +108,11 @@ def verdict(result: FitResult) -> Headline:
     elif gain >= NOTICEABLE_GAIN:
         times = f'{gain:.1f} times' if gain < 10 else f'{gain:.0f} times'
         headline = f'The mean position error falls from {change}: {times} smaller.'
-        mood = 'good'
         if unexplained:
-            mood = 'caution'
             headline += f' {_dominated(unexplained)}'
+        elif validated and not changes:
+            mood = 'good'
     elif gain > 1 / NOTICEABLE_GAIN:
-        mood = 'caution'
         headline = (
             f'The zero-offsets hardly matter here: the mean position error goes from {change}. '
             + (_dominated(unexplained) if unexplained else 'That is what noise explains.')
@@ -133,17 +120,11 @@ def verdict(result: FitResult) -> Headline:
     else:
         mood = 'bad'
         headline = f'The offsets make it worse: the mean position error goes from {change}.'
-
-    points = [_compared(check) for check in unexplained]
-    points += _references(result)[1]
-    if _references(result)[1] and mood == 'good':
-        mood = 'caution'
     if result.implausible:
         mood = 'bad'
         headline += ' Do not apply the offsets yet: they are larger than a mastering is off by.'
         points = [*result.implausible, *points]
     if not validated:
-        mood = 'caution' if mood == 'good' else mood
         points.append(
             'There are no validation poses, so the gain is not proven: measure some and fit again.'
         )
@@ -163,8 +144,8 @@ def verdict(result: FitResult) -> Headline:
     count = len(result.joint_names)
     if unknown:
         points.append(
-            f'{count - len(unknown)} of {count} zero-offsets are measured. The data cannot tell '
-            f'{" and ".join(unknown)} from something else; the table says from what.'
+            f'{count - len(unknown)} of {count} zero-offsets are measured. The data do not '
+            f'distinguish {" and ".join(unknown)} from something else; the table names it.'
         )
     else:
         points.append(f'All {count} zero-offsets are measured.')
@@ -180,7 +161,7 @@ def verdict(result: FitResult) -> Headline:
 def _dominated(unexplained: Sequence[NoiseCheck]) -> str:
     """Return why the error after is no success, and what to do."""
     if all(check.noise_m is None for check in unexplained):
-        return 'Whether noise explains what is left, this session cannot tell.'
+        return 'Whether noise explains what is left, this session cannot show.'
     return (
         'But noise does not explain what is left: other errors dominate; run "remaster discover".'
     )
@@ -191,7 +172,7 @@ def _compared(check: NoiseCheck) -> str:
     if check.noise_error_m is None:
         return (
             f'{check.sensor}: no reading has a standard deviation, and no pose was seen in two '
-            f'joint solutions, so nothing tells how much of the {1e3 * check.error_m:.3f} mm is '
+            f'joint solutions, so nothing shows how much of the {1e3 * check.error_m:.3f} mm is '
             'noise: measure poses in all their joint solutions.'
         )
     sources = [

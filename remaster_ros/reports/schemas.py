@@ -1,22 +1,24 @@
 """What fit.json and discovery.json hold: each key once, for writing and for reading.
 
 A key without a default is what other programs rely on, and a file without it is refused. One that
-is `UNSET` by default stands there where this version has something to say; other makers' files may
-lack it, and keys that are not here are kept as they are.
+is `UNSET` by default is written where it has a value; the files of other programs may lack it.
+Keys that are not here are kept as they are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import msgspec
+import numpy as np
 from msgspec import UNSET, Struct, UnsetType
 
 FIT_FORMAT = 'remaster-fit/1'
 DISCOVERY_FORMAT = 'remaster-discovery/1'
 
 Triple = tuple[float, float, float]
+Content = TypeVar('Content', bound=Struct)
 
 
 class Robot(Struct):
@@ -48,7 +50,7 @@ class MeasuredSession(Struct):
 
 
 class JointOffset(Struct):
-    """One joint's zero-offset; where ``identifiable`` is false, ``why`` says what hides it."""
+    """One joint's zero-offset; where ``identifiable`` is false, ``why`` is the reason."""
 
     joint: str
     mean_deg: float
@@ -59,7 +61,7 @@ class JointOffset(Struct):
 
 
 class GaugeCombination(Struct):
-    """A combination of parameters that the data cannot see, and what fixes it."""
+    """A combination of parameters that the data do not determine, and what fixes it."""
 
     combination: dict[str, float]
     why: str
@@ -83,7 +85,7 @@ class Marker(Struct):
 
 
 class Noise(Struct):
-    """A sensor's noise per axis: of one row, and common to a pose (None: not told apart).
+    """A sensor's noise per axis: of one row, and common to a pose (None: not separable).
 
     Where it differs along and across the line of sight, both stand there as well.
     """
@@ -193,7 +195,7 @@ class EffectParameter(Struct):
 
 
 class LookAlike(Struct):
-    """What could be mistaken for an effect, and what would tell."""
+    """What could be mistaken for an effect, and what would separate the two."""
 
     name: str
     joints: list[int]
@@ -261,7 +263,7 @@ class ConfirmedEffect(Struct):
 
 
 class Confirmed(Struct):
-    """What another session of the arm says."""
+    """How the effects do in another session of the arm."""
 
     rms_before_m: float | None
     rms_after_m: float | None
@@ -290,6 +292,25 @@ class Discovered(Struct):
     sampler: Sampler | UnsetType = UNSET
     rows_searched: SearchedRows | UnsetType = UNSET
     confirmation: Confirmed | UnsetType = UNSET
+
+
+def checked(content: Mapping[str, Any], schema: type[Content]) -> Content:
+    """Return a file's content by its schema: arrays as lists, NaN as None, other keys left out.
+
+    Raises
+    ------
+    msgspec.ValidationError
+        A key that other programs rely on is missing or of another type.
+    """
+    return msgspec.json.decode(msgspec.json.encode(content, enc_hook=_plain), type=schema)
+
+
+def _plain(values: Any) -> Any:
+    if isinstance(values, np.ndarray | np.generic):
+        return values.tolist()
+    if isinstance(values, Mapping):
+        return dict(values)
+    raise NotImplementedError(f'no JSON for {type(values)}')
 
 
 def encode(content: Struct) -> bytes:

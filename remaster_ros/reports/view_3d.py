@@ -21,7 +21,7 @@ ROWS_SHOWN = 600
 
 
 class View3D(NamedTuple):
-    """A plotly figure as plain data, and what its caption must say.
+    """A plotly figure as plain data, and the figures of its caption.
 
     Attributes
     ----------
@@ -53,33 +53,44 @@ def draw_view(result: FitResult) -> View3D:
     points = apply(T_R_N, m.position[shown])
     # From where the marker was measured to where the model has it: minus the residual.
     vectors = {
-        'before': -_rotate(T_before, result.residuals_before[shown]),
-        'after': -_rotate(T_R_N, result.residuals_after[shown]),
+        when: -np.einsum('nij,nj->ni', T[:, :3, :3], residuals[shown])
+        for when, T, residuals in (
+            ('before', T_before, result.residuals_before),
+            ('after', T_R_N, result.residuals_after),
+        )
     }
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     typical = float(np.median(np.linalg.norm(vectors['before'], axis=1)))
     magnification = _round_factor(0.07 * extent / max(typical, 1e-9))
 
     data = [_arms(result), _points(result, points, shown)]
-    for when, color in (('before', BEFORE), ('after', AFTER)):
-        ends = points + magnification * vectors[when]
+    for when, color, width in (('before', BEFORE, 2.0), ('after', AFTER, 3.0)):
         data.append(
-            _line(
-                _segments(points, ends),
+            _trace(
                 f'error {when}, {magnification}\N{MULTIPLICATION SIGN}',
-                color,
-                3.0 if when == 'after' else 2.0,
+                _segments(points, points + magnification * vectors[when]),
+                mode='lines',
+                line={'color': color, 'width': width},
+                hoverinfo='skip',
             )
         )
     centre = points.mean(axis=0)
-    far = []
-    for sensor, T in result.T_R_N.items():
-        distance = float(np.linalg.norm(T[:3, 3] - centre))
-        is_far = distance > 2.5 * max(extent, 0.5)
-        if is_far:
-            far.append(sensor)
-        data.append(_sensor(sensor, T, is_far))
+    far = [
+        sensor
+        for sensor, T in result.T_R_N.items()
+        if np.linalg.norm(T[:3, 3] - centre) > 2.5 * max(extent, 0.5)
+    ]
+    data += [_sensor(sensor, T, sensor in far) for sensor, T in result.T_R_N.items()]
     return View3D(data, _layout(), magnification, len(shown), len(m), far)
+
+
+def _trace(name: str, points: FloatArray, **rest: Any) -> dict[str, Any]:
+    """Return a trace of points (n, 3) to the hundredth of a millimetre, gaps (NaN) as None."""
+    columns = {
+        axis: [None if np.isnan(value) else value for value in column]
+        for axis, column in zip('xyz', np.round(points, 5).T.tolist(), strict=True)
+    }
+    return {'type': 'scatter3d', 'name': name, **columns, **rest}
 
 
 def _arms(result: FitResult) -> dict[str, Any]:
@@ -89,14 +100,15 @@ def _arms(result: FitResult) -> dict[str, Any]:
     tips = result.chain.forward(chosen, result.joint_offsets)[:, None, :3, 3]
     base = np.zeros((len(chosen), 1, 3))
     gap = np.full((len(chosen), 1, 3), np.nan)
-    lines = np.concatenate((base, joints, tips, gap), axis=1).reshape(-1, 3)
-    arms = _line(lines, f'arm, {len(chosen)} of its configurations', ARM, 6.0)
-    return {
-        **arms,
-        'mode': 'lines+markers',
-        'marker': {'size': 3, 'color': ARM},
-        'opacity': 0.75,
-    }
+    return _trace(
+        f'arm, {len(chosen)} of its configurations',
+        np.concatenate((base, joints, tips, gap), axis=1).reshape(-1, 3),
+        mode='lines+markers',
+        line={'color': ARM, 'width': 6.0},
+        marker={'size': 3, 'color': ARM},
+        opacity=0.75,
+        hoverinfo='skip',
+    )
 
 
 def _points(result: FitResult, points: FloatArray, shown: IntArray) -> dict[str, Any]:
@@ -111,42 +123,25 @@ def _points(result: FitResult, points: FloatArray, shown: IntArray) -> dict[str,
         f'<br>error {b:.3f} mm before, {a:.3f} mm after'
         for row, b, a in zip(shown, before, after, strict=True)
     ]
-    return {
-        'type': 'scatter3d',
-        'mode': 'markers',
-        'name': 'markers as measured',
-        **_xyz(points),
-        'marker': {'size': 2.5, 'color': TEXT},
-        'text': text,
-        'hoverinfo': 'text',
-    }
+    marker = {'size': 2.5, 'color': TEXT}
+    return _trace(
+        'markers as measured', points, mode='markers', marker=marker, text=text, hoverinfo='text'
+    )
 
 
 def _sensor(name: str, T_R_N: FloatArray, is_far: bool) -> dict[str, Any]:
     name = _plain(name)
-    return {
-        'type': 'scatter3d',
-        'mode': 'markers+text',
-        'name': f'sensor {name}',
-        **_xyz(T_R_N[None, :3, 3]),
-        'text': [name],
-        'textposition': 'top center',
-        'textfont': {'color': SENSOR},
-        'marker': {'size': 6, 'symbol': 'diamond', 'color': SENSOR},
-        'hoverinfo': 'text',
-        'visible': 'legendonly' if is_far else True,
-    }
-
-
-def _line(points: FloatArray, name: str, color: str, width: float) -> dict[str, Any]:
-    return {
-        'type': 'scatter3d',
-        'mode': 'lines',
-        'name': name,
-        **_xyz(points),
-        'line': {'color': color, 'width': width},
-        'hoverinfo': 'skip',
-    }
+    return _trace(
+        f'sensor {name}',
+        T_R_N[None, :3, 3],
+        mode='markers+text',
+        text=[name],
+        textposition='top center',
+        textfont={'color': SENSOR},
+        marker={'size': 6, 'symbol': 'diamond', 'color': SENSOR},
+        hoverinfo='text',
+        visible='legendonly' if is_far else True,
+    )
 
 
 def _layout() -> dict[str, Any]:
@@ -182,18 +177,6 @@ def _segments(starts: FloatArray, ends: FloatArray) -> FloatArray:
     """Return start, end, gap, start, end, gap, … for one line trace."""
     gap = np.full_like(starts, np.nan)
     return np.stack((starts, ends, gap), axis=1).reshape(-1, 3)
-
-
-def _xyz(points: FloatArray) -> dict[str, list[float | None]]:
-    """Return coordinates to the hundredth of a millimetre, gaps as None."""
-    return {
-        axis: [None if np.isnan(value) else value for value in column]
-        for axis, column in zip('xyz', np.round(points, 5).T.tolist(), strict=True)
-    }
-
-
-def _rotate(T: FloatArray, vectors: FloatArray) -> FloatArray:
-    return np.einsum('nij,nj->ni', T[:, :3, :3], vectors)
 
 
 def _evenly(count: int, most: int) -> IntArray:

@@ -17,7 +17,7 @@ from mcap.records import Channel, Message, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.bag_metadata import FileMetadata
+from remaster_ros.session.bag_metadata import FileMetadata, all_of
 from remaster_ros.session.files import reason
 from remaster_ros.session.manifest import check_file, read_manifest
 from remaster_ros.session.mcap_frames import CutOffError, frames, unchunked, without_zeros
@@ -80,10 +80,8 @@ class BagReader:
         Where the files are.
     topics, counts
         Message type, and number of messages, of every topic.
-    message_count
-        Messages in the bag.
-    start_ns, end_ns
-        Stamps of the first and last message, 0 where there is none.
+    whole
+        Stamps and number of the messages of all files.
     complete
         False where the writer was killed before it closed the bag.
     files
@@ -107,27 +105,19 @@ class BagReader:
             check_file(sums, path)
         self.torn_bytes = 0
         self.topics: dict[str, str] = {}
-        self.message_count = 0
-        self.start_ns = self.end_ns = 0
         self.complete = True
         self.counts: Counter[str] = Counter()
         for file in self.files:
             for message in self.messages_of(file, first_look=True):
-                self._learn(message)
+                known = self.topics.setdefault(message.topic, message.msgtype)
+                if known != message.msgtype:
+                    raise InputError(
+                        f'{self.path}: topic {message.topic} is {known} and {message.msgtype}; '
+                        'record the topics with one type each'
+                    )
+                self.counts[message.topic] += 1
                 file.add(message.stamp_ns)
-
-    def _learn(self, message: BagMessage) -> None:
-        known = self.topics.setdefault(message.topic, message.msgtype)
-        if known != message.msgtype:
-            raise InputError(
-                f'{self.path}: topic {message.topic} is {known} and {message.msgtype}; '
-                'record the topics with one type each'
-            )
-        if not self.message_count:
-            self.start_ns = message.stamp_ns
-        self.end_ns = message.stamp_ns
-        self.counts[message.topic] += 1
-        self.message_count += 1
+        self.whole = all_of(self.files)
 
     def __iter__(self) -> Iterator[BagMessage]:
         """Yield the messages in the order they were recorded."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,16 +54,21 @@ class FileMetadata:
         }
 
 
-def metadata_text(files: list[FileMetadata], topics: list[TopicMetadata]) -> str:
-    """Return metadata.yaml for a bag of these MCAP files, in the order recorded."""
+def all_of(files: list[FileMetadata]) -> FileMetadata:
+    """Return several files, in the order recorded, as one without a name."""
     filled = [file for file in files if file.count]
-    whole = FileMetadata('', count=sum(file.count for file in files))
-    if filled:
-        whole.first_ns, whole.last_ns = filled[0].first_ns, filled[-1].last_ns
+    if not filled:
+        return FileMetadata('')
+    count = sum(file.count for file in filled)
+    return FileMetadata('', filled[0].first_ns, filled[-1].last_ns, count)
+
+
+def metadata_text(files: list[FileMetadata], topics: Iterable[TopicMetadata]) -> str:
+    """Return metadata.yaml for a bag of these MCAP files, in the order recorded."""
     information: dict[str, Any] = {
         'version': 9,
         'storage_identifier': 'mcap',
-        **whole.span(),
+        **all_of(files).span(),
         'topics_with_message_count': [
             {
                 'topic_metadata': {

@@ -9,7 +9,6 @@ only copy of an observation.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
 from pathlib import Path
 from types import TracebackType
 
@@ -26,11 +25,11 @@ from remaster_ros.session.bag_metadata import (
 )
 from remaster_ros.session.files import (
     PatientFile,
-    cannot_write,
     make_new_folder,
     remove_leftovers,
     sync_folder,
     write_atomically,
+    writing,
 )
 from remaster_ros.session.manifest import add_to_manifest, read_manifest
 from remaster_ros.session.message_definitions import definition_of
@@ -49,8 +48,6 @@ class BagWriter:
     ----------
     folder
         New or empty; the bag's name is the folder's.
-    latched
-        Topics offered transient_local: who subscribes late still gets their last message.
     resume
         Go on with the bag that the folder holds: finish the file of a killed writer, and begin
         the next one, as rosbag2 does where it splits a bag.
@@ -61,15 +58,8 @@ class BagWriter:
         The folder holds files, with `resume` a damaged bag, or cannot be written to.
     """
 
-    def __init__(
-        self,
-        folder: str | os.PathLike[str],
-        latched: Collection[str] = LATCHED_TOPICS,
-        *,
-        resume: bool = False,
-    ) -> None:
+    def __init__(self, folder: str | os.PathLike[str], *, resume: bool = False) -> None:
         self.folder = Path(folder)
-        self._latched = latched
         self._topics: dict[str, TopicMetadata] = {}
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
@@ -77,7 +67,9 @@ class BagWriter:
         self._last_ns = self._shift_ns = 0
         if resume and any(self.folder.glob('*.mcap')):
             recover_bag(self.folder)
-            self._learn(BagReader(self.folder))
+            reader = BagReader(self.folder)
+            self._files, self._last_ns = reader.files, reader.whole.last_ns
+            self._topics = _topics_of(reader)
         else:
             if resume:
                 _remove_beginnings(self.folder)
@@ -89,7 +81,7 @@ class BagWriter:
         self._file: PatientFile | None = PatientFile(self._path)
         try:
             self._writer = Writer(
-                # It asks for no more than write and tell.
+                # MCAP's writer calls no more than write and tell.
                 self._file,  # type: ignore[arg-type]
                 compression=CompressionType.NONE,
                 use_chunking=False,
@@ -102,16 +94,6 @@ class BagWriter:
             self._file.close()
             raise
         self._metadata_waits = False
-
-    def _learn(self, reader: BagReader) -> None:
-        """Take over what the files so far hold."""
-        self._files = reader.files
-        self._last_ns = reader.end_ns
-        for topic, msgtype in reader.topics.items():
-            type_hash = definition_of(msgtype)[1]
-            latched = topic in self._latched
-            count = reader.counts[topic]
-            self._topics[topic] = TopicMetadata(topic, msgtype, type_hash, latched, count)
 
     def write(self, topic: str, msgtype: str, cdr: bytes, stamp_ns: int) -> None:
         """Write one message.
@@ -177,10 +159,8 @@ class BagWriter:
         file, self._file = self._file, None
         self._writer.finish()
         file.close()
-        try:
+        with writing(self._path):
             sync_folder(self.folder)
-        except OSError as error:
-            raise cannot_write(self._path, error) from None
         self._write_metadata()
         add_to_manifest(self.folder, self._path.name)
 
@@ -201,17 +181,11 @@ class BagWriter:
             self._schemas[msgtype] = self._writer.register_schema(
                 msgtype, 'ros2msg', definition.encode()
             )
-        self._topics.setdefault(
-            topic, TopicMetadata(topic, msgtype, type_hash, topic in self._latched)
-        )
+        offered = qos_text(topic in LATCHED_TOPICS)
+        self._topics.setdefault(topic, _described(topic, msgtype))
+        about = {'offered_qos_profiles': offered, 'topic_type_hash': type_hash}
         self._channels[topic] = self._writer.register_channel(
-            topic,
-            'cdr',
-            self._schemas[msgtype],
-            {
-                'offered_qos_profiles': qos_text(topic in self._latched),
-                'topic_type_hash': type_hash,
-            },
+            topic, 'cdr', self._schemas[msgtype], about
         )
         self._list_topics()
 
@@ -224,7 +198,7 @@ class BagWriter:
             self._metadata_waits = True
 
     def _write_metadata(self) -> None:
-        text = metadata_text(self._files, list(self._topics.values()))
+        text = metadata_text(self._files, self._topics.values())
         write_atomically(self.folder / METADATA_FILE, text)
 
 
@@ -234,7 +208,7 @@ def recover_bag(folder: str | os.PathLike[str]) -> str:
     Returns
     -------
     str
-        What could not be kept, in words; '' where nothing was lost. A bag that was closed is left
+        What could not be kept; '' where nothing was lost. A bag that was closed is left
         as it is.
 
     Raises
@@ -253,16 +227,15 @@ def recover_bag(folder: str | os.PathLike[str]) -> str:
         with BagWriter(work) as writer:
             for message in reader.messages_of(last):
                 writer.write(*message)
-        try:
+        with writing(path):
             os.replace(writer._path, path)
             sync_folder(folder)
-        except OSError as error:
-            raise cannot_write(path, error) from None
         _remove_work(folder)
     listed = read_manifest(folder)
     unlisted = [file.name for file in reader.files if file.name not in listed]
     if unlisted:
-        write_atomically(folder / METADATA_FILE, _metadata_of(reader))
+        topics = _topics_of(reader)
+        write_atomically(folder / METADATA_FILE, metadata_text(reader.files, topics.values()))
     for name in unlisted:
         add_to_manifest(folder, name)
     if not reader.torn_bytes:
@@ -270,18 +243,17 @@ def recover_bag(folder: str | os.PathLike[str]) -> str:
     return f'{path}: its last {reader.torn_bytes} bytes were no whole message and are dropped'
 
 
-def _metadata_of(reader: BagReader) -> str:
-    topics = [
-        TopicMetadata(
-            topic,
-            msgtype,
-            definition_of(msgtype)[1],
-            topic in LATCHED_TOPICS,
-            reader.counts[topic],
-        )
+def _topics_of(reader: BagReader) -> dict[str, TopicMetadata]:
+    """Return the topics of a bag by name."""
+    return {
+        topic: _described(topic, msgtype, reader.counts[topic])
         for topic, msgtype in reader.topics.items()
-    ]
-    return metadata_text(reader.files, topics)
+    }
+
+
+def _described(topic: str, msgtype: str, count: int = 0) -> TopicMetadata:
+    _, type_hash = definition_of(msgtype)
+    return TopicMetadata(topic, msgtype, type_hash, topic in LATCHED_TOPICS, count)
 
 
 _WORK = '.recovery'
@@ -290,14 +262,12 @@ _WORK = '.recovery'
 def _remove_work(folder: Path) -> None:
     """Remove the work of a recovery that was itself killed, or is done."""
     work = folder / _WORK
-    try:
+    with writing(work):
         if work.is_dir():
             for file in work.iterdir():
                 os.unlink(file)
             os.rmdir(work)
             sync_folder(folder)
-    except OSError as error:
-        raise cannot_write(work, error) from None
 
 
 def _remove_beginnings(folder: Path) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.types import FloatArray, IntArray
+from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 _NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
 _NUMBER_CHARACTERS = re.compile(r'[0-9+\-.eE,]*')
@@ -47,11 +47,20 @@ class Table:
         line = self.first_line + row
         return InputError(f'{self.path}, line {line}, column {column}: {shown} {problem}')
 
-    def integers(self, column: str, optional: bool = False) -> IntArray:
-        """Return a column of integers; -1 stands for an empty cell of an optional column."""
-        cells = self.cells[column]
-        if optional:
-            cells = [cell or '-1' for cell in cells]
+    def refuse(self, wrong: BoolArray, problems: Mapping[str, str]) -> None:
+        """Raise the fault of the first True of `wrong`, (n, columns); `problems` by column."""
+        for row, column in np.argwhere(wrong)[:1]:
+            name = list(problems)[column]
+            raise self.fault(int(row), name, problems[name])
+
+    def integers(self, column: str, least: int | None = None) -> IntArray:
+        """Return a column of integers.
+
+        With `least` it is an optional column, of integers from `least` (above -1) on; -1 stands
+        for an empty cell.
+        """
+        given = self.cells[column]
+        cells = given if least is None else [cell or '-1' for cell in given]
         try:
             values = np.array(list(map(int, cells)), dtype=np.int64)
         except (ValueError, OverflowError):
@@ -60,6 +69,11 @@ class Table:
         if values is None or not _INTEGER_CHARACTERS.fullmatch(','.join(cells)):
             row = next(i for i, cell in enumerate(cells) if not _INTEGER.fullmatch(cell))
             raise self.fault(row, column, 'is not an integer; correct it')
+        if least is not None:
+            few = (values < least) & (np.array(given) != '')
+            self.refuse(
+                few[:, None], {column: f'is less than {least}; leave it empty where unknown'}
+            )
         return values
 
     def numbers(self, columns: Sequence[str], optional: bool = False) -> FloatArray:
@@ -67,14 +81,9 @@ class Table:
         result = np.empty((self.rows, len(columns)))
         for i, column in enumerate(columns):
             cells = self.cells[column]
-            empty = 0
+            empty, blank = (cells.count(''), 'nan') if optional else (0, '')
             try:
-                if optional:
-                    values = [float(cell) if cell else math.nan for cell in cells]
-                    empty = cells.count('')
-                else:
-                    values = list(map(float, cells))
-                result[:, i] = values
+                result[:, i] = [float(cell or blank) for cell in cells]
             except ValueError:
                 raise self._not_a_number(column, optional) from None
             # float() also reads nan, inf, 1_000, blanks and other scripts' digits.
@@ -87,22 +96,18 @@ class Table:
         """Return optional columns of which a row fills all or none."""
         values = self.numbers(columns, optional=True)
         unknown = np.isnan(values)
-        partial = np.flatnonzero(unknown.any(axis=1) & ~unknown.all(axis=1))
-        if len(partial):
-            row = int(partial[0])
-            column = columns[int(np.argmax(unknown[row]))]
-            raise self.fault(
-                row, column, f'is empty though others of {columns[0]} … {columns[-1]} are not; '
-                'fill all of them or none'
-            )  # fmt: skip
+        problem = (
+            f'is empty though others of {columns[0]} … {columns[-1]} are not; fill all of them or '
+            'none'
+        )
+        self.refuse(unknown & ~unknown.all(axis=1, keepdims=True), dict.fromkeys(columns, problem))
         return values
 
     def choices(self, column: str, names: Sequence[str], remedy: str) -> IntArray:
         """Return the index of every cell among `names`."""
         index = {name: i for i, name in enumerate(names)}
         values = np.array([index.get(cell, -1) for cell in self.cells[column]], dtype=np.int64)
-        if (values < 0).any():
-            raise self.fault(int(np.argmin(values)), column, remedy)
+        self.refuse(values[:, None] < 0, {column: remedy})
         return values
 
     def _not_a_number(self, column: str, optional: bool) -> InputError:

@@ -1,9 +1,10 @@
-"""Reading files from strangers and writing files that survive a crash."""
+"""Reading files of unknown origin and writing files that survive a crash."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from remaster_ros.errors import DiskError, InputError
@@ -19,7 +20,7 @@ def read_limited(path: Path, limit: int, missing: str) -> bytes:
     limit
         Largest size accepted, bytes.
     missing
-        What to tell the user where there is no such file.
+        The remedy in the message where there is no such file.
 
     Raises
     ------
@@ -66,31 +67,27 @@ def decode_text(data: bytes, path: Path) -> str:
 
 
 def make_folder(folder: Path) -> None:
-    """Create an output folder with its parents; an `InputError` says why it cannot be."""
-    try:
+    """Create an output folder with its parents, durable on return; `InputError` if impossible."""
+    with writing(folder):
         new = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         # From the top: a folder whose own name is lost takes all in it along.
         for path in reversed(new):
             sync_folder(path.parent)
-    except OSError as error:
-        raise cannot_write(folder, error) from None
 
 
 def make_new_folder(folder: Path) -> None:
     """Create an output folder, or take an empty one; `InputError` where it holds files."""
     make_folder(folder)
-    try:
+    with writing(folder):
         occupied = any(folder.iterdir())
-    except OSError as error:
-        raise cannot_write(folder, error) from None
     if occupied:
         raise InputError(
             f'{folder}: already holds files, which are not overwritten; name a new or empty folder'
         )
 
 
-def write_atomically(path: Path, data: str | bytes) -> None:
+def write_atomically(path: Path, data: str | bytes | bytearray) -> None:
     """Replace a file in one step, durable on return: readers see the old text or the new.
 
     Raises
@@ -99,31 +96,27 @@ def write_atomically(path: Path, data: str | bytes) -> None:
         The folder cannot be written to, or the disk is full.
     """
     temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
-    try:
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+    with writing(path):
         try:
-            write_all(descriptor, data.encode() if isinstance(data, str) else data)
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-        os.replace(temporary, path)
-        sync_folder(path.parent)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise cannot_write(path, error) from None
+            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+            try:
+                write_all(descriptor, data.encode() if isinstance(data, str) else data)
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+            os.replace(temporary, path)
+            sync_folder(path.parent)
+        except OSError:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+            raise
 
 
-def remove_leftovers(folder: Path) -> list[str]:
-    """Remove the temporary files of atomic writes that a crash cut short; return their names."""
-    removed = []
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files of atomic writes that a crash cut short."""
     for path in sorted(folder.glob('.*.tmp')):
-        try:
+        with writing(path):
             os.unlink(path)
-        except OSError as error:
-            raise cannot_write(path, error) from None
-        removed.append(path.name)
-    return removed
 
 
 class AppendFile:
@@ -165,18 +158,19 @@ class AppendFile:
         Raises
         ------
         DiskError
-            The disk does not take it; the file ends as before. Where the disk does not take
-            that either, the file is closed: nobody knows how it ends until it is read again.
+            The disk does not take it; the file ends as before. Where it cannot be cut to that
+            either, the file is closed: how it ends is unknown until it is read again.
         """
         descriptor = self.descriptor
-        try:
-            write_all(descriptor, data)
-            os.fsync(descriptor)
-        except OSError as error:
-            # Half a piece in the middle of the file would make all of it unreadable.
-            with contextlib.suppress(InputError):
-                self.truncate(self.size)
-            raise cannot_write(self.path, error) from None
+        with writing(self.path):
+            try:
+                write_all(descriptor, data)
+                os.fsync(descriptor)
+            except OSError:
+                # Half a piece in the middle of the file would make all of it unreadable.
+                with contextlib.suppress(InputError):
+                    self.truncate(self.size)
+                raise
         self.size += len(data)
 
     def truncate(self, size: int) -> None:
@@ -216,11 +210,9 @@ class PatientFile:
         self.path = path
         self._waiting = bytearray()
         self._given = 0
-        try:
-            flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL
+        with writing(path):
             self._descriptor = os.open(path, flags, 0o666)
-        except OSError as error:
-            raise cannot_write(path, error) from None
 
     @property
     def waiting(self) -> int:
@@ -241,24 +233,21 @@ class PatientFile:
 
     def flush(self) -> None:
         """Write what waits; `DiskError` where some of it has to wait on."""
-        try:
+        with writing(self.path):
             while self._waiting:
                 del self._waiting[: os.write(self._descriptor, self._waiting)]
-        except OSError as error:
-            raise cannot_write(self.path, error) from None
 
     def close(self) -> None:
         """Write what waits, durable on return; `DiskError` where the disk does not take it."""
         try:
             self.flush()
-            os.fsync(self._descriptor)
-        except OSError as error:
-            raise cannot_write(self.path, error) from None
+            with writing(self.path):
+                os.fsync(self._descriptor)
         finally:
             os.close(self._descriptor)
 
 
-def write_all(descriptor: int, data: bytes) -> None:
+def write_all(descriptor: int, data: bytes | bytearray) -> None:
     """Write all of `data`, however many calls the system takes for it."""
     written = 0
     while written < len(data):
@@ -274,8 +263,17 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn an error of the operating system into the `DiskError` that names path and remedy."""
+    try:
+        yield
+    except OSError as error:
+        raise cannot_write(path, error) from None
+
+
 def cannot_write(path: Path, error: OSError) -> DiskError:
-    """Return the error that says why a file or folder cannot be written, and the remedy."""
+    """Return the error with the reason why a file or folder cannot be written, and the remedy."""
     return DiskError(
         f'{path}: cannot be written ({reason(error)}); '
         'name a folder you may write to, with free space'
@@ -283,5 +281,5 @@ def cannot_write(path: Path, error: OSError) -> DiskError:
 
 
 def reason(error: Exception) -> str:
-    """Return an operating-system error in words, without the path it repeats."""
+    """Return the text of an operating-system error, without the path that it repeats."""
     return getattr(error, 'strerror', None) or str(error)

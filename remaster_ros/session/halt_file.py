@@ -70,7 +70,7 @@ class HaltFile:
         write_atomically(self.path, msgspec.json.encode(_Halt(reason, since)))
 
     def clear(self) -> None:
-        """Forget it; an `OSError` says why that is not possible."""
+        """Remove the halt; an `OSError` where that is not possible."""
         self.path.unlink(missing_ok=True)
         if self.path.parent.is_dir():
             sync_folder(self.path.parent)

@@ -1,4 +1,4 @@
-"""Append-only journals: JSON lines with a checksum each, durable before anybody is told.
+"""Append-only journals: JSON lines with a checksum each, durable before `append` returns.
 
 A crash can leave only the last line incomplete: cut anywhere, also inside a character, or with
 zeros where the file system had reserved blocks but not yet written them. Such a line was never
@@ -9,7 +9,6 @@ and the file is refused.
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import json
 import os
 import zlib
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.files import AppendFile, cannot_write, read_limited, write_atomically
+from remaster_ros.session.files import AppendFile, read_limited, write_atomically, writing
 
 JOURNAL_LIMIT = 1024**3
 
@@ -30,23 +29,23 @@ class JournalText(NamedTuple):
     Attributes
     ----------
     records
-        What the whole lines say.
-    size
-        How many bytes these lines are.
+        One for each whole line.
+    whole
+        The bytes of these lines.
     torn
         How many bytes behind them are no whole line.
     """
 
     records: list[Record]
-    size: int
+    whole: bytes
     torn: int
 
 
 class Journal:
     """Write a journal, or go on with one; what `append` returned from is on the disk.
 
-    Opening cuts off what a crash has left of a line. While it is open, nobody else can open it
-    for writing; the lock goes with the process, however that ends.
+    Opening cuts off what a crash has left of a line. While it is open, no other process can open
+    it for writing; the lock ends with the process, however that ends.
 
     Parameters
     ----------
@@ -55,10 +54,10 @@ class Journal:
 
     Attributes
     ----------
-    records
-        Every record so far.
+    records, content
+        Every record so far, and the bytes of all their lines.
     lost
-        What was cut off when opening, in words; '' where nothing was.
+        What was cut off when opening, in a line; '' where nothing was.
 
     Raises
     ------
@@ -71,30 +70,23 @@ class Journal:
         self._file = AppendFile(path)
         try:
             self._lock()
-            self.records, size, torn = read_journal(path)
-            self.lost = torn_words(path, len(self.records), torn)
+            self.records, whole, torn = read_journal(path)
+            self.content = bytearray(whole)
+            self.lost = ''
             if torn:
-                self._file.truncate(size)
-            self._before = self._file.size
-            whole = read_limited(path, JOURNAL_LIMIT, 'it was there a moment ago')[:size]
-            self._sum = self._sum_before = hashlib.sha256(whole)
+                self._file.truncate(len(whole))
+                self.lost = (
+                    f'{path}, line {len(self.records) + 1}: {torn} bytes of a line cut off while '
+                    'being written are dropped'
+                )
         except BaseException:
             self._file.close()
             raise
 
     @property
-    def sha256(self) -> str:
-        """Checksum of all that was written, in hexadecimal."""
-        return self._sum.hexdigest()
-
-    @property
     def names(self) -> int:
         """How many names the open file has: 0 after it was removed."""
         return os.fstat(self._file.descriptor).st_nlink
-
-    def holds(self, data: bytes) -> bool:
-        """Tell whether these bytes are what was written."""
-        return hashlib.sha256(data).hexdigest() == self.sha256
 
     def restore(self) -> None:
         """Write every record again, where the file is no longer the one that was opened.
@@ -106,23 +98,20 @@ class Journal:
         InputError
             Another process writes the file that is there.
         """
-        data = b''.join(map(format_record, self.records))
-        write_atomically(self.path, data)
+        write_atomically(self.path, self.content)
         self._file.close()
         self._file = AppendFile(self.path)
         self._lock()
-        self._before = self._file.size
-        self._sum = self._sum_before = hashlib.sha256(data)
 
     def _lock(self) -> None:
-        try:
-            fcntl.flock(self._file.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(
-                f'{self.path}: another process is writing it; end that one, or name another folder'
-            ) from None
-        except OSError as error:
-            raise cannot_write(self.path, error) from None
+        with writing(self.path):
+            try:
+                fcntl.flock(self._file.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InputError(
+                    f'{self.path}: another process is writing it; end that one, or name another '
+                    'folder'
+                ) from None
 
     def append(self, record: Record) -> None:
         """Write one record; durable on return.
@@ -133,15 +122,15 @@ class Journal:
             The disk does not take it; the file is as it was before.
         """
         line = format_record(record)
-        self._before, self._sum_before = self._file.size, self._sum.copy()
         self._file.append(line)
-        self._sum.update(line)
+        self.content += line
         self.records.append(record)
 
     def take_back(self) -> None:
         """Cut off the record that was appended last; `InputError` where that is not possible."""
-        self._file.truncate(self._before)
-        self._sum = self._sum_before
+        before = self.content.rfind(b'\n', 0, -1) + 1
+        self._file.truncate(before)
+        del self.content[before:]
         self.records.pop()
 
     def close(self) -> None:
@@ -175,16 +164,7 @@ def read_journal(path: Path) -> JournalText:
             f'{path}, line {len(records) + 1}: damaged, though whole lines follow; '
             'take another copy of the file'
         )
-    return JournalText(records, size, len(rest))
-
-
-def torn_words(path: Path, whole: int, torn: int) -> str:
-    """Say what of a journal with `whole` good lines is dropped; '' where nothing is."""
-    if not torn:
-        return ''
-    return (
-        f'{path}, line {whole + 1}: {torn} bytes of a line cut off while being written are dropped'
-    )
+    return JournalText(records, data[:size], len(rest))
 
 
 def format_record(record: Record) -> bytes:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from remaster_ros.errors import InputError
 from remaster_ros.session.files import (
-    cannot_write,
     decode_text,
     read_limited,
     reason,
     sync_folder,
     write_atomically,
+    writing,
 )
 
 MANIFEST = 'SHA256SUMS'
@@ -47,17 +47,6 @@ def read_manifest(folder: Path) -> dict[str, str]:
     return sums
 
 
-def write_manifest(folder: Path, names: Iterable[str]) -> None:
-    """Write down what these files are now; they must not change as long as it stands.
-
-    Raises
-    ------
-    InputError
-        A file cannot be read, or the folder not written to.
-    """
-    write_sums(folder, {name: sha256_of(folder / name) for name in names})
-
-
 def write_sums(folder: Path, sums: Mapping[str, str]) -> None:
     """Write down checksums by name of the file, of what the caller put there.
 
@@ -72,23 +61,19 @@ def write_sums(folder: Path, sums: Mapping[str, str]) -> None:
 
 def add_to_manifest(folder: Path, name: str) -> None:
     """Write down one more closed file; what is written down already stays."""
-    lines = {**read_manifest(folder), name: sha256_of(folder / name)}
-    text = ''.join(f'{checksum}  {file}\n' for file, checksum in sorted(lines.items()))
-    write_atomically(folder / MANIFEST, text)
+    write_sums(folder, {**read_manifest(folder), name: sha256_of(folder / name)})
 
 
 def remove_manifest(folder: Path) -> None:
     """Take the manifest away, durable on return, before its files are changed."""
     path = folder / MANIFEST
-    try:
+    with writing(path):
         if path.exists():
             os.unlink(path)
             sync_folder(folder)
-    except OSError as error:
-        raise cannot_write(path, error) from None
 
 
-def check_data(sums: dict[str, str], path: Path, data: bytes) -> None:
+def check_data(sums: Mapping[str, str], path: Path, data: bytes) -> None:
     """Refuse the content of a file that is not what was closed; unlisted files pass.
 
     Raises
@@ -99,7 +84,7 @@ def check_data(sums: dict[str, str], path: Path, data: bytes) -> None:
     _compare(sums, path, hashlib.sha256(data).hexdigest())
 
 
-def check_file(sums: dict[str, str], path: Path) -> None:
+def check_file(sums: Mapping[str, str], path: Path) -> None:
     """As `check_data`, for a file too large to hold."""
     if path.name in sums:
         _compare(sums, path, sha256_of(path))
@@ -120,7 +105,7 @@ def sha256_of(path: Path) -> str:
         raise InputError(f'{path}: cannot be read ({reason(error)})') from None
 
 
-def _compare(sums: dict[str, str], path: Path, found: str) -> None:
+def _compare(sums: Mapping[str, str], path: Path, found: str) -> None:
     if sums.get(path.name, found) != found:
         raise InputError(
             f'{path}: not as it was closed, by its checksum in {MANIFEST}; take another copy '

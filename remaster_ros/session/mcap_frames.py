@@ -44,7 +44,7 @@ def frames(file: IO[bytes], size: int, crc: int | None, solid: int) -> Iterator[
             raise CutOffError
         opcode, length = struct.unpack('<BQ', head)
         end = file.tell() + length
-        # MCAP knows no opcodes 0 and 0x10 to 0x7f.
+        # MCAP has no opcodes 0 and 0x10 to 0x7f.
         known = 0x01 <= opcode <= 0x0F or opcode >= 0x80
         if not known or end > size or solid < end < size:
             raise CutOffError
@@ -74,14 +74,14 @@ def unchunked(records: Iterator[tuple[int, bytes]]) -> Iterator[tuple[int, bytes
 
 
 def _unpacked(chunk: Chunk) -> bytes:
-    """Unpack a chunk, and never more of it than it says that it holds.
+    """Unpack a chunk, and never more of it than the size that it states.
 
     A few megabytes of zeros, packed, are gigabytes; they are refused before they are in memory.
     """
     stated = chunk.uncompressed_size
     if stated > CHUNK_LIMIT:
-        raise ValueError(f'a chunk says it holds more than {CHUNK_LIMIT} bytes')
-    # One byte more than stated tells that there is more.
+        raise ValueError(f'a chunk states more than {CHUNK_LIMIT} bytes')
+    # One byte more than stated, so that a longer content is noticed.
     if chunk.compression == 'zstd':
         import zstandard
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from functools import cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -40,14 +41,7 @@ def mesh_reader(urdf: Path, mesh_path: Sequence[Path] = ()) -> Callable[[str], F
         File name as written -> vertices, m, (n, 3). It raises InputError where there is no such
         file or none that can be read; a link without its mesh would be a link that hits nothing.
     """
-    cache: dict[str, FloatArray] = {}
-
-    def read(name: str) -> FloatArray:
-        if name not in cache:
-            cache[name] = read_mesh(_find(name, urdf, mesh_path))
-        return cache[name]
-
-    return read
+    return cache(lambda name: read_mesh(_find(name, urdf, mesh_path)))
 
 
 def _find(name: str, urdf: Path, mesh_path: Sequence[Path]) -> Path:
@@ -84,7 +78,7 @@ def read_mesh(path: Path) -> FloatArray:
 
     try:
         loaded = trimesh.load_scene(BytesIO(content), file_type=kind[1:], skip_materials=True)
-        # Instances in their places; COLLADA says how long its unit is.
+        # Instances in their places; COLLADA files state the length of their unit.
         parts: list[Any] = [getattr(part, 'vertices', ()) for part in loaded.dump()]
         vertices = np.array([point for part in parts for point in part], dtype=float)
         vertices = vertices.reshape(-1, 3)

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING
 
 from remaster_ros.errors import InputError
 
-_typestore: Any = None
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 
+@cache
+def _jazzy() -> Typestore:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+@cache
 def definition_of(msgtype: str) -> tuple[str, str]:
     """Return the message definition of one of Jazzy's types and its RIHS01 hash."""
-    global _typestore
-    from rosbags.typesys import Stores, get_typestore
     from rosbags.typesys.store import TypesysError
 
-    if _typestore is None:
-        _typestore = get_typestore(Stores.ROS2_JAZZY)
+    types = _jazzy()
     try:
-        definition, _ = _typestore.generate_msgdef(msgtype, ros_version=2)
-        return definition, _typestore.hash_rihs01(msgtype)
+        definition, _ = types.generate_msgdef(msgtype, ros_version=2)
+        return definition, types.hash_rihs01(msgtype)
     except (KeyError, TypesysError):
         raise InputError(
             f'{msgtype!r}: not a message type of ROS 2 Jazzy; '

@@ -6,7 +6,6 @@ import logging
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,6 @@ from remaster_ros.session.sequence_rules import (
     SPLITS,
     RowKeys,
     SequenceRules,
-    keeps_the_rules,
     row_keys,
     split_indices,
 )
@@ -30,29 +28,26 @@ log = logging.getLogger('remaster_ros')
 LIMIT_TOLERANCE_RAD = math.radians(1.0)
 
 
-@dataclass(frozen=True)
 class ColumnNames:
-    """The column names of a session with k joints, in the order this package writes them."""
+    """The column names of a session with k joints, in the order this package writes them.
 
-    joints: int
-
-    @property
-    def q(self) -> list[str]:
-        """Reported joint positions."""
-        return [f'q{i}_rad' for i in range(1, self.joints + 1)]
-
-    @property
-    def from_q(self) -> list[str]:
-        """Joint positions the arm came from."""
-        return [f'from_q{i}_rad' for i in range(1, self.joints + 1)]
-
-    @property
-    def effort(self) -> list[str]:
-        """Measured joint torques; these columns are optional."""
-        return [f'effort{i}_nm' for i in range(1, self.joints + 1)]
+    Attributes
+    ----------
+    q, from_q
+        Reported joint positions, and those that the arm came from.
+    effort
+        Measured joint torques; these columns are optional.
+    """
 
     position = ('x_m', 'y_m', 'z_m')
     std = ('std_x_m', 'std_y_m', 'std_z_m')
+
+    def __init__(self, joints: int) -> None:
+        self.joints = joints
+        self.q, self.from_q, self.effort = (
+            [f'{prefix}{i}_{unit}' for i in range(1, joints + 1)]
+            for prefix, unit in (('q', 'rad'), ('from_q', 'rad'), ('effort', 'nm'))
+        )
 
     def names(self, with_effort: bool = False) -> list[str]:
         """Return every column's name."""
@@ -63,60 +58,126 @@ class ColumnNames:
         ]
 
 
-def parse_observations(
-    data: bytes,
-    path: Path,
-    chain: SerialChain,
-    sensors: Sequence[str],
-    markers: Sequence[str],
-) -> Measurements:
-    """Read observations.csv.
-
-    What was cut off while it was written is dropped with a warning: a last line without its line
-    end, and last lines with the zeros that a power cut leaves.
+class RowFormat:
+    """observations.csv of one session: reads it, and checks rows that are to be written.
 
     Parameters
     ----------
-    data
-        The file's bytes.
     path
-        Its name, for messages.
+        The file, for messages.
     chain
         The robot, for the number of joints and their limits.
     sensors, markers
         The names in session.yaml, in their order.
-
-    Raises
-    ------
-    InputError
-        One line naming file, line, column and remedy.
     """
-    # Before its zeros are taken for those that a power cut leaves.
-    refuse_utf16(data, path)
-    end = _whole_lines(data, most=len(sensors))
-    if end < len(data):
-        torn = data.count(b'\n', 0, end) + 1
-        log.warning('%s, line %d: cut off while being written, and dropped', path, torn)
-    lines = decode_text(data[:end], path).replace('\r\n', '\n').split('\n')[:-1]
-    while lines and not lines[-1]:
-        lines.pop()
-    if not lines:
-        raise InputError(f'{path}: no header line; the first line names the columns')
-    _refuse_other_separators(lines[0], path)
-    names = split_line(lines[0], path, 1)
-    columns = ColumnNames(len(chain))
-    with_effort = _check_names(names, columns, path)
-    if len(lines) < 2:
-        raise InputError(f'{path}: no observations below the header; measure before fitting')
-    table = Table(path, names, lines[1:], first_line=2)
-    measurements = _columns(table, columns, chain, sensors, markers, with_effort)
-    if not keeps_the_rules(measurements):
-        rules = SequenceRules()
-        for row in row_keys(measurements, first_line=2):
+
+    def __init__(
+        self, path: Path, chain: SerialChain, sensors: Sequence[str], markers: Sequence[str]
+    ) -> None:
+        self._path, self._chain = path, chain
+        self._sensors, self._markers = sensors, markers
+        self._columns = ColumnNames(len(chain))
+
+    def parse(self, data: bytes) -> Measurements:
+        """Read the bytes of the file.
+
+        What was cut off while it was written is dropped with a warning: a last line without its
+        line end, and last lines with the zeros that a power cut leaves.
+
+        Raises
+        ------
+        InputError
+            One line naming file, line, column and remedy.
+        """
+        path = self._path
+        # Before its zeros are taken for those that a power cut leaves.
+        refuse_utf16(data, path)
+        end = _whole_lines(data, most=len(self._sensors))
+        if end < len(data):
+            torn = data.count(b'\n', 0, end) + 1
+            log.warning('%s, line %d: cut off while being written, and dropped', path, torn)
+        lines = decode_text(data[:end], path).replace('\r\n', '\n').split('\n')[:-1]
+        while lines and not lines[-1]:
+            lines.pop()
+        if not lines:
+            raise InputError(f'{path}: no header line; the first line names the columns')
+        _refuse_other_separators(lines[0], path)
+        names = split_line(lines[0], path, 1)
+        _check_names(names, self._columns, path)
+        if len(lines) < 2:
+            raise InputError(f'{path}: no observations below the header; measure before fitting')
+        measurements = self._convert(Table(path, names, lines[1:], first_line=2))
+        self._accept(measurements, 2, SequenceRules())
+        return measurements
+
+    def check(self, rows: Sequence[str], first_line: int, rules: SequenceRules) -> list[RowKeys]:
+        """Check rows that are to be written as a reader would; return their keys.
+
+        Parameters
+        ----------
+        rows
+            Lines without their ends.
+        first_line
+            The line of the first one in the file.
+        rules
+            Accepts the rows.
+
+        Raises
+        ------
+        InputError
+            As `parse`.
+        """
+        if not rows:
+            return []
+        table = Table(self._path, self._columns.names(), list(rows), first_line)
+        return self._accept(self._convert(table), first_line, rules)
+
+    def _accept(self, m: Measurements, first_line: int, rules: SequenceRules) -> list[RowKeys]:
+        keys = list(row_keys(m, first_line))
+        for row in keys:
             if problem := rules.problem(row):
-                raise InputError(f'{path}, line {row.line}, {problem}')
+                raise InputError(f'{self._path}, line {row.line}, {problem}')
             rules.accept(row)
-    return measurements
+        return keys
+
+    def _convert(self, table: Table) -> Measurements:
+        """Convert and check every column by itself."""
+        columns, chain = self._columns, self._chain
+        with_effort = columns.effort[0] in table.cells
+        split = table.choices('split', SPLITS, f'is none of {", ".join(SPLITS)}; correct it')
+        is_reference = split == SPLITS.index('reference')
+        measurements = Measurements(
+            observation=table.integers('observation'),
+            pose=table.integers('pose'),
+            configuration=table.integers('configuration'),
+            is_validation=split == SPLITS.index('validation'),
+            stamp_s=table.numbers(['stamp_s'])[:, 0],
+            sensor=table.choices('sensor', self._sensors, _not_among('sensors', self._sensors)),
+            marker=table.choices('marker', self._markers, _not_among('markers', self._markers)),
+            q=table.numbers(columns.q),
+            from_q=table.whole_or_empty(columns.from_q),
+            position=table.numbers(columns.position),
+            std=table.whole_or_empty(columns.std),
+            samples=table.integers('samples', least=1),
+            temperature_c=table.numbers(['temperature_c'], optional=True)[:, 0],
+            effort=table.numbers(columns.effort, optional=True) if with_effort else None,
+            is_reference=is_reference if is_reference.any() else None,
+        )
+        table.refuse(measurements.std < 0, dict.fromkeys(columns.std, 'is negative; correct it'))
+        problems = [
+            f'rad is more than 1 degree outside the limits of {joint} ({lower:.6g} to {upper:.6g} '
+            'rad); are the units radians, the joints base to tip, and the limits of the URDF '
+            'right?'
+            for joint, lower, upper in zip(chain.joint_names, chain.lower, chain.upper)
+        ]
+        for names, q in ((columns.q, measurements.q), (columns.from_q, measurements.from_q)):
+            below = q < chain.lower - LIMIT_TOLERANCE_RAD
+            above = q > chain.upper + LIMIT_TOLERANCE_RAD
+            table.refuse(below | above, dict(zip(names, problems)))
+        far = f'm is further than {FARTHEST_M:g} m away, beyond any sensor; are the units metres?'
+        outside = np.abs(measurements.position) > FARTHEST_M
+        table.refuse(outside, dict.fromkeys(columns.position, far))
+        return measurements
 
 
 def _refuse_other_separators(header: str, path: Path) -> None:
@@ -142,38 +203,13 @@ def _whole_lines(data: bytes, most: int) -> int:
     return data.rfind(b'\n', 0, zero) + 1
 
 
-def check_row(
-    text: str,
-    line: int,
-    path: Path,
-    chain: SerialChain,
-    sensors: Sequence[str],
-    markers: Sequence[str],
-    rules: SequenceRules,
-) -> RowKeys:
-    """Hold one row about to be written to what the reader will demand of it.
-
-    Raises
-    ------
-    InputError
-        As `parse_observations`.
-    """
-    columns = ColumnNames(len(chain))
-    table = Table(path, columns.names(), [text.rstrip('\n')], first_line=line)
-    measurements = _columns(table, columns, chain, sensors, markers, with_effort=False)
-    row = next(row_keys(measurements, first_line=line))
-    if problem := rules.problem(row):
-        raise InputError(f'{path}, line {line}, {problem}')
-    return row
-
-
 def format_header(joints: int, with_effort: bool = False) -> str:
     """Return the header line of observations.csv."""
     return ','.join(ColumnNames(joints).names(with_effort)) + '\n'
 
 
 def format_observation(observation: Observation) -> str:
-    """Return one observation as a line of the file; numbers survive the round trip exactly."""
+    """Return one observation as a line without its end; numbers survive the round trip exactly."""
     o = observation
     unknown = [''] * len(o.q)
     cells = [
@@ -186,7 +222,7 @@ def format_observation(observation: Observation) -> str:
         '' if o.samples is None else str(int(o.samples)),
         '' if o.temperature_c is None else _text(o.temperature_c),
     ]
-    return ','.join(cells) + '\n'
+    return ','.join(cells)
 
 
 def format_measurements(m: Measurements, sensors: Sequence[str], markers: Sequence[str]) -> str:
@@ -213,21 +249,17 @@ def format_measurements(m: Measurements, sensors: Sequence[str], markers: Sequen
     return format_header(m.q.shape[1], m.effort is not None) + ''.join(f'{row}\n' for row in lines)
 
 
-def _check_names(names: list[str], columns: ColumnNames, path: Path) -> bool:
-    """Hold the header against the format; return whether the file has effort columns."""
+def _check_names(names: list[str], columns: ColumnNames, path: Path) -> None:
+    """Refuse a header that does not have the columns of the format."""
     where = f'{path}, line 1'
     for name in names:
         if names.count(name) > 1:
             raise InputError(f'{where}: column {name[:40]!r} is given twice; keep one')
-    for prefix, wanted in (
-        ('q', columns.q),
-        ('from_q', columns.from_q),
-        ('effort', columns.effort),
-    ):
-        suffix = '_nm' if prefix == 'effort' else '_rad'
+    for wanted in (columns.q, columns.from_q, columns.effort):
+        prefix, suffix = wanted[0].split('1')
         pattern = re.compile(f'{prefix}[0-9]+{suffix}')
         found = [name for name in names if pattern.fullmatch(name)]
-        if set(found) != set(wanted) and (found or prefix != 'effort'):
+        if set(found) != set(wanted) and (found or wanted is not columns.effort):
             raise InputError(
                 f'{where}: {len(found)} columns {prefix}…{suffix} for the {columns.joints} joints '
                 f'of the robot between its base_link and tip_link; give {wanted[0]} to '
@@ -242,71 +274,6 @@ def _check_names(names: list[str], columns: ColumnNames, path: Path) -> bool:
     unknown = [name for name in names if name not in columns.names(with_effort=True)]
     if unknown:
         log.warning('%s: unknown columns are not used: %s', where, ', '.join(map(repr, unknown)))
-    return columns.effort[0] in names
-
-
-def _columns(
-    table: Table,
-    columns: ColumnNames,
-    chain: SerialChain,
-    sensors: Sequence[str],
-    markers: Sequence[str],
-    with_effort: bool,
-) -> Measurements:
-    """Convert and check every column by itself."""
-    split = table.choices('split', SPLITS, f'is none of {", ".join(SPLITS)}; correct it')
-    is_reference = split == SPLITS.index('reference')
-    measurements = Measurements(
-        observation=table.integers('observation'),
-        pose=table.integers('pose'),
-        configuration=table.integers('configuration'),
-        is_validation=split == SPLITS.index('validation'),
-        stamp_s=table.numbers(['stamp_s'])[:, 0],
-        sensor=table.choices('sensor', sensors, _not_among('sensors', sensors)),
-        marker=table.choices('marker', markers, _not_among('markers', markers)),
-        q=table.numbers(columns.q),
-        from_q=table.whole_or_empty(columns.from_q),
-        position=table.numbers(columns.position),
-        std=table.whole_or_empty(columns.std),
-        samples=table.integers('samples', optional=True),
-        temperature_c=table.numbers(['temperature_c'], optional=True)[:, 0],
-        effort=table.numbers(columns.effort, optional=True) if with_effort else None,
-        is_reference=is_reference if is_reference.any() else None,
-    )
-    too_few = np.flatnonzero(
-        (measurements.samples < 1)
-        & np.array([cell != '' for cell in table.cells['samples']], dtype=bool)
-    )
-    if len(too_few):
-        raise table.fault(
-            int(too_few[0]), 'samples', 'is less than 1; leave it empty where unknown'
-        )
-    negative = np.argwhere(measurements.std < 0)
-    if len(negative):
-        row, column = negative[0]
-        raise table.fault(int(row), columns.std[column], 'is negative; correct it')
-    for names, q in ((columns.q, measurements.q), (columns.from_q, measurements.from_q)):
-        outside = np.argwhere(
-            (q < chain.lower - LIMIT_TOLERANCE_RAD) | (q > chain.upper + LIMIT_TOLERANCE_RAD)
-        )
-        if len(outside):
-            row, joint = outside[0]
-            raise table.fault(
-                int(row),
-                names[joint],
-                f'rad is more than 1 degree outside the limits of {chain.joint_names[joint]} '
-                f'({chain.lower[joint]:.6g} to {chain.upper[joint]:.6g} rad); are the units '
-                'radians, the joints base to tip, and the limits of the URDF right?',
-            )
-    far = np.argwhere(np.abs(measurements.position) > FARTHEST_M)
-    if len(far):
-        row, axis = far[0]
-        raise table.fault(
-            int(row),
-            columns.position[axis],
-            f'm is further than {FARTHEST_M:g} m away, beyond any sensor; are the units metres?',
-        )
-    return measurements
 
 
 def _not_among(key: str, names: Sequence[str]) -> str:

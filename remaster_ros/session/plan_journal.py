@@ -1,4 +1,4 @@
-"""The planner's memory: what is planned, which pose is open, what became of each configuration.
+"""What a planner keeps on the disk: its plan, the open pose, the outcome of each configuration.
 
 ``plan.jsonl`` in the session folder is a journal (see `journal`). The plan is in it before the
 arm first moves, each pose before the arm is sent there; a planner that is started again takes up
@@ -14,31 +14,84 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from remaster_ros.errors import DiskError, InputError
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.planning.candidates import Plan, PlannedPose
-from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, PoseVisit, Tour
+from remaster_ros.planning.candidates import Plan
+from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, PoseVisit, Route, Tour
 from remaster_ros.session.files import make_folder
 from remaster_ros.session.journal import Journal, Record
-from remaster_ros.session.session_writer import PLAN
+from remaster_ros.session.plain_data import from_plain, to_plain
+from remaster_ros.session.session_opening import PLAN
 from remaster_ros.types import FloatArray
 
 NO_FREE_PATH = 'no_free_path'
 """Outcome of a configuration that the arm cannot get to without hitting something."""
 
 
-class PlanJournal:
-    """Keep what a planner must not forget; what a method returned from is on the disk.
+class _Begun(msgspec.Struct, tag_field='kind', tag='plan'):
+    """The first record: the plan's name, and what it depends on."""
 
-    Unless `trouble` says that the disk is full: then it is kept until `write_out` succeeds.
+    id: str
+    settings: dict[str, Any]
+
+
+class _Tour(msgspec.Struct, tag_field='kind', tag='tour'):
+    plans: dict[str, Plan]
+    in_order: bool
+    one_solution: bool
+    # Plans of older versions have no references, and go on without them.
+    reference_every: int = 0
+
+
+class _Route(msgspec.Struct, tag_field='kind', tag='route'):
+    """Solutions in the order of their visits, by number; `paths` has those that go around."""
+
+    ids: tuple[int, ...]
+    paths: dict[str, FloatArray] = {}
+    unreached: tuple[int, ...] = ()
+
+    def route(self, joints: int) -> Route:
+        """Return it as a tour has it, for an arm with so many joints."""
+        straight = np.empty((0, joints))
+        paths = tuple(self.paths.get(str(number), straight) for number in self.ids)
+        return Route(self.ids, paths, self.unreached)
+
+
+class _Stop(_Route, kw_only=True, tag='stop'):
+    split: str
+    index: int
+
+
+class _Round(msgspec.Struct, tag_field='kind', tag='round'):
+    """A round of the references is next, by request."""
+
+
+class _Outcome(msgspec.Struct, tag_field='kind', tag='outcome'):
+    id: int
+    result: str
+
+
+class _State(msgspec.Struct, tag_field='kind', tag='state'):
+    state: str
+    run: str = ''
+
+
+_Record = _Begun | _Tour | _Route | _Stop | _Round | _Outcome | _State
+
+
+class PlanJournal:
+    """Keep the state of a planner; when a method returns, what it noted is on the disk.
+
+    Unless the disk is full, which is in `trouble`: then it is kept until `write_out` succeeds.
 
     Parameters
     ----------
     folder
-        The session's; the file is made when there is something to remember.
+        The session's; the file is made with the first record.
     settings
         What the plan depends on, plain data by name.
     chain
@@ -49,7 +102,7 @@ class PlanJournal:
     Attributes
     ----------
     id
-        Tells this plan from others; '' before there is one.
+        Identifies this plan; '' before there is one.
     tour
         The tour under way, at the stop where it was; None where there is none.
     stop
@@ -59,11 +112,11 @@ class PlanJournal:
     references
         The same for visits to the references.
     state
-        What the planner last said it does, '' before.
+        The planner's last state, '' before the first.
     run
-        The token of the run in which it said so, '' where none was under way.
+        The token of the run that it was in, '' where none was under way.
     lost
-        What a crash has cut off, in words; '' where nothing was.
+        What a crash has cut off, in a line; '' where nothing was.
     trouble
         Why something is not on the disk yet; '' where everything is.
 
@@ -98,11 +151,15 @@ class PlanJournal:
         self.lost = self._journal.lost
         if not self._journal.records:
             self.id = uuid.uuid4().hex[:12]
-            self._journal.append({'kind': 'plan', 'id': self.id, 'settings': self._settings})
+            self._journal.append(to_plain(_Begun(self.id, self._settings)))
             return self._journal
         try:
-            self._check(self._journal.records[0])
-            for record in self._journal.records[1:]:
+            begun, *records = from_plain(self._journal.records, list[_Record])
+            if not isinstance(begun, _Begun):
+                raise ValueError('it does not begin with a plan')
+            self.id = begun.id
+            self._refuse_other_settings(begun.settings)
+            for record in records:
                 self._replay(record)
         except BaseException as error:
             self._journal.close()
@@ -114,9 +171,7 @@ class PlanJournal:
             raise
         return self._journal
 
-    def _check(self, record: Record) -> None:
-        self.id = record['id']
-        made = record['settings']
+    def _refuse_other_settings(self, made: Mapping[str, Any]) -> None:
         # Plans of older versions have no references, and go on without them.
         here = {k: v for k, v in self._settings.items() if k != 'reference_every' or k in made}
         other = [name for name, value in here.items() if made.get(name) != value]
@@ -128,35 +183,29 @@ class PlanJournal:
                 'with the same to go on, or name a new session folder'
             )
 
-    def _replay(self, record: Record) -> None:
-        kind = record['kind']
-        if kind == 'tour':
-            plans = {split: _plan(content) for split, content in record['plans'].items()}
-            self.tour = Tour(
-                self._chain,
-                plans,
-                in_order=record['in_order'],
-                one_solution=record['one_solution'],
-                model=self._model,
-                reference_every=record.get('reference_every', 0),
-            )
-            self.stop = None
-        elif kind == 'stop' and self.tour is not None:
-            route = _route(record, len(self._chain))
-            self._take(self.tour.go_to(record['split'], record['index'], *route))
-        elif kind == 'route' and self.stop is not None and self.tour is not None:
-            ids, paths, unreached = _route(record, len(self._chain))
-            pose = self.tour.plans[self.stop.split].poses[self.stop.index]
-            solutions = pose.solutions[list(ids)]
-            self._take(
-                replace(self.stop, solutions=solutions, ids=ids, paths=paths, unreached=unreached)
-            )
-        elif kind == 'round' and self.tour is not None:
-            self.tour.ask_round()
-        elif kind == 'outcome':
-            self._close_solution(record['id'], record['result'])
-        elif kind == 'state':
-            self.state, self.run = record['state'], record.get('run', '')
+    def _replay(self, record: _Record) -> None:
+        tour, stop, joints = self.tour, self.stop, len(self._chain)
+        match record:
+            case _Tour():
+                self.stop = None
+                self.tour = Tour(
+                    self._chain,
+                    record.plans,
+                    in_order=record.in_order,
+                    one_solution=record.one_solution,
+                    model=self._model,
+                    reference_every=record.reference_every,
+                )
+            case _Stop() if tour is not None:
+                self._take(tour.go_to(record.split, record.index, *record.route(joints)))
+            case _Route() if tour is not None and stop is not None:
+                self._take(tour.along(stop, *record.route(joints)))
+            case _Round() if tour is not None:
+                tour.ask_round()
+            case _Outcome():
+                self._close_solution(record.id, record.result)
+            case _State():
+                self.state, self.run = record.state, record.run
 
     def _take(self, stop: PoseVisit) -> None:
         """Go to a stop; the solutions that nothing leads to have their outcome with it."""
@@ -174,15 +223,15 @@ class PlanJournal:
         if split != REGISTRATION:
             (self.references if split == REFERENCE else self.outcomes)[result] += times
 
-    def _append(self, record: Record) -> None:
+    def _append(self, record: _Record) -> None:
         if self._journal is None:
             make_folder(self.path.parent)
             self._journal = self._open()
-        self._unwritten.append(record)
+        self._unwritten.append(to_plain(record))
         self.write_out()
 
     def write_out(self) -> None:
-        """Write what the disk has not taken yet; `trouble` says whether it does now."""
+        """Write what the disk has not taken yet; `trouble` has why it still does not."""
         try:
             while self._unwritten and self._journal is not None:
                 self._journal.append(self._unwritten[0])
@@ -192,38 +241,30 @@ class PlanJournal:
             self.trouble = str(error)
 
     def begin(self, tour: Tour) -> None:
-        """Remember a new tour."""
-        self._append(
-            {
-                'kind': 'tour',
-                'plans': {split: _content(plan) for split, plan in tour.plans.items()},
-                'in_order': tour.in_order,
-                'one_solution': tour.one_solution,
-                'reference_every': tour.reference_every,
-            }
-        )
-        # Said before there was a file to keep it in.
-        self._append({'kind': 'state', 'state': self.state, 'run': self.run})
+        """Note a new tour."""
+        self._append(_Tour(tour.plans, tour.in_order, tour.one_solution, tour.reference_every))
+        # As it was set before there was a file to keep it in.
+        self._append(_State(self.state, self.run))
         self.tour, self.stop = tour, None
 
     def ask_round(self) -> None:
-        """Visit the references next, and remember that: something was seen to by a person."""
+        """Visit the references next, since a person has changed something; note that."""
         if self.tour is not None and self.tour.references:
-            self._append({'kind': 'round'})
+            self._append(_Round())
             self.tour.ask_round()
 
     def open_stop(self, stop: PoseVisit) -> None:
-        """Remember the next stop, before the arm is sent there."""
-        self._append({'kind': 'stop', 'split': stop.split, 'index': stop.index, **_ways(stop)})
+        """Note the next stop, before the arm is sent there."""
+        self._append(_Stop(**_route(stop), split=stop.split, index=stop.index))
         self._take(stop)
 
     def reroute(self, stop: PoseVisit) -> None:
-        """Remember other ways to what is left of the open stop, before the arm is sent there."""
-        self._append({'kind': 'route', **_ways(stop)})
+        """Note other ways to what is left of the open stop, before the arm is sent there."""
+        self._append(_Route(**_route(stop)))
         self._take(stop)
 
     def outcome(self, solution: int, result: str) -> None:
-        """Remember what became of a solution of the open stop; one that has its outcome keeps it.
+        """Note what became of a solution of the open stop; a first outcome stays.
 
         Parameters
         ----------
@@ -235,14 +276,14 @@ class PlanJournal:
         """
         if self.stop is None or solution not in self.stop.ids:
             return
-        self._append({'kind': 'outcome', 'id': solution, 'result': result})
+        self._append(_Outcome(solution, result))
         self._close_solution(solution, result)
 
     def say_state(self, state: str, run: str = '') -> None:
-        """Remember what the planner does, and in which run, once there is a plan."""
+        """Note the planner's state and run, once there is a plan."""
         before, (self.state, self.run) = (self.state, self.run), (state, run)
         if self._journal is not None and before != (state, run):
-            self._append({'kind': 'state', 'state': state, 'run': run})
+            self._append(_State(state, run))
 
     def close(self) -> None:
         """Let others go on with the plan."""
@@ -250,39 +291,6 @@ class PlanJournal:
             self._journal.close()
 
 
-def _content(plan: Plan) -> dict[str, Any]:
-    return {
-        'poses': [
-            {'T_R_T': pose.T_R_T.tolist(), 'solutions': pose.solutions.tolist()}
-            for pose in plan.poses
-        ],
-        'dropped': dict(plan.dropped),
-        'dropped_solutions': dict(plan.dropped_solutions),
-    }
-
-
-def _ways(stop: PoseVisit) -> dict[str, Any]:
-    """Return a stop's solutions and the ways to them, as they are written."""
-    return {
-        'ids': list(stop.ids),
-        'paths': {str(i): way.tolist() for i, way in zip(stop.ids, stop.paths) if len(way)},
-        'unreached': list(stop.unreached),
-    }
-
-
-def _route(
-    record: Record, joints: int
-) -> tuple[tuple[int, ...], tuple[FloatArray, ...], tuple[int, ...]]:
-    """Read what `_ways` wrote: ids, paths, unreached."""
-    written = record.get('paths', {})
-    ids = tuple(record['ids'])
-    paths = tuple(np.array(written.get(str(i), []), float).reshape(-1, joints) for i in ids)
-    return ids, paths, tuple(record.get('unreached', ()))
-
-
-def _plan(content: Mapping[str, Any]) -> Plan:
-    poses = tuple(
-        PlannedPose(np.array(pose['T_R_T'], float), np.array(pose['solutions'], float))
-        for pose in content['poses']
-    )
-    return Plan(poses, content['dropped'], content.get('dropped_solutions', {}))
+def _route(stop: PoseVisit) -> dict[str, Any]:
+    paths = {str(number): path for number, path in zip(stop.ids, stop.paths) if len(path)}
+    return {'ids': stop.ids, 'paths': paths, 'unreached': stop.unreached}

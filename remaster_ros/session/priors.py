@@ -12,19 +12,23 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.files import decode_text, read_limited
-from remaster_ros.session.safe_yaml import YamlError, load_yaml
-from remaster_ros.types import BasePrior, Priors
+from remaster_ros.session.files import read_limited
+from remaster_ros.session.yaml_records import (
+    YAML_LIMIT,
+    BaseFrame,
+    Bounds,
+    Triple,
+    read_yaml,
+)
+from remaster_ros.types import Priors
 
-PRIORS_LIMIT = 256 * 1024
-HELP = 'see "Priors" in docs/statistics.md'
-
-Triple = tuple[float, float, float]
+HELP = '; see "Priors" in docs/statistics.md'
 
 
 class _Strict(msgspec.Struct, forbid_unknown_fields=True):
@@ -32,20 +36,19 @@ class _Strict(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _Offset(_Strict):
-    mean_deg: float
-    std_deg: float
+    mean_deg: Annotated[float, Bounds(-180.0, 180.0, 'degrees')]
+    std_deg: Annotated[float, Bounds(0.0, 180.0, 'degrees', above=True)]
 
 
 class _Marker(_Strict):
-    position_m: Triple
-    std_m: float
+    position_m: Annotated[Triple, Bounds(-10.0, 10.0, 'm')]
+    std_m: Annotated[float, Bounds(0.0, 1.0, 'm', above=True)]
 
 
-class _Base(_Strict):
-    translation_m: Triple
-    rotation_xyzw: tuple[float, float, float, float]
-    std_m: float
-    std_rad: float
+class _Base(BaseFrame, forbid_unknown_fields=True):
+    translation_m: Annotated[Triple, Bounds(-1000.0, 1000.0, 'm')]
+    std_m: Annotated[float, Bounds(0.0, 1000.0, 'm', above=True)]
+    std_rad: Annotated[float, Bounds(0.0, np.pi, 'rad', above=True)]
 
 
 class _File(_Strict):
@@ -55,7 +58,7 @@ class _File(_Strict):
 
 
 def read_priors(path: str | os.PathLike[str]) -> Priors:
-    """Read and check a file of priors; whether the session has these names is the fit's to say.
+    """Read and check a file of priors; the fit checks that the session has these names.
 
     Raises
     ------
@@ -63,14 +66,11 @@ def read_priors(path: str | os.PathLike[str]) -> Priors:
         One line naming file, key and remedy.
     """
     path = Path(path)
-    data = read_limited(path, PRIORS_LIMIT, 'give a YAML file of priors')
-    try:
-        content = msgspec.convert(load_yaml(decode_text(data, path)), _File)
-    except (YamlError, msgspec.ValidationError) as error:
-        raise InputError(f'{path}: {error}; {HELP}') from None
-    problem = _problem(content)
-    if problem:
-        raise InputError(f'{path}: {problem}')
+    data = read_limited(path, YAML_LIMIT, 'give a YAML file of priors')
+    content = read_yaml(data, path, _File, HELP)
+    for sensor, base in content.base.items():
+        if problem := base.problem(f'base.{sensor}'):
+            raise InputError(f'{path}: {problem}')
     return Priors(
         joint_offsets={
             joint: (np.radians(prior.mean_deg), np.radians(prior.std_deg))
@@ -80,40 +80,5 @@ def read_priors(path: str | os.PathLike[str]) -> Priors:
             marker: (np.array(prior.position_m), prior.std_m)
             for marker, prior in content.markers.items()
         },
-        base={
-            sensor: BasePrior(
-                np.array(prior.translation_m),
-                np.array(prior.rotation_xyzw) / np.linalg.norm(prior.rotation_xyzw),
-                prior.std_m,
-                prior.std_rad,
-            )
-            for sensor, prior in content.base.items()
-        },
+        base={sensor: base.prior() for sensor, base in content.base.items()},
     )
-
-
-def _problem(content: _File) -> str:
-    """Return what is wrong with the numbers, or ''."""
-    for joint, offset in content.joint_offsets.items():
-        key = f'joint_offsets.{joint}'
-        if not abs(offset.mean_deg) <= 180.0:
-            return f'{key}.mean_deg is {offset.mean_deg:g}; give degrees from -180 to 180'
-        if not 0.0 < offset.std_deg <= 180.0:
-            return f'{key}.std_deg is {offset.std_deg:g}; give degrees above 0, at most 180'
-    for marker, place in content.markers.items():
-        key = f'markers.{marker}'
-        if not np.all(np.abs(place.position_m) <= 10.0):
-            return f'{key}.position_m is {list(place.position_m)}; give metres in the tool frame'
-        if not 0.0 < place.std_m <= 1.0:
-            return f'{key}.std_m is {place.std_m:g}; give metres above 0, at most 1'
-    for sensor, base in content.base.items():
-        key = f'base.{sensor}'
-        if not np.all(np.abs(base.translation_m) <= 1000.0):
-            return f'{key}.translation_m is {list(base.translation_m)}; give metres'
-        if not np.isclose(np.linalg.norm(base.rotation_xyzw), 1.0, atol=1e-3):
-            return f'{key}.rotation_xyzw is no unit quaternion; give x, y, z, w of length 1'
-        if not 0.0 < base.std_m <= 1000.0:
-            return f'{key}.std_m is {base.std_m:g}; give metres above 0'
-        if not 0.0 < base.std_rad <= np.pi:
-            return f'{key}.std_rad is {base.std_rad:g}; give radians above 0, at most pi'
-    return ''

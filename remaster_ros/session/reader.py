@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,8 +20,9 @@ from remaster_ros.session.files import (
     write_atomically,
 )
 from remaster_ros.session.manifest import check_data, read_manifest
-from remaster_ros.session.observations import format_measurements, parse_observations
-from remaster_ros.session.session_yaml import YAML_LIMIT, parse_header, write_header
+from remaster_ros.session.observations import RowFormat, format_measurements
+from remaster_ros.session.session_yaml import SessionHeader, parse_header, write_header
+from remaster_ros.session.yaml_records import YAML_LIMIT
 from remaster_ros.types import Measurements, Session
 
 URDF_LIMIT = 16 * 1024**2
@@ -71,21 +74,12 @@ def _read(folder: Path, sums: dict[str, str]) -> Session:
     data = read_limited(header_path, YAML_LIMIT, 'a session folder holds session.yaml')
     check_data(sums, header_path, data)
     header = parse_header(data, header_path)
-    urdf_path = folder / header.robot.urdf
-    data = read_limited(urdf_path, URDF_LIMIT, 'robot.urdf in session.yaml names the URDF')
-    check_data(sums, urdf_path, data)
-    urdf = decode_text(data, urdf_path)
-    chain = read_chain(urdf, urdf_path, header.robot.base_link, header.robot.tip_link)
+    urdf, chain = read_robot(folder, header, sums)
     rows_path = folder / ROWS
     data = read_limited(rows_path, OBSERVATIONS_LIMIT, 'a session folder holds observations.csv')
     check_data(sums, rows_path, data)
-    measurements = parse_observations(
-        data,
-        rows_path,
-        chain,
-        tuple(header.sensors),
-        tuple(header.markers),
-    )
+    names = tuple(header.sensors), tuple(header.markers)
+    measurements = RowFormat(rows_path, chain, *names).parse(data)
     references = None
     if measurements.is_reference is not None:
         of_references = measurements.is_reference
@@ -96,23 +90,24 @@ def _read(folder: Path, sums: dict[str, str]) -> Session:
             raise InputError(
                 f'{rows_path}: holds rows of split reference alone; measure before fitting'
             )
+    return header.session(urdf, measurements, references)
 
-    return Session(
-        urdf=urdf,
-        base_link=header.robot.base_link,
-        tip_link=header.robot.tip_link,
-        markers={name: np.array(position) for name, position in header.markers.items()},
-        sensors={name: sensor.marker for name, sensor in header.sensors.items()},
-        measurements=measurements,
-        marker_std_m=header.marker_std_m,
-        settle_s=header.settle_s,
-        base_prior=header.priors(),
-        exit_status=header.exit_status,
-        notes=header.notes,
-        created=header.created,
-        extra=header.extra,
-        references=references,
-    )
+
+def read_header(folder: Path) -> SessionHeader:
+    """Read session.yaml alone."""
+    path = folder / HEADER
+    return parse_header(read_limited(path, YAML_LIMIT, f'a session folder holds {HEADER}'), path)
+
+
+def read_robot(
+    folder: Path, header: SessionHeader, sums: Mapping[str, str] = MappingProxyType({})
+) -> tuple[str, SerialChain]:
+    """Read the URDF of a session, held to its checksum in `sums` where it has one."""
+    path = folder / header.robot.urdf
+    data = read_limited(path, URDF_LIMIT, 'robot.urdf in session.yaml names the URDF')
+    check_data(sums, path, data)
+    urdf = decode_text(data, path)
+    return urdf, read_chain(urdf, path, header.robot.base_link, header.robot.tip_link)
 
 
 def write_session(folder: str | os.PathLike[str], session: Session) -> None:
@@ -126,10 +121,9 @@ def write_session(folder: str | os.PathLike[str], session: Session) -> None:
     folder = Path(folder)
     chain = read_chain(session.urdf, folder / URDF, session.base_link, session.tip_link)
     header = write_header(session, URDF, session.exit_status)
-    rows = format_measurements(
-        all_rows(session), session.sensor_names, session.marker_names
-    ).encode()
-    parse_observations(rows, folder / ROWS, chain, session.sensor_names, session.marker_names)
+    names = session.sensor_names, session.marker_names
+    rows = format_measurements(all_rows(session), *names).encode()
+    RowFormat(folder / ROWS, chain, *names).parse(rows)
     make_new_folder(folder)
     write_atomically(folder / URDF, session.urdf)
     write_atomically(folder / ROWS, rows)

@@ -1,7 +1,7 @@
-"""YAML from strangers: plain data only, YAML 1.2's numbers, no aliases, no tags.
+"""YAML of unknown origin: plain data only, YAML 1.2's numbers, no aliases, no tags.
 
 YAML 1.1, PyYAML's default, reads ``1e-3`` as text, ``no`` as false and ``010`` as eight; a session
-file means what YAML 1.2 says. Aliases are refused: nested ones make a few lines into gigabytes.
+file is read by YAML 1.2. Aliases are refused: nested ones make a few lines into gigabytes.
 """
 
 from __future__ import annotations

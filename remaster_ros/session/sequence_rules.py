@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from remaster_ros.types import BoolArray, IntArray, Measurements
+from remaster_ros.types import IntArray, Measurements
 
 SPLITS = ('optimization', 'validation', 'reference')
 
@@ -38,7 +38,7 @@ class SequenceRules:
         self._of_configuration: MutableMapping[int, RowKeys] = {}
 
     def branch(self) -> SequenceRules:
-        """Return rules that know the same rows; what they accept stays unknown here."""
+        """Return rules after the same rows; rows that they accept change nothing here."""
         rules = SequenceRules()
         rules._last = self._last
         rules._of_observation = ChainMap({}, self._of_observation)
@@ -85,21 +85,6 @@ class SequenceRules:
         self._of_observation[row.observation] = row
         self._of_pose.setdefault(row.pose, row)
         self._of_configuration.setdefault(row.configuration, row)
-
-
-def keeps_the_rules(m: Measurements) -> bool:
-    """Return whether `SequenceRules` would find no problem, in one look at all rows."""
-
-    def belongs(part: IntArray, whole: IntArray | BoolArray) -> bool:
-        _, first, group = np.unique(part, return_index=True, return_inverse=True)
-        return bool((whole[first][group] == whole).all())
-
-    return bool(
-        (np.diff(m.observation) > 0).all()
-        and (np.diff(m.stamp_s) >= 0).all()
-        and belongs(m.pose, split_indices(m))
-        and belongs(m.configuration, m.pose)
-    )
 
 
 def split_indices(m: Measurements) -> IntArray:

@@ -8,30 +8,29 @@ acknowledged it still has in memory, so it can write it again.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from remaster_ros.errors import DiskError
-from remaster_ros.session.files import cannot_write, reason
+from remaster_ros.session.files import reason, writing
 
 Signature = tuple[int, int, int, int]
 """Device, inode, bytes, time of change in ns."""
 
 
 def signature(path: Path) -> Signature | None:
-    """Return what tells a file and its state from others; None where there is none.
+    """Return what identifies a file and its state; None where there is none.
 
     Raises
     ------
     DiskError
         It cannot be looked at.
     """
-    try:
-        found = path.stat()
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise cannot_write(path, error) from None
+    with writing(path):
+        try:
+            found = path.stat()
+        except FileNotFoundError:
+            return None
     return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
 
 
@@ -42,12 +41,16 @@ class SessionGuard:
     ----------
     folder
         The session's.
-    holds
-        By name of the file: whether these bytes are what the writer put there.
+    names
+        The files.
+    content
+        Name of a file -> the bytes that the writer put there.
     """
 
-    def __init__(self, folder: Path, holds: Mapping[str, Callable[[bytes], bool]]) -> None:
-        self._folder, self._holds = folder, holds
+    def __init__(
+        self, folder: Path, names: Sequence[str], content: Callable[[str], bytes]
+    ) -> None:
+        self._folder, self._names, self._content = folder, names, content
         self._descriptor = -1
         self.take_place()
         self._seen: dict[str, Signature | None] = {}
@@ -58,11 +61,11 @@ class SessionGuard:
 
     def note_all(self) -> None:
         """Take all files as they are now."""
-        for name in self._holds:
+        for name in self._names:
             self.note(name)
 
     def is_in_place(self) -> bool:
-        """Tell whether the folder of this name is still the one that was opened."""
+        """Return whether the folder of this name is still the one that was opened."""
         found, mine = signature(self._folder), os.fstat(self._descriptor)
         return found is not None and found[:2] == (mine.st_dev, mine.st_ino)
 
@@ -72,13 +75,11 @@ class SessionGuard:
         It is kept open: the number of a folder that was removed is given to the next one.
         """
         self.close()
-        try:
+        with writing(self._folder):
             self._descriptor = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
-        except OSError as error:
-            raise cannot_write(self._folder, error) from None
 
     def close(self) -> None:
-        """Look no more; closing again does nothing."""
+        """Let the folder go; closing again does nothing."""
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
             os.close(descriptor)
@@ -89,10 +90,10 @@ class SessionGuard:
         Parameters
         ----------
         content
-            Read every file; else only those whose size or time of change is another.
+            Read every file; else only those whose size or time of change is different.
         """
         wrong = {}
-        for name, holds in self._holds.items():
+        for name in self._names:
             path, seen = self._folder / name, self._seen.get(name)
             now = signature(path)
             if now is None:
@@ -100,7 +101,7 @@ class SessionGuard:
             elif seen is None or now[:2] != seen[:2] or not path.is_file():
                 wrong[name] = 'was replaced by another file, as editors do when they save'
             elif content or now != seen:
-                if holds(_read(path)):
+                if _read(path) == self._content(name):
                     self._seen[name] = now
                 else:
                     wrong[name] = 'was changed'
@@ -119,12 +120,11 @@ def set_aside(path: Path) -> str:
     while os.path.lexists(aside):
         number += 1
         aside = path.with_name(f'{path.name}.changed{number}')
-    try:
-        os.rename(path, aside)
-    except FileNotFoundError:
-        return ''
-    except OSError as error:
-        raise cannot_write(path, error) from None
+    with writing(path):
+        try:
+            os.rename(path, aside)
+        except FileNotFoundError:
+            return ''
     return aside.name
 
 

@@ -1,4 +1,4 @@
-"""The recorder's memory: the session it writes, and what it has decided so far.
+"""What a recorder keeps on the disk: the session, and its decisions so far.
 
 A recorder that is started again finds here what it decided before, so that nothing is recorded
 twice, and the points that its sensors were registered by.
@@ -7,19 +7,19 @@ twice, and the points that its sensors were registered by.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from remaster_ros.collection.events import Decided, Outcome
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.session.files import read_limited
 from remaster_ros.session.journal import Record
-from remaster_ros.session.reader import HEADER, OBSERVATIONS_LIMIT, ROWS
-from remaster_ros.session.session_writer import ExitStatus, SessionWriter
-from remaster_ros.session.session_yaml import YAML_LIMIT, parse_header
+from remaster_ros.session.plain_data import from_plain, to_plain
+from remaster_ros.session.reader import HEADER, OBSERVATIONS_LIMIT, ROWS, read_header
+from remaster_ros.session.session_writer import SessionWriter
+from remaster_ros.session.session_yaml import ExitStatus
 from remaster_ros.types import FloatArray, Observation, Session, Split
 
 SHIFT_S = 1.0
@@ -29,12 +29,12 @@ _FINAL: tuple[Outcome, ...] = ('recorded', 'partial')
 
 
 class SessionJournal:
-    """Write a session, new or unfinished, and remember what was decided.
+    """Write a session, new or unfinished, and keep what was decided.
 
     Parameters
     ----------
     folder
-        The session's. A complete session is not written to: `closed` says so from the start.
+        The session's. A complete session is not written to; `closed` is set from the start.
     header
         Everything but the observations.
 
@@ -47,13 +47,13 @@ class SessionJournal:
     observations
         How many observations there are.
     notes
-        What a user should know of how the session was found, a line each.
+        The state in which the session was found, for the user, a line each.
     registration
         The readings that the sensors were registered by in the runs before.
     watched
-        What the references told in the runs before, in order: ``reference`` with the number of the
-        configuration and its readings, ``other`` for any other configuration, ``accepted`` where
-        a person had seen to a change.
+        What was measured at the references in the runs before, in order: ``reference`` with the
+        number of the configuration and its readings, ``other`` for any other configuration,
+        ``accepted`` where a person had seen to a change.
 
     Raises
     ------
@@ -72,7 +72,6 @@ class SessionJournal:
         self._results: dict[tuple[int, int], str] = {}
         self._last_pose: int | None = None
         self._shift_s = 0.0
-        self._told = 0
         self.reopen()
 
     def reopen(self) -> None:
@@ -83,7 +82,7 @@ class SessionJournal:
             self.closed = 'complete'
             self.notes = [f'{self.folder}: this session is complete; name a new folder to record']
             return
-        self._writer, self._told = SessionWriter(self.folder, self._header, resume=True), 0
+        self._writer = SessionWriter(self.folder, self._header, resume=True)
         self.closed, self.notes = '', []
         self.observations = self._writer.observations
         if self._writer.resumed:
@@ -101,7 +100,7 @@ class SessionJournal:
             self._results = {}
         elif kind == 'configuration':
             self._decide(record['pose'], record['solution'], record['result'])
-            readings = [_reading(content) for content in record.get('readings', ())]
+            readings = from_plain(record.get('readings', []), list[PairedReading])
             if record.get('split') == REGISTRATION:
                 self.registration += readings
             elif record.get('split') == REFERENCE and readings:
@@ -194,11 +193,11 @@ class SessionJournal:
         }
         number = 0 if self._writer is None else self._writer.configurations
         if split == REGISTRATION:
-            self._append({**record, 'readings': [_content(reading) for reading in readings]})
+            self._append({**record, 'readings': _plain(readings)})
         else:
             if split == REFERENCE:
                 record['number'] = number
-                record['readings'] = [_content(reading) for reading in readings]
+                record['readings'] = _plain(readings)
             self._append(record, self._rows(pose, split, readings, from_q, temperatures_c))
             self.observations += len(readings)
         self._decide(pose, solution, result)
@@ -227,15 +226,9 @@ class SessionJournal:
                 pose=pose,
                 configuration=writer.configurations,
                 split=_split(split),
-                stamp_s=reading.stamp_s + self._shift_s,
-                sensor=reading.sensor,
-                marker=reading.marker,
-                q=reading.q,
-                position=reading.position,
                 from_q=from_q,
-                std=reading.std,
-                samples=reading.samples,
                 temperature_c=temperature_c,
+                **vars(replace(reading, stamp_s=reading.stamp_s + self._shift_s)),
             )
             for number, (reading, temperature_c) in enumerate(pairs)
         ]
@@ -258,11 +251,10 @@ class SessionJournal:
 
     def take_restored(self) -> list[str]:
         """Return what was restored since the last call, a line each."""
-        lines, self._told = self._restored()[self._told :], len(self._restored())
+        if self._writer is None:
+            return []
+        lines, self._writer.restored = self._writer.restored, []
         return lines
-
-    def _restored(self) -> list[str]:
-        return [] if self._writer is None else self._writer.restored
 
     @property
     def beyond_repair(self) -> str:
@@ -280,11 +272,7 @@ class SessionJournal:
 
 def is_complete(folder: Path) -> bool:
     """Whether a folder holds a session that is complete; `InputError` where it is none."""
-    path = folder / HEADER
-    if not path.exists():
-        return False
-    header = parse_header(read_limited(path, YAML_LIMIT, 'it was there a moment ago'), path)
-    return header.exit_status == 'complete'
+    return (folder / HEADER).exists() and read_header(folder).exit_status == 'complete'
 
 
 def _split(name: str) -> Split:
@@ -294,25 +282,6 @@ def _split(name: str) -> Split:
     return 'reference' if name == REFERENCE else 'optimization'
 
 
-def _content(reading: PairedReading) -> dict[str, Any]:
-    return {
-        'sensor': reading.sensor,
-        'marker': reading.marker,
-        'stamp_s': reading.stamp_s,
-        'q': reading.q.tolist(),
-        'position': reading.position.tolist(),
-        'samples': reading.samples,
-        **({} if reading.std is None else {'std': reading.std.tolist()}),
-    }
-
-
-def _reading(content: dict[str, Any]) -> PairedReading:
-    return PairedReading(
-        sensor=content['sensor'],
-        marker=content['marker'],
-        stamp_s=content['stamp_s'],
-        q=np.array(content['q']),
-        position=np.array(content['position']),
-        std=np.array(content['std']) if 'std' in content else None,
-        samples=content['samples'],
-    )
+def _plain(readings: Sequence[PairedReading]) -> list[dict[str, Any]]:
+    """Return readings as the journal has them: what is None is left out."""
+    return [{k: v for k, v in reading.items() if v is not None} for reading in to_plain(readings)]

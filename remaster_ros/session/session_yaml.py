@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.session.files import decode_text
+from remaster_ros.session.plain_data import to_plain
 from remaster_ros.session.safe_yaml import YamlError, dump_yaml, load_yaml
-from remaster_ros.types import BasePrior, Session
+from remaster_ros.session.yaml_records import BaseFrame, Bounds, Triple, out_of_bounds
+from remaster_ros.types import Measurements, Session
 
 FORMAT = 'remaster-session/1'
-YAML_LIMIT = 256 * 1024
-LARGEST_MARKER_STD_M = 0.4
-"""A session may say that the nominal places of its markers tell nothing, m."""
+ExitStatus = Literal['complete', 'stopped', 'aborted']
+MARKER_STD = Bounds(0.0, 0.4, 'm', remedy='; 0.3 where nothing is known of their places')
 
 log = logging.getLogger('remaster_ros')
-
-Triple = tuple[float, float, float]
 
 
 class _Robot(msgspec.Struct):
@@ -37,43 +35,44 @@ class _Sensor(msgspec.Struct):
     marker: str
 
 
-class _BasePrior(msgspec.Struct):
-    translation_m: Triple
-    rotation_xyzw: tuple[float, float, float, float]
-    std_m: float
-    std_rad: float
-
-
 class SessionHeader(msgspec.Struct):
     """session.yaml as validated; the fields are the keys of the file.
 
-    ``extra`` holds the keys this version does not know, nested as they were.
+    ``extra`` holds the keys that this version does not use, nested as they were.
     """
 
     format: str
     robot: _Robot
     markers: dict[str, Triple]
     sensors: dict[str, _Sensor]
-    settle_s: float
-    marker_std_m: float = 0.5e-3
-    base_prior: dict[str, _BasePrior] = {}
-    exit_status: Literal['', 'complete', 'stopped', 'aborted'] = ''
-    notes: str = ''
+    settle_s: Annotated[float, Bounds(0.0, unit='s')]
+    marker_std_m: Annotated[float, MARKER_STD] = 0.5e-3
+    base_prior: dict[str, BaseFrame] = {}
+    exit_status: Literal['', ExitStatus] = ''
     created: str = ''
+    notes: str = ''
     extra: dict[str, Any] = {}
 
-    def priors(self) -> dict[str, BasePrior]:
-        """Return the known registrations, quaternions normalised."""
-        priors = {}
-        for sensor, prior in self.base_prior.items():
-            rotation = np.array(prior.rotation_xyzw)
-            priors[sensor] = BasePrior(
-                translation_m=np.array(prior.translation_m),
-                rotation_xyzw=rotation / np.linalg.norm(rotation),
-                std_m=prior.std_m,
-                std_rad=prior.std_rad,
-            )
-        return priors
+    def session(
+        self, urdf: str, measurements: Measurements, references: Measurements | None = None
+    ) -> Session:
+        """Return the session with this header, the robot and the rows."""
+        return Session(
+            urdf=urdf,
+            base_link=self.robot.base_link,
+            tip_link=self.robot.tip_link,
+            markers={name: np.array(position) for name, position in self.markers.items()},
+            sensors={name: sensor.marker for name, sensor in self.sensors.items()},
+            measurements=measurements,
+            marker_std_m=self.marker_std_m,
+            settle_s=self.settle_s,
+            base_prior={sensor: base.prior() for sensor, base in self.base_prior.items()},
+            exit_status=self.exit_status,
+            notes=self.notes,
+            created=self.created,
+            extra=self.extra,
+            references=references,
+        )
 
 
 def parse_header(data: bytes, path: Path) -> SessionHeader:
@@ -94,18 +93,11 @@ def parse_header(data: bytes, path: Path) -> SessionHeader:
             f"{path}: key 'format' is {str(found)[:60]!r}, not {FORMAT!r}; "
             'this version reads no other format'
         )
+    header = _checked(content, f'{path}: ')
+    known = msgspec.to_builtins(header)
     # Known to the struct, but no key of the file: a file's own `extra` is an unknown key.
-    known = {key: value for key, value in content.items() if key != 'extra'}
-    try:
-        header = msgspec.convert(known, SessionHeader)
-    except msgspec.ValidationError as error:
-        raise InputError(f'{path}: {error}; see the session format') from None
-    problem = _problem(header)
-    if problem:
-        raise InputError(f'{path}: {problem}')
-    header.extra = _unknown_keys(content)
-    for key in _paths(header.extra):
-        log.warning('%s: unknown key %r is kept, and not used', path, key)
+    del known['extra']
+    header.extra = _unknown_keys(content, known, path)
     return header
 
 
@@ -124,39 +116,39 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
             'base_link': session.base_link,
             'tip_link': session.tip_link,
         },
-        'markers': {name: _floats(position) for name, position in session.markers.items()},
+        'markers': session.markers,
         'sensors': {name: {'marker': marker} for name, marker in session.sensors.items()},
-        'settle_s': float(session.settle_s),
-        'marker_std_m': float(session.marker_std_m),
+        'settle_s': session.settle_s,
+        'marker_std_m': session.marker_std_m,
+        'base_prior': session.base_prior,
+        'exit_status': exit_status,
+        'created': session.created,
+        'notes': session.notes,
     }
-    if session.base_prior:
-        content['base_prior'] = {
-            sensor: {
-                'translation_m': _floats(prior.translation_m),
-                'rotation_xyzw': _floats(prior.rotation_xyzw),
-                'std_m': float(prior.std_m),
-                'std_rad': float(prior.std_rad),
-            }
-            for sensor, prior in session.base_prior.items()
-        }
-    for key, value in (
-        ('exit_status', exit_status),
-        ('created', session.created),
-        ('notes', session.notes),
-    ):
-        if value:
-            content[key] = value
+    header = _checked(to_plain(content), 'session to be written: ')
+    given = {key: value for key, value in to_plain(header).items() if value not in ('', {})}
+    return dump_yaml(_merge(given, session.extra))
+
+
+def with_exit_status(text: str, exit_status: str) -> str:
+    """Return the text of a session.yaml with another exit status."""
+    return dump_yaml({**load_yaml(text), 'exit_status': exit_status})
+
+
+def _checked(content: Mapping[str, Any], where: str) -> SessionHeader:
+    """Return the header that `content` holds; an `InputError` begins with `where`."""
+    known = {key: value for key, value in content.items() if key != 'extra'}
     try:
-        problem = _problem(msgspec.convert(content, SessionHeader))
+        header = msgspec.convert(known, SessionHeader)
     except msgspec.ValidationError as error:
-        problem = str(error)
-    if problem:
-        raise InputError(f'session to be written: {problem}')
-    return dump_yaml(_merge(content, session.extra))
+        raise InputError(f'{where}{error}; see the session format') from None
+    if problem := out_of_bounds(header) or _problem(header):
+        raise InputError(f'{where}{problem}')
+    return header
 
 
 def _problem(header: SessionHeader) -> str:
-    """Return what is wrong with the values, in one line with the remedy; '' where nothing is."""
+    """Return what is wrong with names and times, in one line with the remedy; '' if nothing is."""
     urdf = PurePosixPath(header.robot.urdf)
     if urdf.is_absolute() or '..' in urdf.parts or not urdf.name or '\0' in header.robot.urdf:
         return (
@@ -169,34 +161,18 @@ def _problem(header: SessionHeader) -> str:
         for name in names:
             if not name or name != name.strip() or any(c in name for c in ',"\r\n\0'):
                 return f'{kind}: {name!r} is no usable name; leave out commas, quotes and blanks'
-    for marker, position in header.markers.items():
-        if not all(map(math.isfinite, position)):
-            return f'markers.{marker}: {position} is not finite; give x, y, z in metres'
     for sensor, entry in header.sensors.items():
         if entry.marker not in header.markers:
             return (
                 f'sensors.{sensor}.marker: {entry.marker!r} is not among the markers '
                 f'({", ".join(header.markers)}); correct the name'
             )
-    if header.marker_std_m > LARGEST_MARKER_STD_M:
-        return (
-            f'marker_std_m: {header.marker_std_m:g} m is no marker on a tool; if millimetres were '
-            f'meant, write {header.marker_std_m:g}e-3; 0.3 says that nothing is known'
-        )
-    numbers = {'settle_s': header.settle_s, 'marker_std_m': header.marker_std_m}
-    for sensor, prior in header.base_prior.items():
-        where = f'base_prior.{sensor}'
+    for sensor, base in header.base_prior.items():
         if sensor not in header.sensors:
-            return f'{where}: no such sensor ({", ".join(header.sensors)}); correct the name'
-        if not all(map(math.isfinite, prior.translation_m)):
-            return f'{where}.translation_m: not finite; give x, y, z in metres'
-        norm = math.hypot(*prior.rotation_xyzw)
-        if not abs(norm - 1.0) < 1e-3:
-            return f'{where}.rotation_xyzw: norm {norm:.6g}, not 1; give a unit quaternion'
-        numbers |= {f'{where}.std_m': prior.std_m, f'{where}.std_rad': prior.std_rad}
-    for key, number in numbers.items():
-        if not (math.isfinite(number) and number >= 0):
-            return f'{key}: {number} is not a finite number of at least 0; correct it'
+            known = ', '.join(header.sensors)
+            return f'base_prior.{sensor}: no such sensor ({known}); correct the name'
+        if problem := base.problem(f'base_prior.{sensor}'):
+            return problem
     if header.created:
         try:
             datetime.fromisoformat(header.created)
@@ -205,35 +181,18 @@ def _problem(header: SessionHeader) -> str:
     return ''
 
 
-def _unknown_keys(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the format does not name, nested as in the file."""
-
-    def unknown(value: Any, struct: type[msgspec.Struct]) -> dict[str, Any]:
-        return {k: v for k, v in value.items() if k not in struct.__struct_fields__}
-
-    extra = unknown(content, SessionHeader)
-    if 'extra' in content:
-        extra['extra'] = content['extra']
-    if robot := unknown(content['robot'], _Robot):
-        extra['robot'] = robot
-    for key, struct in (('sensors', _Sensor), ('base_prior', _BasePrior)):
-        for name, value in content.get(key, {}).items():
-            if entry := unknown(value, struct):
-                extra.setdefault(key, {})[name] = entry
-    return extra
-
-
-def _paths(extra: Mapping[str, Any], depth: int = 0, prefix: str = '') -> list[str]:
-    """Return the dotted names of unknown keys; known parents are not themselves unknown."""
-    nested = {'robot': 1, 'sensors': 2, 'base_prior': 2}
-    paths = []
-    for key, value in extra.items():
-        levels = nested.get(key, 0) if not prefix else depth
-        if levels:
-            paths += _paths(value, levels - 1, f'{prefix}{key}.')
-        else:
-            paths.append(f'{prefix}{key}')
-    return paths
+def _unknown_keys(
+    content: Mapping[str, Any], known: Mapping[str, Any], path: Path, prefix: str = ''
+) -> dict[str, Any]:
+    """Return what of nested dictionaries `known` has not, nested as it was, with a warning."""
+    extra = {}
+    for key, value in content.items():
+        if key not in known:
+            log.warning('%s: unknown key %r is kept, and not used', path, f'{prefix}{key}')
+            extra[key] = value
+        elif isinstance(value, dict):
+            extra[key] = _unknown_keys(value, known[key], path, f'{prefix}{key}.')
+    return {key: value for key, value in extra.items() if key not in known or value}
 
 
 def _merge(content: dict[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
@@ -245,7 +204,3 @@ def _merge(content: dict[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
         elif isinstance(merged[key], dict) and isinstance(value, Mapping):
             merged[key] = _merge(merged[key], value)
     return merged
-
-
-def _floats(values: Any) -> list[float]:
-    return [float(value) for value in values]

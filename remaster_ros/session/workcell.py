@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-from collections.abc import Mapping
-from math import isfinite, radians
+from math import degrees, pi, radians
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -15,18 +14,31 @@ import numpy as np
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.bodies import Body, Shape, box, cylinder, obstacle, sphere
 from remaster_ros.kinematics.collision import HALF_STEP_M, CollisionModel, arm_bodies
+from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_rpy, transform
 from remaster_ros.kinematics.urdf_geometry import MeshReader, chain_bodies
-from remaster_ros.planning.candidates import LineOfSight, PoseRanges
+from remaster_ros.planning.candidates import (
+    LIMIT_MARGIN_RAD,
+    LineOfSight,
+    PlanningScene,
+    PoseRanges,
+)
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.meshes import mesh_reader
-from remaster_ros.session.safe_yaml import YamlError, load_yaml
-from remaster_ros.session.workcell_units import unit_problem
-from remaster_ros.types import FloatArray
+from remaster_ros.session.reader import URDF_LIMIT
+from remaster_ros.session.yaml_records import YAML_LIMIT, Bounds, Triple, read_yaml
+from remaster_ros.types import FARTHEST_M, FloatArray
 
-YAML_LIMIT = 256 * 1024
-URDF_LIMIT = 16 * 1024**2
+Range = tuple[float, float]
+# No arm or tool of those that this is for reaches so far.
+REACH = Bounds(-10.0, 10.0, 'm')
+ON_TOOL = Bounds(-3.0, 3.0, 'm')
+# A marker is placed better than this; a session file may give more, where nothing is known.
+MARKER_STD = Bounds(0.0, 0.02, 'm', above=True)
+# A retroreflector or sphere is seen from further round than this.
+VIEW = Bounds(3.5, 180.0, 'degrees')
+CLEARANCE = Bounds(HALF_STEP_M, 1.0, 'm', remedy='; half the step of a path check is the least')
 
 
 class CellRobot(msgspec.Struct, forbid_unknown_fields=True):
@@ -60,17 +72,17 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
 
     marker: str
     topic: str
-    rough_position_m: tuple[float, float, float]
+    rough_position_m: Annotated[Triple, Bounds(-FARTHEST_M, FARTHEST_M, 'm')]
     single_shot: bool = False
     measure_service: str = ''
-    max_angle_deg: float = 60.0
+    max_angle_deg: Annotated[float, VIEW] = 60.0
 
 
 class CellBox(msgspec.Struct, forbid_unknown_fields=True):
     """An obstacle: a box in base_link, turned by `yaw_deg` about its z axis."""
 
-    center_m: tuple[float, float, float]
-    size_m: tuple[float, float, float]
+    center_m: Triple
+    size_m: Triple
     yaw_deg: float = 0.0
 
     def body(self, name: str) -> Body:
@@ -85,9 +97,9 @@ class CellToolBody(msgspec.Struct, forbid_unknown_fields=True):
     A box (`size_m`), a cylinder along its z (`radius_m`, `length_m`) or a sphere (`radius_m`).
     """
 
-    center_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    size_m: tuple[float, float, float] | None = None
+    center_m: Triple = (0.0, 0.0, 0.0)
+    rpy_deg: Triple = (0.0, 0.0, 0.0)
+    size_m: Triple | None = None
     radius_m: float | None = None
     length_m: float | None = None
 
@@ -114,10 +126,10 @@ class CellToolBody(msgspec.Struct, forbid_unknown_fields=True):
 class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
     """Ranges of the Latin hypercube of poses."""
 
-    azimuth_deg: tuple[float, float] = (0.0, 360.0)
-    radius_m: tuple[float, float] = (0.2, 0.5)
-    height_m: tuple[float, float] = (0.4, 0.8)
-    roll_deg: tuple[float, float] = (0.0, 360.0)
+    azimuth_deg: Range = (0.0, 360.0)
+    radius_m: Annotated[Range, Bounds(0.0, 10.0, 'm')] = (0.2, 0.5)
+    height_m: Annotated[Range, REACH] = (0.4, 0.8)
+    roll_deg: Range = (0.0, 360.0)
 
     def ranges(self) -> PoseRanges:
         """Return the ranges in SI units."""
@@ -133,21 +145,23 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     """A cell file; see config/cells/demo.yaml for what each key means."""
 
     robot: CellRobot
-    markers: dict[str, tuple[float, float, float]]
+    markers: Annotated[dict[str, Triple], ON_TOOL]
     sensors: dict[str, CellSensor]
     aim_at: str
-    marker_std_m: float = 0.5e-3
+    marker_std_m: Annotated[float, MARKER_STD] = 0.5e-3
     held_joint: str | None = ''
     held_values_deg: list[float] | None = []
     poses: CellPoses = msgspec.field(default_factory=CellPoses)
-    link_radius_m: float = 0.075
+    link_radius_m: Annotated[float, Bounds(0.0, 1.0, 'm', above=True)] = 0.075
     obstacles: dict[str, CellBox] = {}
     floor_z_m: float | None = 0.0
     tool: dict[str, CellToolBody] = {}
-    marker_radius_m: float = 0.02
-    clearance_m: float = 0.008
-    unknown_offset_deg: float = 1.0
-    acceleration_limit_rad_s2: float | list[float] = 5.0
+    marker_radius_m: Annotated[float, Bounds(0.0, unit='m', above=True)] = 0.02
+    clearance_m: Annotated[float, CLEARANCE] = 0.008
+    unknown_offset_deg: Annotated[float, Bounds(0.0, 10.0, 'degrees')] = 1.0
+    acceleration_limit_rad_s2: Annotated[
+        float | list[float], Bounds(0.0, unit='rad/s²', above=True)
+    ] = 5.0
     mesh_path: list[str] = []
     urdf_text: str = ''
     # Where it was read from; nothing a plan depends on.
@@ -220,25 +234,32 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
             link_radius=self.link_radius_m,
         )
 
-    def rough_places(self) -> dict[str, FloatArray]:
-        """Return T_R_N of each sensor as far as it is known beforehand, not turned, (4, 4)."""
-        return {
-            name: transform(np.eye(3), np.array(sensor.rough_position_m))
-            for name, sensor in self.sensors.items()
-        }
-
-    def lines_of_sight(self, sensors_R: Mapping[str, FloatArray]) -> list[LineOfSight]:
-        """Return what every pose must keep free, for sensors at these origins in R, m, (3,)."""
-        return [
+    def planning_scene(
+        self,
+        chain: SerialChain,
+        limit_margin_rad: float = LIMIT_MARGIN_RAD,
+        *,
+        without_meshes: bool = False,
+    ) -> PlanningScene:
+        """Return what the poses of this cell are planned from; arguments and errors as above."""
+        sights = [
             LineOfSight(
                 name,
-                sensors_R[name],
+                np.array(sensor.rough_position_m),
                 np.array(self.markers[sensor.marker]),
                 radians(sensor.max_angle_deg),
+                sensor.marker,
             )
             for name, sensor in self.sensors.items()
-            if name in sensors_R
         ]
+        return PlanningScene(
+            InverseKinematics(chain, self.held(chain)),
+            self.collision_model(chain, without_meshes=without_meshes),
+            self.poses.ranges(),
+            sights,
+            self.aim_at,
+            limit_margin_rad,
+        )
 
 
 def _no_mesh(name: str) -> None:
@@ -275,11 +296,7 @@ def read_cell(path: str | Path) -> Workcell:
     path = Path(path)
     if not path.suffix and not path.exists():
         path = config_path(f'cells/{path}.yaml')
-    try:
-        data = load_yaml(decode_text(read_limited(path, YAML_LIMIT, 'name a cell file'), path))
-        cell = msgspec.convert(data, Workcell)
-    except (YamlError, msgspec.ValidationError) as error:
-        raise InputError(f'{path}: {error}') from None
+    cell = read_yaml(read_limited(path, YAML_LIMIT, 'name a cell file'), path, Workcell)
     urdf = path.parent / cell.robot.urdf
     cell.file = str(path)
     missing = (
@@ -292,72 +309,49 @@ def read_cell(path: str | Path) -> Workcell:
 
 
 def _check(path: Path, cell: Workcell) -> None:
-    """Refuse names that point nowhere and values that cannot be."""
-    _require_finite(path, '', msgspec.to_builtins(cell))
+    """Refuse names that point nowhere and values that contradict each other."""
     try:
         chain = cell.chain()
     except InputError as error:
         raise InputError(f'{path.parent / cell.robot.urdf}: {error}') from None
-    names = chain.joint_names
-    if cell.held_joint and cell.held_joint not in names:
-        raise InputError(f'{path}: held_joint {cell.held_joint!r} is none of {", ".join(names)}')
+    if problem := _problem(cell, chain):
+        raise InputError(f'{path}: {problem}')
+
+
+def _problem(cell: Workcell, chain: SerialChain) -> str:
+    """Return what is wrong between the keys of a cell file; '' where nothing is."""
+    if cell.held_joint and cell.held_joint not in chain.joint_names:
+        return f'held_joint {cell.held_joint!r} is none of {", ".join(chain.joint_names)}'
     if cell.held_joint and not cell.held_values_deg:
-        raise InputError(f'{path}: held_values_deg is empty; give at least one angle')
+        return 'held_values_deg is empty; give at least one angle'
     if not cell.sensors:
-        raise InputError(f'{path}: sensors is empty; name at least one')
+        return 'sensors is empty; name at least one'
     for name, sensor in cell.sensors.items():
         if sensor.marker not in cell.markers:
             known = ', '.join(cell.markers)
-            raise InputError(
-                f'{path}: sensor {name} follows marker {sensor.marker!r}; markers has {known}'
-            )
+            return f'sensor {name} follows marker {sensor.marker!r}; markers has {known}'
     if cell.aim_at not in cell.sensors:
-        raise InputError(
-            f'{path}: aim_at {cell.aim_at!r} is none of the sensors {", ".join(cell.sensors)}'
+        return f'aim_at {cell.aim_at!r} is none of the sensors {", ".join(cell.sensors)}'
+    for key in cell.poses.__struct_fields__:
+        low, high = getattr(cell.poses, key)
+        if low > high:
+            return f'poses.{key} goes from {low:g} down to {high:g}; give the smaller one first'
+        if key.endswith('_deg') and low < high and max(abs(low), abs(high)) < 2.0 * pi + 0.01:
+            return (
+                f'poses.{key} is {low:g} to {high:g}, a range of {high - low:.3g} degrees; if '
+                f'radians were meant, write {degrees(low):.4g}, {degrees(high):.4g}'
+            )
+    limits = cell.acceleration_limit_rad_s2
+    if isinstance(limits, list) and len(limits) != len(chain):
+        return (
+            f'acceleration_limit_rad_s2 has {len(limits)} values; give one number, or one for '
+            f'each of the {len(chain)} joints'
         )
-    if problem := unit_problem(cell):
-        raise InputError(f'{path}: {problem}')
-    if not (cell.marker_std_m > 0 and cell.link_radius_m > 0):
-        raise InputError(f'{path}: marker_std_m and link_radius_m must be positive')
-    _check_collision(path, cell, chain)
-
-
-def _check_collision(path: Path, cell: Workcell, chain: SerialChain) -> None:
-    """Refuse sizes and limits that cannot be; meshes are read when they are needed."""
-    if not cell.marker_radius_m > 0:
-        raise InputError(f'{path}: marker_radius_m must be positive')
-    if not HALF_STEP_M <= cell.clearance_m <= 1.0:
-        raise InputError(
-            f'{path}: clearance_m is {cell.clearance_m}; it must be from {HALF_STEP_M} (what lies '
-            'between two checks of a path) to 1'
-        )
-    if not 0.0 <= cell.unknown_offset_deg <= 10.0:
-        raise InputError(
-            f'{path}: unknown_offset_deg is {cell.unknown_offset_deg}; it must be from 0 to 10'
-        )
-    limits = np.atleast_1d(np.array(cell.acceleration_limit_rad_s2, dtype=float))
-    if isinstance(cell.acceleration_limit_rad_s2, list) and len(limits) != len(chain):
-        raise InputError(
-            f'{path}: acceleration_limit_rad_s2 has {len(limits)} values; give one number, or '
-            f'one for each of the {len(chain)} joints'
-        )
-    if not np.all(limits > 0.0):
-        raise InputError(f'{path}: acceleration_limit_rad_s2 must be positive')
+    # Meshes are read when they are needed.
     for key, parts in (('obstacles', cell.obstacles), ('tool', cell.tool)):
         for name, part in parts.items():
             try:
                 part.body(name) if isinstance(part, CellBox) else part.body(name, chain)
             except InputError as error:
-                raise InputError(f'{path}: {key}.{name}: {error}') from None
-
-
-def _require_finite(path: Path, key: str, value: Any) -> None:
-    """Refuse a number that is none, wherever it stands."""
-    if isinstance(value, dict):
-        for name, inner in value.items():
-            _require_finite(path, f'{key}.{name}'.lstrip('.'), inner)
-    elif isinstance(value, list | tuple):
-        for inner in value:
-            _require_finite(path, key, inner)
-    elif isinstance(value, float) and not isfinite(value):
-        raise InputError(f'{path}: {key}: {value} is not a finite number; correct it')
+                return f'{key}.{name}: {error}'
+    return ''

@@ -1,1 +1,1 @@
-"""The hidden world and the fake devices, which speak the real wire formats."""
+"""The hidden world, and fake devices with the real wire formats."""

@@ -3,7 +3,7 @@
 The reported joint positions x follow a reference r by x'' + 2 ζ ω x' + ω² x = ω² r. Each piece
 of the reference is a polynomial, so x lags while moving, overshoots a little and settles. The
 solution is a polynomial plus a decaying oscillation: exact at any time, without integration, and
-therefore the same in every process that knows the trajectories.
+therefore the same in every process that has read the trajectories.
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ NATURAL_FREQUENCY = 14.0
 """ω of the servo, rad/s."""
 DAMPING = 0.7
 """ζ of the servo; below 1 the arm overshoots."""
+_DECAY = DAMPING * NATURAL_FREQUENCY
+_DAMPED = NATURAL_FREQUENCY * np.sqrt(1 - DAMPING * DAMPING)
+"""ζω and ω_d = ω √(1 - ζ²), rad/s."""
 
 
 @dataclass(frozen=True)
@@ -66,10 +69,6 @@ def _steady_response(reference: FloatArray) -> FloatArray:
     return out
 
 
-def _derivative(coefficients: FloatArray) -> FloatArray:
-    return coefficients[1:] * np.arange(1, len(coefficients))[:, None]
-
-
 @dataclass(frozen=True)
 class _Response:
     """x(s) = polynomial(s) + e^(-ζωs) (a cos ω_d s + b sin ω_d s) for s = t - start >= 0."""
@@ -82,25 +81,22 @@ class _Response:
     @classmethod
     def of(cls, start_s: float, reference: FloatArray, x: FloatArray, v: FloatArray) -> _Response:
         steady = _steady_response(reference)
-        w, z = NATURAL_FREQUENCY, DAMPING
-        wd = w * np.sqrt(1 - z * z)
         a = x - steady[0]
         slope = steady[1] if len(steady) > 1 else np.zeros_like(x)
-        b = (v - slope + z * w * a) / wd
+        b = (v - slope + _DECAY * a) / _DAMPED
         return cls(start_s, steady, a, b)
 
     def at(self, t: float) -> tuple[FloatArray, FloatArray]:
         """Position and velocity at time t."""
         s = t - self.start_s
-        w, z = NATURAL_FREQUENCY, DAMPING
-        wd = w * np.sqrt(1 - z * z)
-        decay, c, sn = np.exp(-z * w * s), np.cos(wd * s), np.sin(wd * s)
+        decay = np.exp(-_DECAY * s)
+        cosine, sine = decay * np.cos(_DAMPED * s), decay * np.sin(_DAMPED * s)
         powers = s ** np.arange(len(self.polynomial))
-        slope = _derivative(self.polynomial)
-        x = powers @ self.polynomial + decay * (self.a * c + self.b * sn)
-        v = powers[: len(slope)] @ slope + decay * (
-            (self.b * wd - z * w * self.a) * c - (self.a * wd + z * w * self.b) * sn
-        )
+        slope = self.polynomial[1:] * np.arange(1, len(self.polynomial))[:, None]
+        x = powers @ self.polynomial + self.a * cosine + self.b * sine
+        v = powers[: len(slope)] @ slope
+        v = v + (self.b * _DAMPED - _DECAY * self.a) * cosine
+        v = v - (self.a * _DAMPED + _DECAY * self.b) * sine
         return x, v
 
 
@@ -139,7 +135,7 @@ class Motion:
             reference, begin = waypoint.q, end
             velocity = np.zeros_like(x) if waypoint.velocity is None else waypoint.velocity
         self._responses.append(_Response.of(begin, reference[None], x, v))
-        # Nobody asks for times long gone; bounded memory over hours of collection.
+        # The past is read back for seconds at most; memory stays bounded over hours of collection.
         del self._responses[:-16]
 
     def at(self, t: float) -> tuple[FloatArray, FloatArray]:

@@ -1,7 +1,7 @@
-"""Draws effects to hide: which joint, which way, which sign.
+"""Draws effects to hide: which joint, which direction, which sign.
 
-Signs are drawn too, but for what can only give way to a load or grow when it warms. Every draw is
-of about the largest size that is plausible; `WorldModel.of_size` makes it smaller.
+Compliance and thermal growth have the sign of physics. Every draw has about the largest size that
+is plausible; `WorldModel.of_size` makes it smaller.
 """
 
 from __future__ import annotations
@@ -14,188 +14,189 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.simulation.hidden_effects import ARC_MINUTE, NAMED, Circumstances, HiddenEffect
+from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.simulation.world_model import WorldModel
 from remaster_ros.types import FloatArray
 
 RANDOM = 'random'
-# What a hidden effect leaves where nobody says how much, m.
+# What a hidden effect leaves where no size is given, m.
 USUAL_M = (0.2e-3, 0.6e-3)
 TRIES = 30
 
-Draw = Callable[[np.random.Generator, int, Circumstances, tuple[str, ...]], HiddenEffect]
-"""(rng, number of joints, circumstances, names of the sensors) -> an effect."""
+
+@dataclass(frozen=True, eq=False)
+class DrawContext:
+    """What an effect is drawn from.
+
+    Attributes
+    ----------
+    rng
+        Source of all randomness.
+    joints
+        Number of joints.
+    circumstances
+        Of the visits.
+    sensors
+        Their names.
+    """
+
+    rng: np.random.Generator
+    joints: int
+    circumstances: Circumstances
+    sensors: tuple[str, ...]
+
+    def joint(self, first: int = 1) -> tuple[int]:
+        """Draw a joint, 1-based."""
+        return (int(self.rng.integers(first, self.joints + 1)),)
+
+    def sign(self) -> float:
+        """Draw -1 or 1."""
+        return float(self.rng.choice((-1.0, 1.0)))
+
+    def direction(self, size: int) -> FloatArray:
+        """Draw a unit vector."""
+        values = self.rng.standard_normal(size)
+        return values / np.linalg.norm(values)
 
 
-def _sign(rng: np.random.Generator) -> float:
-    return float(rng.choice((-1.0, 1.0)))
+Draw = Callable[[str, DrawContext], HiddenEffect]
+"""(kind, what to draw from) -> an effect."""
 
 
-def _direction(rng: np.random.Generator, size: int) -> FloatArray:
-    values = rng.standard_normal(size)
-    return values / np.linalg.norm(values)
-
-
-def _one_value(kind: str, largest: float, first_joint: int = 1) -> Draw:
+def _one_value(largest: float, first_joint: int = 1) -> Draw:
     """Draw a joint and a sign."""
+    return lambda kind, context: HiddenEffect(
+        kind, context.joint(first_joint), np.array([largest * context.sign()])
+    )
 
-    def draw(
-        rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
-    ) -> HiddenEffect:
-        joint = int(rng.integers(first_joint, k + 1))
-        return HiddenEffect(kind, (joint,), np.array([largest * _sign(rng)]))
+
+def _no_joint(largest: float) -> Draw:
+    """One value, whose sign is that of physics: nothing is left to draw."""
+    return lambda kind, context: HiddenEffect(kind, (), np.array([largest]))
+
+
+def _of_sensor(largest: float, size: int = 1, forms: tuple[str, ...] = ('',)) -> Draw:
+    """Draw a sensor, a form and a direction."""
+
+    def draw(kind: str, context: DrawContext) -> HiddenEffect:
+        detail = {
+            'sensor': str(context.rng.choice(context.sensors)),
+            'form': str(context.rng.choice(forms)),
+        }
+        return HiddenEffect(kind, (), largest * context.direction(size), detail)
 
     return draw
 
 
-def _of_sensor(kind: str, largest: float, size: int = 1, forms: tuple[str, ...] = ('',)) -> Draw:
-    """Draw a sensor, a direction and a form."""
-
-    def draw(
-        rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
-    ) -> HiddenEffect:
-        detail = {'sensor': str(rng.choice(sensors)), 'form': str(rng.choice(forms))}
-        return HiddenEffect(kind, (), largest * _direction(rng, size), detail)
-
-    return draw
-
-
-def _two_joints(kind: str, largest: float, forms: tuple[str, ...] = ('',)) -> Draw:
+def _two_joints(largest: float, forms: tuple[str, ...] = ('',)) -> Draw:
     """Draw the joint that errs and the one that it follows."""
 
-    def draw(
-        rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
-    ) -> HiddenEffect:
-        joint, by = (int(j) for j in 1 + rng.choice(k, 2, replace=False))
-        form = str(rng.choice(forms))
-        values = largest * _direction(rng, 2 if form == 'sin/cos' else 1)
+    def draw(kind: str, context: DrawContext) -> HiddenEffect:
+        joint, by = (int(j) for j in 1 + context.rng.choice(context.joints, 2, replace=False))
+        form = str(context.rng.choice(forms))
+        values = largest * context.direction(2 if form == 'sin/cos' else 1)
         return HiddenEffect(kind, (joint,), values, {'by': by, 'form': form})
 
     return draw
 
 
-def _draw_compliance(
-    rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
-) -> HiddenEffect:
-    loaded = 1 + np.flatnonzero(np.ptp(c.torque, axis=0) > 0.5)
-    count = min(int(rng.choice((1, 1, 2))), len(loaded))
-    joints = np.sort(rng.choice(loaded, count, replace=False))
-    values = 4e-4 * rng.uniform(0.5, 1.0, count)
-    return HiddenEffect('joint_compliance', tuple(int(j) for j in joints), values)
+def _compliance(kind: str, context: DrawContext) -> HiddenEffect:
+    loaded = 1 + np.flatnonzero(np.ptp(context.circumstances.torque, axis=0) > 0.5)
+    count = min(int(context.rng.choice((1, 1, 2))), len(loaded))
+    joints = np.sort(context.rng.choice(loaded, count, replace=False))
+    values = 4e-4 * context.rng.uniform(0.5, 1.0, count)
+    return HiddenEffect(kind, tuple(int(j) for j in joints), values)
 
 
-def _draw_eccentricity(
-    rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
-) -> HiddenEffect:
-    orders = ((1,), (2,), (1, 2))[rng.integers(3)]
-    values = 20 * ARC_MINUTE * _direction(rng, 2 * len(orders))
-    joint = int(rng.integers(1, k + 1))
-    return HiddenEffect('encoder_eccentricity', (joint,), values, {'orders': orders})
+def _eccentricity(kind: str, context: DrawContext) -> HiddenEffect:
+    orders = ((1,), (2,), (1, 2))[context.rng.integers(3)]
+    values = 20 * ARC_MINUTE * context.direction(2 * len(orders))
+    return HiddenEffect(kind, context.joint(), values, {'orders': orders})
 
 
-def _draw_gear(
-    rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
-) -> HiddenEffect:
+def _gear(kind: str, context: DrawContext) -> HiddenEffect:
     # Twice the ratio of a strain wave gear of 50 to 160.
-    order = int(2 * rng.integers(50, 161))
-    values = 10 * ARC_MINUTE * _direction(rng, 2)
-    joint = int(rng.integers(1, k + 1))
-    return HiddenEffect('gear_periodic', (joint,), values, {'orders': (order,)})
+    order = int(2 * context.rng.integers(50, 161))
+    values = 10 * ARC_MINUTE * context.direction(2)
+    return HiddenEffect(kind, context.joint(), values, {'orders': (order,)})
 
 
-def _draw_curve(
-    rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
-) -> HiddenEffect:
+def _curve(kind: str, context: DrawContext) -> HiddenEffect:
     orders = np.arange(4, 25)
     # Weights of a Gaussian bell: waves shorter than its width hardly occur.
-    weight = np.exp(-0.5 * (orders * np.deg2rad(rng.uniform(4.0, 10.0))) ** 2)
-    amplitudes = weight * np.abs(rng.standard_normal(len(orders)))
+    weight = np.exp(-0.5 * (orders * np.deg2rad(context.rng.uniform(4.0, 10.0))) ** 2)
+    amplitudes = weight * np.abs(context.rng.standard_normal(len(orders)))
     amplitudes /= np.sqrt(0.5 * np.sum(amplitudes**2))
-    phases = rng.uniform(0, 2 * np.pi, len(orders))
+    phases = context.rng.uniform(0, 2 * np.pi, len(orders))
     detail = {'orders': orders, 'amplitudes': amplitudes, 'phases': phases}
-    joint = int(rng.integers(1, k + 1))
-    return HiddenEffect('joint_error_curve', (joint,), np.array([8 * ARC_MINUTE]), detail)
+    return HiddenEffect(kind, context.joint(), np.array([8 * ARC_MINUTE]), detail)
 
 
-def _draw_link(
-    rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
-) -> HiddenEffect:
-    joint = int(rng.integers(1, k))
-    segment = c.segments[joint]
+def _link(kind: str, context: DrawContext) -> HiddenEffect:
+    joint = int(context.rng.integers(1, context.joints))
+    segment = context.circumstances.segments[joint]
     length = np.linalg.norm(segment)
-    axis = str(rng.choice(('x', 'y', 'z')))
+    axis = str(context.rng.choice(('x', 'y', 'z')))
     # Offsets of a link are as likely as a wrong length, where it has one.
-    if length > 0.02 and (rng.random() < 0.5 or abs(segment['xyz'.index(axis)]) > 0.1 * length):
+    if length > 0.02 and (
+        context.rng.random() < 0.5 or abs(segment['xyz'.index(axis)]) > 0.1 * length
+    ):
         axis = 'along'
-    return HiddenEffect('link_length', (joint,), np.array([5e-3 * _sign(rng)]), {'axis': axis})
+    return HiddenEffect(kind, (joint,), np.array([5e-3 * context.sign()]), {'axis': axis})
 
 
-def _draw_tilt(
-    rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
-) -> HiddenEffect:
-    joint = int(rng.integers(2, k + 1))
-    axis = c.axes[joint - 1]
-    across = np.cross(axis, rng.standard_normal(3))
-    return HiddenEffect('joint_axis_tilt', (joint,), 0.01 * across / np.linalg.norm(across))
+def _tilt(kind: str, context: DrawContext) -> HiddenEffect:
+    (joint,) = context.joint(2)
+    across = np.cross(context.circumstances.axes[joint - 1], context.rng.standard_normal(3))
+    return HiddenEffect(kind, (joint,), 0.01 * across / np.linalg.norm(across))
 
 
-def _draw_marker(
-    rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
-) -> HiddenEffect:
-    return HiddenEffect('marker_offset', (), 10e-3 * _direction(rng, 3))
-
-
-def _no_joint(kind: str, largest: float) -> Draw:
-    """Nothing to draw: one value, whose sign physics gives."""
-
-    def draw(
-        rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
-    ) -> HiddenEffect:
-        return HiddenEffect(kind, (), np.array([largest]))
-
-    return draw
+def _marker(kind: str, context: DrawContext) -> HiddenEffect:
+    return HiddenEffect(kind, (), 10e-3 * context.direction(3))
 
 
 def _at_some_time(draw: Draw) -> Draw:
-    def timed(
-        rng: np.random.Generator, k: int, c: Circumstances, sensors: tuple[str, ...]
-    ) -> HiddenEffect:
-        effect = draw(rng, k, c, sensors)
-        moment = float(rng.uniform(0.15, 0.4) * c.time_s[-1])
+    """Draw also the moment from which on the effect is there."""
+
+    def timed(kind: str, context: DrawContext) -> HiddenEffect:
+        effect = draw(kind, context)
+        moment = float(context.rng.uniform(0.15, 0.4) * context.circumstances.time_s[-1])
         return replace(effect, detail={**effect.detail, 'moment_s': moment})
 
     return timed
 
 
 DRAWS: dict[str, Draw] = {
-    'joint_compliance': _draw_compliance,
-    'encoder_eccentricity': _draw_eccentricity,
-    'encoder_scale': _one_value('encoder_scale', 5e-3),
-    'gear_periodic': _draw_gear,
-    'joint_error_curve': _draw_curve,
-    'backlash': _one_value('backlash', 15 * ARC_MINUTE),
-    'settling': _one_value('settling', 3e-3),
-    'joint_coupling': _two_joints('joint_coupling', 5e-3, ('linear', 'sin/cos')),
-    'link_length': _draw_link,
-    'joint_axis_tilt': _draw_tilt,
-    'marker_offset': _draw_marker,
-    'thermal_growth': _no_joint('thermal_growth', 2e-4),
-    'base_compliance': _no_joint('base_compliance', 1e-4),
-    'registration_drift': _of_sensor('registration_drift', 1e-6, 3),
-    'sensor_scale': _of_sensor('sensor_scale', 1e-2, 1, ('all', 'depth')),
-    'sensor_distortion': _of_sensor('sensor_distortion', 0.2),
-    'foreign_torque': _two_joints('foreign_torque', 4e-4),
-    'creeping_joint': _one_value('creeping_joint', 1e-6, 2),
-    'slipped_joint': _at_some_time(_one_value('slipped_joint', 15 * ARC_MINUTE, 2)),
-    'warm_joint': _one_value('warm_joint', 5e-4, 2),
-    'bent_coupling': _two_joints('bent_coupling', 3e-3),
-    'sagging_tool': _no_joint('sagging_tool', 3e-3),
-    'bumped_sensor': _at_some_time(_of_sensor('bumped_sensor', 3e-3, 3)),
+    'joint_compliance': _compliance,
+    'encoder_eccentricity': _eccentricity,
+    'encoder_scale': _one_value(5e-3),
+    'gear_periodic': _gear,
+    'joint_error_curve': _curve,
+    'backlash': _one_value(15 * ARC_MINUTE),
+    'settling': _one_value(3e-3),
+    'joint_coupling': _two_joints(5e-3, ('linear', 'sin/cos')),
+    'link_length': _link,
+    'joint_axis_tilt': _tilt,
+    'marker_offset': _marker,
+    'thermal_growth': _no_joint(2e-4),
+    'base_compliance': _no_joint(1e-4),
+    'registration_drift': _of_sensor(1e-6, 3),
+    'sensor_scale': _of_sensor(1e-2, 1, ('all', 'depth')),
+    'sensor_distortion': _of_sensor(0.2),
+    'foreign_torque': _two_joints(4e-4),
+    'creeping_joint': _one_value(1e-6, 2),
+    'slipped_joint': _at_some_time(_one_value(15 * ARC_MINUTE, 2)),
+    'warm_joint': _one_value(5e-4, 2),
+    'bent_coupling': _two_joints(3e-3),
+    'sagging_tool': _no_joint(3e-3),
+    'bumped_sensor': _at_some_time(_of_sensor(3e-3, 3)),
 }
+"""The largest sizes are in the units of the effects' rules, see `hidden_effects`."""
 
 
 @dataclass(frozen=True)
 class EffectSpec:
-    """What somebody wants hidden.
+    """What is to be hidden.
 
     Attributes
     ----------
@@ -236,7 +237,7 @@ class EffectSpec:
 def hide(
     stage: WorldModel, requests: Sequence[EffectSpec], rng: np.random.Generator
 ) -> tuple[HiddenEffect, ...]:
-    """Draw what was asked for.
+    """Draw the requested effects.
 
     Raises
     ------
@@ -250,11 +251,23 @@ def hide(
             kind = str(rng.choice(tuple(NAMED)))
         size_m = request.size_m
         if size_m is None:
-            # A marker is known to half a millimetre: less than that would be nothing new.
+            # A marker is known to half a millimetre: a smaller offset would be lost in that.
             scale = 10.0 if kind == 'marker_offset' else 1.0
             size_m = scale * rng.uniform(*USUAL_M)
         effects.append(draw_effect(stage, kind, rng, size_m, request.joint))
     return tuple(effects)
+
+
+def with_effects(
+    truth: SessionTruth,
+    stage: WorldModel,
+    requests: Sequence[EffectSpec],
+    rng: np.random.Generator,
+) -> SessionTruth:
+    """Return a truth in which so much more is wrong, as `hide` draws it."""
+    effects = hide(stage, requests, rng)
+    sizes_m = tuple(stage.size_m(effect) for effect in effects)
+    return replace(truth, effects=effects, effect_sizes_m=sizes_m)
 
 
 def draw_effect(
@@ -270,9 +283,10 @@ def draw_effect(
     InputError
         Where all draws leave nothing, or none is about that joint.
     """
+    context = DrawContext(rng, stage.arm.joints, stage.circumstances, tuple(stage.sensors))
     best, best_size = None, 0.0
     for _ in range(TRIES if joint is None else TRIES * stage.arm.joints):
-        effect = DRAWS[kind](rng, stage.arm.joints, stage.circumstances, tuple(stage.sensors))
+        effect = DRAWS[kind](kind, context)
         if joint is not None and effect.joints != (joint,):
             continue
         if len(effect.joints) > 1:
@@ -289,9 +303,9 @@ def draw_effect(
 
 
 def _balanced(stage: WorldModel, effect: HiddenEffect) -> HiddenEffect:
-    """Let every joint that shares in an effect leave as much as the drawn values are large.
+    """Scale the joints that share in an effect so that each leaves as much as its drawn value.
 
-    Else one of two joints that give way could be there in name only.
+    Otherwise one of two joints that give way could have no visible part in it.
     """
     alone = [
         stage.size_m(replace(effect, joints=(joint,), values=np.ones(1)))

@@ -1,7 +1,7 @@
-"""What discovery would have to say of a hidden effect: its cause, and its parameters by name.
+"""What discovery has to report of a hidden effect: its cause, and its parameters by name.
 
-The one place that knows both how effects are hidden and how they are reported; only judges use it,
-after everything that estimates has ended.
+This is the one module that uses both the names of hidden effects and those of discovery.json; only
+judges use it, after everything that estimates has ended.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The true arm of the fakes: the package's chain as `simulation.world_model` wants it."""
+"""The true arm of the fakes: the package's chain as `simulation.world_model` needs it."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ import numpy as np
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.simulation.world_model import ArmState
+from remaster_ros.simulation.truth import SessionTruth
+from remaster_ros.simulation.world_model import ArmState, Round, WorldModel
 from remaster_ros.types import FloatArray
 
 GRAVITY = (0.0, 0.0, -9.81)
+SECONDS_PER_CONFIGURATION = 10.0
+"""About what a configuration takes: motion, settling and measuring."""
 
 
 class ChainArm:
@@ -49,3 +52,10 @@ class ChainArm:
     def segments(self) -> FloatArray:
         """From each joint to the next one, the last to the tool, m, (k + 1, 3)."""
         return self._chain.T_fixed[:, :3, 3]
+
+
+def model_of_tour(chain: SerialChain, truth: SessionTruth, q: FloatArray) -> WorldModel:
+    """Return the true arm on its way through the configurations q, rad, (m, k), in that order."""
+    time_s = SECONDS_PER_CONFIGURATION * np.arange(len(q), dtype=float)
+    visited = Round(q, q[0], time_s, truth.warming.at(truth.warming.start_s + time_s))
+    return WorldModel(ChainArm(chain), visited, truth.sensors, truth.markers, truth.joint_offsets)

@@ -139,27 +139,8 @@ class HiddenEffect:
         return replace(self, values=factor * self.values)
 
     def add_to(self, deviation: Deviation, c: Circumstances) -> None:
-        """Deviate as the rule says."""
+        """Add what the rule of this effect makes of the circumstances."""
         (NAMED | UNNAMED)[self.kind].rule(self, deviation, c)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain lists and numbers, for a file."""
-        detail = {
-            key: value.tolist() if isinstance(value, np.ndarray) else value
-            for key, value in self.detail.items()
-        }
-        return {
-            'kind': self.kind,
-            'joints': list(self.joints),
-            'values': self.values.tolist(),
-            'detail': detail,
-        }
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> HiddenEffect:
-        """Undo `to_dict`."""
-        joints = tuple(data['joints'])
-        return cls(data['kind'], joints, np.array(data['values']), data['detail'])
 
     def __str__(self) -> str:
         shown = {key: value for key, value in self.detail.items() if np.ndim(value) < 1}

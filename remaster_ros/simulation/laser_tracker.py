@@ -7,7 +7,6 @@ import selectors
 import socket
 import threading
 from collections.abc import Iterable
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,22 +29,22 @@ from remaster_ros.simulation.laser_tracker_settings import TrackerBehaviour
 from remaster_ros.types import FloatArray
 
 if TYPE_CHECKING:
-    from remaster_ros.simulation.world import WorldView
+    from remaster_ros.simulation.world import World
 
 _POLL_WALL_S = 0.005
-"""How often the instrument lives on; the result does not depend on it, its latency does."""
+"""How often the instrument goes on in time; this sets its latency, not its results."""
 
 
 class FakeLaserTracker:
-    """A laser tracker that listens on a TCP port and lives in world time.
+    """A laser tracker that listens on a TCP port and runs in world time.
 
-    As with the real one, a single client at a time; a second one is told so and sent away. The
-    instrument is switched on when it is made; a client that leaves ends what it had begun.
+    As with the real one, a single client at a time; a second one is refused with an error report.
+    The instrument is switched on when it is made; a client that leaves ends what it had begun.
 
     Parameters
     ----------
     world
-        See `WorldView`.
+        The hidden world.
     sensor
         The tracker's name in the world.
     rng
@@ -60,7 +59,7 @@ class FakeLaserTracker:
 
     def __init__(
         self,
-        world: WorldView,
+        world: World,
         sensor: str,
         rng: np.random.Generator,
         *,
@@ -88,12 +87,7 @@ class FakeLaserTracker:
         self.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         """Close."""
         self.close()
 
@@ -143,7 +137,7 @@ class FakeLaserTracker:
             self._listener = None
 
     def break_beam(self) -> None:
-        """Interrupt the beam, as somebody who walks through it does."""
+        """Interrupt the beam, as a person who walks through it does."""
         with self._lock:
             self._send(self._instrument.break_beam())
 
@@ -157,10 +151,10 @@ class FakeLaserTracker:
             ready = [key.fileobj for key, _ in self._selector.select(_POLL_WALL_S)]
             with self._lock:
                 faults = self._world.faults(self._sensor)
-                self._suffer(faults)
+                self._apply(faults)
                 if 'stuck' not in faults:
                     self._send(self._instrument.step(self._instrument_time(faults)))
-                # The client first: one that has left makes room for one that knocks.
+                # The client first: one that has left makes room for a new one.
                 if self._client in ready and 'stuck' not in faults:
                     self._receive()
                 if self._listener in ready:
@@ -174,8 +168,8 @@ class FakeLaserTracker:
         self._lost_s += passed * (1.0 - 1.0 / faults.get('slow', 1.0))
         return now - self._lost_s
 
-    def _suffer(self, faults: Numbers) -> None:
-        """Break what the faults say is broken."""
+    def _apply(self, faults: Numbers) -> None:
+        """Apply the injected faults that concern the connection and the power."""
         if 'off' in faults:
             self._drop_client()
         if 'renumbered' in faults and not self._restarted:
@@ -196,7 +190,7 @@ class FakeLaserTracker:
         try:
             client, _ = self._listener.accept()
         except OSError:
-            # The client has gone again before it was welcomed.
+            # The client has already closed the connection.
             return
         if 'off' in self._world.faults(self._sensor):
             client.close()

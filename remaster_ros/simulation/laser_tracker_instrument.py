@@ -1,10 +1,7 @@
 """How the fake laser tracker behaves: packets in, packets out, world time as an argument.
 
-Physics in short. A beam follows the reflector while nothing is in its way, the reflector faces it
-and does not outrun it. Large moves of the arm lose it now and then even so. A search winds a
-spiral about the place the tracker points to. The ADM averages over the integration time and
-refuses a target that moves meanwhile. Errors are those of a data sheet, in range and angles:
-limits of 10 µm + 0.3 µm/m along the beam and 15 µm + 6 µm/m across it, at two standard deviations.
+The beam is described in `laser_tracker_beam`. A search winds a spiral about the place the tracker
+points to. The ADM averages over the integration time and refuses a target that moves meanwhile.
 """
 
 from __future__ import annotations
@@ -24,7 +21,13 @@ from remaster_ros.sensors.laser_tracker.protocol.packets import (
     StatusChange,
     Value,
 )
-from remaster_ros.simulation.laser_tracker_optics import adm_result, angle_between, covariance
+from remaster_ros.simulation.laser_tracker_beam import (
+    STEP_S,
+    Beam,
+    adm_result,
+    angle_between,
+    covariance,
+)
 from remaster_ros.simulation.laser_tracker_settings import (
     LENGTH_UNITS_M,
     REFLECTORS,
@@ -35,20 +38,16 @@ from remaster_ros.simulation.laser_tracker_settings import (
 from remaster_ros.types import FloatArray
 
 if TYPE_CHECKING:
-    from remaster_ros.simulation.world import WorldView
+    from remaster_ros.simulation.world import World
 
-_STEP_S = 0.1
-"""World time between two looks at the world."""
 _LONGEST_CATCH_UP_S = 5.0
-_SIGHT_EVERY_S = 0.5
-
 
 Operation = Iterator[None]
 """A command that takes time: advanced once a step until it ends."""
 
 
 class TrackerInstrument:
-    """The instrument behind the wire; knows no sockets, threads or clocks.
+    """The instrument without sockets, threads and clocks.
 
     Parameters
     ----------
@@ -64,12 +63,12 @@ class TrackerInstrument:
         See `TrackerBehaviour`.
     aim
         Where it points at first, in its own frame, m, (3,); None: where the reflector is, as
-        somebody who sets up the instrument leaves it.
+        a person who sets up the instrument leaves it.
     """
 
     def __init__(
         self,
-        world: WorldView,
+        world: World,
         sensor: str,
         rng: np.random.Generator,
         switched_on_s: float,
@@ -77,33 +76,23 @@ class TrackerInstrument:
         aim: FloatArray | None = None,
     ) -> None:
         self.behaviour = behaviour or TrackerBehaviour()
-        self.locked = False
-        self._world, self._sensor, self._rng = world, sensor, rng
+        self._world, self._rng = world, rng
+        self._beam = Beam(world, sensor, rng, self.behaviour, switched_on_s, aim)
         self._warm_at = switched_on_s + self.behaviour.warm_up_s
         self._time = switched_on_s
-        self._home = self._reflector() if aim is None else np.asarray(aim, float)
-        self._aim = self._home
         self._initialized = False
         self._operation: Operation | None = None
         self._command = Command.UNKNOWN
         self._last_measured: FloatArray | None = None
-        self._seen_at = -np.inf
-        self._swept_rad = 0.0
-        self._move_judged = False
         self._out: list[Event] = []
-        b = self.behaviour
-        self._settings: dict[Command, tuple[Value, ...]] = {
-            Command.GET_UNITS: (1, 0, 0, 0, 0),
-            Command.GET_ENVIRONMENT: (b.temperature_c, b.pressure_hpa, b.humidity_percent),
-            Command.GET_MEASUREMENT_MODE: (0,),
-            Command.GET_COORDINATE_SYSTEM_TYPE: (0,),
-            Command.GET_STATIONARY_MODE: (1000, 1),
-            Command.GET_REFLECTOR: (1,),
-            Command.GET_SEARCH: (50.0, 10_000),
-            Command.GET_STATISTIC_MODE: (0, 0),
-        }
+        self._settings = {setting.get: setting.initial for setting in SETTINGS.values()}
 
     # What a client sees
+
+    @property
+    def locked(self) -> bool:
+        """Whether the beam is on the reflector."""
+        return self._beam.locked
 
     @property
     def readiness(self) -> Readiness:
@@ -113,7 +102,7 @@ class TrackerInstrument:
         return Readiness.READY if self.locked else Readiness.NOT_READY
 
     def greeting(self) -> list[Event]:
-        """Return what a client is told when it connects."""
+        """Return the first packets for a client that connects."""
         return [self._readiness_change()]
 
     def handle(self, request: Request) -> list[Event]:
@@ -121,22 +110,15 @@ class TrackerInstrument:
         command = request.command
         if command in SETTINGS:
             self._set(command, request.values)
-        elif command in self._settings:
-            self._reply(command, 0, self._settings[command])
-        elif command is Command.GET_SYSTEM_STATUS:
-            self._system_status()
-        elif command is Command.GET_TRACKER_STATUS:
-            self._reply(command, 0, (self.readiness,))
-        elif command is Command.GET_MEASUREMENT_STATUS_INFO:
-            self._measurement_status()
-        elif command is Command.GET_REFLECTORS:
-            self._reflectors()
+        elif command in _TAKES_TIME:
+            self._begin(command, request.values)
         elif command is Command.STOP_MEASUREMENT:
             self._reply(command)
             if self._operation and self._command is Command.START_MEASUREMENT:
                 self.abort()
-        elif command in _TAKES_TIME:
-            self._begin(command, request.values)
+        elif answers := self._answers(command):
+            for values in answers:
+                self._reply(command, 0, values)
         else:
             self._reply(command, Status.NOT_IMPLEMENTED)
         return self._sent()
@@ -144,10 +126,10 @@ class TrackerInstrument:
     def step(self, t: float) -> list[Event]:
         """Go on to world time t; return what is sent meanwhile."""
         self._time = max(self._time, t - _LONGEST_CATCH_UP_S)
-        while t - self._time >= _STEP_S:
-            self._time += _STEP_S
-            if self.locked:
-                self._follow()
+        while t - self._time >= STEP_S:
+            self._time += STEP_S
+            if self.locked and not self._beam.follow(self._time):
+                self._lose()
             self._advance()
         return self._sent()
 
@@ -158,7 +140,7 @@ class TrackerInstrument:
             self._out.append(self._readiness_change())
 
     def break_beam(self) -> list[Event]:
-        """Lose the reflector, as somebody who walks through the beam does."""
+        """Lose the reflector, as when a person walks through the beam."""
         self._lose()
         return self._sent()
 
@@ -180,15 +162,15 @@ class TrackerInstrument:
         return LENGTH_UNITS_M[int(self._settings[Command.GET_UNITS][0])]
 
     def _set(self, command: Command, values: tuple[Value, ...]) -> None:
-        get, change = SETTINGS[command]
+        setting = SETTINGS[command]
         status = Status.SERVER_BUSY if self._operation else refusal(command, values)
         if status == Status.ALL_OK:
             if command is Command.SET_UNITS:
                 self._convert_lengths(int(values[0]))
-            self._settings[get] = values
+            self._settings[setting.get] = values
         self._reply(command, status)
         if status == Status.ALL_OK:
-            self._out.append(StatusChange(change))
+            self._out.append(StatusChange(setting.change))
 
     def _convert_lengths(self, unit: int) -> None:
         """Keep the search radius what it is when its unit changes."""
@@ -196,31 +178,26 @@ class TrackerInstrument:
         scale = self._unit_m / LENGTH_UNITS_M[unit]
         self._settings[Command.GET_SEARCH] = (float(radius) * scale, timeout)
 
-    def _system_status(self) -> None:
-        warm = self._time >= self._warm_at
-        processor = 5 if self._initialized else 3
-        laser, adm = (3, 2) if warm else (0, 1)
-        self._reply(
-            Command.GET_SYSTEM_STATUS,
-            0,
-            (Status.ALL_OK, processor, laser, adm, 3, 8, 500, 0, 0, 390001),
-        )
-
-    def _measurement_status(self) -> None:
-        # Tracker, its compensation, ADM, its compensation, reflector, face 1, initialised.
-        flags = 1 | 2 | 4 | 8 | self.locked * 2048 | 4096 | self._initialized * 65536
-        self._reply(Command.GET_MEASUREMENT_STATUS_INFO, 0, (Status.ALL_OK, flags))
-
-    def _reflectors(self) -> None:
-        for number, (kind, offset, name) in REFLECTORS.items():
-            values = (
-                len(REFLECTORS),
-                number,
-                kind,
-                offset / self._unit_m,
-                name.encode('utf-16le'),
-            )
-            self._reply(Command.GET_REFLECTORS, 0, values)
+    def _answers(self, command: Command) -> list[tuple[Value, ...]]:
+        """Return the values of each reply to a query; none where it is no query."""
+        if command in self._settings:
+            return [self._settings[command]]
+        if command is Command.GET_TRACKER_STATUS:
+            return [(self.readiness,)]
+        if command is Command.GET_SYSTEM_STATUS:
+            processor = 5 if self._initialized else 3
+            laser, adm = (3, 2) if self._time >= self._warm_at else (0, 1)
+            return [(Status.ALL_OK, processor, laser, adm, 3, 8, 500, 0, 0, 390001)]
+        if command is Command.GET_MEASUREMENT_STATUS_INFO:
+            # Tracker, its compensation, ADM, its compensation, reflector, face 1, initialised.
+            flags = 1 | 2 | 4 | 8 | self.locked * 2048 | 4096 | self._initialized * 65536
+            return [(Status.ALL_OK, flags)]
+        if command is Command.GET_REFLECTORS:
+            return [
+                (len(REFLECTORS), number, kind, offset / self._unit_m, name.encode('utf-16le'))
+                for number, (kind, offset, name) in REFLECTORS.items()
+            ]
+        return []
 
     # Commands that take time
 
@@ -230,6 +207,7 @@ class TrackerInstrument:
             self._reply(command, status)
             return
         if command is Command.START_MEASUREMENT:
+            # Its result follows later.
             self._reply(command)
         self._command, self._operation = command, self._start(command, values)
         self._out.append(self._readiness_change())
@@ -241,15 +219,15 @@ class TrackerInstrument:
         if command is Command.INITIALIZE:
             return self._initialize()
         if command is Command.FIND_REFLECTOR:
-            return self._search(command, self._aim, float(values[0]) * self._unit_m)
+            return self._search(command, self._beam.aim, float(values[0]) * self._unit_m)
         if command in (Command.GO_POSITION, Command.POINT_LASER):
             target = np.array(values[:3], float) * self._unit_m
         elif command is Command.GO_LAST_MEASURED_POINT and self._last_measured is not None:
             target = self._last_measured
         elif command is Command.CHANGE_FACE:
-            target = self._aim
+            target = self._beam.aim
         else:
-            target = self._home
+            target = self._beam.home
         if command in _ONLY_TURNS:
             return self._point(command, target)
         return self._search(command, target, float(np.linalg.norm(target)))
@@ -284,7 +262,7 @@ class TrackerInstrument:
             self._out.append(self._readiness_change())
 
     def _initialize(self) -> Operation:
-        self.locked = False
+        self._beam.locked = False
         yield from self._wait(self.behaviour.initialise_s)
         self._initialized = True
         self._reply(Command.INITIALIZE)
@@ -296,10 +274,12 @@ class TrackerInstrument:
             yield
 
     def _turn(self, target: FloatArray) -> Operation:
-        self.locked = False
+        self._beam.locked = False
         b = self.behaviour
-        yield from self._wait(b.slew_settle_s + angle_between(self._aim, target) / b.slew_rad_s)
-        self._aim = target
+        yield from self._wait(
+            b.slew_settle_s + angle_between(self._beam.aim, target) / b.slew_rad_s
+        )
+        self._beam.aim = target
 
     def _point(self, command: Command, target: FloatArray) -> Operation:
         yield from self._turn(target)
@@ -320,24 +300,23 @@ class TrackerInstrument:
             yield
             area = b.spiral_pitch_m * b.spiral_speed_m_s * (self._time - start)
             reached = np.sqrt(area / np.pi)
-            offset = angle_between(target, self._reflector()) * distance
-            found = not blind and offset <= min(reached, radius) and self._sees()
+            offset = angle_between(target, self._beam.reflector(self._time)) * distance
+            found = not blind and offset <= min(reached, radius) and self._beam.sees(self._time)
         if found:
             yield from self._wait(b.acquire_s)
-            found = self._sees()
+            found = self._beam.sees(self._time)
         if found:
-            self.locked, self._aim, self._seen_at = True, self._reflector(), self._time
-            self._swept_rad, self._move_judged = 0.0, False
+            self._beam.lock(self._time)
         self._reply(command, Status.ALL_OK if found else Status.MEASUREMENT_STATUS_NOT_READY)
 
     def _measure(self) -> Operation:
         integration_ms, _ = self._settings[Command.GET_STATIONARY_MODE]
         end = self._time + int(integration_ms) * 1e-3
-        samples = [self._reflector()]
+        samples = [self._beam.reflector(self._time)]
         problem = Status.ALL_OK
         while self._time < end and problem == Status.ALL_OK:
             yield
-            samples.append(self._aim)
+            samples.append(self._beam.aim)
             if not self.locked:
                 problem = Status.MEASUREMENT_STATUS_NOT_READY
             elif np.linalg.norm(samples[-1] - samples[0]) > self.behaviour.stability_limit_m:
@@ -351,7 +330,7 @@ class TrackerInstrument:
         cov = covariance(truth, self.behaviour)
         self._last_measured = self._rng.multivariate_normal(truth, cov)
         temperature, pressure, humidity = map(float, self._settings[Command.GET_ENVIRONMENT])
-        # The weather station goes by what was set, and notices when it gets warmer.
+        # The weather station measures the warming on top of the temperature that was set.
         temperature += self._world.warming_k(self._time)
         return adm_result(
             self._last_measured,
@@ -360,42 +339,8 @@ class TrackerInstrument:
             (temperature, pressure, humidity),
         )
 
-    # The beam
-
-    def _reflector(self) -> FloatArray:
-        return self._world.marker_in_sensor(self._sensor, self._time)
-
-    def _sees(self) -> bool:
-        return self._world.line_of_sight(self._sensor, self._time)
-
-    def _follow(self) -> None:
-        """Let the beam follow the reflector, or lose it."""
-        t = self._time
-        reflector, moving = self._reflector(), self._world.is_moving(t)
-        across_speed = angle_between(self._aim, reflector) * np.linalg.norm(reflector) / _STEP_S
-        # The world's answer is dear, and changes little while nothing moves.
-        hidden = False
-        if moving or t - self._seen_at > _SIGHT_EVERY_S:
-            hidden, self._seen_at = not self._sees(), t
-        outrun = across_speed > self.behaviour.tracking_speed_m_s
-        if self._shaken(moving) or hidden or outrun:
-            self._lose()
-        else:
-            self._aim = reflector
-
-    def _shaken(self, moving: bool) -> bool:
-        """Whether a large move breaks the beam now; each is judged once."""
-        if not moving:
-            self._swept_rad, self._move_judged = 0.0, False
-            return False
-        self._swept_rad += self._world.joint_speed(self._time) * _STEP_S
-        if self._move_judged or self._swept_rad <= self.behaviour.large_move_rad:
-            return False
-        self._move_judged = True
-        return self._rng.random() < self.behaviour.large_move_break_share
-
     def _lose(self) -> None:
-        self.locked = False
+        self._beam.locked = False
         if self._operation is None:
             self._out.append(self._readiness_change())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,20 +16,34 @@ LENGTH_UNITS_M = (1.0, 1e-3, 1e-6, 0.3048, 0.9144, 0.0254)
 REFLECTORS = {1: (1, 0.01905, 'CCR 1.5in'), 2: (1, 0.00635, 'CCR 0.5in')}
 """Number -> target type (corner cube), surface offset (m), name."""
 
+
+class Setting(NamedTuple):
+    """The command that reads a setting, what is sent when it changes, the first values."""
+
+    get: Command
+    change: Change
+    initial: tuple[Value, ...]
+
+
 SETTINGS = {
-    Command.SET_UNITS: (Command.GET_UNITS, Change.UNITS),
-    Command.SET_ENVIRONMENT: (Command.GET_ENVIRONMENT, Change.ENVIRONMENT),
-    Command.SET_MEASUREMENT_MODE: (Command.GET_MEASUREMENT_MODE, Change.MEASUREMENT_MODE),
-    Command.SET_COORDINATE_SYSTEM_TYPE: (
-        Command.GET_COORDINATE_SYSTEM_TYPE,
-        Change.COORDINATE_SYSTEM_TYPE,
+    Command.SET_UNITS: Setting(Command.GET_UNITS, Change.UNITS, (1, 0, 0, 0, 0)),
+    Command.SET_ENVIRONMENT: Setting(
+        Command.GET_ENVIRONMENT, Change.ENVIRONMENT, (20.0, 1013.25, 50.0)
     ),
-    Command.SET_STATIONARY_MODE: (Command.GET_STATIONARY_MODE, Change.STATIONARY_MODE),
-    Command.SET_REFLECTOR: (Command.GET_REFLECTOR, Change.REFLECTOR),
-    Command.SET_SEARCH: (Command.GET_SEARCH, Change.SEARCH),
-    Command.SET_STATISTIC_MODE: (Command.GET_STATISTIC_MODE, Change.STATISTIC_MODE),
+    Command.SET_MEASUREMENT_MODE: Setting(
+        Command.GET_MEASUREMENT_MODE, Change.MEASUREMENT_MODE, (0,)
+    ),
+    Command.SET_COORDINATE_SYSTEM_TYPE: Setting(
+        Command.GET_COORDINATE_SYSTEM_TYPE, Change.COORDINATE_SYSTEM_TYPE, (0,)
+    ),
+    Command.SET_STATIONARY_MODE: Setting(
+        Command.GET_STATIONARY_MODE, Change.STATIONARY_MODE, (1000, 1)
+    ),
+    Command.SET_REFLECTOR: Setting(Command.GET_REFLECTOR, Change.REFLECTOR, (1,)),
+    Command.SET_SEARCH: Setting(Command.GET_SEARCH, Change.SEARCH, (50.0, 10_000)),
+    Command.SET_STATISTIC_MODE: Setting(Command.GET_STATISTIC_MODE, Change.STATISTIC_MODE, (0, 0)),
 }
-"""Setting -> the command that reads it, and what a client is told of a change."""
+"""The environment is temperature (°C), pressure (mbar) and relative humidity (%) of the air."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +73,6 @@ class TrackerBehaviour:
         The ADM refuses a reflector that leaves a sphere of this radius while it integrates.
     range_limit_m, range_limit_ppm, across_limit_m, across_limit_ppm
         Accuracy limits (two standard deviations): a constant, and parts per million of distance.
-    temperature_c, pressure_hpa, humidity_percent
-        Of the air, reported with each result unless a client sets others.
     """
 
     warm_up_s: float = 5.0
@@ -78,9 +91,6 @@ class TrackerBehaviour:
     range_limit_ppm: float = 0.3
     across_limit_m: float = 15e-6
     across_limit_ppm: float = 6.0
-    temperature_c: float = 20.0
-    pressure_hpa: float = 1013.25
-    humidity_percent: float = 50.0
 
 
 def refusal(command: Command, values: tuple[Value, ...]) -> Status:

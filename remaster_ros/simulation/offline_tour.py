@@ -7,21 +7,16 @@ from collections.abc import Mapping
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.planning.candidates import candidate_poses, plan_poses
 from remaster_ros.planning.tour_order import Tour
 from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import FloatArray
-
-# As the planner node's default: distance kept from the joint limits.
-LIMIT_MARGIN_RAD = np.deg2rad(1.0)
 
 
 def plan_tour(
     chain: SerialChain,
     cell: Workcell,
-    places: Mapping[str, FloatArray],
+    places: Mapping[str, FloatArray] | None,
     counts: Mapping[str, int],
     rng: np.random.Generator,
     *,
@@ -34,29 +29,25 @@ def plan_tour(
     chain, cell
         The arm, and where it works.
     places
-        T_R_N of every sensor that has to see its marker, (4, 4).
+        T_R_N of every sensor that has to see its marker, (4, 4); None for the cell's rough places.
     counts
         Split -> number of candidate poses.
     rng
         Source of randomness.
     without_meshes
-        Take capsules in place of meshes: nobody stands beside a simulated arm, and its meshes may
-        be on another machine.
+        Take capsules in place of meshes: a simulated arm can hurt no one, and its meshes may be on
+        another machine.
 
     Raises
     ------
     InputError
         No closed form for this robot, or no pose to fit that it can take.
     """
-    inverse = InverseKinematics(chain, cell.held(chain))
-    arm = cell.collision_model(chain, without_meshes=without_meshes)
-    sights = cell.lines_of_sight({name: T_R_N[:3, 3] for name, T_R_N in places.items()})
-    aim = places[cell.aim_at][:3, 3]
-    plans = {}
-    for split, count in counts.items():
-        if count:
-            candidates = candidate_poses(count, cell.poses.ranges(), aim, rng)
-            plans[split] = plan_poses(inverse, arm, candidates, sights, LIMIT_MARGIN_RAD)
+    scene = cell.planning_scene(chain, without_meshes=without_meshes)
+    sensors_R = scene.rough_R
+    if places is not None:
+        sensors_R = {name: T_R_N[:3, 3] for name, T_R_N in places.items()}
+    plans = {split: scene.plan(n, sensors_R, rng) for split, n in counts.items() if n}
     tour = Tour(chain, plans)
     if not tour.poses['optimization']:
         raise InputError(

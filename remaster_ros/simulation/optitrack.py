@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.sensors.optitrack.diagnosis import require_group
 from remaster_ros.sensors.optitrack.protocol import natnet
 from remaster_ros.sensors.optitrack.protocol.frames import Frame
 from remaster_ros.sensors.optitrack.protocol.natnet import (
@@ -27,12 +26,13 @@ from remaster_ros.sensors.optitrack.protocol.natnet import (
     Version,
 )
 from remaster_ros.sensors.optitrack.protocol.wire import require_supported
+from remaster_ros.sensors.optitrack.settings import require_group
 from remaster_ros.sensors.optitrack.sockets import open_socket
 from remaster_ros.simulation.optitrack_faults import FrameFaults
 from remaster_ros.simulation.optitrack_scene import CLOCK_HZ, OptiTrackBehaviour, OptiTrackScene
 
 if TYPE_CHECKING:
-    from remaster_ros.simulation.world import WorldView
+    from remaster_ros.simulation.world import World
 
 MAX_CLIENTS = 16
 _POLL_WALL_S = 0.1
@@ -46,7 +46,7 @@ Address = tuple[str, int]
 
 @dataclass
 class _Client:
-    """A unicast client: when it was last heard (wall time), and its bitstream."""
+    """A unicast client: when its last datagram came (wall time), and its bitstream."""
 
     last_seen_s: float
     version: Version
@@ -58,7 +58,7 @@ class FakeOptiTrackServer:
     Parameters
     ----------
     world
-        See `WorldView`.
+        The hidden world.
     sensor
         The camera bar's name in the world.
     rng
@@ -66,7 +66,7 @@ class FakeOptiTrackServer:
     version
         Bitstream version, such as ``(2, 10)``, ``(3, 1)`` or ``(4, 1)``.
     transport
-        ``multicast`` streams to the group; ``unicast`` to every client that says CONNECT.
+        ``multicast`` streams to the group; ``unicast`` to every client that sends CONNECT.
     rate_hz
         Frames per second of world time.
     host
@@ -76,8 +76,8 @@ class FakeOptiTrackServer:
     multicast_group, data_port
         Where multicast frames go.
     unicast_port
-        Send unicast frames to this port of a client instead of the one that it speaks from, and
-        never drop it: old clients such as ``natnetclient`` listen there and say nothing more.
+        Send unicast frames to this port of a client instead of the one that it sends from, and
+        never drop it: old clients such as ``natnetclient`` listen there and send nothing more.
     client_timeout_s
         A unicast client that is silent for so long (wall time) is dropped.
     behaviour
@@ -91,7 +91,7 @@ class FakeOptiTrackServer:
 
     def __init__(
         self,
-        world: WorldView,
+        world: World,
         sensor: str,
         rng: np.random.Generator,
         *,
@@ -133,7 +133,6 @@ class FakeOptiTrackServer:
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
         self._latest: Frame | None = None
-        self.frames_sent = 0
 
     @property
     def command_port(self) -> int:
@@ -207,7 +206,6 @@ class FakeOptiTrackServer:
             self._latest = frame
             for message in self._spoiler.spoil(frame, self._world.faults(self._sensor)):
                 self._distribute(message)
-            self.frames_sent += 1
 
     def _distribute(self, frame: Frame | bytes) -> None:
         if self._data is not None:
@@ -294,7 +292,7 @@ class FakeOptiTrackServer:
         return natnet.Response(f'Bitstream,{version}\0'.encode())
 
     def _can_stream(self, wanted: Version) -> bool:
-        """Servers from 4.0 on speak older bitstreams to unicast clients that ask."""
+        """Servers from 4.0 on send older bitstreams to unicast clients that request them."""
         return self._version >= (4, 0) and (3, 0) <= wanted <= self._version
 
     def _version_of(self, address: Address) -> Version:

@@ -30,7 +30,7 @@ from remaster_ros.sensors.optitrack.protocol.wire import Vec3, Version
 from remaster_ros.types import FloatArray
 
 if TYPE_CHECKING:
-    from remaster_ros.simulation.world import WorldView
+    from remaster_ros.simulation.world import World
 
 CLOCK_HZ = 10_000_000
 """Ticks per second of the server's fine clock, as on usual Windows hosts."""
@@ -100,7 +100,7 @@ class OptiTrackScene:
 
     def __init__(
         self,
-        world: WorldView,
+        world: World,
         sensor: str,
         rng: np.random.Generator,
         behaviour: OptiTrackBehaviour,

@@ -7,7 +7,6 @@ with a log line what it cannot follow, an empty trajectory too, and does not cla
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -17,14 +16,10 @@ from remaster_ros.simulation.faults import Numbers, is_out
 from remaster_ros.simulation.world import World
 from remaster_ros.types import FloatArray
 
-
-@dataclass(frozen=True)
-class TrajectoryPoint:
-    """A point as it comes in a trajectory_msgs/JointTrajectory; seconds, rad, rad/s."""
-
-    time_from_start_s: float
-    positions: Sequence[float]
-    velocities: Sequence[float] = ()
+REPEATABILITY_RAD = 2e-5
+"""Standard deviation with which a joint comes back to a commanded position."""
+ENCODER_RAD = 2e-6
+"""Standard deviation of the noise of a reported joint position."""
 
 
 class FakeArm:
@@ -42,7 +37,7 @@ class FakeArm:
         self.world = world
         self.names = world.chain.joint_names
         self._rng = rng
-        # joint_state_broadcaster reports in an order of its own; everyone must permute by name.
+        # joint_state_broadcaster reports in an order of its own; subscribers must permute by name.
         self._order = rng.permutation(len(self.names))
         self._commanded: tuple[float, FloatArray] | None = None
         self._braked = False
@@ -51,7 +46,7 @@ class FakeArm:
         self._wrapped_once = False
 
     def command(
-        self, names: Sequence[str], points: Sequence[TrajectoryPoint], start_s: float = 0.0
+        self, names: Sequence[str], points: Sequence[ServoPoint], start_s: float = 0.0
     ) -> str | None:
         """Take a trajectory.
 
@@ -74,20 +69,24 @@ class FakeArm:
             return reason
         columns = [list(names).index(name) for name in self.names]
         # The arm does not come back to quite the same place twice.
-        stray = self._rng.normal(0.0, self.world.truth.repeatability_rad, len(columns))
-        waypoints = []
-        for point in points:
-            q = np.asarray(point.positions, float)[columns] + stray
-            velocity = np.asarray(point.velocities, float)[columns] if point.velocities else None
-            waypoints.append(ServoPoint(point.time_from_start_s, q, velocity))
-        waypoints = _spoil(waypoints, faults)
+        stray = self._rng.normal(0.0, REPEATABILITY_RAD, len(columns))
+        # Faults: beside the target, or slowly.
+        slow, beside = faults.get('slow', 1.0), faults.get('elsewhere', 0.0)
+        waypoints = [
+            ServoPoint(
+                slow * point.time_s,
+                point.q[columns] + stray + beside,
+                None if point.velocity is None else point.velocity[columns] / slow,
+            )
+            for point in points
+        ]
         begin = max(start_s, now)
-        self._commanded = begin + waypoints[-1].time_s, np.asarray(points[-1].positions)[columns]
+        self._commanded = begin + waypoints[-1].time_s, points[-1].q[columns]
         self.world.begin_motion(begin, waypoints)
         return None
 
     def _refuse(
-        self, names: Sequence[str], points: Sequence[TrajectoryPoint], start_s: float, now: float
+        self, names: Sequence[str], points: Sequence[ServoPoint], start_s: float, now: float
     ) -> str | None:
         unknown = sorted(set(names) - set(self.names))
         missing = sorted(set(self.names) - set(names))
@@ -95,17 +94,18 @@ class FakeArm:
             return f'incoming joints do not match: unknown {unknown}, missing {missing}'
         if not points:
             return 'the trajectory is empty'
-        times = [0.0, *(point.time_from_start_s for point in points)]
+        times = [0.0, *(point.time_s for point in points)]
         if any(later <= earlier for earlier, later in pairwise(times)):
             return 'time_from_start does not increase'
         for point in points:
-            if len(point.positions) != len(self.names):
-                return f'{len(point.positions)} positions for {len(self.names)} joints'
-            if len(point.velocities) not in (0, len(self.names)):
-                return f'{len(point.velocities)} velocities for {len(self.names)} joints'
-            if not np.all(np.isfinite([*point.positions, *point.velocities])):
-                return 'a position or velocity is not finite'
-        if np.any(np.asarray(points[-1].velocities, float) != 0.0):
+            for what, values in (('positions', point.q), ('velocities', point.velocity)):
+                if values is None:
+                    continue
+                if len(values) != len(self.names):
+                    return f'{len(values)} {what} for {len(self.names)} joints'
+                if not np.all(np.isfinite(values)):
+                    return 'a position or velocity is not finite'
+        if points[-1].velocity is not None and np.any(points[-1].velocity != 0.0):
             return 'velocity of the last point is not zero'
         if start_s > 0.0 and start_s + times[-1] <= now:
             return 'the trajectory ends in the past'
@@ -129,7 +129,7 @@ class FakeArm:
             return self._last
         now -= faults.get('late', 0.0)
         q, velocity = self.world.reported(now)
-        q = q + self._rng.normal(0.0, self.world.truth.encoder_rad, len(q))
+        q = q + self._rng.normal(0.0, ENCODER_RAD, len(q))
         if 'copy' in faults and self._commanded is not None and now >= self._commanded[0]:
             q = self._commanded[1]
         if 'drift' in faults:
@@ -178,14 +178,3 @@ def _fault_reason(faults: Numbers, now: float) -> str:
         if name in faults:
             return f'fault injected: {name}'
     return 'fault injected: intermittent' if is_out(faults.get('intermittent'), now) else ''
-
-
-def _spoil(waypoints: Sequence[ServoPoint], faults: Numbers) -> list[ServoPoint]:
-    """Go beside the target, or slowly."""
-    slow, beside = faults.get('slow', 1.0), faults.get('elsewhere', 0.0)
-    return [
-        ServoPoint(
-            p.time_s * slow, p.q + beside, None if p.velocity is None else p.velocity / slow
-        )
-        for p in waypoints
-    ]

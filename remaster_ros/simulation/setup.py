@@ -7,29 +7,27 @@ import stat
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import yaml
 
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.workcell import Workcell, config_path
-from remaster_ros.simulation.effect_sampling import EffectSpec, hide
-from remaster_ros.simulation.hidden_arm import ChainArm
-from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.simulation.effect_sampling import EffectSpec, with_effects
+from remaster_ros.simulation.hidden_arm import model_of_tour
 from remaster_ros.simulation.offline_tour import plan_tour, visit
-from remaster_ros.simulation.world import START_S, World, WorldTruth
-from remaster_ros.simulation.world_model import Round, WorldModel
+from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor, Warming, place_sensor
+from remaster_ros.simulation.world import START_S, WORLD_FILE, World, WorldContent
+from remaster_ros.types import FloatArray
 
 PRACTICE_CANDIDATES = 14
-# About what a configuration takes, world time.
-PRACTICE_STEP_S = 10.0
+PLACEMENT_STD_M = 0.03
+"""How far a fake sensor stands from its place in config/fake_world.yaml."""
 
 
 def default_folder(namespace: str = '/') -> Path:
-    """Where the fakes of this user, DDS domain and ROS namespace meet when nobody says otherwise.
+    """Return the folder of the fakes of this user, DDS domain and ROS namespace.
 
     Parameters
     ----------
@@ -42,9 +40,9 @@ def default_folder(namespace: str = '/') -> Path:
 
 
 def make_private_folder(folder: Path) -> None:
-    """Make a folder that nobody else may look into, or take over such a one.
+    """Make a folder that only this user may read, or take over such a one.
 
-    Its name can be foreseen and the temporary directory is open to all: another user may have
+    Its name can be guessed and the temporary directory is open to all: another user may have
     put a folder or a link there, through which files elsewhere would be overwritten.
 
     Raises
@@ -118,50 +116,45 @@ def make_world(
     missing = sorted(set(cell.sensors) - set(settings['sensors']))
     if missing:
         raise InputError(f'fake_world.yaml places no sensor {", ".join(missing)}')
-    start_q = np.deg2rad(settings['start_q_deg'])
-    truth = WorldTruth.draw(
-        seed,
-        len(chain),
-        {name: np.array(cell.markers[s.marker]) for name, s in cell.sensors.items()},
-        cell.marker_std_m,
-        {name: settings['sensors'][name] for name in cell.sensors},
-        np.deg2rad(settings['offset_std_deg']),
-    )
+    rng = np.random.default_rng([seed, 1])
+    markers: dict[str, FloatArray] = {}
+    sensors = {}
+    for name, sensor in cell.sensors.items():
+        place = settings['sensors'][name]
+        T_R_N = place_sensor(place['position_m'], place['look_at_m'], PLACEMENT_STD_M, rng)
+        if sensor.marker not in markers:
+            nominal = np.array(cell.markers[sensor.marker])
+            markers[sensor.marker] = nominal + rng.normal(0, cell.marker_std_m, 3)
+        acceptance = np.deg2rad(place['acceptance_deg'])
+        sensors[name] = SimulatedSensor(sensor.marker, T_R_N, acceptance_rad=acceptance)
+    joint_offsets = rng.normal(0, np.deg2rad(settings['offset_std_deg']), len(chain))
+    warming = Warming(rng.uniform(2.0, 6.0), rng.uniform(300.0, 1500.0), START_S)
+    truth = SessionTruth(joint_offsets, markers, sensors, warming)
     if hidden:
-        truth = replace(truth, effects=_draw_hidden(truth, cell, chain, hidden, candidates))
+        # Effects get the requested sizes on a tour like the one that will be visited.
+        rng = np.random.default_rng([seed, 2])
+        places = {name: sensor.T_R_N for name, sensor in sensors.items()}
+        counts = dict.fromkeys(('optimization', 'validation'), candidates)
+        visits = visit(plan_tour(chain, cell, places, counts, rng), chain)
+        q = np.concatenate([*visits['optimization'], *visits['validation']])
+        truth = with_effects(truth, model_of_tour(chain, truth, q), hidden, rng)
     return World.create(
         folder,
-        truth,
-        urdf=cell.urdf_text,
-        base_link=cell.robot.base_link,
-        tip_link=cell.robot.tip_link,
-        rate=rate,
-        start_q=start_q[: len(chain)],
-        link_radius_m=cell.link_radius_m,
+        WorldContent(
+            truth,
+            seed,
+            rate,
+            cell.urdf_text,
+            cell.robot.base_link,
+            cell.robot.tip_link,
+            np.deg2rad(settings['start_q_deg'])[: len(chain)],
+            cell.link_radius_m,
+        ),
     )
-
-
-def _draw_hidden(
-    truth: WorldTruth,
-    cell: Workcell,
-    chain: SerialChain,
-    hidden: Sequence[EffectSpec],
-    candidates: int,
-) -> tuple[HiddenEffect, ...]:
-    """Draw effects of the sizes they have on a round like the one that will be visited."""
-    rng = np.random.default_rng([truth.seed, 2])
-    places = {name: sensor.T_R_N for name, sensor in truth.sensors.items()}
-    counts = dict.fromkeys(('optimization', 'validation'), candidates)
-    visits = visit(plan_tour(chain, cell, places, counts, rng), chain)
-    q = np.concatenate([*visits['optimization'], *visits['validation']])
-    time_s = PRACTICE_STEP_S * np.arange(len(q), dtype=float)
-    practice = Round(q, q[0], time_s, truth.warming.at(START_S + time_s))
-    stage = WorldModel(ChainArm(chain), practice, *truth.staged(), truth.joint_offsets)
-    return hide(stage, hidden, rng)
 
 
 def open_world(folder: str, namespace: str = '/', timeout_s: float = 20.0) -> World:
-    """Open the World in `folder` ('' for the default one), waiting until somebody has made it.
+    """Open the World in `folder` ('' for the default one), waiting until it has been made.
 
     Parameters
     ----------
@@ -177,9 +170,9 @@ def open_world(folder: str, namespace: str = '/', timeout_s: float = 20.0) -> Wo
     """
     path = Path(folder) if folder else default_folder(namespace)
     deadline = time.monotonic() + timeout_s
-    while not (path / 'world.yaml').exists() and time.monotonic() < deadline:
+    while not (path / WORLD_FILE).exists() and time.monotonic() < deadline:
         time.sleep(0.05)
-    # As long as it is not there, somebody else may put it there.
+    # Another user may have put a folder of this name there meanwhile.
     if not folder and os.path.lexists(path):
         require_private(path)
     return World.open(path)

@@ -1,8 +1,8 @@
-"""An arm with whatever is wrong with it, on a round of visits, before sensors: what they see.
+"""What sensors measure of an arm with hidden effects, on one round of visits.
 
-The stage of every hidden world: the fakes play on it with the package's chain, the tests with
-pinocchio's. It also knows how much of an effect is left when registration, zero-offsets and
-markers are fitted, by least squares of its own: that is the size of an effect in millimetres.
+Every hidden world uses this model: the fakes with the package's chain, the tests with pinocchio's.
+It also works out, by least squares of its own, how much of an effect is left when registration,
+zero-offsets and markers are fitted: that is the size of an effect in millimetres.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from remaster_ros.simulation.hidden_effects import (
     Deviation,
     HiddenEffect,
 )
+from remaster_ros.simulation.truth import SimulatedSensor
 from remaster_ros.types import FloatArray
 
 
@@ -67,15 +68,6 @@ class Arm(Protocol):
 
         Segment j is fixed in the frame after joint j; segment 0, before joint 1, in the base.
         """
-
-
-@dataclass(frozen=True, eq=False)
-class StagedSensor:
-    """A sensor: rotation and origin of its frame N in R, and the marker it follows."""
-
-    rotation: FloatArray
-    origin: FloatArray
-    marker: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +150,19 @@ def placed(state: ArmState, marker: FloatArray, wrong: Deviation | None) -> Floa
     return Rotation.from_rotvec(wrong.base).apply(point + wrong.shift[:, 0])
 
 
+def measured(
+    state: ArmState,
+    name: str,
+    sensor: SimulatedSensor,
+    marker: FloatArray,
+    wrong: Deviation | None,
+) -> FloatArray:
+    """What the named sensor measures of a marker of the tool frame (3,), in N, m, (n, 3)."""
+    if wrong is None:
+        return sensor.in_sensor(placed(state, marker, None))
+    return wrong.measured(name, sensor.in_sensor(placed(state, marker + wrong.marker, wrong)))
+
+
 @dataclass(eq=False)
 class WorldModel:
     """The true arm and sensors on one round.
@@ -178,7 +183,7 @@ class WorldModel:
 
     arm: Arm
     visited: Round
-    sensors: Mapping[str, StagedSensor]
+    sensors: Mapping[str, SimulatedSensor]
     markers: Mapping[str, FloatArray]
     joint_offsets: FloatArray
 
@@ -192,14 +197,16 @@ class WorldModel:
 
         Rows as they are recorded: at every configuration one of each sensor.
         """
-        wrong = deviation(effects, self.circumstances, tuple(self.sensors))
-        state = self.arm.state(self.visited.q + self.joint_offsets + wrong.angle)
-        points = np.empty((len(self.visited.q), len(self.sensors), 3))
-        for s, (name, sensor) in enumerate(self.sensors.items()):
-            in_base = placed(state, self.markers[sensor.marker] + wrong.marker, wrong)
-            in_sensor = (in_base - sensor.origin) @ sensor.rotation
-            points[:, s] = wrong.measured(name, in_sensor)
-        return points.reshape(-1, 3)
+        q, wrong = self.visited.q + self.joint_offsets, None
+        if effects:
+            wrong = deviation(effects, self.circumstances, tuple(self.sensors))
+            q = q + wrong.angle
+        state = self.arm.state(q)
+        points = [
+            measured(state, name, sensor, self.markers[sensor.marker], wrong)
+            for name, sensor in self.sensors.items()
+        ]
+        return np.stack(points, axis=1).reshape(-1, 3)
 
     def response(self, effect: HiddenEffect) -> FloatArray:
         """How far an effect moves what the sensors see, m, (n, 3)."""
@@ -231,7 +238,7 @@ class WorldModel:
             first = 3 * list(self.markers).index(sensor.marker)
             places[:, :, first : first + 3] = state.tool
             block = np.concatenate((offsets, frames, places), axis=2)
-            blocks.append(np.einsum('ji,njp->nip', sensor.rotation, block))
+            blocks.append(np.einsum('ji,njp->nip', sensor.T_R_N[:3, :3], block))
         return np.stack(blocks, axis=1).reshape(-1, 3, blocks[0].shape[2])
 
     def left(self, response: FloatArray, *, fit_markers: bool = True) -> FloatArray:

@@ -69,7 +69,7 @@ def expected_positions(session: Session, truth: dict) -> np.ndarray:
     return expected
 
 
-def test_a_simulated_session_is_what_its_truth_says(tmp_path: Path) -> None:
+def test_a_simulated_session_agrees_with_its_truth(tmp_path: Path) -> None:
     session, truth = simulate(
         tmp_path / 's', '--noise-mm', 0, '--pose-noise-mm', 0, '--outliers', 0.03, '--seed', 4
     )

@@ -309,7 +309,7 @@ def without_ros(tmp_path: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize('args', [('demo',), ('replay', 'bag')])
-def test_without_ros_it_says_what_to_install(
+def test_without_ros_the_error_names_what_to_install(
     args: tuple[str, ...], without_ros: dict[str, str]
 ) -> None:
     line = refusal(*args, environment=without_ros)

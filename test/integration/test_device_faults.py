@@ -19,10 +19,12 @@ import tracker_world
 
 from remaster_ros.calibration.registration import register_ransac
 from remaster_ros.errors import DeviceError, InsufficientDataError
-from remaster_ros.kinematics import transforms
-from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient, LaserTrackerSettings
-from remaster_ros.sensors.optitrack.client import MarkerChoice, NatNetClient, NatNetSettings
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
+from remaster_ros.sensors.laser_tracker.settings import LaserTrackerSettings
+from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.diagnosis import warning
+from remaster_ros.sensors.optitrack.frame_gate import MarkerChoice
+from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.laser_tracker import FakeLaserTracker
 from remaster_ros.simulation.laser_tracker_settings import TrackerBehaviour
@@ -341,8 +343,7 @@ def test_a_stray_during_the_registration(tmp_path):
     turns = np.array([[0.0] * 7, [0.5, 0.2] + [0.0] * 5, [-0.3, 0.4] + [0.0] * 5, [0.2] * 7])
     q = world.start_q + turns
     model_R = chain.positions(q, np.array(cell.markers['sir']))
-    marker_R = chain.positions(q, sensor.marker, truth.joint_offsets)
-    seen = transforms.apply(transforms.inverse(sensor.T_R_N), marker_R)
+    seen = truth.without_noise(chain, 'mocap', q)
     seen = seen + rng.normal(0, 3e-5, seen.shape)
     seen[1] = seen[0] + [0.1, 0.0, 0.0]
     with pytest.raises(InsufficientDataError) as refusal:

@@ -104,7 +104,7 @@ def test_fit(case: str, healthy: Path, tmp_path: Path) -> None:
 
 
 def test_offsets_that_are_corrected_hardly_matter(healthy: Path, tmp_path: Path) -> None:
-    """The fit of an arm that was corrected: nothing is left to gain, and that is said."""
+    """The fit of an arm that was corrected: nothing is left to gain, and the report states it."""
     out = tmp_path / 'fit'
     assert remaster('fit', healthy, '--out', out, '--no-figures').returncode == 0
     urdf = (out / 'apply' / 'robot_calibrated.urdf').read_text(encoding='utf-8')

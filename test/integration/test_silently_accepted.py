@@ -14,7 +14,8 @@ from command_line import ROOT, refusal, remaster
 
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.session.reader import read_chain, read_session, write_session
-from remaster_ros.simulation.session_simulator import SimulatedSensor, simulate_session
+from remaster_ros.simulation.session_simulator import simulate_session
+from remaster_ros.simulation.truth import SimulatedSensor
 
 
 def cell_with(folder: Path, *changes: tuple[str, str]) -> Path:
@@ -45,16 +46,20 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ('old', 'new', 'words'),
     [
-        ('marker_std_m: 0.5e-3', 'marker_std_m: 0.5', 'write 0.5e-3'),
+        ('marker_std_m: 0.5e-3', 'marker_std_m: 0.5', 'if millimetres were meant, write 0.0005'),
         ('azimuth_deg: [0.0, 360.0]', 'azimuth_deg: [-1.05, 1.05]', 'write -60.16, 60.16'),
         ('roll_deg: [0.0, 360.0]', 'roll_deg: [0, 6.2832]', 'write 0, 360'),
         ('azimuth_deg: [0.0, 360.0]', 'azimuth_deg: [60, -60]', 'from 60 down to -60'),
         ('radius_m: [0.2, 0.5]', 'radius_m: [200, 500]', 'if millimetres were meant, write 0.2'),
         ('height_m: [0.4, 0.8]', 'height_m: [0.4, 800]', 'if millimetres were meant, write 0.8'),
-        ('radius_m: [0.2, 0.5]', 'radius_m: [-0.2, 0.5]', 'must not be negative'),
+        (
+            'radius_m: [0.2, 0.5]',
+            'radius_m: [-0.2, 0.5]',
+            'radius_m is -0.2; it must be from 0 to 10 m',
+        ),
         ('sir: [0.1, 0.0, 0.0]', 'sir: [100, 0.0, 0.0]', 'if millimetres were meant, write 0.1'),
         ('[1.9, 0.0, 1.3]', '[1900, 0.0, 1300]', 'if millimetres were meant, write 1.9'),
-        ('max_angle_deg: 60.0', 'max_angle_deg: 1.05', 'radians would be 60.16 degrees'),
+        ('max_angle_deg: 60.0', 'max_angle_deg: 1.05', 'if radians were meant, write 60.16'),
         ('link_radius_m: 0.075', 'link_radius_m: 75', 'if millimetres were meant, write 0.075'),
     ],
 )
@@ -79,8 +84,8 @@ def test_markers_of_a_session_in_another_unit(session: Path, tmp_path: Path) -> 
     text = header.read_text(encoding='utf-8')
     header.write_text(text.replace('marker_std_m: 0.0005', 'marker_std_m: 0.5'), encoding='utf-8')
     line = refusal('fit', copy, '--out', tmp_path / 'out')
-    assert 'session.yaml: marker_std_m: 0.5 m is no marker on a tool' in line
-    assert 'write 0.5e-3' in line
+    assert 'session.yaml: marker_std_m is 0.5; it must be from 0 to 0.4 m' in line
+    assert 'if millimetres were meant, write 0.0005; 0.3 where nothing is known' in line
 
 
 def test_ten_degrees_are_not_simulated(tmp_path: Path) -> None:
@@ -88,7 +93,7 @@ def test_ten_degrees_are_not_simulated(tmp_path: Path) -> None:
     assert '--offset-std-deg: 10 is more than 2 deg' in line
 
 
-def test_ten_degrees_that_a_fit_finds_are_said_loudly(tmp_path: Path) -> None:
+def test_offsets_of_ten_degrees_lead_to_a_warning(tmp_path: Path) -> None:
     robot = robot_descriptions.ur5e()
     chain = read_chain(robot.urdf, tmp_path, robot.base_link, robot.tip_link)
     rng = np.random.default_rng(3)
@@ -211,7 +216,7 @@ def test_a_robot_that_the_links_do_not_fit_is_named(tmp_path: Path) -> None:
 def test_seven_joints_of_which_the_wrong_one_is_held(
     robot: str, held: str, tmp_path: Path
 ) -> None:
-    """The error says which may be; with one of those there is a session."""
+    """The error lists what is allowed; with one of those there is a session."""
     description = {'panda': robot_descriptions.panda, 'xarm7': robot_descriptions.xarm7}[robot]()
     (tmp_path / 'arm.urdf').write_text(description.urdf, encoding='utf-8')
 

@@ -17,7 +17,7 @@ from remaster_ros.calibration.fit import FitResult, fit_session
 from remaster_ros.calibration.model import predict_in_sensor
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
-from remaster_ros.simulation.session_simulator import SessionTruth
+from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.types import BasePrior, Session
 
 SEEDS = range(100, 112)

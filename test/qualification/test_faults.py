@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from ros_rig import call, wait_until
 
-from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.workcell import read_cell
@@ -155,11 +154,8 @@ def test_one_fault_after_the_other_and_the_run_completes(start, client, tmp_path
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     m = session.measurements
     for index, name in enumerate(session.sensor_names):
-        sensor, mine = truth.sensors[name], m.sensor == index
-        expected = transforms.apply(
-            transforms.inverse(sensor.T_R_N),
-            chain.positions(m.q[mine], sensor.marker, truth.joint_offsets),
-        )
+        mine = m.sensor == index
+        expected = truth.without_noise(chain, name, m.q[mine])
         assert np.linalg.norm(m.position[mine] - expected, axis=1).max() < 0.3e-3
     # Once each; and only the swapped marker cost a reading.
     pairs = list(zip(m.configuration.tolist(), m.sensor.tolist()))

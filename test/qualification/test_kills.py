@@ -62,7 +62,7 @@ def test_killed_nodes_cost_nothing(start, tmp_path):
     demo.communicate(timeout=30)
     rows()
     truth = make_world(tmp_path / 'world', read_cell('demo'), SEED, 20.0).truth
-    result = judge(out, seen, truth.to_dict())
+    result = judge(out, seen, truth)
     assert result['exit_status'] == 'complete'
     assert (result['lost'], result['twice'], result['wrong']) == (0, 0, 0)
     assert result['configurations'] == result['planned_configurations'] > 5

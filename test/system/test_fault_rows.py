@@ -117,7 +117,7 @@ def cells(row, seen):
 
 @pytest.mark.parametrize('row', TRIED, ids=lambda row: f'{row.who}: {row.fault}')
 def test_row(benches, row):
-    """What is commanded must be right every time; what is told, in one of some tries.
+    """The commands must be right every time; the messages, in one of some tries.
 
     Which of several reasons comes first depends on the moment and on how busy the machine is.
     """

@@ -1,4 +1,4 @@
-"""Nodes without the demo around them: whom the arm waits for, and a disk that fills up."""
+"""Nodes without the demo around them: which sensor the arm waits for, and a disk that fills up."""
 
 import resource
 from contextlib import contextmanager
@@ -65,7 +65,7 @@ def test_one_required_sensor_is_enough_and_a_full_disk_is_waited_for(start, clie
 
 @pytest.mark.qualify
 def test_any_sensor_is_enough(start, client, tmp_path):
-    """The bar stops for good in the middle: the tracker alone goes on, and nobody waits."""
+    """The bar stops for good in the middle: the collection goes on with the tracker, at once."""
     cell = Cell(start, client, tmp_path, 'any', ['mocap', 'tracker'])
     cell.until(lambda: int(cell.recorder('observations') or 0) > 1, 'the first configurations')
     inject(tmp_path / 'world', {'mocap': {'off': 1}})
@@ -98,7 +98,7 @@ def test_a_collection_goes_on_where_the_tracker_does_not_see_its_marker(start, c
     cell.check(cell.complete())
 
 
-def test_a_settled_arm_is_read_though_its_pose_is_heard_of_later(start, client, tmp_path):
+def test_a_settled_arm_is_measured_though_its_pose_arrives_later(start, client, tmp_path):
     """Topics overtake each other: /remaster/settled comes before what the planner announced."""
     from geometry_msgs.msg import PointStamped
     from sensor_msgs.msg import JointState

@@ -158,7 +158,7 @@ def test_it_sees_the_beam_break_and_the_reflector_found_again(judge):
     )
 
 
-def test_what_the_fake_does_not_know_it_hears_in_a_packet_it_can_read(judge):
+def test_the_fake_refuses_an_unknown_command_in_a_readable_packet(judge):
     _, _, command = judge
     with pytest.raises(Exception, match='failed with status 2'):
         command.GetAT4xxInfo()

@@ -21,11 +21,11 @@ from optitrack_world import SENSOR, MarkerWorld, eventually, free_port, open_des
 
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.sensors.optitrack import natnetclient_backend
-from remaster_ros.sensors.optitrack.client import NatNetSettings
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
 from remaster_ros.sensors.optitrack.natnetclient_backend import NatNetClientBackend
 from remaster_ros.sensors.optitrack.protocol import natnet as our_natnet
 from remaster_ros.sensors.optitrack.protocol.frames import LabeledMarker
+from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.simulation.optitrack import FakeOptiTrackServer
 from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour
 
@@ -310,7 +310,7 @@ def test_a_fault_of_natnetclient_never_becomes_a_reading(monkeypatch, fault):
     assert client.status().accepted == 0
 
 
-def test_the_natnetclient_backend_says_when_the_package_is_missing(monkeypatch):
+def test_the_natnetclient_backend_reports_a_missing_package(monkeypatch):
     monkeypatch.setitem(sys.modules, 'natnetclient', None)
     with pytest.raises(InputError, match='pip install natnetclient'):
         NatNetClientBackend(NatNetSettings(transport='unicast'), print)

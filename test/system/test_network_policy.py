@@ -78,7 +78,7 @@ def test_the_policy_is_what_the_nodes_use(start, client, tmp_path):
 
 
 @pytest.mark.parametrize('node', NODES)
-def test_nobody_but_the_bridge_may_command(node):
+def test_only_the_bridge_may_command(node):
     commands = ('publish', '/joint_trajectory_controller/joint_trajectory')
     assert (commands in allowed(node)) == (node == 'robot_bridge')
     assert ('publish', '/joint_states') not in allowed(node)

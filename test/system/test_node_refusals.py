@@ -1,4 +1,4 @@
-"""A node that cannot work says so in one line and ends with status 2."""
+"""A node that cannot work ends with one error line and status 2."""
 
 import socket
 import subprocess
@@ -116,7 +116,7 @@ sys.exit(run(Busy, threads=2))
 """
 
 
-def test_a_node_that_ends_while_callbacks_are_queued_says_nothing(ros_environment):
+def test_a_node_that_ends_while_callbacks_are_queued_prints_nothing(ros_environment):
     done = subprocess.run(
         [sys.executable, '-c', QUEUED],
         env=ros_environment,
@@ -141,4 +141,6 @@ def test_a_link_where_the_fakes_meet(start, ros_environment, tmp_path, monkeypat
     assert not list(victim.iterdir())
     (tmp_path / name).unlink()
     (tmp_path / name).mkdir(mode=0o755)
+    # Without it the node would wait for somebody to make it.
+    (tmp_path / name / 'world.yaml').touch()
     assert 'open to other users' in refuse(start, 'fake_optitrack')

@@ -1,4 +1,4 @@
-"""Best-effort joint states are taken; what does not match is said."""
+"""Best-effort joint states are received; a mismatch of the quality of service is reported."""
 
 import pytest
 from ros_rig import node_arguments, wait_until
@@ -42,7 +42,7 @@ def test_joint_states_of_any_driver_are_taken(start, client, said, tmp_path, rel
     wait_until(heard, 60, 'the joint states')
 
 
-def test_a_mismatch_is_said_and_goes_away(start, client, said, tmp_path):
+def test_a_mismatch_is_reported_until_it_ends(start, client, said, tmp_path):
     from geometry_msgs.msg import PointStamped
     from rclpy.qos import QoSProfile, ReliabilityPolicy
 

@@ -1,4 +1,4 @@
-"""The recorder by itself: a test says what the robot, the planner and the sensors would say.
+"""The recorder by itself: a test publishes in place of the robot, the planner and the sensors.
 
 What it writes down of them is then known to the last digit.
 """

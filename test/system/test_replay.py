@@ -17,7 +17,7 @@ NAMES = list(read_cell('demo').chain().joint_names)
 
 @pytest.fixture(params=[pytest.param('old', marks=pytest.mark.qualify), 'new'])
 def bag(request, tmp_path):
-    """Two seconds of an arm and of what it was told, as bags have held it before, and do now."""
+    """Two seconds of an arm and its commands, as older bags hold them and as bags do now."""
     from rclpy.serialization import serialize_message
     from sensor_msgs.msg import JointState
     from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -104,7 +104,7 @@ def test_the_events_of_an_old_bag_are_published_as_records(start, client, tmp_pa
 
 
 @pytest.mark.parametrize('more', [(), ('--with-commands',)])
-def test_a_controller_that_listens_is_never_told(start, client, bag, more):
+def test_a_controller_that_subscribes_receives_no_command(start, client, bag, more):
     from trajectory_msgs.msg import JointTrajectory
 
     heard = []
@@ -116,7 +116,7 @@ def test_a_controller_that_listens_is_never_told(start, client, bag, more):
 
 
 @pytest.mark.qualify
-def test_a_controller_that_comes_later_is_never_told(start, client, old_bag):
+def test_a_controller_that_subscribes_later_receives_no_command(start, client, old_bag):
     """Not one message reaches it: who is matched is looked at before each command."""
     from sensor_msgs.msg import JointState
     from trajectory_msgs.msg import JointTrajectory
@@ -179,7 +179,7 @@ def test_a_recorder_only_listens_and_writes_commands_under_another_name(
 
 @pytest.mark.qualify
 def test_another_namespace_is_another_graph(start, client, old_bag):
-    """A robot in /left does not keep a replay in /right from playing, nor hears it."""
+    """A robot in /left neither prevents a replay in /right nor receives its messages."""
     from sensor_msgs.msg import JointState
 
     heard = {'left': [], 'right': []}

@@ -24,7 +24,7 @@ def planner(cell, key):
 
 
 def restart(cell, *others):
-    """Kill the planner and others, and start them again; wait for the new planner's word."""
+    """Kill the planner and others and start them again; wait for the new planner's decision."""
     for name in (*others, 'pose_planner'):
         cell.nodes[name].kill()
         cell.nodes[name].wait()
@@ -41,7 +41,7 @@ def restart(cell, *others):
 
 
 def stands(cell, seconds=2.0):
-    """Watch that nothing is commanded, and that nobody but a person can change that."""
+    """Check that nothing is commanded for some seconds and that the planner does not run."""
     commanded = cell.said['robot_bridge']['commanded']
     until = time.monotonic() + seconds
     cell.until(lambda: time.monotonic() > until, 'time')
@@ -60,7 +60,7 @@ def test_a_killed_planner_goes_on_in_its_run(cell):
 
 @pytest.mark.qualify
 @pytest.mark.parametrize('other', ['recorder', 'robot_bridge'])
-def test_it_waits_where_somebody_else_was_started_again(cell, other):
+def test_it_waits_where_another_node_was_started_again(cell, other):
     restart(cell, other)
     assert planner(cell, 'state') == 'idle'
     words = f'/remaster/collect goes on ({other} did not take part in its run)'
@@ -86,7 +86,7 @@ def test_it_waits_after_a_pause_and_whatever_the_files_are_dated(cell):
 
 @pytest.mark.qualify
 def test_a_session_of_another_day_waits(start, cell, tmp_path):
-    """What a killed cell has left, with a plan file dated now: nobody holds its token."""
+    """All nodes were killed, so that none holds the run token; the plan file is dated now."""
     for process in cell.nodes.values():
         process.kill()
         process.wait()
@@ -100,7 +100,7 @@ def test_a_session_of_another_day_waits(start, cell, tmp_path):
 
 
 def test_a_halted_arm_is_not_collected_with(start, client, tmp_path):
-    """The planner alone, with a bridge of the test that says it is halted."""
+    """The planner alone, with a bridge of the test that reports a halt."""
     import rclpy
     from sensor_msgs.msg import JointState
 

@@ -227,7 +227,7 @@ def test_an_emergency_stop_topic_that_is_silent_means_no_motion(bridge):
     assert bench.clear_halt() is True
 
 
-def test_an_arm_in_a_margin_leaves_slowly_and_only_after_a_person_said_so(bridge, tmp_path):
+def test_an_arm_in_a_margin_leaves_slowly_and_only_after_clear_halt(bridge, tmp_path):
     """A box that nearly touches the tool where the arm stands."""
     tool = CHAIN.forward(HOME)[:3, 3]
     obstacle = {'center_m': (tool - np.array([0.0, 0.0, 0.3])).tolist(), 'size_m': [0.2, 0.2, 0.1]}

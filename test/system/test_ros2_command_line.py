@@ -34,7 +34,7 @@ def until(client, condition, timeout_s, what):
 
 @pytest.fixture
 def session_bag(start, client, tmp_path):
-    """Return the bag of a real recorder that heard an arm being commanded and poses announced."""
+    """Return the bag of a real recorder during which an arm was commanded and poses published."""
     from rclpy.qos import QoSProfile
     from sensor_msgs.msg import JointState
     from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint

@@ -67,7 +67,7 @@ def test_an_optimizer_started_again_publishes_the_last_fit(start, client, tmp_pa
     np.testing.assert_allclose(heard[0].position, np.deg2rad([r['mean_deg'] for r in rows]))
 
 
-def test_a_fit_of_no_session_says_why(start, client, tmp_path):
+def test_a_fit_without_a_session_is_refused_with_the_reason(start, client, tmp_path):
     start('remaster_ros.nodes.optimizer', *node_arguments(session=tmp_path / 'none'))
     response = call(client, '/remaster/fit')
     assert not response.success

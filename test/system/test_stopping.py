@@ -93,7 +93,7 @@ def test_while_it_collects(start, tmp_path):
 
 
 def test_a_killed_demo_leaves_no_process(start, tmp_path):
-    """Even SIGKILL: the kernel tells the children that their parent has died."""
+    """Even SIGKILL: the kernel signals the children that their parent has died."""
     out = tmp_path / 'out'
     process = start('remaster_ros.cli.main', 'demo', '--out', out, '--no-figures')
     wait_until(lambda: observations(out / 'session') >= 0, 60, 'the session')

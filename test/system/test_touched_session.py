@@ -1,4 +1,4 @@
-"""Somebody edits, renames or removes the session while real nodes write it: noticed at once."""
+"""The session is edited, renamed or removed while real nodes write it: noticed within seconds."""
 
 import shutil
 import subprocess
@@ -61,7 +61,7 @@ def test_what_an_editor_did_is_undone_and_a_renamed_folder_holds_the_arm(start, 
 
 
 @pytest.mark.qualify
-def test_a_removed_folder_is_said_and_its_observations_come_back(start, client, tmp_path):
+def test_a_removed_folder_is_reported_and_its_observations_are_restored(start, client, tmp_path):
     cell = begun(start, client, tmp_path)
     shutil.rmtree(cell.session)
     cell.until(lambda: 'folder was removed' in cell.messages['recorder'], 'the reason', SOON_S)

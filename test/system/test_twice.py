@@ -1,4 +1,4 @@
-"""The same node twice on one cell: the second says so and ends with status 2."""
+"""The same node twice on one cell: the second ends with an error line and status 2."""
 
 import signal
 import time

@@ -123,7 +123,10 @@ def test_every_import_is_declared(setup_arguments: dict[str, Any]) -> None:
     optional = {normal(line) for line in setup_arguments['extras_require']['natnetclient']}
     root = ElementTree.parse(ROOT / 'package.xml').getroot()
     depends = {element.text for element in root.findall('exec_depend')}
-    for module in imported(ROOT / 'remaster_ros') - WITH_RCLPY:
+    # The launch files alone need these, which come with ROS and not with pip.
+    launch = {'launch', 'launch_ros'}
+    assert 'ros2launch' in depends
+    for module in imported(ROOT / 'remaster_ros') - WITH_RCLPY - launch:
         name = normal(DISTRIBUTION.get(module, module))
         assert name in declared | ros | optional, f'{module} is imported but not required'
         if name in ros:
@@ -135,7 +138,7 @@ def test_package_xml_names_every_requirement_or_how_to_get_it(
 ) -> None:
     """What rosdep cannot install stands in a comment, as one command."""
     text = (ROOT / 'package.xml').read_text(encoding='utf-8')
-    command = re.search(r'pip install -c constraints-ros\.txt ([A-Za-z ]+)', text)
+    command = re.search(r'pip install -c constraints-ros\.txt ([A-Za-z\s-]+)', text)
     assert command is not None
     by_pip = {normal(name) for name in command[1].split()}
     depends = {
@@ -149,7 +152,7 @@ def test_package_xml_names_every_requirement_or_how_to_get_it(
     assert by_pip | by_rosdep == required
     assert not by_pip & by_rosdep
     checks = (ROOT / 'test' / 'conftest.py').read_text(encoding='utf-8')
-    assert {normal(n) for n in re.findall(r"^    '(\w+)': '\w+',$", checks, re.M)} == by_pip
+    assert {normal(n) for n in re.findall(r"^    '([\w-]+)': '\w+',$", checks, re.M)} == by_pip
 
 
 BLOCKER = """
@@ -183,12 +186,12 @@ def collected(modules: set[str], folder: Path) -> subprocess.CompletedProcess[st
 
 def test_without_the_judges_the_other_tests_are_collected(tmp_path: Path) -> None:
     """Another's program that judges is not there on every machine; it must not stop the rest."""
-    judges = {'pinocchio', 'mcap_ros2', 'arviz_stats', 'NatNetClient', 'natnet', 'CESAPI'}
+    judges = {'pinocchio', 'mcap_ros2', 'NatNetClient', 'natnet', 'CESAPI'}
     done = collected(judges, tmp_path)
     for judge in judges:
         assert f"No module named '{judge}" not in done.stdout
     assert 'needs the judge: pip install pin' in done.stdout
-    assert 'test_robots.py::test_names_and_masses' in done.stdout
+    assert 'test_robots.py::test_names_masses_and_limits' in done.stdout
 
 
 def test_without_a_requirement_one_line_says_how_to_get_it(tmp_path: Path) -> None:

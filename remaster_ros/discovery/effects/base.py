@@ -6,9 +6,10 @@ The true joint angle is the reported one plus the zero-offset plus effects at th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -18,14 +19,7 @@ from remaster_ros.types import FloatArray
 Place = Literal[
     'joint_angle', 'link_translation', 'link_rotation', 'base_rotation', 'marker', 'sensor_frame'
 ]
-PLACES: tuple[Place, ...] = (
-    'joint_angle',
-    'link_translation',
-    'link_rotation',
-    'base_rotation',
-    'marker',
-    'sensor_frame',
-)
+PLACES: tuple[Place, ...] = get_args(Place)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,19 +70,19 @@ class Cell:
     penalty
         For free forms: precision of the parameters, (m, m), up to the smoothness; None else.
     variant
-        Tells cells of the same name and joints apart: the order of a harmonic, an axis.
+        Distinguishes cells of the same name and joints: the order of a harmonic, an axis.
     subject
         The sensor or marker it is about; '' where it is about joints or the whole arm.
     """
 
     name: str
-    joints: tuple[int, ...]
     place: Place
     driver: str
     form: str
     parameters: tuple[str, ...]
     unit: str
     columns: Callable[[Context], Design]
+    joints: tuple[int, ...] = ()
     drawn_from: int = 1
     penalty: FloatArray | None = None
     variant: str = ''
@@ -101,7 +95,7 @@ class Cell:
 
     @property
     def key(self) -> tuple[str, tuple[int, ...], str, str, str, str]:
-        """What makes this cell another than the others."""
+        """What distinguishes this cell from all others."""
         return self.name, self.joints, self.place, self.driver, self.form, self.label
 
     @property
@@ -112,7 +106,7 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """A physical cause with a name: everything that the program knows of it.
+    """A physical cause with a name: everything that the program needs to find and explain it.
 
     Attributes
     ----------
@@ -130,11 +124,11 @@ class Effect:
         For a technician; ``{subject}`` (its joints or sensor), ``{other}`` (the joint that
         drives) and ``{driver}`` are filled in.
     separate_by
-        Which measurements tell it from others.
+        Which measurements distinguish it from others.
     cells
         All of its cells for a context.
     needs
-        Tells why a context cannot show it; '' where it can.
+        Returns why a context cannot show it; '' where it can.
     family
         Effects of one family strike all joints or links alike: they are tried together, too, and
         share their prior probability. '' for an effect that comes alone.
@@ -172,30 +166,45 @@ class Effect:
     driven_by_joint: bool = False
 
     def cell(
-        self,
-        *,
-        columns: Callable[[Context], Design],
-        parameters: tuple[str, ...],
-        joints: tuple[int, ...] = (),
-        **more: Any,
+        self, columns: Callable[[Context], Design], parameters: Iterable[str], **more: Any
     ) -> Cell:
-        """Return a cell of this effect; see `Cell` for the arguments."""
-        return Cell(
-            name=self.name,
-            place=self.place,
-            driver=self.driver,
-            form=self.form,
-            unit=self.unit,
-            columns=columns,
-            parameters=parameters,
-            joints=joints,
-            **more,
-        )
+        """Return a cell of this effect; ``more`` are further arguments of `Cell`."""
+        own = {name: getattr(self, name) for name in ('name', 'place', 'driver', 'form', 'unit')}
+        return Cell(columns=columns, parameters=tuple(parameters), **{**own, **more})
+
+    def at_joints(
+        self,
+        joints: Iterable[int],
+        features: Callable[[Context, int], Sequence[FloatArray]],
+        parameters: Sequence[str],
+        **more: Any,
+    ) -> Iterator[Cell]:
+        """Give a cell for each of some joints (1-based), which adds to that joint's angle.
+
+        Parameters
+        ----------
+        joints
+            Which.
+        features
+            Context and joint to m added angles, rad per unit, (n,) each.
+        parameters
+            Names of the m parameters, with ``{joint}`` for the joint.
+        more
+            Further arguments of `Cell`.
+        """
+        for joint in joints:
+            yield self.cell(
+                partial(_added, joint=joint, features=features),
+                [name.format(joint=joint) for name in parameters],
+                joints=(joint,),
+                **more,
+            )
 
 
-def at_joint(joint: int, *features: FloatArray) -> Design:
-    """Return columns that add features (n,) to the angle of a joint (1-based)."""
-    return Design(joint - 1, np.stack(features, axis=-1))
+def _added(
+    context: Context, joint: int, features: Callable[[Context, int], Sequence[FloatArray]]
+) -> Design:
+    return Design(joint - 1, np.stack(features(context, joint), axis=-1))
 
 
 def displaced(*shifts: FloatArray) -> Design:
@@ -209,15 +218,15 @@ def turned(context: Context, axes: Sequence[FloatArray], about: FloatArray) -> D
 
 
 def needs_gravity(context: Context) -> str:
-    """Say why gravity's effects cannot be tested; '' where they can."""
+    """Return why gravity's effects cannot be tested; '' where they can."""
     return '' if context.has_gravity else 'the URDF has no link masses, so gravity is unknown'
 
 
 def needs_approach(context: Context) -> str:
-    """Say why approach and last move cannot be tested; '' where they can."""
+    """Return why approach and last move cannot be tested; '' where they can."""
     return '' if context.has_approach else 'where the arm came from (from_q) is not recorded'
 
 
 def needs_time(context: Context) -> str:
-    """Say why drift cannot be tested; '' where it can."""
+    """Return why drift cannot be tested; '' where it can."""
     return '' if context.has_time else 'all rows have the same time'

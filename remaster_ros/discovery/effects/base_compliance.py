@@ -3,34 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, needs_gravity, turned
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.types import FloatArray
 
 
 def cells(context: Context) -> Iterator[Cell]:
     """One compliance for all directions, or one about each horizontal axis."""
-
-    def isotropic(context: Context) -> Design:
-        return turned(context, [context.base_moment], np.zeros(3))
-
-    def by_axis(context: Context) -> Design:
-        axes = [context.base_moment * unit for unit in np.eye(3)[:2]]
-        return turned(context, axes, np.zeros(3))
-
-    for variant, columns, parameters in (
-        ('isotropic', isotropic, ('base_compliance',)),
-        ('by axis', by_axis, ('base_compliance_x', 'base_compliance_y')),
+    x, y, z = np.eye(3)
+    for variant, axes, parameters in (
+        ('isotropic', [x + y + z], ['base_compliance']),
+        ('by axis', [x, y], ['base_compliance_x', 'base_compliance_y']),
     ):
-        yield EFFECT.cell(
-            joints=(),
-            parameters=parameters,
-            columns=columns,
-            drawn_from=2,
-            variant=variant,
-        )
+        yield EFFECT.cell(partial(_tipped, axes=axes), parameters, drawn_from=2, variant=variant)
+
+
+def _tipped(context: Context, axes: list[FloatArray]) -> Design:
+    return turned(context, [context.base_moment * axis for axis in axes], np.zeros(3))
 
 
 EFFECT = Effect(

@@ -27,7 +27,7 @@ BLOCK_ROWS = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """The rows of a session as effects see them: n rows, k joints.
+    """What effects may depend on: n rows, k joints.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ class Context:
 
     @cached_property
     def has_gravity(self) -> bool:
-        """Does the URDF have link masses?"""
+        """Whether the URDF has link masses."""
         return self.chain.has_inertials
 
     @cached_property
@@ -144,7 +144,7 @@ class Context:
 
     @cached_property
     def has_approach(self) -> bool:
-        """Is it known where the arm came from?"""
+        """Whether it is recorded where the arm came from."""
         known = np.all(np.isfinite(self.measurements.from_q), axis=1)
         return bool(len(known) and np.mean(known) >= KNOWN_SHARE)
 
@@ -155,12 +155,12 @@ class Context:
 
     @cached_property
     def has_time(self) -> bool:
-        """Do the rows lie apart in time?"""
+        """Whether the rows lie apart in time."""
         return bool(np.ptp(self.elapsed_s) > 0.0)
 
     @cached_property
     def warming(self) -> FloatArray:
-        """Temperature above that of the first row that knows one, K, (n,); 0 where unknown."""
+        """Temperature above the first known one, K, (n,); 0 where unknown."""
         given = self.measurements.temperature_c
         known = np.isfinite(given)
         if not known.any():
@@ -170,7 +170,7 @@ class Context:
 
     @cached_property
     def has_temperature(self) -> bool:
-        """Is the temperature known, and does it vary?"""
+        """Whether the temperature is known and varies."""
         known = np.isfinite(self.measurements.temperature_c)
         return bool(np.mean(known) >= KNOWN_SHARE and np.ptp(self.warming) >= LEAST_WARMING_K)
 
@@ -187,11 +187,11 @@ class Context:
 
     @cached_property
     def centers(self) -> FloatArray:
-        """Mean of the modelled markers that each sensor saw, in R, m, (sensors, 3)."""
+        """Mean of the modelled markers of each sensor's rows, in R, m, (sensors, 3)."""
         points = self.chain.positions(
             self.measurements.q, self.markers[self.marker], self.joint_offsets
         )
-        # A sensor without rows has no cell that asks for its centre.
+        # No cell uses the centre of a sensor without rows.
         seen = [points[self.seen_by(sensor)] for sensor in range(len(self.sensor_names))]
         return np.array([rows.mean(axis=0) if len(rows) else np.zeros(3) for rows in seen])
 
@@ -206,7 +206,7 @@ class Context:
         Every value is that which the row has here, also where it depends on other rows: time
         since the first row, the move before, a sensor's centre.
         """
-        return PartOfScene(
+        return PartOfContext(
             self.chain,
             self.measurements.select(rows),
             self.sensor_names,
@@ -257,7 +257,7 @@ class Context:
 
 
 @dataclass(frozen=True, eq=False)
-class PartOfScene(Context):
+class PartOfContext(Context):
     """Some rows of a context; what depends on more than a row itself is that of the whole.
 
     Attributes
@@ -291,7 +291,7 @@ class PartOfScene(Context):
 
     @cached_property
     def warming(self) -> FloatArray:
-        """Temperature above that of the whole's first row that knows one, K, (n,)."""
+        """Temperature above the first known one of the whole, K, (n,)."""
         return self.whole.warming[self.rows]
 
     @cached_property

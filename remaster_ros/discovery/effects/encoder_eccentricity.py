@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, at_joint
+from remaster_ros.discovery.effects.base import Cell, Effect
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.types import FloatArray
 
 # Orders tried together: the disc off centre, the disc or its bearing oval, both.
 ORDERS = ((1,), (2,), (1, 2))
@@ -15,25 +17,19 @@ ORDERS = ((1,), (2,), (1, 2))
 
 def cells(context: Context) -> Iterator[Cell]:
     """Sine and cosine of the joint's own angle."""
-    for joint in context.moving:
-        for orders in ORDERS:
+    for orders in ORDERS:
+        yield from EFFECT.at_joints(
+            context.moving,
+            partial(_waves, orders=orders),
+            [f'{wave}{order}_{{joint}}' for order in orders for wave in ('sin', 'cos')],
+            drawn_from=context.joints * len(ORDERS),
+            variant='+'.join(map(str, orders)),
+        )
 
-            def columns(
-                context: Context, joint: int = joint, orders: tuple[int, ...] = orders
-            ) -> Design:
-                angle = context.measurements.q[:, joint - 1]
-                waves = [wave(order * angle) for order in orders for wave in (np.sin, np.cos)]
-                return at_joint(joint, *waves)
 
-            yield EFFECT.cell(
-                joints=(joint,),
-                parameters=tuple(
-                    f'{wave}{order}_{joint}' for order in orders for wave in ('sin', 'cos')
-                ),
-                columns=columns,
-                drawn_from=context.joints * len(ORDERS),
-                variant='+'.join(map(str, orders)),
-            )
+def _waves(context: Context, joint: int, orders: tuple[int, ...]) -> list[FloatArray]:
+    angle = context.measurements.q[:, joint - 1]
+    return [wave(order * angle) for order in orders for wave in (np.sin, np.cos)]
 
 
 EFFECT = Effect(

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, at_joint
+from remaster_ros.discovery.effects.base import Cell, Effect
 from remaster_ros.discovery.effects.context import Context
 
 
 def cells(context: Context) -> Iterator[Cell]:
     """One cell per joint: δq_j = s_j q_j."""
-    for joint in context.moving:
-
-        def columns(context: Context, joint: int = joint) -> Design:
-            return at_joint(joint, context.measurements.q[:, joint - 1])
-
-        yield EFFECT.cell(
-            joints=(joint,),
-            parameters=(f'scale_{joint}',),
-            columns=columns,
-            drawn_from=context.joints,
-        )
+    return EFFECT.at_joints(
+        context.moving,
+        lambda context, joint: [context.measurements.q[:, joint - 1]],
+        ['scale_{joint}'],
+        drawn_from=context.joints,
+    )
 
 
 EFFECT = Effect(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, at_joint
+from remaster_ros.discovery.effects.base import Cell, Effect
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.types import FloatArray
 
 # Lower orders are the encoder's. Twice the ratio of a 200:1 harmonic drive is the highest known.
 LOWEST_ORDER = 3
@@ -15,23 +17,22 @@ HIGHEST_ORDER = 400
 
 
 def cells(context: Context) -> Iterator[Cell]:
-    """Sine and cosine at every whole order that the rows are enough to tell."""
+    """Sine and cosine at every whole order that the number of rows allows."""
     highest = int(min(HIGHEST_ORDER, 4 * len(context)))
     orders = range(LOWEST_ORDER, highest + 1)
-    for joint in context.moving:
-        for order in orders:
+    for order in orders:
+        yield from EFFECT.at_joints(
+            context.moving,
+            partial(_waves, order=order),
+            [f'sin{order}_{{joint}}', f'cos{order}_{{joint}}'],
+            drawn_from=context.joints * len(orders),
+            variant=str(order),
+        )
 
-            def columns(context: Context, joint: int = joint, order: int = order) -> Design:
-                phase = order * context.measurements.q[:, joint - 1]
-                return at_joint(joint, np.sin(phase), np.cos(phase))
 
-            yield EFFECT.cell(
-                joints=(joint,),
-                parameters=(f'sin{order}_{joint}', f'cos{order}_{joint}'),
-                columns=columns,
-                drawn_from=context.joints * len(orders),
-                variant=str(order),
-            )
+def _waves(context: Context, joint: int, order: int) -> list[FloatArray]:
+    phase = order * context.measurements.q[:, joint - 1]
+    return [np.sin(phase), np.cos(phase)]
 
 
 EFFECT = Effect(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -21,26 +22,19 @@ def cells(context: Context) -> Iterator[Cell]:
         directions = tilt_directions(context, joint)
         # A tilt has any direction; on a whole arm some of them are other names for a link's.
         for axes in (''.join(directions), *directions):
-
-            def columns(
-                context: Context,
-                joint: int = joint,
-                chosen: tuple[FloatArray, ...] = tuple(directions[axis] for axis in axes),
-            ) -> Design:
-                fixed = context.chain.T_fixed[joint - 1][:3, :3]
-                turn = context.link_rotation(joint - 1) @ fixed
-                return turned(
-                    context, [turn @ axis for axis in chosen], context.joint_origin(joint)
-                )
-
+            rarity = 1 if len(axes) > 1 else RARITY * len(directions)
             yield EFFECT.cell(
+                partial(_tilted, joint=joint, axes=[directions[axis] for axis in axes]),
+                [f'tilt_{axis}_{joint}' for axis in axes],
                 joints=(joint,),
-                parameters=tuple(f'tilt_{axis}_{joint}' for axis in axes),
-                columns=columns,
-                drawn_from=(context.joints - 1)
-                * (1 if len(axes) > 1 else RARITY * len(directions)),
+                drawn_from=(context.joints - 1) * rarity,
                 variant=axes,
             )
+
+
+def _tilted(context: Context, joint: int, axes: list[FloatArray]) -> Design:
+    turn = context.link_rotation(joint - 1) @ context.chain.T_fixed[joint - 1][:3, :3]
+    return turned(context, [turn @ axis for axis in axes], context.joint_origin(joint))
 
 
 def tilt_directions(context: Context, joint: int) -> dict[str, FloatArray]:

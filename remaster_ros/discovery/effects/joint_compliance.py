@@ -4,29 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from remaster_ros.discovery.effects.base import (
-    Cell,
-    Design,
-    Effect,
-    at_joint,
-    needs_gravity,
-)
+from remaster_ros.discovery.effects.base import Cell, Effect, needs_gravity
 from remaster_ros.discovery.effects.context import Context
 
 
 def cells(context: Context) -> Iterator[Cell]:
     """One cell per joint: δq_j = c_j τ_j."""
-    for joint in range(1, context.joints + 1):
-
-        def columns(context: Context, joint: int = joint) -> Design:
-            return at_joint(joint, context.gravity_torque[:, joint - 1])
-
-        yield EFFECT.cell(
-            joints=(joint,),
-            parameters=(f'compliance_{joint}',),
-            columns=columns,
-            drawn_from=context.joints,
-        )
+    return EFFECT.at_joints(
+        range(1, context.joints + 1),
+        lambda context, joint: [context.gravity_torque[:, joint - 1]],
+        ['compliance_{joint}'],
+        drawn_from=context.joints,
+    )
 
 
 EFFECT = Effect(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, at_joint
+from remaster_ros.discovery.effects.base import Cell, Design, Effect
 from remaster_ros.discovery.effects.context import Context
 
 
@@ -17,30 +18,26 @@ def cells(context: Context) -> Iterator[Cell]:
         for other in context.moving:
             if other == joint:
                 continue
-
-            def linear(context: Context, joint: int = joint, other: int = other) -> Design:
-                return at_joint(joint, context.measurements.q[:, other - 1])
-
-            def waves(context: Context, joint: int = joint, other: int = other) -> Design:
-                angle = context.measurements.q[:, other - 1]
-                return at_joint(joint, np.sin(angle), np.cos(angle))
-
             pair = f'{joint}_by_{other}'
-            for form, columns, parameters in (
-                ('linear', linear, (f'coupling_{pair}',)),
-                ('sin/cos', waves, (f'sin_{pair}', f'cos_{pair}')),
+            for form, unit, parameters in (
+                ('linear', 'rad/rad', [f'coupling_{pair}']),
+                ('sin/cos', 'rad', [f'sin_{pair}', f'cos_{pair}']),
             ):
-                yield Cell(
-                    name=EFFECT.name,
+                yield EFFECT.cell(
+                    partial(_followed, joint=joint, other=other, form=form),
+                    parameters,
                     joints=(joint, other),
-                    place=EFFECT.place,
                     driver=f'angle_of_joint_{other}',
                     form=form,
-                    parameters=parameters,
-                    unit='rad/rad' if form == 'linear' else 'rad',
-                    columns=columns,
+                    unit=unit,
                     drawn_from=count,
                 )
+
+
+def _followed(context: Context, joint: int, other: int, form: str) -> Design:
+    angle = context.measurements.q[:, other - 1]
+    features = [angle] if form == 'linear' else [np.sin(angle), np.cos(angle)]
+    return Design(joint - 1, np.stack(features, axis=-1))
 
 
 EFFECT = Effect(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -33,18 +34,17 @@ def cells(context: Context) -> Iterator[Cell]:
     for joint in context.moving:
         knots = knots_of(context, joint)
         angles = np.degrees(centers(knots))
-
-        def columns(context: Context, joint: int = joint, knots: FloatArray = knots) -> Design:
-            values = basis(context.measurements.q[:, joint - 1], knots)
-            return Design(joint - 1, values)
-
         yield EFFECT.cell(
+            partial(_splines, joint=joint, knots=knots),
+            [f'curve_{joint}_at_{angle:+.1f}deg' for angle in angles],
             joints=(joint,),
-            parameters=tuple(f'curve_{joint}_at_{angle:+.1f}deg' for angle in angles),
-            columns=columns,
             drawn_from=RARITY * context.joints,
             penalty=roughness(len(angles)),
         )
+
+
+def _splines(context: Context, joint: int, knots: FloatArray) -> Design:
+    return Design(joint - 1, basis(context.measurements.q[:, joint - 1], knots))
 
 
 EFFECT = Effect(

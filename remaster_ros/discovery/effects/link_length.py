@@ -1,8 +1,9 @@
-"""Link length: a joint's axis lies elsewhere on the link before it than the drawing says."""
+"""Link length: a joint's axis lies elsewhere on the link before it than drawn."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -16,19 +17,17 @@ def cells(context: Context) -> Iterator[Cell]:
     for link in context.links():
         directions = link_directions(context, link)
         for axis, direction in directions.items():
-
-            def columns(
-                context: Context, link: int = link, direction: FloatArray = direction
-            ) -> Design:
-                return displaced(context.link_rotation(link) @ direction)
-
             yield EFFECT.cell(
+                partial(_shifted, link=link, direction=direction),
+                [f'length_{link}' if axis == 'along' else f'offset_{axis}_{link}'],
                 joints=(link,),
-                parameters=(f'length_{link}' if axis == 'along' else f'offset_{axis}_{link}',),
-                columns=columns,
                 drawn_from=len(context.links()) * len(directions),
                 variant=axis,
             )
+
+
+def _shifted(context: Context, link: int, direction: FloatArray) -> Design:
+    return displaced(context.link_rotation(link) @ direction)
 
 
 def link_directions(context: Context, link: int) -> dict[str, FloatArray]:

@@ -1,8 +1,9 @@
-"""Marker offset: the marker is not where the session says it is on the tool."""
+"""Marker offset: the marker is not at its stated place on the tool."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
@@ -12,22 +13,20 @@ def cells(context: Context) -> Iterator[Cell]:
     """Each marker, along the axes of the tool frame.
 
     The offsets model fits the markers already: this cell is judged by how far the fit moved them,
-    against how well the session claims to know them.
+    against their stated accuracy.
     """
     for index, name in enumerate(context.marker_names):
-
-        def columns(context: Context, index: int = index) -> Design:
-            mine = (context.marker == index)[:, None]
-            turn = context.tool[:, :3, :3]
-            return displaced(*(turn[:, :, axis] * mine for axis in range(3)))
-
         yield EFFECT.cell(
-            joints=(),
-            parameters=tuple(f'{axis}_{name}' for axis in 'xyz'),
-            columns=columns,
+            partial(_moved, marker=index),
+            [f'{axis}_{name}' for axis in 'xyz'],
             drawn_from=len(context.marker_names),
             subject=name,
         )
+
+
+def _moved(context: Context, marker: int) -> Design:
+    mine = (context.marker == marker)[:, None]
+    return displaced(*(context.tool[:, :3, axis] * mine for axis in range(3)))
 
 
 EFFECT = Effect(
@@ -39,7 +38,7 @@ EFFECT = Effect(
     source='eq. 8 of Van Wyk et al. with the marker as a parameter',
     unit='m',
     plausible=(1e-5, 2e-2),
-    sentence='The marker {subject} is not where the session says it is on the tool.',
+    sentence='The marker {subject} is not at its stated place on the tool.',
     separate_by='the marker measured against the tool plate, or the last joint turned by itself',
     cells=cells,
     moves_the_fit=True,

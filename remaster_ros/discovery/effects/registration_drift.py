@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -13,35 +14,27 @@ from remaster_ros.discovery.effects.context import Context
 def cells(context: Context) -> Iterator[Cell]:
     """Each sensor's frame shifts steadily, or shifts and turns."""
     for index, name in enumerate(context.sensor_names):
-
-        def shift(context: Context, index: int = index) -> Design:
-            amount = (context.elapsed_s * context.seen_by(index))[:, None]
-            return displaced(*(amount * context.sensor_turn[:, :, axis] for axis in range(3)))
-
-        def motion(context: Context, index: int = index) -> Design:
-            mine = context.seen_by(index)
-            amount = (context.elapsed_s * mine)[:, None]
-            arms = context.points - context.centers[index]
-            axes = [context.sensor_turn[:, :, axis] for axis in range(3)]
-            shifts = [amount * axis for axis in axes]
-            # A turn seen at one metre, which has the unit of the shifts.
-            turns = [amount * np.cross(axis, arms) for axis in axes]
-            return displaced(*shifts, *turns)
-
-        shifts = tuple(f'drift_{axis}_{name}' for axis in 'xyz')
-        turns = tuple(f'drift_r{axis}_{name}' for axis in 'xyz')
-        for variant, columns, parameters in (
-            ('shift', shift, shifts),
-            ('shift and turn', motion, shifts + turns),
-        ):
+        shifts = [f'drift_{axis}_{name}' for axis in 'xyz']
+        turns = [f'drift_r{axis}_{name}' for axis in 'xyz']
+        for variant, parameters in (('shift', shifts), ('shift and turn', shifts + turns)):
             yield EFFECT.cell(
-                joints=(),
-                parameters=parameters,
-                columns=columns,
+                partial(_crept, sensor=index, turning=parameters != shifts),
+                parameters,
                 drawn_from=2 * len(context.sensor_names),
                 variant=variant,
                 subject=name,
             )
+
+
+def _crept(context: Context, sensor: int, turning: bool) -> Design:
+    amount = (context.elapsed_s * context.seen_by(sensor))[:, None]
+    axes = [context.sensor_turn[:, :, axis] for axis in range(3)]
+    shifts = [amount * axis for axis in axes]
+    if turning:
+        # A turn seen at one metre, which has the unit of the shifts.
+        arms = context.points - context.centers[sensor]
+        shifts += [amount * np.cross(axis, arms) for axis in axes]
+    return displaced(*shifts)
 
 
 EFFECT = Effect(

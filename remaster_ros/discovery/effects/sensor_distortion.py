@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -10,40 +11,42 @@ from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.types import FloatArray
 
-# No lens bends lengths about the sensor's origin, and over most rooms it looks like a plain scale.
+# No lens distorts lengths about the sensor's origin, and in most rooms it resembles a scale.
 SPHERE_RARITY = 20
+# Name, form, unit, and axes where it has a parameter for each.
+VARIANTS = (
+    ('radial', 'radial', '1/m^2', ''),
+    ('radial angle', 'radial', 'm/m', ''),
+    ('radial sphere', 'radial', '1/m^2', ''),
+    ('quadratic', 'quadratic', '1/m', 'xyz'),
+)
 
 
 def cells(context: Context) -> Iterator[Cell]:
     """Each sensor: radial about its z axis, in metres or in field angle, or about its origin."""
     for index, name in enumerate(context.sensor_names):
-        for variant in ('radial', 'radial angle', 'radial sphere', 'quadratic'):
-
-            def columns(context: Context, index: int = index, variant: str = variant) -> Design:
-                mine = context.seen_by(index)[:, None]
-                shifts = [
-                    np.einsum('nij,nj->ni', context.sensor_turn, shift * mine)
-                    for shift in distortions(context.in_sensor, variant)
-                ]
-                return displaced(*shifts)
-
-            axes = 'xyz' if variant == 'quadratic' else ''
+        for variant, form, unit, axes in VARIANTS:
             kind = variant.replace(' ', '_')
-            yield Cell(
-                name=EFFECT.name,
-                joints=(),
-                place=EFFECT.place,
-                driver=EFFECT.driver,
-                form='quadratic' if axes else 'radial',
-                parameters=tuple(f'{kind}_{axis}_{name}' for axis in axes) or (f'{kind}_{name}',),
-                unit='1/m' if axes else ('m/m' if 'angle' in variant else '1/m^2'),
-                columns=columns,
-                drawn_from=4
-                * len(context.sensor_names)
-                * (SPHERE_RARITY if variant == 'radial sphere' else 1),
+            rarity = SPHERE_RARITY if variant == 'radial sphere' else 1
+            yield EFFECT.cell(
+                partial(_bent, sensor=index, variant=variant),
+                [f'{kind}_{axis}_{name}' for axis in axes] or [f'{kind}_{name}'],
+                form=form,
+                unit=unit,
+                drawn_from=len(VARIANTS) * len(context.sensor_names) * rarity,
                 variant=variant,
                 subject=name,
             )
+
+
+def _bent(context: Context, sensor: int, variant: str) -> Design:
+    mine = context.seen_by(sensor)[:, None]
+    return displaced(
+        *(
+            np.einsum('nij,nj->ni', context.sensor_turn, shift * mine)
+            for shift in distortions(context.in_sensor, variant)
+        )
+    )
 
 
 def distortions(p: FloatArray, variant: str) -> list[FloatArray]:

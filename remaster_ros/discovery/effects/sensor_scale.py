@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -13,34 +14,30 @@ from remaster_ros.types import FloatArray
 
 def cells(context: Context) -> Iterator[Cell]:
     """Each sensor: one scale, one along its z axis (depth), or one per axis."""
+    x, y, z = np.eye(3)
     for index, name in enumerate(context.sensor_names):
-
-        def stretch(context: Context, along: FloatArray, index: int = index) -> FloatArray:
-            stretched = (context.in_sensor * along) * context.seen_by(index)[:, None]
-            return np.einsum('nij,nj->ni', context.sensor_turn, stretched)
-
-        def isotropic(context: Context, stretch=stretch) -> Design:  # type: ignore[no-untyped-def]
-            return displaced(stretch(context, np.ones(3)))
-
-        def depth(context: Context, stretch=stretch) -> Design:  # type: ignore[no-untyped-def]
-            return displaced(stretch(context, np.eye(3)[2]))
-
-        def by_axis(context: Context, stretch=stretch) -> Design:  # type: ignore[no-untyped-def]
-            return displaced(*(stretch(context, axis) for axis in np.eye(3)))
-
-        for variant, columns, parameters in (
-            ('', isotropic, (f'scale_{name}',)),
-            ('depth', depth, (f'scale_z_{name}',)),
-            ('by axis', by_axis, tuple(f'scale_{axis}_{name}' for axis in 'xyz')),
+        for variant, directions, parameters in (
+            ('', [x + y + z], [f'scale_{name}']),
+            ('depth', [z], [f'scale_z_{name}']),
+            ('by axis', [x, y, z], [f'scale_{axis}_{name}' for axis in 'xyz']),
         ):
             yield EFFECT.cell(
-                joints=(),
-                parameters=parameters,
-                columns=columns,
+                partial(_stretched, sensor=index, directions=directions),
+                parameters,
                 drawn_from=3 * len(context.sensor_names),
                 variant=variant,
                 subject=name,
             )
+
+
+def _stretched(context: Context, sensor: int, directions: list[FloatArray]) -> Design:
+    mine = context.seen_by(sensor)[:, None]
+    return displaced(
+        *(
+            np.einsum('nij,nj->ni', context.sensor_turn, context.in_sensor * along * mine)
+            for along in directions
+        )
+    )
 
 
 EFFECT = Effect(

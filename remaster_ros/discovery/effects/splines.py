@@ -1,7 +1,7 @@
 """Free forms: cubic B-splines of a driver with a roughness penalty (P-splines).
 
 Eilers & Marx 1996, Statistical Science 11. The penalty is a Gaussian prior up to one factor, the
-smoothness, which the evidence decides; see `discovery_evidence`.
+smoothness, which the evidence decides; see `discovery.evidence`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from scipy.interpolate import BSpline
 from remaster_ros.types import FloatArray
 
 DEGREE = 3
-# Keeps the straight line, which the roughness does not see, of a finite size.
+# Keeps the straight line, which the roughness leaves free, of a finite size.
 RIDGE = 1e-3
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.drivers import Driver, slow_drivers
 from remaster_ros.types import FloatArray
 
 # Growth with time is rarer by so much where the temperature is recorded.
@@ -16,37 +18,27 @@ BESIDE_TEMPERATURE = 50
 
 def cells(context: Context) -> Iterator[Cell]:
     """The whole arm, and each link, in proportion to warming and to time."""
-    drivers = {}
-    if context.has_temperature:
-        drivers['temperature'] = '1/K'
-    if context.has_time:
-        drivers['time'] = '1/s'
     arm: tuple[int, ...] = ()
     parts = [arm, *((link,) for link in context.links() if _has_length(context, link))]
-    for driver, unit in drivers.items():
+    for driver in slow_drivers(context):
         for joints in parts:
-
-            def columns(
-                context: Context, driver: str = driver, joints: tuple[int, ...] = joints
-            ) -> Design:
-                amount = context.warming if driver == 'temperature' else context.elapsed_s
-                links = joints or tuple(range(context.joints + 1))
-                return displaced(amount[:, None] * sum(link_vector(context, j) for j in links))
-
-            yield Cell(
-                name=EFFECT.name,
+            # The whole arm first: that one link alone grows is rare. And where the temperature
+            # is known, what time explains beyond it is hardly growth.
+            beside = driver.name == 'time' and context.has_temperature
+            yield EFFECT.cell(
+                partial(_grown, driver=driver, joints=joints),
+                [f'growth_{joints[0]}' if joints else 'growth'],
                 joints=joints,
-                place=EFFECT.place,
-                driver=driver,
-                form=EFFECT.form,
-                parameters=(f'growth_{joints[0]}' if joints else 'growth',),
-                unit=unit,
-                columns=columns,
-                # The whole arm first: that one link alone grows is rare. And where the
-                # temperature is known, what time explains beyond it is hardly growth.
-                drawn_from=(2 if not joints else 4 * len(parts))
-                * (BESIDE_TEMPERATURE if driver == 'time' and len(drivers) > 1 else 1),
+                driver=driver.name,
+                unit=f'1/{driver.unit}',
+                drawn_from=(4 * len(parts) if joints else 2)
+                * (BESIDE_TEMPERATURE if beside else 1),
             )
+
+
+def _grown(context: Context, driver: Driver, joints: tuple[int, ...]) -> Design:
+    links = joints or range(context.joints + 1)
+    return displaced(driver.value(context)[:, None] * sum(link_vector(context, j) for j in links))
 
 
 def link_vector(context: Context, link: int) -> FloatArray:
@@ -62,7 +54,7 @@ def _has_length(context: Context, link: int) -> bool:
 
 
 def needs_warming(context: Context) -> str:
-    """Say why growth cannot be tested; '' where it can."""
+    """Return why growth cannot be tested; '' where it can."""
     if context.has_temperature or context.has_time:
         return ''
     return 'neither temperature nor time varies'

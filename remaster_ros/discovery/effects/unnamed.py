@@ -17,6 +17,14 @@ from remaster_ros.discovery.effects.base import (
     turned,
 )
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.drivers import (
+    Driver,
+    angle_of,
+    approach_of,
+    last_move_of,
+    slow_drivers,
+    torque_of,
+)
 from remaster_ros.discovery.effects.splines import basis, knot_vector, roughness
 from remaster_ros.types import FloatArray
 
@@ -29,15 +37,6 @@ MOMENTS = 24
 Feature = Callable[[Context], FloatArray]
 
 
-@dataclass(frozen=True, eq=False)
-class Driver:
-    """What may drive an error: its name, unit, and value in each row, (n,)."""
-
-    name: str
-    unit: str
-    value: Feature
-
-
 def cells(context: Context) -> Iterator[Cell]:
     """All cells that no named effect has."""
     found = [*_joint_angles(context), *_links(context), *_frames(context)]
@@ -45,28 +44,49 @@ def cells(context: Context) -> Iterator[Cell]:
         yield replace(cell, drawn_from=RARITY * len(found))
 
 
-def _elapsed(context: Context) -> FloatArray:
-    return context.elapsed_s
+@dataclass(frozen=True, eq=False)
+class _Form:
+    """A form of a driver: its m features, (n, m), with suffixes and unit of the parameters."""
+
+    driver: str
+    name: str
+    features: Feature
+    suffixes: tuple[str, ...]
+    unit: str = ''
+    penalty: FloatArray | None = None
+    variant: str = ''
 
 
-def _warming(context: Context) -> FloatArray:
-    return context.warming
+def _forms(context: Context, driver: Driver, *names: str) -> Iterator[_Form]:
+    """Give forms of a driver; none where it hardly varies."""
+    values = driver.value(context)
+    low, high = float(values.min()), float(values.max())
+    if high - low < 1e-9:
+        return
+    for name in names:
+        form = partial(_Form, driver.name, name)
+        if name == 'sin/cos':
+            yield form(partial(_sine_cosine, value=driver.value), ('_sin', '_cos'))
+        elif name == 'free':
+            knots = knot_vector(low, high, (high - low) / FREE_KNOTS)
+            count = len(knots) - 4
+            features = partial(_spline, value=driver.value, knots=knots)
+            suffixes = tuple(f'_{i}' for i in range(count))
+            yield form(features, suffixes, penalty=roughness(count))
+        else:
+            power = 2 if name == 'quadratic' else 1
+            unit = '' if driver.unit == '1' else f'/{driver.unit}' + ('^2' if power == 2 else '')
+            yield form(partial(_power, value=driver.value, power=power), ('',), unit)
 
 
-def _angle(context: Context, joint: int) -> FloatArray:
-    return context.measurements.q[:, joint - 1]
-
-
-def _torque(context: Context, joint: int) -> FloatArray:
-    return context.gravity_torque[:, joint - 1]
-
-
-def _approach(context: Context, joint: int) -> FloatArray:
-    return context.approach[:, joint - 1]
-
-
-def _move(context: Context, joint: int) -> FloatArray:
-    return context.last_move[:, joint - 1]
+def _steps(context: Context) -> Iterator[_Form]:
+    """Give steps at moments spread over the session, between rows."""
+    times = np.unique(context.elapsed_s)
+    if not context.has_time:
+        return
+    for i in np.unique(np.linspace(0, len(times) - 1, MOMENTS + 2).astype(int)[1:-1]):
+        after = partial(_after, moment=float(times[i]))
+        yield _Form('time', 'step', after, ('',), variant=f'{times[i]:.0f} s')
 
 
 def _power(context: Context, value: Feature, power: int) -> FloatArray:
@@ -85,156 +105,83 @@ def _spline(context: Context, value: Feature, knots: FloatArray) -> FloatArray:
     return basis(value(context), knots)
 
 
-def slow_drivers(context: Context) -> list[Driver]:
-    """Return the drivers that change over the session."""
-    found = [Driver('time', 's', _elapsed)] if context.has_time else []
-    return found + ([Driver('temperature', 'K', _warming)] if context.has_temperature else [])
-
-
-@dataclass(frozen=True, eq=False)
-class _Form:
-    """A form of a driver: its m features, (n, m), with suffixes and unit of the parameters."""
-
-    name: str
-    features: Feature
-    suffixes: tuple[str, ...]
-    unit: str
-    penalty: FloatArray | None = None
-    variant: str = ''
-
-
-def _form(context: Context, driver: Driver, name: str) -> _Form | None:
-    """Return a driver's form; None where the driver hardly varies."""
-    values = driver.value(context)
-    low, high = float(values.min()), float(values.max())
-    if high - low < 1e-9:
-        return None
-    if name == 'sin/cos':
-        return _Form(name, partial(_sine_cosine, value=driver.value), ('_sin', '_cos'), '')
-    if name == 'free':
-        knots = knot_vector(low, high, (high - low) / FREE_KNOTS)
-        count = len(knots) - 4
-        suffixes = tuple(f'_{i}' for i in range(count))
-        features = partial(_spline, value=driver.value, knots=knots)
-        return _Form(name, features, suffixes, '', roughness(count))
-    power = 2 if name == 'quadratic' else 1
-    unit = '' if driver.unit == '1' else f'/{driver.unit}' + ('^2' if power == 2 else '')
-    return _Form(name, partial(_power, value=driver.value, power=power), ('',), unit)
-
-
-def _steps(context: Context) -> list[_Form]:
-    """Return steps at moments spread over the session, between rows."""
-    if not context.has_time:
-        return []
-    times = np.unique(context.elapsed_s)
-    chosen = np.unique(np.linspace(0, len(times) - 1, MOMENTS + 2).astype(int)[1:-1])
-    return [
-        _Form(
-            'step', partial(_after, moment=float(times[i])), ('',), '', None, f'{times[i]:.0f} s'
-        )
-        for i in chosen
-    ]
-
-
-def _joint_drivers(context: Context, joint: int) -> Iterator[tuple[Driver, tuple[int, ...], str]]:
-    """Give each driver of a joint's angle with the joints it concerns and the forms tried."""
-    if joint in context.moving:
-        yield Driver('own_angle', 'rad', partial(_angle, joint=joint)), (joint,), 'quadratic'
-    for driver in slow_drivers(context):
-        yield driver, (joint,), 'linear quadratic free'
-    if context.has_gravity:
-        own = Driver('gravity_torque', '(N m)', partial(_torque, joint=joint))
-        yield own, (joint,), 'quadratic free'
-    for other in range(1, context.joints + 1):
-        if other == joint:
-            continue
-        pair = (joint, other)
-        if other in context.moving:
-            angle = Driver(f'angle_of_joint_{other}', 'rad', partial(_angle, joint=other))
-            yield angle, pair, 'quadratic free'
-        if context.has_gravity:
-            name = f'gravity_torque_of_joint_{other}'
-            yield Driver(name, '(N m)', partial(_torque, joint=other)), pair, 'linear'
-        if context.has_approach and other in context.moving:
-            name = f'approach_of_joint_{other}'
-            yield Driver(name, '1', partial(_approach, joint=other)), pair, 'linear'
-            name = f'last_move_of_joint_{other}'
-            yield Driver(name, 'rad', partial(_move, joint=other)), pair, 'linear'
-
-
-def _at(context: Context, joint: int, form: _Form) -> Design:
-    return Design(joint - 1, form.features(context))
-
-
-def _joint_angles(context: Context) -> Iterator[Cell]:
-    """Angles: by own angle squared, by other joints, by torques, over time and temperature."""
-    for joint in range(1, context.joints + 1):
-        forms = [
-            (driver.name, joints, _form(context, driver, name))
-            for driver, joints, names in _joint_drivers(context, joint)
-            for name in names.split()
-        ]
-        forms += [('time', (joint,), step) for step in _steps(context)]
-        for driver_name, joints, form in forms:
-            if form is not None:
-                yield _cell(
-                    'joint_angle',
-                    joints,
-                    driver_name,
-                    form,
-                    (f'joint_{joint}_by_{driver_name}',),
-                    'rad',
-                    partial(_at, joint=joint, form=form),
-                )
-
-
 def _cell(
     place: Place,
-    joints: tuple[int, ...],
-    driver: str,
     form: _Form,
-    stems: tuple[str, ...],
+    stems: list[str],
     unit: str,
     columns: Callable[[Context], Design],
+    joints: tuple[int, ...] = (),
     subject: str = '',
 ) -> Cell:
-    return Cell(
-        name='unnamed',
+    return EFFECT.cell(
+        columns,
+        [f'{stem}{suffix}' for suffix in form.suffixes for stem in stems],
         joints=joints,
         place=place,
-        driver=driver,
+        driver=form.driver,
         form=form.name,
-        parameters=tuple(f'{stem}{suffix}' for suffix in form.suffixes for stem in stems),
         unit=f'{unit}{form.unit}',
-        columns=columns,
         penalty=form.penalty,
         variant=form.variant,
         subject=subject,
     )
 
 
+def _joint_forms(context: Context, joint: int) -> Iterator[tuple[tuple[int, ...], _Form]]:
+    """Give what may drive a joint's angle, with the joints that it concerns."""
+
+    def by(driver: Driver, *names: str) -> Iterator[tuple[tuple[int, ...], _Form]]:
+        joints = (joint,) if driver.joint in (0, joint) else (joint, driver.joint)
+        return ((joints, form) for form in _forms(context, driver, *names))
+
+    if joint in context.moving:
+        yield from by(angle_of(joint), 'quadratic')
+    for driver in slow_drivers(context):
+        yield from by(driver, 'linear', 'quadratic', 'free')
+    if context.has_gravity:
+        yield from by(torque_of(joint), 'quadratic', 'free')
+    for other in range(1, context.joints + 1):
+        if other == joint:
+            continue
+        if other in context.moving:
+            yield from by(angle_of(other, f'angle_of_joint_{other}'), 'quadratic', 'free')
+        if context.has_gravity:
+            yield from by(torque_of(other, f'gravity_torque_of_joint_{other}'), 'linear')
+        if context.has_approach and other in context.moving:
+            yield from by(approach_of(other, f'approach_of_joint_{other}'), 'linear')
+            yield from by(last_move_of(other, f'last_move_of_joint_{other}'), 'linear')
+    yield from (((joint,), step) for step in _steps(context))
+
+
+def _joint_angles(context: Context) -> Iterator[Cell]:
+    """Angles: by own angle squared, by other joints, by torques, over time and temperature."""
+    for joint in range(1, context.joints + 1):
+        for joints, form in _joint_forms(context, joint):
+            stem = f'joint_{joint}_by_{form.driver}'
+            columns = partial(_at, joint=joint, form=form)
+            yield _cell('joint_angle', form, [stem], 'rad', columns, joints)
+
+
+def _at(context: Context, joint: int, form: _Form) -> Design:
+    return Design(joint - 1, form.features(context))
+
+
+def _along_axes(context: Context, turn: Feature, form: _Form) -> list[FloatArray]:
+    """Return each feature times each axis of a rotation (n, 3, 3), (n, 3) each."""
+    features, axes = form.features(context), turn(context)
+    count = features.shape[1]
+    return [features[:, [i]] * axes[:, :, a] for i in range(count) for a in range(3)]
+
+
 def _shifted(context: Context, turn: Feature, form: _Form) -> Design:
     """Shift along the axes of a rotation (n, 3, 3), for each feature."""
-    features = form.features(context)
-    axes = turn(context)
-    count = features.shape[1]
-    return displaced(*(features[:, [i]] * axes[:, :, a] for i in range(count) for a in range(3)))
+    return displaced(*_along_axes(context, turn, form))
 
 
 def _rotated(context: Context, turn: Feature, about: Feature, form: _Form) -> Design:
     """Turn about the axes of a rotation (n, 3, 3) through points (n, 3), for each feature."""
-    features = form.features(context)
-    frame = turn(context)
-    axes = [features[:, [i]] * frame[:, :, a] for i in range(features.shape[1]) for a in range(3)]
-    return turned(context, axes, about(context))
-
-
-def _link_turn(context: Context, link: int) -> FloatArray:
-    return context.link_rotation(link)
-
-
-def _joint_origin(context: Context, joint: int) -> FloatArray:
-    return context.joint_origin(joint)
+    return turned(context, _along_axes(context, turn, form), about(context))
 
 
 def _bending(context: Context, link: int) -> Design:
@@ -247,29 +194,25 @@ def _bending(context: Context, link: int) -> Design:
 
 def _links(context: Context) -> Iterator[Cell]:
     """Links that shift or turn: by gravity's moment, over time, by temperature."""
+    slow = [form for driver in slow_drivers(context) for form in _forms(context, driver, 'linear')]
     for link in context.links():
-        turn = partial(_link_turn, link=link)
-        axes = tuple(f'link_{link}_{axis}' for axis in 'xyz')
-        turns = tuple(f'link_{link}_r{axis}' for axis in 'xyz')
-        for driver in slow_drivers(context):
-            form = _form(context, driver, 'linear')
-            if form is None:
-                continue
+        turn = partial(Context.link_rotation, joint=link)
+        about = partial(Context.joint_origin, joint=link + 1)
+        for form in slow:
+            axes, turns = ([f'link_{link}_{kind}{axis}' for axis in 'xyz'] for kind in ('', 'r'))
             shift = partial(_shifted, turn=turn, form=form)
-            yield _cell('link_translation', (link,), driver.name, form, axes, 'm', shift)
-            about = partial(_joint_origin, joint=link + 1)
+            yield _cell('link_translation', form, axes, 'm', shift, (link,))
             rotation = partial(_rotated, turn=turn, about=about, form=form)
-            yield _cell('link_rotation', (link,), driver.name, form, turns, 'rad', rotation)
+            yield _cell('link_rotation', form, turns, 'rad', rotation, (link,))
         if context.has_gravity:
-            yield Cell(
-                name='unnamed',
+            yield EFFECT.cell(
+                partial(_bending, link=link),
+                [f'lateral_compliance_{link}'],
                 joints=(link,),
                 place='link_rotation',
                 driver='gravity_moment',
                 form='linear',
-                parameters=(f'lateral_compliance_{link}',),
                 unit='rad/(N m)',
-                columns=partial(_bending, link=link),
             )
 
 
@@ -304,62 +247,52 @@ def _line_of_sight(context: Context, sensor: int, power: int) -> Design:
 
 def _frames(context: Context) -> Iterator[Cell]:
     """Base, markers and sensors: over time, by temperature, gravity, joint 1, range."""
-    slow = [
-        (driver.name, form)
-        for driver in slow_drivers(context)
-        if (form := _form(context, driver, 'linear')) is not None
-    ]
-    turns = tuple(f'base_r{axis}' for axis in 'xyz')
-    first = Driver('angle_of_joint_1', 'rad', partial(_angle, joint=1))
-    for name, form in (*slow, (first.name, _form(context, first, 'sin/cos'))):
-        if form is not None:
-            columns = partial(_rotated, turn=_base_turn, about=_base_origin, form=form)
-            yield _cell('base_rotation', (), name, form, turns, 'rad', columns)
+    slow = [form for driver in slow_drivers(context) for form in _forms(context, driver, 'linear')]
+    for form in (*slow, *_forms(context, angle_of(1, 'angle_of_joint_1'), 'sin/cos')):
+        columns = partial(_rotated, turn=_base_turn, about=_base_origin, form=form)
+        yield _cell('base_rotation', form, [f'base_r{axis}' for axis in 'xyz'], 'rad', columns)
     for index, marker in enumerate(context.marker_names):
-        turn = partial(_tool_turn, marker=index)
-        axes = tuple(f'marker_{marker}_{axis}' for axis in 'xyz')
-        for name, form in slow:
-            columns = partial(_shifted, turn=turn, form=form)
-            yield _cell('marker', (), name, form, axes, 'm', columns, subject=marker)
-        yield Cell(
-            name='unnamed',
-            joints=(),
+        axes = [f'marker_{marker}_{axis}' for axis in 'xyz']
+        for form in slow:
+            columns = partial(_shifted, turn=partial(_tool_turn, marker=index), form=form)
+            yield _cell('marker', form, axes, 'm', columns, subject=marker)
+        yield EFFECT.cell(
+            partial(_sagging, marker=index),
+            [f'sag_{marker}'],
             place='marker',
             driver='gravity',
             form='linear',
-            parameters=(f'sag_{marker}',),
             unit='m',
-            columns=partial(_sagging, marker=index),
             subject=marker,
         )
     for index, sensor in enumerate(context.sensor_names):
-        turn = partial(_sensor_turn, sensor=index)
-        axes = tuple(f'{sensor}_{axis}' for axis in 'xyz')
-        forms = [('time', step) for step in _steps(context)]
-        forms += [
-            (driver.name, form)
-            for driver in slow_drivers(context)
-            for form in (_form(context, driver, name) for name in ('linear', 'free'))
-            if form is not None and (driver.name, form.name) != ('time', 'linear')
-        ]
-        for name, form in forms:
-            if form.penalty is not None:
-                penalty: FloatArray = np.kron(form.penalty, np.eye(3)).astype(float)
-                form = replace(form, penalty=penalty)
-            columns = partial(_shifted, turn=turn, form=form)
-            yield _cell('sensor_frame', (), name, form, axes, 'm', columns, subject=sensor)
-        for form_name, power, unit in (('constant', 0, 'm'), ('quadratic', 2, '1/m')):
-            yield Cell(
-                name='unnamed',
-                joints=(),
+        axes = [f'{sensor}_{axis}' for axis in 'xyz']
+        for form in _sensor_forms(context):
+            columns = partial(_shifted, turn=partial(_sensor_turn, sensor=index), form=form)
+            yield _cell('sensor_frame', form, axes, 'm', columns, subject=sensor)
+        for name, power, unit in (('constant', 0, 'm'), ('quadratic', 2, '1/m')):
+            yield EFFECT.cell(
+                partial(_line_of_sight, sensor=index, power=power),
+                [f'range_{name}_{sensor}'],
                 place='sensor_frame',
                 driver='range',
-                form=form_name,
-                parameters=(f'range_{form_name}_{sensor}',),
+                form=name,
                 unit=unit,
-                columns=partial(_line_of_sight, sensor=index, power=power),
                 subject=sensor,
             )
+
+
+def _sensor_forms(context: Context) -> Iterator[_Form]:
+    """Give what may drive a sensor's shift; one that is linear in time has a name."""
+    yield from _steps(context)
+    for driver in slow_drivers(context):
+        for form in _forms(context, driver, 'linear', 'free'):
+            if form.penalty is not None:
+                # The three axes of a knot stand next to each other.
+                penalty: FloatArray = np.kron(form.penalty, np.eye(3)).astype(float)
+                yield replace(form, penalty=penalty)
+            elif form.driver != 'time':
+                yield form
 
 
 EFFECT = Effect(

@@ -1,4 +1,4 @@
-"""Driver of a laser tracker that speaks emScon: lock the reflector, measure it standing still.
+"""Client of a laser tracker by emScon: lock the reflector, measure it standing still.
 
 A tracker follows the reflector with its beam. When the beam breaks it has to find the reflector
 again, by searching a spiral about the place it points to (`LaserTrackerClient.find_reflector`) or
@@ -23,53 +23,25 @@ from remaster_ros.sensors.laser_tracker.protocol import codes
 from remaster_ros.sensors.laser_tracker.protocol.codes import Change, Command, Readiness, Status
 from remaster_ros.sensors.laser_tracker.protocol.packets import Value
 from remaster_ros.sensors.laser_tracker.settings import (
-    Environment,
+    CHANGES_OF_READINGS,
+    SET_FOR_READINGS,
     LaserTrackerSettings,
     TrackerReading,
     TrackerStatus,
 )
 from remaster_ros.types import FARTHEST_M, FloatArray
 
-__all__ = [
-    'Environment',
-    'LaserTrackerClient',
-    'LaserTrackerError',
-    'LaserTrackerSettings',
-    'TrackerReading',
-    'TrackerStatus',
-]
-
 _SLEW_S = 15.0
 """Time-out of turning to a position, s: half a turn of a slow head."""
 _RETRY_S = 0.5
 _WARM_UP_RETRY_S = 2.0
 
-# What a reading depends on: (command that reads it back, the values we set, in words).
-_UNITS = (
-    codes.METRE,
-    codes.RADIAN,
-    codes.CELSIUS,
-    codes.MILLIBAR,
-    codes.RELATIVE_HUMIDITY,
-)
-_AS_SET: tuple[tuple[Command, tuple[Value, ...], str], ...] = (
-    (Command.GET_UNITS, _UNITS, 'units (metre, radian, °C, mbar)'),
-    (
-        Command.GET_COORDINATE_SYSTEM_TYPE,
-        (codes.RIGHT_HANDED_CARTESIAN,),
-        'coordinate system (right-handed Cartesian)',
-    ),
-    (Command.GET_MEASUREMENT_MODE, (codes.STATIONARY,), 'measurement mode (stationary)'),
-)
-_CHANGES_A_READING = (Change.UNITS, Change.COORDINATE_SYSTEM_TYPE, Change.MEASUREMENT_MODE)
-
-
-_STATUS_OF_CHANGE = {
+_STATUS_OF_CHANGE: dict[int, TrackerStatus] = {
     Change.NOT_READY: TrackerStatus.NOT_READY,
     Change.BUSY: TrackerStatus.BUSY,
     Change.READY: TrackerStatus.READY,
 }
-_STATUS_OF_READINESS = {
+_STATUS_OF_READINESS: dict[Value, TrackerStatus] = {
     Readiness.NOT_READY: TrackerStatus.NOT_READY,
     Readiness.BUSY: TrackerStatus.BUSY,
     Readiness.READY: TrackerStatus.READY,
@@ -80,9 +52,9 @@ class LaserTrackerClient:
     """A laser tracker behind emScon over TCP.
 
     Every method raises `LaserTrackerError` (a `DeviceError`) when the instrument refuses, is busy,
-    cannot be reached or does not answer; its `status` tells a refusal from a lost connection. One
-    command is under way at a time: a second one, from another thread, is refused as busy. After a
-    lost connection `connect` and `initialise` begin anew.
+    cannot be reached or does not answer; its `status` distinguishes a refusal from a lost
+    connection. One command is under way at a time: a second one, from another thread, is refused
+    as busy. After a lost connection `connect` and `initialise` begin anew.
 
     Parameters
     ----------
@@ -142,7 +114,7 @@ class LaserTrackerClient:
 
     @property
     def status(self) -> TrackerStatus:
-        """What the instrument last reported; `request_status` asks it."""
+        """What the instrument last reported; `request_status` brings it up to date."""
         return self._status if self.connected else TrackerStatus.DISCONNECTED
 
     @property
@@ -170,10 +142,10 @@ class LaserTrackerClient:
         self._link.close()
 
     def request_status(self) -> TrackerStatus:
-        """Ask the instrument for its status."""
+        """Request the status of the instrument."""
         (readiness,) = self._ask(Command.GET_TRACKER_STATUS, what='status')
-        # A number it should not send is no permission to measure.
-        self._status = _STATUS_OF_READINESS.get(readiness, TrackerStatus.NOT_READY)  # type: ignore[call-overload]
+        # A number that is no `Readiness` must not permit a measurement.
+        self._status = _STATUS_OF_READINESS.get(readiness, TrackerStatus.NOT_READY)
         return self._status
 
     def initialise(self, *, force: bool = False) -> None:
@@ -186,9 +158,8 @@ class LaserTrackerClient:
         if force or processor != codes.TRACKER_INITIALIZED:
             self._initialise()
         s = self.settings
-        self._ask(Command.SET_UNITS, *_UNITS)
-        self._ask(Command.SET_COORDINATE_SYSTEM_TYPE, codes.RIGHT_HANDED_CARTESIAN)
-        self._ask(Command.SET_MEASUREMENT_MODE, codes.STATIONARY)
+        for command, _, values, _ in SET_FOR_READINGS:
+            self._ask(command, *values)
         self._ask(Command.SET_STATIONARY_MODE, round(s.integration_s * 1e3), True)
         self._ask(Command.SET_STATISTIC_MODE, codes.STANDARD_STATISTICS, codes.STANDARD_STATISTICS)
         self._set_search()
@@ -201,7 +172,7 @@ class LaserTrackerClient:
         self.request_status()
 
     def set_search_radius(self, radius_m: float) -> None:
-        """Set how far (m) about the place it is told, or points to, the instrument searches."""
+        """Set how far (m) about the given place, or where it points, the instrument searches."""
         self.settings = replace(self.settings, search_radius_m=radius_m)
         self._set_search()
 
@@ -297,7 +268,7 @@ class LaserTrackerClient:
                     f'{FARTHEST_M:g} m; measure again',
                     Status.NO_STATIONARY_RESULT,
                 )
-            # Whoever changed the units or the frame meanwhile has changed the numbers.
+            # A change of the units or the frame meanwhile has changed the numbers.
             if not self._settings_checked:
                 self._check_settings()
         except LaserTrackerError:
@@ -382,7 +353,7 @@ class LaserTrackerClient:
         """
         # Set first: a change that is reported during the check makes it count for nothing.
         self._settings_checked = True
-        for command, expected, words in _AS_SET:
+        for _, command, expected, words in SET_FOR_READINGS:
             if self._ask(command) != expected:
                 self._settings_checked = False
                 raise LaserTrackerError(
@@ -393,9 +364,9 @@ class LaserTrackerClient:
 
     def _changed(self, change: int) -> None:
         """Take note of a status change; runs in the reading thread."""
-        if change in _CHANGES_A_READING:
+        if change in CHANGES_OF_READINGS:
             self._settings_checked = False
-        status = _STATUS_OF_CHANGE.get(change)  # type: ignore[call-overload]
+        status = _STATUS_OF_CHANGE.get(change)
         if status is None:
             return
         if self._status is TrackerStatus.READY and status is TrackerStatus.NOT_READY:

@@ -29,13 +29,13 @@ from remaster_ros.sensors.laser_tracker.protocol.packets import (
 )
 
 _LEAST_WALL_S = 2.0
-"""World time may run many times as fast as the wall clock; networks and schedulers do not."""
+"""Simulated time may run many times as fast as the wall clock; networks do not."""
 _POLL_S = 0.02
 _HANG_UP_S = 1.0
 
 
 class LaserTrackerError(DeviceError):
-    """A laser tracker failed; the text names it, what was asked, the code in words, a remedy.
+    """A laser tracker failed; the text names it, the command, the code in words, a remedy.
 
     Attributes
     ----------
@@ -62,8 +62,8 @@ class _Exchange:
 class TrackerLink:
     """Sends commands over TCP and waits for what belongs to them.
 
-    The protocol has no sequence numbers: a reply that comes too late cannot be told from that to
-    the next command. Whenever a reply stays away, the connection is therefore closed.
+    The protocol has no sequence numbers: a reply that comes too late cannot be distinguished
+    from that to the next command. The connection is therefore closed where a reply is missing.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class TrackerLink:
     ----------
     counts
         How often each thing happened: ``connections``, ``bad_packets``, ``unknown_packets``,
-        ``unexpected_packets`` (nothing had asked for them).
+        ``unexpected_packets`` (no command was waiting for them).
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class TrackerLink:
         self._thread.start()
 
     def close(self, reason: str = 'closed by this program') -> None:
-        """Close the connection; who waits for a reply is told the reason."""
+        """Close the connection; a command that waits for its reply fails with the reason."""
         self._lose(reason)
         with self._news:
             connection, self._socket = self._socket, None
@@ -230,7 +230,7 @@ class TrackerLink:
         try:
             connection.sendall(encode(Request(exchange.command, values)))
         except OSError as error:
-            # The reading thread knows more: what the instrument said before it hung up.
+            # The reading thread may have what the instrument reported before it closed.
             if (thread := self._thread) is not None:
                 thread.join(_HANG_UP_S)
             self._lose(f'connection lost ({error})')
@@ -260,7 +260,7 @@ class TrackerLink:
         if isinstance(event, ErrorReport) and event.command in (exchange.command, Command.UNKNOWN):
             self._check(event.status or Status.NO_STATIONARY_RESULT, exchange.what)
         self.count('unexpected_packets')
-        # An instrument that never stops talking would otherwise hold us for ever.
+        # An instrument that sends without end would otherwise block this thread for ever.
         if exchange.is_late():
             raise self._late_error(exchange)
 

@@ -1,4 +1,4 @@
-"""What the laser tracker driver is told, and what it returns."""
+"""Settings of the laser tracker's client, and what it returns."""
 
 from __future__ import annotations
 
@@ -8,11 +8,36 @@ from enum import Enum
 import numpy as np
 
 from remaster_ros.errors import InputError
+from remaster_ros.parameters import check_all, parameter
+from remaster_ros.sensors.laser_tracker.protocol import codes
+from remaster_ros.sensors.laser_tracker.protocol.codes import Change, Command
+from remaster_ros.sensors.laser_tracker.protocol.packets import Value
 from remaster_ros.types import FloatArray, MarkerReading
+
+_UNITS = codes.METRE, codes.RADIAN, codes.CELSIUS, codes.MILLIBAR, codes.RELATIVE_HUMIDITY
+SET_FOR_READINGS: tuple[tuple[Command, Command, tuple[Value, ...], str], ...] = (
+    (Command.SET_UNITS, Command.GET_UNITS, _UNITS, 'units (metre, radian, °C, mbar)'),
+    (
+        Command.SET_COORDINATE_SYSTEM_TYPE,
+        Command.GET_COORDINATE_SYSTEM_TYPE,
+        (codes.RIGHT_HANDED_CARTESIAN,),
+        'coordinate system (right-handed Cartesian)',
+    ),
+    (
+        Command.SET_MEASUREMENT_MODE,
+        Command.GET_MEASUREMENT_MODE,
+        (codes.STATIONARY,),
+        'measurement mode (stationary)',
+    ),
+)
+"""What a reading depends on: the command that sets it, the one that reads it back, the values, and
+what they are."""
+CHANGES_OF_READINGS = (Change.UNITS, Change.COORDINATE_SYSTEM_TYPE, Change.MEASUREMENT_MODE)
+"""Status changes after which these are read back."""
 
 
 class TrackerStatus(Enum):
-    """What the instrument last said of itself."""
+    """What the instrument last reported."""
 
     DISCONNECTED = 'disconnected'
     NOT_READY = 'not ready'
@@ -33,16 +58,14 @@ class Environment:
 
 @dataclass(frozen=True)
 class LaserTrackerSettings:
-    """What the driver sets on the instrument, and how long it waits.
+    """What the client sets on the instrument, and how long it waits.
+
+    Those made with `parameter` are parameters of the node as well.
 
     Attributes
     ----------
     reflector_id
         The instrument's number of the reflector mounted; None leaves the one it has set.
-    search_radius_m, search_timeout_s
-        Of every search for the reflector, at the reflector's distance.
-    integration_s
-        Averaging time of one measurement.
     environment
         None leaves the instrument's own weather station, or what is set there.
     connect_timeout_s
@@ -54,9 +77,17 @@ class LaserTrackerSettings:
     """
 
     reflector_id: int | None = None
-    search_radius_m: float = 0.05
-    search_timeout_s: float = 10.0
-    integration_s: float = 1.0
+    search_radius_m: float = parameter(
+        0.05,
+        'how far about the expected place it searches, at the distance of the reflector',
+        unit='m',
+        low=1e-3,
+        high=5.0,
+    )
+    search_timeout_s: float = parameter(20.0, 'longest search', unit='s', low=0.1, high=600.0)
+    integration_s: float = parameter(
+        1.0, 'averaging time of one measurement', unit='s', low=0.05, high=60.0
+    )
     environment: Environment | None = None
     connect_timeout_s: float = 5.0
     reply_timeout_s: float = 5.0
@@ -70,12 +101,13 @@ class LaserTrackerSettings:
         InputError
             Naming the setting.
         """
+        check_all('laser tracker', self)
         for name, value in vars(self).items():
             if name.endswith(('_s', '_m')) and not 0 < value < np.inf:
                 raise InputError(f'laser tracker: {name} is {value}; it must be above 0')
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrackerReading(MarkerReading):
     """One ADM measurement.
 
@@ -88,6 +120,5 @@ class TrackerReading(MarkerReading):
     """
 
     std: FloatArray
-    temperature_c: float
     pressure_hpa: float
     humidity_percent: float

@@ -1,8 +1,8 @@
 """An OptiTrack client: sockets and one thread around the NatNet decoder; no ROS.
 
 Nothing that arrives can end the thread: what is foreign, damaged, late or not measured is counted
-with its reason and dropped. The client greets the server again whenever the stream falls silent
-or stops making sense, so a restarted server, or one of another version, is picked up by itself.
+with its reason and dropped. CONNECT is sent again whenever the stream falls silent
+or cannot be decoded, so that a restarted server, or one of another version, is followed.
 """
 
 from __future__ import annotations
@@ -15,12 +15,7 @@ from collections import deque
 from collections.abc import Callable
 
 from remaster_ros.errors import DeviceError
-from remaster_ros.sensors.optitrack.diagnosis import (
-    Diagnosis,
-    NatNetSettings,
-    StreamStatus,
-)
-from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice, MarkerSample
+from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerSample
 from remaster_ros.sensors.optitrack.frame_source import Source
 from remaster_ros.sensors.optitrack.marker_follower import MarkerFollower
 from remaster_ros.sensors.optitrack.protocol import natnet
@@ -36,21 +31,12 @@ from remaster_ros.sensors.optitrack.protocol.natnet import (
     ProtocolError,
     ServerInfo,
 )
+from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.sensors.optitrack.sockets import (
     open_multicast_socket,
     open_socket,
     port_is_closed,
 )
-
-__all__ = [
-    'Diagnosis',
-    'Dropped',
-    'MarkerChoice',
-    'MarkerSample',
-    'NatNetClient',
-    'NatNetSettings',
-    'StreamStatus',
-]
 
 RETRY_S = 0.5
 KEEPALIVE_S = 1.0
@@ -62,7 +48,7 @@ DIGEST_S = 0.005
 MAX_BACKLOG_BYTES = 1 << 26
 """What may wait to be decoded: twenty seconds of 1 kHz frames with 50 markers."""
 MALFORMED_IN_A_ROW = 3
-"""Then the version has probably changed, and the server is asked."""
+"""Then the version has probably changed, and CONNECT is sent again."""
 NEGOTIATION_TRIES = 4
 MAX_DATAGRAM_BYTES = 1 << 16
 _FRAME_ID = MessageId.FRAMEOFDATA.to_bytes(2, 'little')
@@ -121,7 +107,7 @@ class NatNetClient(MarkerFollower):
                 raise
 
     def _close(self) -> None:
-        self._send(natnet.encode_plain_request(MessageId.DISCONNECT))
+        self._send(natnet.join_datagram(MessageId.DISCONNECT))
         for opened in (self._command, self._data):
             if opened is not None:
                 opened.close()
@@ -161,12 +147,12 @@ class NatNetClient(MarkerFollower):
         if negotiating and self._is_due('bitstream', now, RETRY_S):
             self._negotiate(self._server)
         if self._is_unicast(self._server) and self._is_due('keepalive', now, KEEPALIVE_S):
-            self._send(natnet.encode_plain_request(MessageId.KEEPALIVE))
+            self._send(natnet.join_datagram(MessageId.KEEPALIVE))
         if self._version and self._model_wanted and self._is_due('model', now, RETRY_S):
-            self._send(natnet.encode_plain_request(MessageId.REQUEST_MODELDEF))
+            self._send(natnet.join_datagram(MessageId.REQUEST_MODELDEF))
 
     def _is_unicast(self, server: ServerInfo) -> bool:
-        """Tell whether the server streams to those who keep asking; it knows best."""
+        """Return whether the server streams unicast, by its own answer where it has one."""
         if server.connection is None:
             return self._settings.transport == 'unicast'
         return not server.connection.is_multicast
@@ -224,8 +210,8 @@ class NatNetClient(MarkerFollower):
     ) -> None:
         """Decode one datagram and act on it.
 
-        Frames are believed from one source; answers from the port that was asked, as whoever
-        else sends on that computer could name another version or another marker.
+        Frames count from one source, answers from the command port alone: another program on
+        that computer could send another version or another marker.
         """
         looks_like_frame = datagram[:2] == _FRAME_ID
         answers = not from_data_socket and sender[1] == self._settings.command_port
@@ -294,7 +280,7 @@ class NatNetClient(MarkerFollower):
         self._version = None if self._settings.wanted_version else server.natnet_version
 
     def _negotiate(self, server: ServerInfo) -> None:
-        """Ask for the wanted bitstream; without an agreement the server's own is read."""
+        """Request the wanted bitstream; where that fails, the server's own is read."""
         wanted = self._settings.wanted_version
         if wanted is None or self._negotiation_tries >= NEGOTIATION_TRIES:
             self._version = server.natnet_version
@@ -303,7 +289,7 @@ class NatNetClient(MarkerFollower):
         self._send(natnet.encode_command_request(f'Bitstream,{natnet.format_version(wanted)}'))
 
     def _take_bitstream(self, answer: natnet.Response | None) -> None:
-        """Take the answer to what `_negotiate` asked; None for a request that was refused."""
+        """Take the answer to the request of `_negotiate`; None where it was refused."""
         if self._server is None or self._version is not None:
             return
         self._version = self._server.natnet_version

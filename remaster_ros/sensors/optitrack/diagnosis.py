@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
-from remaster_ros.errors import InputError
-from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
+from remaster_ros.sensors.optitrack.frame_gate import Dropped
 from remaster_ros.sensors.optitrack.protocol import natnet
 from remaster_ros.sensors.optitrack.protocol.natnet import ProtocolError, ServerInfo, Version
 from remaster_ros.sensors.optitrack.protocol.wire import require_supported
+from remaster_ros.sensors.optitrack.settings import NatNetSettings
 
 Fault = Literal[
     'none',
@@ -23,79 +23,6 @@ Fault = Literal[
     'marker',
     'silence',
 ]
-
-
-@dataclass(frozen=True)
-class NatNetSettings:
-    """How to reach an OptiTrack server.
-
-    Attributes
-    ----------
-    server
-        Address or name of the computer with Motive.
-    local_interface
-        Address of this machine's network card towards the server; '' lets the routing decide.
-    transport
-        As set in Motive's streaming pane: ``multicast`` or ``unicast``.
-    multicast_group, command_port, data_port
-        As in Motive; group and data port matter for multicast only (the data port for
-        ``client: natnetclient`` too).
-    bitstream
-        Version to ask for, such as ``4.1`` (unicast and servers from 4.0 only); '' takes the
-        server's own.
-    marker
-        Which marker to follow.
-    silence_s
-        Without a frame for this long the stream counts as stopped, s (wall clock).
-    """
-
-    server: str = '127.0.0.1'
-    local_interface: str = ''
-    transport: Literal['multicast', 'unicast'] = 'multicast'
-    multicast_group: str = natnet.DEFAULT_MULTICAST_GROUP
-    command_port: int = natnet.DEFAULT_COMMAND_PORT
-    data_port: int = natnet.DEFAULT_DATA_PORT
-    bitstream: str = ''
-    marker: MarkerChoice = field(default_factory=MarkerChoice)
-    silence_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse what can never work."""
-        if self.transport not in ('multicast', 'unicast'):
-            raise InputError(f'transport: {self.transport!r} is neither multicast nor unicast')
-        for name in ('command_port', 'data_port'):
-            if not 1 <= getattr(self, name) <= 65535:
-                raise InputError(f'{name}: {getattr(self, name)} is not 1 to 65535')
-        require_group(self.multicast_group)
-        if not self.silence_s > 0:
-            raise InputError(f'silence_s: {self.silence_s} is not above 0')
-        if self.bitstream:
-            if self.transport == 'multicast':
-                raise InputError(
-                    'bitstream: a multicast stream has one version for all; remove it'
-                )
-            try:
-                require_supported(natnet.parse_version(self.bitstream))
-            except (ValueError, ProtocolError) as error:
-                raise InputError(f'bitstream: {error}') from error
-
-    @property
-    def wanted_version(self) -> Version | None:
-        """The bitstream to ask for, None for the server's own."""
-        return natnet.parse_version(self.bitstream) if self.bitstream else None
-
-
-def require_group(group: str) -> None:
-    """Raise `InputError` unless it is an IPv4 multicast group."""
-    parts = group.split('.')
-    numeric = len(parts) == 4 and all(
-        p.isascii() and p.isdecimal() and int(p) < 256 for p in parts
-    )
-    if not numeric or not 224 <= int(parts[0]) <= 239:
-        raise InputError(
-            f'multicast_group: {group!r} is none (224.0.0.0 to 239.255.255.255; Motive uses '
-            f'{natnet.DEFAULT_MULTICAST_GROUP})'
-        )
 
 
 @dataclass(frozen=True)
@@ -167,7 +94,7 @@ class StreamStatus:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is wrong, in one word and in one line with the remedy."""
+    """What is wrong: its kind, and one line with the remedy."""
 
     fault: Fault
     message: str
@@ -177,7 +104,7 @@ HEALTHY = Diagnosis('none', '')
 
 
 def diagnose(status: StreamStatus, settings: NatNetSettings) -> Diagnosis:
-    """Tell why readings are missing; `HEALTHY` if they are not."""
+    """Return why readings are missing; `HEALTHY` if they are not."""
     if status.server is None:
         return _unanswered(status, settings)
     version = status.version or status.server.natnet_version
@@ -300,7 +227,7 @@ def _refused(status: StreamStatus) -> str:
 
 
 def warning(status: StreamStatus) -> str:
-    """Tell what is odd while readings come: who else sends; '' if nobody does."""
+    """Return which other programs send while readings come; '' if none does."""
     others = [*status.rivals, *status.foreign]
     if not others or not status.source:
         return ''

@@ -39,7 +39,7 @@ class Dropped(StrEnum):
 
     FOREIGN = 'foreign'
     """It came from an address that is not the configured server's, or from a port of it that is
-    not the believed one (`natnet_source`)."""
+    not the believed one (`frame_source`)."""
     PROBATION = 'probation'
     """Its source is not believed yet: it must be the only one for a moment."""
     OVERRUN = 'overrun'
@@ -158,7 +158,7 @@ class MarkerGate:
     marker_id
         Id on the wire; None while unknown, and for a lone marker.
     problem
-        Why the marker cannot be told from the rest, with the remedy; '' if it can.
+        Why the marker cannot be identified, with the remedy; '' if it can.
     """
 
     def __init__(self, choice: MarkerChoice) -> None:

@@ -34,13 +34,13 @@ class SourceVerdict(Enum):
 
     BELIEVED = 'believed'
     PROBATION = 'probation'
-    """Nobody has the lock yet; the frame counts towards it and gives no reading."""
+    """No source has the lock yet; the frame counts towards it and gives no reading."""
     FOREIGN = 'foreign'
 
 
 @dataclass
 class _Other:
-    """A source without the lock: when it was first and last heard, s, and how many frames."""
+    """A source without the lock: when it first and last sent, s, and how many frames."""
 
     first_s: float
     last_s: float
@@ -62,7 +62,7 @@ class SourceLock:
     Attributes
     ----------
     source
-        Who has the lock; None while nobody has.
+        The source with the lock; None while there is none.
     taken
         How often the lock was given to another source than before.
     """
@@ -81,7 +81,7 @@ class SourceLock:
         self._answered = True
 
     def release_if_silent(self, now_s: float) -> bool:
-        """Free the lock after a silence of its holder; tell whether it was freed now."""
+        """Free the lock after a silence of its holder; return whether it was freed now."""
         if self.source is None or now_s - self._last_frame_s <= self._silence_s:
             return False
         self.source = None
@@ -89,7 +89,7 @@ class SourceLock:
         return True
 
     def is_refused(self, source: Source, now_s: float) -> bool:
-        """Tell whether nothing of this source counts, decoded or not; note that it sent."""
+        """Return whether nothing of this source counts, decoded or not; note that it sent."""
         if source == self.source:
             return False
         if self.source is not None:
@@ -126,7 +126,7 @@ class SourceLock:
         return SourceVerdict.BELIEVED
 
     def rivals(self, now_s: float) -> tuple[Source, ...]:
-        """Return who is refused and was heard lately, while or after another had the lock."""
+        """Return the refused sources that sent lately, while or after another had the lock."""
         return tuple(
             source
             for source, other in list(self._others.items())

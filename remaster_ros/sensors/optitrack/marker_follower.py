@@ -1,4 +1,4 @@
-"""What every OptiTrack client of ours does: one thread, one marker, one honest account."""
+"""What both OptiTrack clients have in common: the thread, the marker, counts and diagnosis."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from collections.abc import Callable
 from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.optitrack.diagnosis import (
     Diagnosis,
-    NatNetSettings,
     StreamStatus,
     diagnose,
 )
@@ -19,6 +18,7 @@ from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerGate, Marke
 from remaster_ros.sensors.optitrack.frame_source import Source, SourceLock, SourceVerdict, describe
 from remaster_ros.sensors.optitrack.protocol.frames import Frame
 from remaster_ros.sensors.optitrack.protocol.natnet import ServerInfo, Version
+from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.sensors.optitrack.sockets import interface_towards, resolve
 
 FOREIGN_REMEMBERED = 4
@@ -114,7 +114,7 @@ class MarkerFollower(ABC):
         self.stop()
 
     def status(self) -> StreamStatus:
-        """Return a snapshot of what has arrived, been dropped and is known of the server."""
+        """Return a snapshot of counts and of what the server has answered."""
         now = time.monotonic()
         gate = self._gate
         return StreamStatus(
@@ -144,7 +144,7 @@ class MarkerFollower(ABC):
         )
 
     def diagnosis(self) -> Diagnosis:
-        """Tell what is wrong when readings are missing, and the remedy."""
+        """Return what is wrong when readings are missing, and the remedy."""
         return diagnose(self.status(), self._settings)
 
     @abstractmethod

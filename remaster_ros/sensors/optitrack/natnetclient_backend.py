@@ -1,9 +1,9 @@
 """The optional backend ``client: natnetclient``: PyPI ``natnetclient``, guarded.
 
 That package (LGPL, 2018) reads NatNet 2.6 to 2.10 from a server on the same computer that sends
-its frames unicast to a fixed port. It trusts every datagram, never forgets an old marker and
-waits a minute for silence to end. So it runs here without its own thread: each datagram is first
-checked by our decoder, then read by ``natnetclient`` with its memory cleared, and a reading
+its frames unicast to a fixed port. It checks no datagram, keeps markers that are no longer sent
+and waits a minute where nothing comes. So it runs here without its own thread: each datagram is
+first checked by our decoder, then read by ``natnetclient`` with its memory cleared, and a reading
 counts only if both agree on it.
 """
 
@@ -18,7 +18,7 @@ from collections.abc import Callable
 from typing import Any
 
 from remaster_ros.errors import DeviceError, InputError
-from remaster_ros.sensors.optitrack.diagnosis import Diagnosis, NatNetSettings
+from remaster_ros.sensors.optitrack.diagnosis import Diagnosis
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerSample
 from remaster_ros.sensors.optitrack.marker_follower import MarkerFollower
 from remaster_ros.sensors.optitrack.protocol import natnet
@@ -30,6 +30,7 @@ from remaster_ros.sensors.optitrack.protocol.frames import (
 )
 from remaster_ros.sensors.optitrack.protocol.natnet import ProtocolError
 from remaster_ros.sensors.optitrack.protocol.wire import OLDEST_VERSION
+from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.sensors.optitrack.sockets import open_socket, port_is_closed
 
 NEWEST_READ = (2, 10)
@@ -44,14 +45,14 @@ class NatNetClientBackend(MarkerFollower):
     Parameters
     ----------
     settings
-        Must say ``unicast``; frames are expected on `data_port` of this computer.
+        `transport` must be ``unicast``; frames are expected on `data_port` of this computer.
     on_sample, clock
         As for `NatNetClient`.
 
     Raises
     ------
     InputError
-        If ``natnetclient`` is not installed, or the settings ask for what it cannot do.
+        If ``natnetclient`` is not installed, or the settings need what it cannot do.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class NatNetClientBackend(MarkerFollower):
             raise DeviceError(f'OptiTrack: {self._refusal}')
 
     def diagnosis(self) -> Diagnosis:
-        """Tell what is wrong when readings are missing, and the remedy."""
+        """Return what is wrong when readings are missing, and the remedy."""
         return Diagnosis('version', self._refusal) if self._refusal else super().diagnosis()
 
     def _open(self) -> None:
@@ -161,7 +162,7 @@ class NatNetClientBackend(MarkerFollower):
             if self._is_foreign(sender[0]) or self._is_refused(sender):
                 continue
             try:
-                frame = natnet.decode_message(datagram, self._version)
+                frame = natnet.decode_message(datagram, self._version, markers_only=True)
                 if not isinstance(frame, Frame):
                     raise ProtocolError('a message on the data port that is no frame')
             except ProtocolError as error:

@@ -116,9 +116,9 @@ def open_multicast_socket(group: str, port: int, interface: str) -> socket.socke
 
 
 def port_is_closed(server_ip: str, port: int, request: bytes) -> bool:
-    """Tell whether the host is there but nothing listens on the port.
+    """Return whether the host is there but nothing listens on the port.
 
-    Only a connected socket is told of the "port unreachable" that such a host sends back.
+    Only a connected socket reports the "port unreachable" that such a host sends back.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.settimeout(0.2)

@@ -102,8 +102,7 @@ def test_more_pairs_than_the_limit_are_drawn_evenly(monkeypatch: pytest.MonkeyPa
 def test_what_a_session_does_not_allow_is_null_with_a_reason() -> None:
     rows = measurements([0, 1, 2], [[1e-3, 0, 0], [0, 2e-3, 0], [0, 0, 3e-3]])
     nothing = np.zeros((3, 3))
-    splits = {'optimization': np.arange(3), 'validation': np.zeros(0, dtype=np.int64)}
-    both = accuracy_of(rows, splits, nothing, nothing, None, RNG)
+    both = accuracy_of(rows, np.arange(3), nothing, nothing, None, RNG)
     assert both['validation'] is None
     found = both['optimization']
     assert found['relative']['before'] is None

@@ -75,7 +75,7 @@ def test_a_prior_on_effects_pulls_them_to_zero(sagging) -> None:
     assert np.all(np.abs(theta) < [1e-7, 1e-7, 1e-5])
 
 
-def test_what_only_its_prior_knows_is_as_wide_as_the_prior(sagging) -> None:
+def test_what_only_its_prior_determines_is_as_wide_as_the_prior(sagging) -> None:
     """A spline beyond the data, beside an effect whose unit is six decades smaller."""
     session, arrays = sagging
     nothing = np.zeros_like(arrays['joint'][:, :, :1])

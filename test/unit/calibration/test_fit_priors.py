@@ -1,4 +1,4 @@
-"""What a user knows before a fit takes part in it, and is named where it decides."""
+"""Priors that a user gives take part in the fit, and are reported where they decide."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def measured():
     return scene(61, poses=15)
 
 
-def test_a_prior_on_joint_1_frees_it_and_is_what_it_is_known_by(measured) -> None:
+def test_a_prior_on_joint_1_determines_it_and_is_reported(measured) -> None:
     session, _ = measured
     priors = Priors(joint_offsets={'joint_1': (0.004, 0.001)})
     result = fit_session(session, rng=np.random.default_rng(1), priors=priors)
     assert not result.identifiable[0]
     assert result.gauge[0].fixed_by == 'the prior on joint_1, 0.0572958 deg'
-    # The data say nothing of it: the posterior is the prior, to five standard errors.
+    # The data do not determine it: the posterior is the prior, to five standard errors.
     assert result.joint_offsets[0] == pytest.approx(0.004, abs=5 * 0.001 / np.sqrt(2500))
     assert result.joint_offsets_std[0] == pytest.approx(0.001, rel=0.1)
 

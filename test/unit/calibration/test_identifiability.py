@@ -76,7 +76,7 @@ def test_a_known_base_frame_fixes_the_first_joint() -> None:
     assert gauge.why[0]
 
 
-def test_a_hardly_known_marker_cannot_fix_the_last_joint() -> None:
+def test_a_badly_known_marker_cannot_fix_the_last_joint() -> None:
     gauge = gauge_of(scene(25, poses=15, marker_std_m=0.1)[0])
     assert gauge.directions[1].fixed_by == 'joint_7 = 0'
     assert gauge.held.tolist() == [0, 6]
@@ -132,7 +132,7 @@ def test_a_joint_that_is_hardly_seen_is_named() -> None:
         -weak[0].combination['joint_3'], rel=0.2
     )
     assert 'hardly change the observations' in weak[0].why
-    assert 'would tell them apart' in weak[0].why
+    assert 'would separate them' in weak[0].why
     # It is seen all the same, if badly: no reason why it could not be.
     assert gauge.held.tolist() == [0]
     assert [bool(why) for why in gauge.why] == [True, *[False] * 5, True]

@@ -129,7 +129,7 @@ def test_too_many_gross_errors_are_an_error(share: float, message: str) -> None:
         find(rows, errors)
 
 
-def test_the_limit_of_good_rows_is_where_it_is_said_to_be() -> None:
+def test_the_limit_of_good_rows_is_the_documented_one() -> None:
     """Of good errors with one more at x: the x from which on it is gross, by chi's quantiles."""
     for count in (30, 200, 5000):
         good = chi.ppf((np.arange(count) + 0.5) / count, 3)
@@ -142,7 +142,7 @@ def test_the_limit_of_good_rows_is_where_it_is_said_to_be() -> None:
 
 
 def test_the_mixture_finds_share_and_kind_of_each_row() -> None:
-    """5 % of 2,000 errors 30 times as wide: nearly all are told, in proportion to their length."""
+    """5 % of 2,000 errors 30 times as wide: nearly all are found, in line with their length."""
     rng = np.random.default_rng(11)
     lengths = np.linalg.norm(rng.standard_normal((2000, 3)), axis=1)
     bad = np.arange(2000) < 100

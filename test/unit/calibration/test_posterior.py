@@ -15,7 +15,7 @@ from remaster_ros.calibration.laplace import find_mode
 from remaster_ros.calibration.metropolis import random_walk_sampler
 from remaster_ros.calibration.noise import RESOLUTION_M
 from remaster_ros.calibration.priors import base_prior, marker_prior
-from remaster_ros.calibration.proposal import FactorisedProposal, LaplaceProposal
+from remaster_ros.calibration.proposal import LaplaceProposal
 from remaster_ros.calibration.sampling import sample_posterior
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
@@ -31,7 +31,7 @@ def test_density_is_that_of_correlated_normal_errors(found) -> None:
     """The whole covariance matrix of every sensor's errors, written out."""
     posterior, model = found.posterior, found.model
     rng = np.random.default_rng(1)
-    points, _ = LaplaceProposal.of(found.mode).sample(6, rng)
+    points, _ = LaplaceProposal(found.mode).sample(6, rng)
     expected = []
     for point in points:
         noise = posterior.noise(point[len(posterior.free) :])
@@ -61,14 +61,14 @@ def test_density_is_that_of_correlated_normal_errors(found) -> None:
 
 
 def test_negative_ratios_have_no_density(found) -> None:
-    point, _ = LaplaceProposal.of(found.mode).sample(1, np.random.default_rng(1))
+    point, _ = LaplaceProposal(found.mode).sample(1, np.random.default_rng(1))
     point[0, -1] *= -1.0
     assert found.posterior.log_density(point)[0] == -np.inf
 
 
 def test_linearised_posterior_is_nearly_the_exact_one(found) -> None:
     """Conditional times marginal equals the density but for a constant, near the mode."""
-    proposal = LaplaceProposal.of(found.mode)
+    proposal = LaplaceProposal(found.mode)
     points, _ = proposal.sample(200, np.random.default_rng(2))
     f = len(found.posterior.free)
     mean, factor, marginal = found.mode.linearisation.conditional(points[:, f:])
@@ -79,9 +79,9 @@ def test_linearised_posterior_is_nearly_the_exact_one(found) -> None:
     assert np.std(difference) < 0.05
 
 
-@pytest.mark.parametrize('kind', [LaplaceProposal, FactorisedProposal])
-def test_proposal_reports_the_density_it_samples_from(found, kind) -> None:
-    proposal = kind.of(found.mode)
+@pytest.mark.parametrize('factorised', [False, True])
+def test_proposal_reports_the_density_it_samples_from(found, factorised) -> None:
+    proposal = LaplaceProposal(found.mode, factorised)
     points, density = proposal.sample(50, np.random.default_rng(3))
     np.testing.assert_allclose(proposal.log_density(points), density)
     assert np.all(points[:, -2:] >= 0.0)
@@ -138,7 +138,7 @@ def test_the_draws_do_not_depend_on_the_proposal() -> None:
         assert kstest(sample, walk.draws[..., index].ravel()).pvalue > 1e-3 / posterior.size
 
 
-def test_poor_proposals_are_adapted_and_said_so() -> None:
+def test_poor_proposals_are_adapted_and_the_name_shows_it() -> None:
     """A Laplace proposal with the noise three standard deviations off and half as wide."""
     found = estimate(Problem.of(scene(13, poses=8)[0]))
     width = np.sqrt(np.diag(found.mode.eta_covariance))

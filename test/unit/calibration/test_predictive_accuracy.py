@@ -98,7 +98,7 @@ def test_noise_along_the_line_of_sight_alone_is_as_long_as_one_axis(seen: Measur
     assert invariant.after.mean() == pytest.approx(1e-3 * np.sqrt(2.0 / np.pi), rel=0.012)
 
 
-def test_all_draws_and_rows_have_their_say(seen: Measurements) -> None:
+def test_all_draws_and_rows_are_used(seen: Measurements) -> None:
     """One draw of 300 is a metre off; with fewer draws than rows it is still among the pairs."""
     given = predictive({})
     given.draws[17, given.model.names.index('registration.mocap.y')] = 1.0

@@ -8,7 +8,7 @@ from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.kinematics.transforms import (
     apply,
     inverse,
-    rotation_angle,
+    matrix_to_rotation_vector,
     rotation_vector_to_matrix,
     transform,
 )
@@ -38,7 +38,9 @@ def test_noise_is_averaged_and_reported():
     assert rms == pytest.approx(noise * np.sqrt(3 * (1 - 6 / 1200)), rel=0.1)
     left = inverse(T_R_N) @ found
     # Six sigma of the angle over points 0.5 m wide; the translation lies up to 5 m from them.
-    assert rotation_angle(left[:3, :3]) < 6 * noise / (0.29 * np.sqrt(400))
+    assert np.linalg.norm(matrix_to_rotation_vector(left[:3, :3])) < 6 * noise / (
+        0.29 * np.sqrt(400)
+    )
     center = points_R.mean(axis=0)
     moved = apply(found, apply(inverse(T_R_N), center)) - center
     assert np.linalg.norm(moved) < 6 * noise / np.sqrt(400)
@@ -75,7 +77,7 @@ TRIANGLE = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.2, 0]])
         (TRIANGLE * 0, TRIANGLE, 'lie on a line'),
     ],
 )
-def test_too_few_and_collinear_points_say_what_to_measure(points_R, points_N, message):
+def test_too_few_and_collinear_points_are_refused_with_a_remedy(points_R, points_N, message):
     with pytest.raises(InsufficientDataError, match=message):
         register_points(points_R, points_N)
 
@@ -99,7 +101,7 @@ def test_a_stray_at_one_point_is_found_by_the_next(seed, moved):
     """It stands still or moves; three points that disagree are refused, the fourth decides."""
     rng, T_R_N, points_R, points_N = random_case(seed, 5)
     points_R += rng.normal(0, 2e-3, points_R.shape)
-    # A stray so near that the triangle is as it should be could not be told.
+    # A stray so near that the triangle is as it should be cannot be found.
     points_N[1] = points_N[0] + (points_N[1] - points_N[0]) * (1.6 if moved else 0.3)
     with pytest.raises(InsufficientDataError, match='of 3 points too few agree'):
         register_ransac(points_R[:3], points_N[:3], 0.025)

@@ -52,7 +52,7 @@ def test_density_is_the_exact_one_where_it_matters(kind: str) -> None:
         p = found.posterior
         split = type(p).of(p.model, p.rows, p.priors, p.free, mode.z, split=(0,))
         mode = find_mode(split)
-    points, _ = LaplaceProposal.of(mode).sample(500, np.random.default_rng(2))
+    points, _ = LaplaceProposal(mode).sample(500, np.random.default_rng(2))
     surrogate = Surrogate.of(mode)
     difference = surrogate.log_density(points) - mode.linearisation.posterior.log_density(points)
     difference = np.abs(difference - np.median(difference))
@@ -96,27 +96,28 @@ def test_proposals_fit_a_pose_sigma_that_is_surely_zero() -> None:
 
 
 def test_sampling_goes_on_until_the_precision_is_reached() -> None:
-    """Arviz agrees that it is."""
-    judge = pytest.importorskip('arviz_stats.base').array_stats
+    """Every mean is as near to that of a run many times as long as the precision promises."""
     session, _ = scene(43, poses=12)
+    mode = estimate(Problem.of(session)).mode
+    size = mode.linearisation.posterior.size
+    long = sample_posterior(mode, chains=4, draws=40_000, rng=np.random.default_rng(50)).run.draws
+    long = long.reshape(-1, size)
     lengths = []
     for precision in (0.02, 0.012):
-        result = fit_session(session, rng=np.random.default_rng(5), precision=precision)
-        info = result.sampler
+        rng = np.random.default_rng(5)
+        run, _ = sample_posterior(mode, chains=4, precision=precision, rng=rng)
+        error = (run.draws.reshape(-1, size).mean(axis=0) - long.mean(axis=0)) / long.std(axis=0)
+        # A normal number is beyond 3.9 in 1 of 10,000 cases.
+        assert np.abs(error).max() < 3.9 * precision
+        info = fit_session(session, rng=np.random.default_rng(5), precision=precision).sampler
         assert info.converged
         assert info.message.startswith('converged')
         assert info.precision <= info.precision_wanted == precision
-        axes = {'chain_axis': 0, 'draw_axis': 1}
-        for index in range(result.draws.shape[2]):
-            draws = result.draws[..., index]
-            assert judge.rhat(draws, **axes) <= 1.01
-            for options in ({'method': 'bulk'}, {'method': 'tail', 'prob': 0.05}):
-                assert judge.ess(draws, **options, **axes) >= 0.999 * precision**-2
         lengths.append(info.draws)
     assert lengths[1] > lengths[0]
 
 
-def test_a_precision_that_is_not_reached_is_said_so(monkeypatch) -> None:
+def test_a_precision_that_is_not_reached_is_reported(monkeypatch) -> None:
     monkeypatch.setattr(sampling, 'ALLOWANCE', 900)
     session, _ = scene(43, poses=12)
     result = fit_session(session, rng=np.random.default_rng(6), precision=0.005)

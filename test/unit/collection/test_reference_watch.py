@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from remaster_ros.collection.reference_causes import choose_references
 from remaster_ros.collection.reference_readings import ReferenceReading
 from remaster_ros.collection.reference_session import replay
 from remaster_ros.collection.reference_watch import ReferenceWatch
 from remaster_ros.kinematics import transforms
+from remaster_ros.planning.reference_choice import choose_references
 from remaster_ros.session.workcell import read_cell
 
 CELL = read_cell('demo')
@@ -68,9 +68,10 @@ class Scene:
                 position = transforms.apply(transforms.inverse(T), point) + noise
                 self.readings.append(
                     ReferenceReading(
-                        self.configuration, name, marker, stands, position, self.time_s,
+                        name, marker, self.time_s, stands, position,
                         None if name == 'tracker' else np.full(3, 1e-5),
                         1 if name == 'tracker' else 30,
+                        configuration=self.configuration,
                     )
                 )  # fmt: skip
             self.configuration += 1

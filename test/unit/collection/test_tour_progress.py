@@ -1,5 +1,7 @@
 """Which pose is next, with the journal of a real session and tours of a few poses."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -38,8 +40,9 @@ class Tours:
             plans[REFERENCE] = plan_of(3, self.references, 1)
         return Tour(CHAIN, plans, reference_every=100 * bool(self.references))
 
-    def standing_trouble(self, q):
-        return self.standing
+    @property
+    def model(self):
+        return SimpleNamespace(trouble=lambda q: self.standing)
 
 
 class Planning:

@@ -10,7 +10,7 @@ from srs_solver import SrsArm
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.kinematics.transforms import inverse, rotation_angle, transform
+from remaster_ros.kinematics.transforms import inverse, matrix_to_rotation_vector, transform
 
 ROOT = Path(__file__).parents[3]
 DATA = ROOT.parent / 'shared' / 'data'
@@ -55,7 +55,8 @@ def distinct(q):
 def assert_certified(chain, solutions, T):
     left = inverse(T) @ chain.forward(solutions)
     assert np.all(np.linalg.norm(left[:, :3, 3], axis=1) < 1e-8)
-    assert np.all(rotation_angle(left[:, :3, :3]) < 2e-8)
+    turns = matrix_to_rotation_vector(left[:, :3, :3])
+    assert np.all(np.linalg.norm(turns, axis=1) < 2e-8)
 
 
 def poses_of(arm, q):
@@ -217,16 +218,6 @@ def test_any_joint_but_the_elbow_can_be_held(joint):
         solutions = ik.solutions(T)
         assert_certified(chain, solutions, T)
         assert np.min(distance(row, solutions)) < SAME_RAD
-
-
-def test_solve_reports_what_forward_kinematics_leaves():
-    chain = read_robot('lwr4plus')
-    ik = InverseKinematics(chain)
-    T = chain.forward([0.3, 0.8, 0.0, 1.4, 0.5, 1.0, -0.4])
-    solved = ik.solve(T)
-    np.testing.assert_array_equal([s.q for s in solved], ik.solutions(T))
-    assert all(0 <= s.position_error_m < 1e-8 for s in solved)
-    assert all(0 <= s.rotation_error_rad < 1e-8 for s in solved)
 
 
 @pytest.mark.parametrize('folder', ['ur10_two_solutions', 'irb120_three_points'])

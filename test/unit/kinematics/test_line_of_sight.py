@@ -52,11 +52,17 @@ def test_segment_distance_is_the_least_over_both_segments():
     np.testing.assert_allclose(exact[30:40], 0, atol=1e-12)
 
 
-def test_points_run_from_the_base_over_the_joints_to_the_tool(lwr):
-    heights = LinkCapsules(lwr).points(np.zeros(7))[:, 2]
-    np.testing.assert_allclose(
-        heights, [0, 0.102, 0.3105, 0.502, 0.7105, 0.902, 1.1005, 1.1785, 1.2285]
-    )
+def test_the_links_hide_from_the_base_to_the_origin_of_the_last_joint(lwr):
+    arm = LinkCapsules(lwr, radius=0.05)
+
+    def hides(height):
+        marker_T = [0.5, 0.0, height - 1.2285]
+        return arm.hides(np.zeros(7), marker_T, [-0.5, 0.0, height])
+
+    assert not hides(-0.051)
+    assert all(hides(height) for height in np.arange(-0.049, 1.2285, 0.001))
+    assert hides(1.1785 + 0.049)
+    assert not hides(1.1785 + 0.051)
 
 
 def test_batches_agree_with_single_configurations(lwr):

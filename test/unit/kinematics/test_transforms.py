@@ -45,20 +45,45 @@ def test_rotation_vectors_round_trip(rng, angle):
     vector = angle * axis / np.linalg.norm(axis)
     matrix = transforms.rotation_vector_to_matrix(vector)
     np.testing.assert_allclose(transforms.matrix_to_rotation_vector(matrix), vector, atol=1e-8)
-    np.testing.assert_allclose(transforms.rotation_angle(matrix), angle, atol=1e-15, rtol=1e-9)
+    length = np.linalg.norm(transforms.matrix_to_rotation_vector(matrix))
+    np.testing.assert_allclose(length, angle, atol=1e-15, rtol=1e-9)
 
 
-def test_rotation_angle_of_a_half_turn():
+def test_rotation_vectors_of_any_leading_shape(rng):
+    vectors = rng.normal(size=(2, 0, 4, 3))
+    assert transforms.rotation_vector_to_matrix(vectors).shape == (2, 0, 4, 3, 3)
+    vectors = rng.normal(size=(2, 5, 3))
+    matrices = transforms.rotation_vector_to_matrix(vectors)
+    np.testing.assert_allclose(transforms.matrix_to_rotation_vector(matrices), vectors)
+
+
+def test_a_half_turn_has_a_rotation_vector_of_length_pi():
     half_turn = np.diag([1.0, -1.0, -1.0])
-    assert transforms.rotation_angle(half_turn) == pytest.approx(np.pi)
+    vector = transforms.matrix_to_rotation_vector(half_turn)
+    assert np.linalg.norm(vector) == pytest.approx(np.pi)
+
+
+@pytest.mark.parametrize('axis', [[0, 0, 1], [0, 0, -1], [0, 2, 0], [-3, 0, 0], [1, -2, 3]])
+def test_with_z_along_is_a_rotation_whose_z_axis_lies_there(axis):
+    R = transforms.with_z_along(axis)
+    np.testing.assert_allclose(R[:, 2], np.array(axis) / np.linalg.norm(axis), atol=1e-15)
+    np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-15)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize('quaternion', [[0, 0, 0, 0], [0, 0, np.nan, 1], [np.inf, 0, 0, 1]])
+def test_a_quaternion_without_direction_is_refused(quaternion):
+    with pytest.raises(ValueError, match='is no rotation'):
+        transforms.matrix_from_quaternion_xyzw(quaternion)
 
 
 def test_quaternions_round_trip_with_positive_w(rng):
-    R = transforms.rotation_vector_to_matrix(rng.uniform(-4, 4, size=(3, 50, 3)))
-    q = transforms.quaternion_xyzw(R)
-    assert q.shape == (3, 50, 4)
-    assert np.all(q[..., 3] >= 0)
-    np.testing.assert_allclose(transforms.matrix_from_quaternion_xyzw(-2.5 * q), R, atol=1e-14)
+    R = transforms.rotation_vector_to_matrix(rng.uniform(-4, 4, size=(150, 3)))
+    for matrix in R:
+        q = transforms.quaternion_xyzw(matrix)
+        assert q[3] >= 0
+        back = transforms.matrix_from_quaternion_xyzw(-2.5 * q)
+        np.testing.assert_allclose(back, matrix, atol=1e-14)
 
 
 def test_quaternion_order_is_x_y_z_w():
@@ -103,6 +128,7 @@ def test_looking_at_points_z_at_the_target_with_x_level(target):
     assert R[:, 0] @ rolled[:, 0] == pytest.approx(np.cos(0.3))
 
 
-def test_looking_at_itself_is_refused():
+@pytest.mark.parametrize('x', [1.0, np.nan])
+def test_looking_at_itself_is_refused(x):
     with pytest.raises(InputError, match='another place'):
-        transforms.looking_at([1.0, 2.0, 3.0], [1.0, 2.0, 3.0])
+        transforms.looking_at([x, 2.0, 3.0], [1.0, 2.0, 3.0])

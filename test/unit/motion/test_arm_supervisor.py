@@ -14,11 +14,12 @@ from remaster_ros.motion.actions import (
     Stop,
     SupervisorRules,
 )
-from remaster_ros.motion.arm_supervisor import PROBE, ArmSupervisor
+from remaster_ros.motion.arm_supervisor import ArmSupervisor
 from remaster_ros.motion.following import STANDING_S
 from remaster_ros.motion.joint_reports import JointReport, JointReports
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import MotionGate
+from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.motion.trajectory import Line
@@ -57,11 +58,11 @@ def test_every_solution_is_visited_once_and_in_order(rig):
         assert line.duration_s - 0.1 < settled.motion_s < line.duration_s + 1.0
         assert 1.0 <= settled.settle_s < 1.05
         assert rig.supervisor.busy
-        assert not rig.supervisor.moving
+        assert not rig.supervisor._motion.is_moving
         rig.run(3.0)
         assert len(rig.said(Drive)) == solution + 1, 'it went on without the recorder'
         rig.answer(solution)
-        assert rig.supervisor.moving == (solution < 2)
+        assert rig.supervisor._motion.is_moving == (solution < 2)
     assert [drive.solution for drive in rig.said(Drive)] == [0, 1, 2]
     rig.run(5.0)
     assert not rig.supervisor.busy
@@ -304,7 +305,7 @@ def test_an_answer_to_another_pose_counts_nothing(rig):
     assert rig.supervisor.path_found(first.number, Rig._free(first), rig.wall) == []
     assert not rig.supervisor.busy
     rig.do(rig.supervisor.path_found(second.number, Rig._free(second), rig.wall))
-    assert rig.supervisor.moving
+    assert rig.supervisor._motion.is_moving
 
 
 def test_the_way_to_the_next_solution_goes_through_its_own_waypoints(rig):
@@ -387,7 +388,7 @@ def test_a_recorder_that_does_not_answer_loses_the_configuration_and_not_the_run
     settled = rig.t
     rig.run(40.0, lambda: rig.said(Failed))
     assert rig.last(Failed).solution == 0
-    assert rig.last(Failed).reason == 'the recorder did not say what became of it'
+    assert rig.last(Failed).reason == 'the recorder did not answer in time'
     assert RULES.answer_timeout_s < rig.t - settled < RULES.answer_timeout_s + 0.1
     rig.run(20.0, lambda: len(rig.said(Settled)) == 2)
     assert not rig.said(Halted, Stop)

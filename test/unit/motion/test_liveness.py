@@ -11,7 +11,7 @@ def test_silent_or_not_ready_is_absent_and_says_why():
     liveness.node_reports('mocap', True, '', 10.0)
     liveness.node_reports('tracker', False, 'warming up', 10.0)
     liveness.node_reports('stranger', False, 'whatever', 10.0)
-    assert liveness.words == {'mocap': 1, 'tracker': 1}
+    assert liveness.reports == {'mocap': 1, 'tracker': 1}
     assert liveness.absent(13.0) == {'tracker': 'warming up'}
     silent = 'its node has been silent for 3 s'
     assert liveness.absent(13.1) == {'mocap': silent, 'tracker': silent}
@@ -19,7 +19,7 @@ def test_silent_or_not_ready_is_absent_and_says_why():
     assert liveness.absent(14.0) == {'mocap': silent}
     liveness.node_reports('tracker', False, '', 14.0)
     assert liveness.absent(14.0)['tracker'] == 'not ready'
-    assert liveness.words == {'mocap': 1, 'tracker': 3}
+    assert liveness.reports == {'mocap': 1, 'tracker': 3}
 
 
 def test_readings_are_counted_and_dated():
@@ -53,7 +53,7 @@ def test_what_has_not_been_heard_yet_is_absent_for_a_while_where_it_is_required(
     liveness = Liveness(['mocap', 'tracker'], 3.0, since_s=10.0)
     liveness.reads('tracker', 10.1)
     assert liveness.absent(19.9) == {}, 'one that is not required is not given up for that'
-    unheard = {'mocap': 'its node has not been heard yet'}
+    unheard = {'mocap': 'its node has not reported yet'}
     assert liveness.absent(19.9, ['mocap', 'tracker']) == unheard
     assert liveness.absent(20.0, ['mocap', 'tracker']) == {}, 'a bag of readings without status'
     liveness.node_reports('mocap', True, '', 11.0)

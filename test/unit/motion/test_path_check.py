@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.motion.path_check import (
-    PEAK_STEP_RAD,
-    FreePath,
-    PointSpeeds,
-    free_path_along,
-    peak_speeds,
-)
+from remaster_ros.motion.path_check import PEAK_STEP_RAD, FreePath, PointSpeeds
 
 pin = pytest.importorskip('pinocchio', reason='a judge: pip install .[test]')
 
@@ -113,28 +107,15 @@ def test_an_arm_that_stands_has_no_fast_point_and_no_bodies_no_speed(arm):
 # Paths
 
 
-class Wall:
-    """Something is in the way beyond a metre on the first axis."""
-
-    def trouble(self, q):
-        return 'wall' if q[0] > 1.0 else ''
-
-    def path_trouble(self, waypoints):
-        return next(filter(None, map(self.trouble, waypoints)), '')
-
-
-def test_a_free_path_comes_with_the_peaks_of_its_lines(arm):
+def test_the_peaks_of_a_polyline_are_those_of_its_lines(arm):
     _, _, speeds, _ = arm
     points = np.zeros((3, 7))
     points[1, 0], points[2, 1] = 0.5, 0.3
-    found = free_path_along(points, Wall(), speeds)
-    np.testing.assert_array_equal(found.points, points)
     expected = (speeds.peak_m(points[0], points[1]), speeds.peak_m(points[1], points[2]))
-    assert found.peaks_m == peak_speeds(points, speeds) == expected
+    assert speeds.peaks_m(points) == expected
+    found = FreePath(points)
+    assert found.peaks_m == ()
     assert not found.way_out
-    assert free_path_along(points, Wall(), None).peaks_m == peak_speeds(points, None) == ()
-    points[2, 0] = 1.5
-    assert free_path_along(points, Wall(), speeds) == 'wall'
 
 
 @pytest.mark.parametrize(

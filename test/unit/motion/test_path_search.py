@@ -7,7 +7,7 @@ import pytest
 from simple_cells import write_cell
 
 from remaster_ros.motion.actions import CheckPath
-from remaster_ros.motion.path_check import PointSpeeds, peak_speeds
+from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.motion.path_search import PathSearch
 from remaster_ros.session.workcell import read_cell
 
@@ -52,7 +52,7 @@ def ask(search, start, target, *waypoints):
 
 def is_path(path, points, speeds):
     np.testing.assert_array_equal(path.points, points)
-    assert path.peaks_m == peak_speeds(path.points, speeds)
+    assert path.peaks_m == speeds.peaks_m(path.points)
     assert not path.way_out
     return True
 
@@ -123,7 +123,7 @@ def test_an_arm_that_stands_too_near_is_offered_a_slow_way_out(scene):
     assert way.way_out
     np.testing.assert_array_equal(way.points[0], ARM)
     assert not model.trouble(way.points[-1])
-    assert way.peaks_m == peak_speeds(way.points, speeds)
+    assert way.peaks_m == speeds.peaks_m(way.points)
     assert all(peak > 0.0 for peak in way.peaks_m)
 
 

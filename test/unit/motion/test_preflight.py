@@ -39,8 +39,8 @@ def test_joint_states_of_another_robot_say_so_once():
 @pytest.mark.parametrize(
     ('change', 'finding'),
     [
-        ({'said_age_s': 3.1}, 'mocap: no sign of its node: is it running in this ROS domain?'),
-        ({'said_age_s': nan}, 'mocap: no sign of its node: is it running in this ROS domain?'),
+        ({'node_age_s': 3.1}, 'mocap: no sign of its node: is it running in this ROS domain?'),
+        ({'node_age_s': nan}, 'mocap: no sign of its node: is it running in this ROS domain?'),
         ({'ready': False, 'message': 'set data_port'}, 'mocap: set data_port'),
         ({'ready': False}, 'mocap: not ready'),
         (
@@ -65,11 +65,11 @@ def test_a_sensor_that_cannot_measure_says_why(change, finding):
 
 
 def test_exactly_three_seconds_are_fresh():
-    old = replace(MOCAP, said_age_s=3.0, read_age_s=3.0)
+    old = replace(MOCAP, node_age_s=3.0, read_age_s=3.0)
     assert preflight(replace(GOOD, sensors=(old,))) == ()
 
 
 def test_everything_at_once_is_all_named():
-    gone = [replace(sensor, said_age_s=inf) for sensor in (MOCAP, TRACKER)]
+    gone = [replace(sensor, node_age_s=inf) for sensor in (MOCAP, TRACKER)]
     assert len(preflight(Facts(inf, '', inf, inf, gone))) == 5
     assert len(preflight(Facts(inf, '', inf, inf, gone, any_sensor=True))) == 5

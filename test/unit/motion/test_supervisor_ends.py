@@ -64,17 +64,17 @@ def test_an_arm_that_was_not_seen_for_a_while_has_as_much_longer_to_arrive(rig):
     rig.alter = lambda t, q: np.add(q, [1e-3 * np.arcsin(np.sin(t)), 0.0])
     rig.plan([0.5, 0.5])
     rig.run(4.0)
-    deadline = rig.supervisor._visit.deadline
+    deadline = rig.supervisor._motion.visit.deadline
     rig.alive.discard('robot')
     rig.run(0.4)
     rig.alive.add('robot')
     rig.run(0.2)
-    assert rig.supervisor._visit.deadline == deadline, 'a short one adds nothing'
+    assert rig.supervisor._motion.visit.deadline == deadline, 'a short one adds nothing'
     rig.alive.discard('robot')
     rig.run(2.0)
     rig.alive.add('robot')
     rig.run(0.1)
-    assert rig.supervisor._visit.deadline == pytest.approx(deadline + 2.0, abs=0.05)
+    assert rig.supervisor._motion.visit.deadline == pytest.approx(deadline + 2.0, abs=0.05)
 
 
 def test_the_reasons_are_given_in_an_order(rig):

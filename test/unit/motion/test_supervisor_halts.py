@@ -16,7 +16,7 @@ from remaster_ros.motion.actions import (
     Stop,
     SupervisorRules,
 )
-from remaster_ros.motion.arm_supervisor import PROBE, WAY_OUT
+from remaster_ros.motion.move_queue import PROBE, WAY_OUT
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.trajectory import Line
 from remaster_ros.simulation import arm_motion as servo
@@ -73,7 +73,7 @@ def goes_on(rig):
     drives = len(rig.said(Drive))
     rig.run(30.0, lambda: rig.said(Drive)[drives:] and rig.said(Settled))
     assert rig.said(Drive)[drives].solution == PROBE
-    rig.run(30.0, lambda: rig.supervisor.busy and not rig.supervisor.moving)
+    rig.run(30.0, lambda: rig.supervisor.busy and not rig.supervisor._motion.is_moving)
     np.testing.assert_allclose(rig.last(Settled).q, [0.2, 0.1], atol=1e-4)
 
 
@@ -302,9 +302,9 @@ def test_after_how_long_doubts_halt(rig):
     rig.alive.discard('robot')
     wall = np.ceil(rig.wall)
     for passed in (0.0, 0.25, 0.5):
-        rig.do(rig.supervisor.unreadable('joint_states lacks a', wall + passed))
+        rig.do(rig.supervisor.doubt('joint_states lacks a', wall + passed))
         assert rig.supervisor.trouble == ''
-    rig.do(rig.supervisor.unreadable('joint_states lacks a', wall + 0.5 + 2.0**-20))
+    rig.do(rig.supervisor.doubt('joint_states lacks a', wall + 0.5 + 2.0**-20))
     assert rig.supervisor.trouble == 'joint_states lacks a'
 
 
@@ -331,11 +331,11 @@ def test_reports_that_cannot_be_read(rig):
     rig.alter = lambda t, q: q
     for _ in range(20):
         rig.step()
-        rig.do(rig.supervisor.unreadable('joint_states lacks a', rig.wall))
+        rig.do(rig.supervisor.doubt('joint_states lacks a', rig.wall))
     assert not rig.said(Halted)
     for _ in range(20):
         rig.step()
-        rig.do(rig.supervisor.unreadable('joint_states lacks a', rig.wall))
+        rig.do(rig.supervisor.doubt('joint_states lacks a', rig.wall))
     (stop,) = rig.said(Halted)
     assert stop.reason == rig.supervisor.trouble == 'joint_states lacks a'
     assert not rig.said(Stop)
@@ -350,7 +350,7 @@ def test_reports_that_cannot_be_read_while_idle_only_hold(rig):
     rig.alive.discard('robot')
     for _ in range(50):
         rig.step()
-        rig.do(rig.supervisor.unreadable('joint_states lacks a', rig.wall))
+        rig.do(rig.supervisor.doubt('joint_states lacks a', rig.wall))
     assert not rig.said(Halted)
     assert rig.supervisor.trouble == 'joint_states lacks a'
     rig.state = 'running'
@@ -724,7 +724,7 @@ def test_a_recorder_that_does_not_answer_is_no_failure_of_the_robot(rig):
     """However often: each configuration was reached."""
     rig.plan(*([0.1 * i, 0.3] for i in range(5)))
     rig.run(150.0, lambda: len(rig.said(Failed)) == 4)
-    assert {f.reason for f in rig.said(Failed)} == {'the recorder did not say what became of it'}
+    assert {f.reason for f in rig.said(Failed)} == {'the recorder did not answer in time'}
     assert [f.solution for f in rig.said(Failed)] == [0, 1, 2, 3]
     assert not rig.said(Halted)
 

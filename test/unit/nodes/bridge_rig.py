@@ -280,7 +280,7 @@ class Rig:
 
     def flush(self):
         """Wait for the path that is looked for, and for what the bridge has published."""
-        self.wait(lambda: self.bridge.supervisor._pending is None, 'a path')
+        self.wait(lambda: self.bridge.supervisor._queue.pending is None, 'a path')
         self.wait(self._has_come, 'what the bridge has published')
 
     def _has_come(self):

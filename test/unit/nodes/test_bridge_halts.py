@@ -381,7 +381,7 @@ def test_every_rule_is_asked_at_the_time_it_is(rig):
     ]
     assert {args[2] for args in seen['observe']} == {r.wall}
     assert seen['plan'][0][1:] == (r.wall, {})
-    assert seen['unreadable'][0][1] == r.wall
+    assert seen['doubt'][0][1] == r.wall
     (report,) = seen['report'][0]
     assert report.wall_s == r.wall
     assert report.clock_s == r.wall + 0.25

@@ -688,7 +688,10 @@ def test_a_controller_that_goes_halts_the_arm(rig):
     assert r.bridge.published == sent + 1
 
 
-@pytest.mark.parametrize('name', ['recorder', 'laser_tracker_markers', 'robot_bridge'])
+@pytest.mark.parametrize(
+    'name',
+    ['recorder', 'laser_tracker_markers', 'laser_tracker_markers_left', 'robot_bridge'],
+)
 def test_a_recorder_that_listens_is_no_controller(rig, name):
     """Nodes of ours listen to the commands, too: no arm moves by it."""
     r = rig(ready=False, controller=False)

@@ -24,6 +24,7 @@ from remaster_ros.nodes.launching import (
     fake_nodes,
     real_nodes,
 )
+from remaster_ros.sensors.registry import DRIVERS
 
 ROOT = Path(__file__).parents[3]
 CELL, REAL = str(ROOT / 'config' / 'cells' / 'demo.yaml'), str(ROOT / 'config' / 'real.yaml')
@@ -49,7 +50,7 @@ def test_every_node_is_started_with_the_cell_and_the_file():
             assert node.parameters[1] == {'cell': CELL}
 
 
-def test_sensors_by_the_names_of_the_cell(tmp_path):
+def test_sensors_by_the_names_of_the_cell(tmp_path, monkeypatch):
     nodes = {node.name: node for node in real_nodes(CELL, REAL, 'mocap')}
     assert set(nodes) == {*CORE, 'optitrack_markers'}
     # Nobody waits for the one that is not there.
@@ -66,6 +67,13 @@ def test_sensors_by_the_names_of_the_cell(tmp_path):
 
     (bar,) = real_nodes(CELL, edited(tmp_path, rename), 'mocap')[len(CORE) :]
     assert (bar.executable, bar.name) == ('optitrack_markers', 'optitrack_markers_left')
+
+    def another(data):
+        data['/**/gauge_left'] = data.pop('/**/optitrack_markers')
+
+    monkeypatch.setitem(DRIVERS, 'gauge', 'gauge.driver:GaugeDriver')
+    (gauge,) = real_nodes(CELL, edited(tmp_path, another), 'mocap')[len(CORE) :]
+    assert (gauge.executable, gauge.name) == ('sensor_markers', 'gauge_left')
     with pytest.raises(InputError, match=r"no sensor 'leica'; it has mocap, tracker"):
         real_nodes(CELL, REAL, 'leica')
     lost = edited(tmp_path, lambda data: data.pop('/**/laser_tracker_markers'))
@@ -159,6 +167,8 @@ def test_the_launch_files(name, monkeypatch):
     }
     for module, members in stand_ins.items():
         monkeypatch.setitem(sys.modules, module, types.SimpleNamespace(**members))
+    # It imports launch.
+    monkeypatch.delitem(sys.modules, 'remaster_ros.nodes.launch_actions', raising=False)
     path = ROOT / 'launch' / f'{name}.launch.py'
     *declared, (_, on_exit), start = runpy.run_path(str(path))['generate_launch_description']()
     arguments = dict(declared)
@@ -173,6 +183,9 @@ def test_the_launch_files(name, monkeypatch):
         assert node['namespace'] == '/left'
         assert node['respawn']
         assert 0 < node['respawn_max_retries'] < 20
+        # An enclave of config/sros2/policy.xml, which has none for the fakes.
+        enclave = ['--enclave', f'/remaster/{node["executable"]}']
+        assert node['ros_arguments'] == (enclave if name == 'real' else None)
     ended = types.SimpleNamespace(returncode=2, process_name='recorder')
     assert on_exit(ended, None) == [
         ('emit', ('shutdown', 'recorder ended with status 2')),

@@ -1,6 +1,5 @@
 """Node parameters: every config file fits; wrong values are refused with one line."""
 
-import dataclasses
 import importlib
 from pathlib import Path
 
@@ -10,32 +9,29 @@ import yaml
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 from remaster_ros.errors import InputError
-from remaster_ros.nodes.parameters import check
+from remaster_ros.parameters import check, parameter_fields
+from remaster_ros.sensors.driver import SensorParameters
+from remaster_ros.sensors.registry import DRIVERS, load_driver
 
 pytestmark = pytest.mark.ros
 
 CONFIG = Path(__file__).parents[3] / 'config'
-# A node has its parameters in its own file, or in one beside it.
-BESIDE = {
-    'bridge_parameters': 'robot_bridge',
-    'planner_parameters': 'pose_planner',
-    'recorder_parameters': 'recorder',
-}
-NODES = sorted(
-    BESIDE.get(path.stem, path.stem)
-    for path in (Path(__file__).parents[3] / 'remaster_ros' / 'nodes').glob('*.py')
-    if 'class Parameters' in path.read_text()
-)
+NODES = sorted(path.name for path in (Path(__file__).parents[3] / 'scripts').iterdir())
 
 
 def fields_of(node):
-    kind = importlib.import_module(f'remaster_ros.nodes.{node}').Parameters
-    return {field.name: field for field in dataclasses.fields(kind)}
+    return parameter_fields(importlib.import_module(f'remaster_ros.nodes.{node}').Parameters)
 
 
-def test_every_executable_has_parameters():
-    scripts = {path.name for path in (Path(__file__).parents[3] / 'scripts').iterdir()}
-    assert scripts == set(NODES)
+def test_every_module_with_a_main_is_an_executable_with_parameters():
+    """So are the drivers of sensors: each has those of every sensor, and its own."""
+    nodes = (Path(__file__).parents[3] / 'remaster_ros' / 'nodes').glob('*.py')
+    assert sorted(path.stem for path in nodes if '\ndef main(' in path.read_text()) == NODES
+    for node in NODES:
+        assert fields_of(node)
+    for kind in DRIVERS:
+        own = load_driver(kind).parameters_type
+        assert list(parameter_fields(own))[:3] == list(parameter_fields(SensorParameters))
 
 
 @pytest.mark.parametrize('node', NODES)

@@ -9,14 +9,12 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics import body_pairs
 from remaster_ros.kinematics.collision import CollisionModel, arm_bodies
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
-from remaster_ros.kinematics.line_of_sight import LinkCapsules
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning import candidates
 from remaster_ros.planning.candidates import (
     LineOfSight,
     PoseRanges,
     candidate_poses,
-    order_by_proximity,
     order_solutions,
     plan_poses,
 )
@@ -151,7 +149,7 @@ def test_a_link_in_the_line_of_sight_drops_the_solution(ik):
     T = ik.chain.forward(q)
     marker = np.array([0.1, 0, 0.02])
     arm = capsules(ik.chain)
-    elbow = LinkCapsules(ik.chain).points(q)[4]
+    elbow = ik.chain.frames(q)[3, :3, 3]
     at = ik.chain.positions(q, marker)
     sight = LineOfSight('mocap', at + 3 * (elbow - at), marker, max_angle_rad=np.pi)
     plan = plan_poses(ik, arm, T[None], [sight])
@@ -165,12 +163,6 @@ def test_a_link_in_the_line_of_sight_drops_the_solution(ik):
 def test_no_candidates_make_an_empty_plan(ik):
     plan = plan_poses(ik, capsules(ik.chain), np.empty((0, 4, 4)), SIGHTS)
     assert (plan.poses, plan.dropped, plan.dropped_solutions) == ((), {}, {})
-
-
-def test_order_by_proximity_goes_to_the_nearest_that_is_left():
-    points = np.array([[0, 0, 0], [5, 0, 0], [1, 0, 0], [2.5, 0, 0], [-9, 0, 0]])
-    assert order_by_proximity(points, [1.2, 0, 0]).tolist() == [2, 0, 3, 1, 4]
-    assert order_by_proximity(np.empty((0, 3)), [0, 0, 0]).tolist() == []
 
 
 def test_order_solutions_is_by_travel_time_of_the_slowest_joint():

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import msgspec
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from discovery_scenes import at_joint, session_with
 
+from remaster_ros.calibration.noise import Noise, NoiseModel
 from remaster_ros.discovery.confirmation import confirm
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.errors import InputError
@@ -31,7 +33,7 @@ def saved(tmp_path_factory):
     return found, folder
 
 
-def test_discovery_json_has_what_the_contract_asks(saved):
+def test_discovery_json_keeps_its_contract(saved):
     found, folder = saved
     content = json.loads((folder / 'discovery.json').read_text())
     assert content['format'] == 'remaster-discovery/1'
@@ -49,7 +51,7 @@ def test_discovery_json_has_what_the_contract_asks(saved):
     assert read_discovery(folder / 'discovery.json') == content
 
 
-def test_the_report_needs_nothing_else_and_says_the_cause(saved):
+def test_the_report_needs_nothing_else_and_names_the_cause(saved):
     found, folder = saved
     page = (folder / 'report.html').read_text()
     assert not re.findall(r'(?:src|href)="(?!#)[^"]', page)
@@ -96,3 +98,20 @@ def test_what_is_no_discovery_is_refused_in_one_line(saved, tmp_path):
         with pytest.raises(InputError, match=words) as error:
             read_discovery(path)
         assert '\n' not in str(error.value)
+
+
+def test_noise_along_the_line_of_sight_is_drawn_by_sensor(saved):
+    """0.3 mm along it within poses, 0.6 mm across it shared: root mean squares over the axes."""
+    found, _ = saved
+    data = found.residuals
+    noise_model = NoiseModel.of(data.rows, np.eye(4)[None], (0,))
+    noise = Noise(np.array([0.3e-3, 0.0]), np.array([0.0, 0.6e-3]))
+    selection = replace(
+        found.selection,
+        empty=replace(found.selection.empty, noise=noise),
+        solution=replace(found.selection.solution, noise=noise),
+    )
+    residuals = replace(data, noise_model=noise_model)
+    figure = discovery_figures.gain(replace(found, residuals=residuals, selection=selection))
+    heights = [bar.get_height() for bar in figure.axes[1].patches]
+    np.testing.assert_allclose(heights, 2 * [0.6 * np.sqrt(2.0 / 3.0), 0.3 / np.sqrt(3.0)])

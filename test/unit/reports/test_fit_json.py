@@ -171,7 +171,7 @@ def test_the_offset_layer_is_a_ros_parameter_file(fit_result):
     assert parameters['left_out'] == names[~known].tolist()
 
 
-def test_the_instructions_say_minus_the_offset(fit_result):
+def test_the_instructions_are_for_minus_the_offset(fit_result):
     text = remaster_text(fit_result)
     table, _, notes = text.partition('Left out of all three')
     for i, joint in enumerate(fit_result.joint_names):
@@ -202,7 +202,7 @@ def test_all_joints_or_none_may_be_applied(fit_result, known):
     assert ('left_out' in parameters) != known
     text = texts['remaster.txt']
     assert ('drive to, deg' in text) == known
-    assert ('these data tell no offset' in text) != known
+    assert ('these data determine no offset' in text) != known
     assert ('Left out' in text) != known
     urdf = texts['robot_calibrated.urdf']
     chain = SerialChain.from_urdf(urdf, result.chain.base_link, result.chain.tip_link)

@@ -1,4 +1,4 @@
-"""The report is one page that needs nothing else, says the verdict, and stays of bounded size."""
+"""The report is one page that needs nothing else, with the verdict, and of bounded size."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_the_page_is_whole_and_needs_nothing_else(page, html):
         assert reference in page.ids
 
 
-def test_the_page_says_what_was_found(fit_result, page):
+def test_the_page_shows_what_was_found(fit_result, page):
     text = ' '.join(' '.join(page.text).split())
     metrics = fit_result.accuracy['validation']['post_registration']
     before, after = (f'{metrics[side]["mean_mm"]:.3f} mm' for side in ('before', 'after'))
@@ -226,7 +226,7 @@ def test_an_error_that_noise_does_not_explain_is_never_green(fit_result, check, 
         assert '0.110 mm per axis within a pose' in told
         assert 'makes 0.176 mm' in told
     else:
-        assert 'this session cannot tell' in judged.headline
+        assert 'this session cannot show' in judged.headline
         assert 'measure poses in all their joint solutions' in told
     assert judged.points[0].startswith('tracker: ')
     html = report_html(replace(fit_result, noise_checks=(check,)), {})
@@ -315,7 +315,7 @@ def with_references(fit_result, shift_m):
     return replace(fit_result, session=replace(session, references=references)), name
 
 
-def test_what_changed_in_the_session_is_said_first(fit_result):
+def test_what_changed_in_the_session_is_reported_first(fit_result):
     assert 'id="references"' not in report_html(fit_result, {})
     result, _ = with_references(fit_result, 0.0)
     html = report_html(result, {})

@@ -14,13 +14,8 @@ import pytest
 from tracker_world import MARKER, ReflectorWorld, across_and_along
 
 from remaster_ros.errors import DeviceError, InputError
-from remaster_ros.sensors.laser_tracker.client import (
-    Environment,
-    LaserTrackerClient,
-    LaserTrackerError,
-    LaserTrackerSettings,
-    TrackerStatus,
-)
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
+from remaster_ros.sensors.laser_tracker.link import LaserTrackerError
 from remaster_ros.sensors.laser_tracker.protocol.codes import Change, Command, Status
 from remaster_ros.sensors.laser_tracker.protocol.packets import (
     NEED_DATA,
@@ -33,6 +28,11 @@ from remaster_ros.sensors.laser_tracker.protocol.packets import (
     StatusChange,
     UnknownPacket,
     encode,
+)
+from remaster_ros.sensors.laser_tracker.settings import (
+    Environment,
+    LaserTrackerSettings,
+    TrackerStatus,
 )
 from remaster_ros.simulation.laser_tracker import FakeLaserTracker
 from remaster_ros.simulation.laser_tracker_settings import TrackerBehaviour

@@ -15,7 +15,7 @@ from optitrack_world import RATE, SENSOR, MarkerWorld, eventually, free_port, op
 
 from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.optitrack import client as natnet_client
-from remaster_ros.sensors.optitrack.client import NatNetClient, NatNetSettings
+from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
 from remaster_ros.sensors.optitrack.protocol import natnet
 from remaster_ros.sensors.optitrack.protocol.frames import (
@@ -25,6 +25,7 @@ from remaster_ros.sensors.optitrack.protocol.frames import (
     LabeledMarker,
 )
 from remaster_ros.sensors.optitrack.protocol.models import ModelDefinition, RigidBodyDescription
+from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.simulation.optitrack import FakeOptiTrackServer
 from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour
 

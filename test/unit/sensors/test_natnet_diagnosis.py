@@ -8,13 +8,13 @@ import pytest
 
 from remaster_ros.errors import InputError
 from remaster_ros.sensors.optitrack.diagnosis import (
-    NatNetSettings,
     StreamStatus,
     diagnose,
     warning,
 )
 from remaster_ros.sensors.optitrack.frame_gate import Dropped
 from remaster_ros.sensors.optitrack.protocol.natnet import Connection, ServerInfo
+from remaster_ros.sensors.optitrack.settings import NatNetSettings
 
 GROUP = '239.255.42.99'
 MULTICAST = Connection(10_000_000, 1511, True, GROUP)

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from remaster_ros.sensors.optitrack.protocol.frame_writer import encode_frame
 from remaster_ros.sensors.optitrack.protocol.frames import (
     MEASURED,
     OCCLUDED,
@@ -25,6 +24,7 @@ from remaster_ros.sensors.optitrack.protocol.frames import (
     RigidBody,
     Skeleton,
     decode_frame,
+    encode_frame,
 )
 from remaster_ros.sensors.optitrack.protocol.wire import ProtocolError
 

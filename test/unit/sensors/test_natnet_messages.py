@@ -159,7 +159,7 @@ def test_requests_are_understood_whatever_their_header_says():
     assert natnet.decode_request(natnet.encode_echo_request(2**63)).clock == 2**63
     for message_id in (MessageId.REQUEST_MODELDEF, MessageId.KEEPALIVE, MessageId.DISCONNECT):
         plain = natnet.ClientRequest(message_id)
-        assert natnet.decode_request(natnet.encode_plain_request(message_id)) == plain
+        assert natnet.decode_request(natnet.join_datagram(message_id)) == plain
         assert natnet.decode_request(struct.pack('<HH', message_id, 0) + b'\0') == plain
 
 

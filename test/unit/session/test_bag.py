@@ -92,8 +92,8 @@ def test_what_is_written_is_read(bag):
     assert list(reader) == list(messages())
     assert list(reader) == list(messages())
     assert reader.complete
-    assert reader.message_count == 40
-    assert (reader.start_ns, reader.end_ns) == (START_NS, START_NS + 390_000_000)
+    assert reader.whole.count == 40
+    assert (reader.whole.first_ns, reader.whole.last_ns) == (START_NS, START_NS + 390_000_000)
     assert reader.topics == {topic: make(0)[0] for topic, make in TOPICS.items()}
     assert list(BagReader(bag / 'bag_0.mcap')) == list(messages())
 
@@ -289,8 +289,8 @@ def test_zeros_after_a_power_cut_are_no_messages(bag, tmp_path):
         path.write_bytes(whole[:cut] + bytes(5000))
         reader = BagReader(path)
         assert not reader.complete
-        assert list(reader) == wanted[: reader.message_count]
-        counts.add(reader.message_count)
+        assert list(reader) == wanted[: reader.whole.count]
+        counts.add(reader.whole.count)
     assert len(counts) > 1
 
 
@@ -329,7 +329,7 @@ def test_the_writer_refuses_what_no_reader_would_understand(tmp_path):
         writer.write('/clock', 'std_msgs/msg/Empty', b'\0\1\0\0\0', 7)
     with pytest.raises(InputError, match='already holds files'):
         BagWriter(tmp_path / 'bag')
-    assert BagReader(tmp_path / 'bag').message_count == 1
+    assert BagReader(tmp_path / 'bag').whole.count == 1
 
 
 def test_a_clock_set_back_leaves_a_bag_in_order(tmp_path):

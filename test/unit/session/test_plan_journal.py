@@ -11,6 +11,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import Plan, PlannedPose
 from remaster_ros.planning.tour_order import REGISTRATION, Tour, registration_tour
+from remaster_ros.session.journal import Journal
 from remaster_ros.session.plan_journal import PlanJournal
 from remaster_ros.session.workcell import read_cell
 
@@ -244,3 +245,24 @@ def test_a_plan_of_a_version_without_references_goes_on_without(chain, tmp_path)
     again.ask_round()
     assert again.tour.next(np.zeros(len(chain))).split == 'optimization'
     again.close()
+
+
+@pytest.mark.parametrize(
+    'records',
+    [
+        [{'kind': 'outcome', 'id': 0, 'result': 'recorded'}],
+        [{'kind': 'plan', 'id': 'a', 'settings': SETTINGS}, {'kind': 'other'}],
+        [{'kind': 'plan', 'id': 'a', 'settings': SETTINGS}, {'kind': 'stop', 'split': 'x'}],
+        [{'kind': 'plan', 'id': 'a'}],
+    ],
+)
+def test_records_that_are_no_plan_are_refused(chain, tmp_path, records):
+    """Whole lines with a right checksum, of another program or version."""
+    journal = Journal(tmp_path / 'plan.jsonl')
+    for record in records:
+        journal.append(record)
+    journal.close()
+    with pytest.raises(InputError, match='no plan of this version'):
+        PlanJournal(tmp_path, SETTINGS, chain)
+    # And it is not held any longer.
+    Journal(tmp_path / 'plan.jsonl').close()

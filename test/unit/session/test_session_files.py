@@ -13,7 +13,6 @@ import pytest
 
 from remaster_ros.errors import InputError
 from remaster_ros.session.reader import read_session, write_session
-from remaster_ros.session.sequence_rules import SequenceRules, keeps_the_rules, row_keys
 
 DATA = Path(__file__).parents[4] / 'shared' / 'data'
 
@@ -278,7 +277,7 @@ def test_unknown_yaml_keys_are_reported_and_kept(folder, caplog):
     with caplog.at_level(logging.WARNING, 'remaster_ros'):
         extra = read_session(folder).extra
     assert extra == {'cell': {'operator': 'no', 'humidity': 0.4}, 'robot': {'serial': '0123'}}
-    assert re.findall("unknown key '(.*?)'", caplog.text) == ['cell', 'robot.serial']
+    assert re.findall("unknown key '(.*?)'", caplog.text) == ['robot.serial', 'cell']
 
 
 def test_existing_files_are_not_overwritten(session, folder):
@@ -299,31 +298,6 @@ def test_the_writer_refuses_what_the_reader_would(session, tmp_path):
     with pytest.raises(InputError, match='no usable name'):
         write_session(tmp_path / 'a', replace(session, sensors={'a,b': 'sir'}))
     assert not (tmp_path / 'a').exists()
-
-
-def test_the_quick_look_at_all_rows_agrees_with_the_rules(session):
-    """Random small changes; about half of them break a rule."""
-    seed = 7
-    print('seed', seed)
-    rng = np.random.default_rng(seed)
-    broken = 0
-    for _ in range(300):
-        columns = {
-            name: getattr(session.measurements, name).copy()
-            for name in ('observation', 'pose', 'configuration', 'is_validation', 'stamp_s')
-        }
-        for _ in range(rng.integers(0, 3)):
-            name = list(columns)[rng.integers(5)]
-            i, j = rng.integers(0, 20, 2)
-            columns[name][i] = columns[name][j]
-        m = replace(session.measurements, **columns)
-        rules, fine = SequenceRules(), True
-        for row in row_keys(m, first_line=2):
-            fine = fine and not rules.problem(row)
-            rules.accept(row)
-        assert keeps_the_rules(m) == fine
-        broken += not fine
-    assert 50 < broken < 250
 
 
 def test_nothing_but_the_one_error_comes_out_of_damaged_files(folder):

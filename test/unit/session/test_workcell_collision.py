@@ -90,12 +90,15 @@ def test_a_plan_depends_on_the_obstacles_but_not_on_where_the_file_lies(tmp_path
         ({'tool': {'probe': {'radius_m': 0.1, 'size_m': [1, 1, 1]}}}, 'tool.probe: give size_m'),
         ({'tool': {'probe': {'radius_m': 0.0}}}, 'tool.probe: .*sphere'),
         ({'clearance_m': 0.001}, 'clearance_m is 0.001; it must be from 0.005'),
-        ({'unknown_offset_deg': -1.0}, 'unknown_offset_deg is -1.0'),
+        (
+            {'unknown_offset_deg': -1.0},
+            'unknown_offset_deg is -1; it must be from 0 to 10 degrees',
+        ),
         ({'floor_z_m': float('nan')}, 'floor_z_m: nan is not a finite number'),
         ({'floor_z_m': 'ground'}, 'floor_z_m'),
-        ({'marker_radius_m': 0.0}, 'marker_radius_m must be positive'),
+        ({'marker_radius_m': 0.0}, 'marker_radius_m is 0; it must be above 0 m'),
         ({'acceleration_limit_rad_s2': [5.0, 5.0]}, 'has 2 values; .* 7 joints'),
-        ({'acceleration_limit_rad_s2': 0.0}, 'must be positive'),
+        ({'acceleration_limit_rad_s2': 0.0}, 'it must be above 0 rad/s²'),
     ],
 )
 def test_wrong_keys_are_named(tmp_path, keys, message):

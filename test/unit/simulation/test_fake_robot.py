@@ -5,9 +5,11 @@ import pytest
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.workcell import config_path
+from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.faults import inject
-from remaster_ros.simulation.robot import FakeArm, TrajectoryPoint
-from remaster_ros.simulation.world import SensorTruth, World, WorldTruth
+from remaster_ros.simulation.robot import FakeArm
+from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor
+from remaster_ros.simulation.world import World, WorldContent
 
 
 class SteppedWorld(World):
@@ -26,19 +28,21 @@ def world(tmp_path):
     rng = np.random.default_rng(5)
     T = np.eye(4)
     T[:3, 3] = [2.0, 0.0, 1.0]
-    truth = WorldTruth(
-        5, rng.normal(0, 0.005, 7), {'mocap': SensorTruth(T, np.array([0.1, 0, 0]), np.pi)}
-    )
-    world = SteppedWorld.create(
-        tmp_path / 'world',
-        truth,
+    content = WorldContent(
+        SessionTruth(
+            rng.normal(0, 0.005, 7),
+            {'sir': np.array([0.1, 0, 0])},
+            {'mocap': SimulatedSensor('sir', T)},
+        ),
+        seed=5,
+        rate=10.0,
         urdf=urdf,
         base_link=chain.base_link,
         tip_link=chain.tip_link,
-        rate=10.0,
         start_q=np.array([0, 0.3, 0, -1.2, 0, 1.0, 0]),
         link_radius_m=0.06,
     )
+    world = SteppedWorld.create(tmp_path / 'world', content)
     yield world
     world.close()
 
@@ -48,8 +52,9 @@ def arm(world):
     return FakeArm(world, np.random.default_rng(7))
 
 
-def go(arm, target, seconds=2.0, names=None, **kwargs):
-    return arm.command(names or arm.names, [TrajectoryPoint(seconds, target, **kwargs)])
+def go(arm, target, seconds=2.0, names=None, velocities=None):
+    velocity = None if velocities is None else np.array(velocities)
+    return arm.command(names or arm.names, [ServoPoint(seconds, np.array(target), velocity)])
 
 
 def test_it_follows_permuted_names(world, arm):
@@ -89,7 +94,7 @@ def test_what_it_cannot_follow_is_dropped_with_a_reason(world, arm, change, reas
 
 
 def test_times_must_increase_and_not_end_in_the_past(arm):
-    points = [TrajectoryPoint(1.0, [0.0] * 7), TrajectoryPoint(1.0, [0.1] * 7)]
+    points = [ServoPoint(1.0, np.zeros(7)), ServoPoint(1.0, np.full(7, 0.1))]
     assert 'increase' in arm.command(arm.names, points)
     assert 'past' in arm.command(arm.names, points[:1], start_s=50.0)
 
@@ -120,7 +125,7 @@ def test_the_marker_is_where_offsets_put_it(world):
     """True angle = reported one + zero-offset."""
     truth = world.truth
     T = world.chain.forward(world.start_q + truth.joint_offsets)
-    expected = T @ [*truth.sensors['mocap'].marker, 1.0]
+    expected = T @ [*truth.markers['sir'], 1.0]
     seen = truth.sensors['mocap'].T_R_N @ [*world.marker_in_sensor('mocap', 100.0), 1.0]
     np.testing.assert_allclose(seen, expected, atol=1e-12)
 

@@ -1,19 +1,29 @@
 """Effects hidden in the fakes: over time in a World, on a stage, and as they are asked for."""
 
+import json
+
 import numpy as np
 import pytest
 from calibration_scenes import CHAIN, random_poses
 
 from remaster_ros.errors import InputError
+from remaster_ros.kinematics.transforms import transform
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.effect_sampling import RANDOM, EffectSpec, hide
 from remaster_ros.simulation.hidden_arm import ChainArm
 from remaster_ros.simulation.hidden_effects import NAMED, UNNAMED, HiddenEffect
 from remaster_ros.simulation.setup import make_world
+from remaster_ros.simulation.truth import (
+    SessionTruth,
+    SimulatedSensor,
+    Warming,
+    from_plain,
+    to_plain,
+)
 from remaster_ros.simulation.world import World
-from remaster_ros.simulation.world_model import Round, StagedSensor, WorldModel
-from remaster_ros.simulation.wrong_arm import Warming, WrongArm
+from remaster_ros.simulation.world_model import Round, WorldModel
+from remaster_ros.simulation.wrong_arm import WrongArm
 
 SEED = 5
 WARMING = Warming(5.0, 100.0, 0.0)
@@ -25,7 +35,7 @@ def stage():
     rng = np.random.default_rng(SEED)
     q = np.concatenate(random_poses(40, rng))
     time_s = 12.0 * np.arange(1, len(q) + 1)
-    sensor = StagedSensor(np.eye(3), np.array([0.1, 0.2, -2.0]), 'sir')
+    sensor = SimulatedSensor('sir', transform(np.eye(3), (0.1, 0.2, -2.0)))
     return WorldModel(
         ChainArm(CHAIN),
         Round(q, np.full(7, 0.1), time_s, WARMING.at(time_s)),
@@ -40,16 +50,8 @@ def test_over_time_the_arm_errs_as_on_the_stage(stage, kind):
     """Where each motion has ended, the sensor sees what it sees on a stage."""
     print(f'seed {SEED}')
     effects = hide(stage, [EffectSpec(kind, size_m=0.5e-3)], np.random.default_rng(SEED))
-    arm = WrongArm(
-        CHAIN,
-        stage.joint_offsets,
-        stage.sensors,
-        stage.markers,
-        effects,
-        0.0,
-        stage.visited.home,
-        WARMING,
-    )
+    truth = SessionTruth(stage.joint_offsets, stage.markers, stage.sensors, WARMING, effects)
+    arm = WrongArm(CHAIN, truth, 0.0, stage.visited.home)
     expected = stage.seen(effects)
     here = stage.visited.home
     for i, (time_s, q) in enumerate(zip(stage.visited.time_s, stage.visited.q)):
@@ -63,7 +65,8 @@ def test_over_time_the_arm_errs_as_on_the_stage(stage, kind):
 def test_while_it_moves_the_error_passes_over(stage):
     scale = HiddenEffect('encoder_scale', (2,), np.array([1e-3]))
     start, end = np.zeros(7), np.full(7, 1.0)
-    arm = WrongArm(CHAIN, np.zeros(7), stage.sensors, stage.markers, [scale], 0.0, start, WARMING)
+    truth = SessionTruth(np.zeros(7), stage.markers, stage.sensors, WARMING, (scale,))
+    arm = WrongArm(CHAIN, truth, 0.0, start)
     arm.move(10.0, start, 20.0, end)
     angles = [arm.deviation(t).angle[0, 1] for t in (0.0, 10.0, 12.0, 15.0, 18.0, 20.0, 99.0)]
     assert angles[0] == angles[1] == 0.0
@@ -75,7 +78,7 @@ def test_while_it_moves_the_error_passes_over(stage):
 def test_an_effect_survives_its_file(stage):
     for kind in (*NAMED, *UNNAMED):
         (effect,) = hide(stage, [EffectSpec(kind)], np.random.default_rng(SEED))
-        again = HiddenEffect.from_dict(effect.to_dict())
+        again = from_plain(json.loads(json.dumps(to_plain(effect))), HiddenEffect)
         np.testing.assert_array_equal(stage.seen([again]), stage.seen([effect]))
 
 

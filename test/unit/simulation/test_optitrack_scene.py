@@ -171,7 +171,7 @@ def test_the_command_channel_answers_what_clients_ask(unicast_server):
         model = asker.ask(struct.pack('<2H', 4, 0) + b'\0', natnet.ModelDefinition)
         assert model.labelled_assets == {'tool': 1}
         assert model.rigid_bodies[0].marker_names[0] == 'tool_1'
-        assert asker.ask(natnet.encode_plain_request(MessageId.REQUEST_FRAMEOFDATA), Frame)
+        assert asker.ask(natnet.join_datagram(MessageId.REQUEST_FRAMEOFDATA), Frame)
         for unknown in (struct.pack('<2H', 55, 0), natnet.encode_command_request('Fly')):
             notice = asker.ask(unknown, natnet.Notice)
             assert notice.id == MessageId.UNRECOGNIZED_REQUEST

@@ -11,9 +11,10 @@ from remaster_ros.errors import InputError
 from remaster_ros.planning.candidates import order_solutions
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation import simulated_workcell
-from remaster_ros.simulation.session_simulator import SimulatedSensor
+from remaster_ros.simulation.truth import SimulatedSensor, place_sensor
 
 ROOT = Path(__file__).parents[3]
+MIDDLE = np.array([0.0, 0.0, 0.6])
 
 
 @pytest.fixture
@@ -26,7 +27,7 @@ def place_all(cell, seed):
     return {
         name: SimulatedSensor(
             sensor.marker,
-            simulated_workcell.place_sensor(cell, np.array(sensor.rough_position_m), rng),
+            place_sensor(sensor.rough_position_m, MIDDLE, simulated_workcell.PLACEMENT_STD_M, rng),
         )
         for name, sensor in cell.sensors.items()
     }
@@ -73,7 +74,7 @@ def test_sensors_stand_near_their_rough_place_and_look_at_the_workspace(cell):
     for name, sensor in place_all(cell, 3).items():
         T, rough = sensor.T_R_N, np.array(cell.sensors[name].rough_position_m)
         assert np.all(np.abs(T[:3, 3] - rough) < 5 * simulated_workcell.PLACEMENT_STD_M)
-        to_middle = np.array([0.0, 0.0, 0.6]) - T[:3, 3]
+        to_middle = MIDDLE - T[:3, 3]
         np.testing.assert_allclose(T[:3, 2], to_middle / np.linalg.norm(to_middle), atol=1e-12)
     assert not np.allclose(
         place_all(cell, 3)['mocap'].T_R_N, place_all(cell, 4)['mocap'].T_R_N, atol=1e-3

@@ -146,8 +146,8 @@ class Status(IntEnum):
 _MEANING: dict[int, tuple[str, str]] = {
     Status.SERVER_BUSY: ('it is busy with another command', 'wait until that is done'),
     Status.NOT_IMPLEMENTED: (
-        'it does not know this command',
-        'check that it speaks emScon and its firmware version',
+        'it does not have this command',
+        'check that it is an emScon instrument, and its firmware version',
     ),
     Status.WRONG_CURRENT_REFLECTOR: (
         'the reflector set is not the one it sees',
@@ -155,7 +155,7 @@ _MEANING: dict[int, tuple[str, str]] = {
     ),
     Status.NO_LAST_MEASURED_POINT: ('nothing has been measured yet', 'go to a position instead'),
     Status.NO_ADM: ('it has no absolute distance meter', 'use a tracker with ADM'),
-    Status.NO_DISTANCE_SET: ('it knows no distance', 'find the reflector first'),
+    Status.NO_DISTANCE_SET: ('it has no distance yet', 'find the reflector first'),
     Status.NO_TRACKER_CONNECTED: (
         'its controller sees no tracker head',
         'check the cable between controller and head',
@@ -240,7 +240,7 @@ class Readiness(IntEnum):
 
 
 METRE, RADIAN, CELSIUS, MILLIBAR, RELATIVE_HUMIDITY = 0, 0, 0, 0, 0
-"""The units we ask for, in the order of `Command.SET_UNITS`; 1 mbar = 1 hPa."""
+"""The units that are set, in the order of `Command.SET_UNITS`; 1 mbar = 1 hPa."""
 RIGHT_HANDED_CARTESIAN = 0
 STATIONARY = 0
 STANDARD_STATISTICS = 0

@@ -1,16 +1,18 @@
-"""The Leica emScon subset we speak: bytes to events and back, in both directions, without I/O.
+"""The Leica emScon subset that is used here: bytes to events and back, both directions, no I/O.
 
 Every packet is ``int32 size`` (of the whole packet), ``uint32 type`` and a body, little-endian and
-packed. Commands and replies share type 0, so a reader has to know on which side it stands.
+packed. Commands and replies share type 0, so a reader is made for one side.
 """
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
 from enum import Enum
+from itertools import islice
 from struct import Struct
-from typing import Literal
+from typing import Any, Literal
 
 from remaster_ros.sensors.laser_tracker.protocol.codes import Command, DataType
 
@@ -22,12 +24,14 @@ _HEADER = Struct('<iI')
 _CODE = Struct('<I')
 _COMMAND_AND_STATUS = Struct('<II')
 _RESULT = Struct('<IIi17d')
+_TRIPLES = ('values', 'std', 'pointing_error', 'a_priori_std')
 
 Value = int | float | bytes
+Triple = tuple[float, float, float]
 
 
 class ProtocolError(Exception):
-    """The peer sent bytes that are not emScon; the text says what is wrong with them."""
+    """The peer sent bytes that are not emScon; the text states what is wrong."""
 
 
 class NeedData(Enum):
@@ -66,7 +70,7 @@ class ErrorReport:
 
 @dataclass(frozen=True)
 class StatusChange:
-    """The instrument reports that something changed: a `Change`, or a number unknown to us."""
+    """The instrument reports that something changed: a `Change`, or an unknown number."""
 
     change: int
 
@@ -86,11 +90,11 @@ class Measurement:
     status: int
     mode: int
     is_try: int
-    values: tuple[float, float, float]
-    std: tuple[float, float, float]
+    values: Triple
+    std: Triple
     std_total: float
-    pointing_error: tuple[float, float, float]
-    a_priori_std: tuple[float, float, float]
+    pointing_error: Triple
+    a_priori_std: Triple
     a_priori_std_total: float
     temperature: float
     pressure: float
@@ -99,7 +103,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class UnknownPacket:
-    """A whole packet of a type or command that we do not know; to be counted and dropped."""
+    """A whole packet of an unknown type or command; to be counted and dropped."""
 
     type: int
     body: bytes
@@ -147,20 +151,7 @@ def _type_and_body(event: Event) -> tuple[int, bytes]:
         case StatusChange(change):
             return DataType.STATUS_CHANGE, _CODE.pack(change)
         case Measurement():
-            return DataType.SINGLE_RESULT, _RESULT.pack(
-                event.status,
-                event.mode,
-                event.is_try,
-                *event.values,
-                *event.std,
-                event.std_total,
-                *event.pointing_error,
-                *event.a_priori_std,
-                event.a_priori_std_total,
-                event.temperature,
-                event.pressure,
-                event.humidity,
-            )
+            return DataType.SINGLE_RESULT, _RESULT.pack(*_flat(event))
         case UnknownPacket(type_, body):
             return type_, body
     raise ValueError(f'{event} is no packet')
@@ -277,18 +268,16 @@ def _decode_reply(body: bytes) -> Event:
 
 
 def _decode_result(body: bytes) -> Measurement:
-    status, mode, is_try, *numbers = _unpack(_RESULT, body, 'measurement')
-    return Measurement(
-        status,
-        mode,
-        is_try,
-        values=tuple(numbers[0:3]),
-        std=tuple(numbers[3:6]),
-        std_total=numbers[6],
-        pointing_error=tuple(numbers[7:10]),
-        a_priori_std=tuple(numbers[10:13]),
-        a_priori_std_total=numbers[13],
-        temperature=numbers[14],
-        pressure=numbers[15],
-        humidity=numbers[16],
+    numbers: Iterator[Any] = iter(_unpack(_RESULT, body, 'measurement'))
+    values: Iterator[Any] = (
+        tuple(islice(numbers, 3)) if field.name in _TRIPLES else next(numbers)
+        for field in fields(Measurement)
     )
+    return Measurement(*values)
+
+
+def _flat(result: Measurement) -> Iterator[float]:
+    """Undo `_decode_result`: three numbers for what has one per coordinate."""
+    for field in fields(result):
+        value = getattr(result, field.name)
+        yield from value if field.name in _TRIPLES else (value,)

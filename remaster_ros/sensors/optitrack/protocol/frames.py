@@ -9,11 +9,25 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache, partial
 from itertools import chain
-from typing import Any, NamedTuple
+from struct import Struct
+from typing import NamedTuple
 
-from remaster_ros.sensors.optitrack.protocol import layouts, wire
+from remaster_ros.sensors.optitrack.protocol.codec import (
+    F32,
+    I32,
+    TEXT,
+    VEC3,
+    Codec,
+    Columns,
+    List,
+    Record,
+    Row,
+    SizedList,
+)
 from remaster_ros.sensors.optitrack.protocol.wire import (
+    NEWEST_VERSION,
     ProtocolError,
     Quaternion,
     Reader,
@@ -49,7 +63,7 @@ class LabeledMarker(NamedTuple):
     size
         Diameter, m.
     params
-        The flags above; NatNet 2 knows the first three only.
+        The flags above; NatNet 2 has the first three only.
     residual
         Metres per ray; None before NatNet 3.
     """
@@ -173,80 +187,97 @@ def decode_frame(payload: bytes, version: Version, *, markers_only: bool = False
         nothing and may be anything.
     """
     require_supported(version)
+    layout = _layout(min(version, NEWEST_VERSION))
     reader = Reader(payload)
-    number = reader.integer()
-    before = {} if markers_only else _read_before(reader, version)
-    if markers_only:
-        layouts.skip_to_labeled(reader, version)
-    labeled_layout = layouts.LABELED_3 if version >= (3, 0) else layouts.LABELED_2
-    labeled = _labeled(reader.row_section(version, labeled_layout), version)
-    analog: list[tuple[AnalogDevice, ...]] = [(), ()]
-    for i, since in enumerate(layouts.ANALOG_SINCE):
-        if version < since:
-            continue
-        if markers_only:
-            reader.skip_section(version, layouts.skip_analog, 8)
+    frame = {'number': I32.read(reader)}
+    for name, codec in layout.sections.items():
+        if markers_only and name != 'labeled_markers':
+            codec.skip(reader)
         else:
-            analog[i] = reader.section(version, _read_analog, 8)
-
-    latency = reader.unpack(layouts.LATENCY)[0] if version < (3, 0) else 0.0
-    timecode = layouts.TIMECODE_F64 if version >= (2, 7) else layouts.TIMECODE_F32
-    timecode_main, timecode_sub, timestamp = reader.unpack(timecode)
-    stamps = reader.unpack(layouts.STAMPS) if version >= (3, 0) else (0, 0, 0)
-    precision = reader.unpack(layouts.PRECISION) if version >= (4, 1) else (0, 0)
-    params, tag = reader.unpack(layouts.END)
+            frame[name] = codec.read(reader)
+    *rest, tag = reader.unpack(layout.rest)
+    frame.update(zip(layout.rest_names, rest))
     if tag != 0 or reader.left:
         raise ProtocolError(
-            f'frame {number} does not end where it should (tag {tag}, {reader.left} bytes left)'
+            f'frame {frame["number"]} does not end where it should '
+            f'(tag {tag}, {reader.left} bytes left)'
         )
-    _require_finite((timestamp, latency), 'time')
-    return Frame(
-        number=number,
-        timestamp=timestamp,
-        labeled_markers=labeled,
-        force_plates=analog[0],
-        devices=analog[1],
-        software_latency=latency,
-        timecode=timecode_main,
-        timecode_sub=timecode_sub,
-        mid_exposure=stamps[0],
-        data_received=stamps[1],
-        transmitted=stamps[2],
-        precision_seconds=precision[0],
-        precision_fraction=precision[1],
-        params=params,
-        **before,
-    )
+    _require_finite((frame['timestamp'], frame.get('software_latency', 0.0)), 'time')
+    return Frame(**frame)
 
 
-def _read_before(reader: Reader, version: Version) -> dict[str, Any]:
-    """Read the sections before the labelled markers, as fields of a `Frame`."""
-    marker_sets = reader.section(version, _read_marker_set, 5)
-    other_markers = reader.row_section(version, wire.VEC3)
-    if version >= (3, 0):
-        bodies = tuple(_body(row) for row in reader.row_section(version, layouts.BODY_3))
-    else:
-        bodies = reader.items(_read_body_2, layouts.BODY_2_BYTES)
-    skeletons = reader.section(version, lambda r: _read_skeleton(r, version), 8)
-    assets = reader.section(version, _read_asset, 12) if version >= (4, 1) else ()
-    in_sets = chain.from_iterable([marker_set.positions for marker_set in marker_sets])
-    _require_finite(chain.from_iterable(in_sets), 'position of a marker')
-    _require_finite(chain.from_iterable(other_markers), 'position of a marker')
-    _require_tracked_bodies_finite(bodies)
-    return {
-        'marker_sets': marker_sets,
-        'other_markers': tuple(other_markers),
-        'rigid_bodies': bodies,
-        'skeletons': skeletons,
-        'assets': assets,
+def encode_frame(frame: Frame, version: Version) -> bytes:
+    """Encode the payload of a FRAMEOFDATA message; what the version does not have is left out.
+
+    Raises
+    ------
+    ProtocolError
+        If the version is unknown.
+    ValueError, struct.error
+        If a value does not fit its field.
+    """
+    require_supported(version)
+    layout = _layout(min(version, NEWEST_VERSION))
+    sections = [codec.write(getattr(frame, name)) for name, codec in layout.sections.items()]
+    rest = [getattr(frame, name) for name in layout.rest_names]
+    return b''.join((I32.write(frame.number), *sections, layout.rest.pack(*rest, 0)))
+
+
+class _Layout(NamedTuple):
+    """A frame of one version: its sections in order, then numbers; all named as in `Frame`."""
+
+    sections: dict[str, Codec]
+    rest_names: tuple[str, ...]
+    rest: Struct
+
+
+@cache
+def _layout(version: Version) -> _Layout:
+    """Describe the frame of a version."""
+    since_3, since_4_1 = version >= (3, 0), version >= (4, 1)
+    section = SizedList if since_4_1 else List
+    body = _BODY_3 if since_3 else _BODY_2
+    labeled = _LABELED_3 if since_3 else _LABELED_2
+    analog = Record(AnalogDevice, I32, List(List(F32)))
+    sections: dict[str, Codec] = {
+        'marker_sets': section(Record(MarkerSet, TEXT, List(_POSITION))),
+        'other_markers': section(_POSITION),
+        'rigid_bodies': section(body),
+        'skeletons': section(Record(Skeleton, I32, List(body))),
     }
+    if since_4_1:
+        sections['assets'] = section(Record(Asset, I32, List(body), List(labeled)))
+    sections['labeled_markers'] = section(labeled)
+    if version >= (2, 9):
+        sections['force_plates'] = section(analog)
+    if version >= (2, 11):
+        sections['devices'] = section(analog)
+    rest = {} if since_3 else {'software_latency': 'f'}
+    rest |= {'timecode': 'I', 'timecode_sub': 'I', 'timestamp': 'd' if version >= (2, 7) else 'f'}
+    if since_3:
+        rest |= {'mid_exposure': 'Q', 'data_received': 'Q', 'transmitted': 'Q'}
+    if since_4_1:
+        rest |= {'precision_seconds': 'I', 'precision_fraction': 'I'}
+    rest['params'] = 'H'
+    end_tag = 'i'
+    return _Layout(sections, tuple(rest), Struct('<' + ''.join(rest.values()) + end_tag))
 
 
-def _labeled(rows: list[tuple], version: Version) -> tuple[LabeledMarker, ...]:
-    """Build the labelled markers; one sum tells whether any number needs a closer look."""
-    # Past the named tuple's own constructor, which takes as long as all the rest of a frame.
+def _require_finite(values: Iterable[float], what: str) -> None:
+    if not all(map(math.isfinite, values)):
+        raise ProtocolError(f'the {what} is not finite')
+
+
+def _positions(rows: list[tuple]) -> list[tuple]:
+    _require_finite(chain.from_iterable(rows), 'position of a marker')
+    return rows
+
+
+def _labeled(rows: list[tuple], *, has_residual: bool) -> list[LabeledMarker]:
+    """Build the labelled markers; the sum of all numbers shows whether one is not finite."""
+    # The named tuple's own constructor would take as long as all the rest of a frame.
     make = tuple.__new__
-    if version >= (3, 0):
+    if has_residual:
         markers = [
             make(LabeledMarker, (label, (x, y, z), size, params, residual))
             for label, x, y, z, size, params, residual in rows
@@ -260,72 +291,52 @@ def _labeled(rows: list[tuple], version: Version) -> tuple[LabeledMarker, ...]:
         for marker in markers:
             if not marker.params & OCCLUDED:
                 _require_finite(marker.position, f'position of marker {marker.id}')
-    return tuple(markers)
+    return markers
 
 
-def _require_finite(values: Iterable[float], what: str) -> None:
-    # A sum of f32 values cannot overflow a double; an infinity or NaN among them always shows.
-    if not math.isfinite(sum(values)):
-        raise ProtocolError(f'the {what} is not finite')
+def _flat_labeled_2(marker: LabeledMarker) -> tuple:
+    return marker.id, *marker.position, marker.size, marker.params
 
 
-def _require_tracked_bodies_finite(bodies: Iterable[RigidBody]) -> None:
+def _flat_labeled_3(marker: LabeledMarker) -> tuple:
+    return *_flat_labeled_2(marker), math.nan if marker.residual is None else marker.residual
+
+
+def _bodies_3(rows: list[tuple]) -> list[RigidBody]:
+    bodies = [RigidBody(row[0], row[1:4], row[4:8], row[8], row[9]) for row in rows]
     for body in bodies:
-        if body.params & TRACKING_VALID:
-            _require_finite(body.position + body.orientation_xyzw, f'pose of rigid body {body.id}')
+        _require_finite_if_tracked(body)
+    return bodies
 
 
-def _read_marker_set(reader: Reader) -> MarkerSet:
-    name = reader.text()
-    return MarkerSet(name, tuple(reader.rows(wire.VEC3, reader.count(wire.VEC3.size))))  # type: ignore[arg-type]
+def _flat_body_3(body: RigidBody) -> tuple:
+    return body.id, *body.position, *body.orientation_xyzw, body.mean_error, body.params
 
 
-def _body(row: tuple) -> RigidBody:
-    return RigidBody(row[0], row[1:4], row[4:8], row[8], row[9])
+def _body_2(head: tuple, columns: tuple[tuple, ...], end: tuple) -> RigidBody:
+    markers = tuple(map(BodyMarker, *columns))
+    mean_error, params = end
+    body = RigidBody(head[0], head[1:4], head[4:8], mean_error, params, markers)
+    _require_finite_if_tracked(body)
+    return body
 
 
-def _read_body_2(reader: Reader) -> RigidBody:
-    body_id, x, y, z, *orientation = reader.unpack(layouts.BODY_2)
-    count = reader.count(layouts.BODY_MARKER_BYTES)
-    positions = reader.rows(wire.VEC3, count)
-    ids = reader.numbers('i', count)
-    sizes = reader.numbers('f', count)
-    mean_error, params = reader.unpack(layouts.BODY_2_END)
-    markers = tuple(
-        [tuple.__new__(BodyMarker, marker) for marker in zip(positions, ids, sizes, strict=True)]
-    )
-    if params & TRACKING_VALID:
-        _require_finite(chain.from_iterable(positions), f'position of a marker of body {body_id}')
-    return RigidBody(body_id, (x, y, z), tuple(orientation), mean_error, params, markers)  # type: ignore[arg-type]
+def _parts_of_body_2(body: RigidBody) -> tuple:
+    columns = tuple(zip(*body.markers)) or ((), (), ())
+    head = body.id, *body.position, *body.orientation_xyzw
+    return head, columns, (body.mean_error, body.params)
 
 
-def _read_skeleton(reader: Reader, version: Version) -> Skeleton:
-    skeleton_id = reader.integer()
-    if version >= (3, 0):
-        bodies = _read_bodies_3(reader)
-    else:
-        bodies = reader.items(_read_body_2, layouts.BODY_2_BYTES)
-    _require_tracked_bodies_finite(bodies)
-    return Skeleton(skeleton_id, bodies)
+def _require_finite_if_tracked(body: RigidBody) -> None:
+    if not body.params & TRACKING_VALID:
+        return
+    _require_finite(body.position + body.orientation_xyzw, f'pose of rigid body {body.id}')
+    inside = chain.from_iterable([marker.position for marker in body.markers])
+    _require_finite(inside, f'position of a marker of body {body.id}')
 
 
-def _read_bodies_3(reader: Reader) -> tuple[RigidBody, ...]:
-    return tuple(
-        _body(row) for row in reader.rows(layouts.BODY_3, reader.count(layouts.BODY_3.size))
-    )
-
-
-def _read_asset(reader: Reader) -> Asset:
-    asset_id = reader.integer()
-    bodies = _read_bodies_3(reader)
-    _require_tracked_bodies_finite(bodies)
-    rows = reader.rows(layouts.LABELED_3, reader.count(layouts.LABELED_3.size))
-    return Asset(asset_id, bodies, _labeled(rows, (4, 1)))
-
-
-def _read_analog(reader: Reader) -> AnalogDevice:
-    return AnalogDevice(reader.integer(), reader.items(_read_channel, 4))
-
-
-def _read_channel(reader: Reader) -> tuple[float, ...]:
-    return reader.numbers('f', reader.count(wire.F32.size))
+_POSITION = Row('3f', _positions)
+_LABELED_2 = Row('i4fH', partial(_labeled, has_residual=False), _flat_labeled_2)
+_LABELED_3 = Row('i4fHf', partial(_labeled, has_residual=True), _flat_labeled_3)
+_BODY_2 = Record(_body_2, Row('i7f'), Columns(VEC3, I32, F32), Row('fH'), flatten=_parts_of_body_2)
+_BODY_3 = Row('i8fH', _bodies_3, _flat_body_3)

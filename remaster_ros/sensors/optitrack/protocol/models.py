@@ -1,12 +1,24 @@
-"""MODELDEF, the names behind the ids of a frame: decode and encode, NatNet 2.6 to 4.3."""
+"""MODELDEF, the names behind the ids of a frame: read and written, NatNet 2.6 to 4.3."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from struct import Struct
+from functools import cache
+from typing import NamedTuple
 
-from remaster_ros.sensors.optitrack.protocol import wire
+from remaster_ros.sensors.optitrack.protocol.codec import (
+    I32,
+    QUATERNION,
+    TEXT,
+    VEC3,
+    Codec,
+    Columns,
+    List,
+    Record,
+    Row,
+)
 from remaster_ros.sensors.optitrack.protocol.wire import (
+    NEWEST_VERSION,
     ProtocolError,
     Quaternion,
     Reader,
@@ -17,23 +29,17 @@ from remaster_ros.sensors.optitrack.protocol.wire import (
 
 MARKER_SET, RIGID_BODY, SKELETON, FORCE_PLATE, DEVICE, CAMERA, ASSET = range(7)
 
-_FORCE_PLATE_BODY = Struct(f'<{2 + 3 + 144 + 12}f2i')
-_BODY_HEAD = Struct('<2i3f')
-_CAMERA_POSE = Struct('<7f')
-_ASSET_MARKER_TAIL = Struct('<i4fH')
 _IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
-@dataclass(frozen=True)
-class MarkerSetDescription:
+class MarkerSetDescription(NamedTuple):
     """A marker set and the names of its markers."""
 
     name: str
     marker_names: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class RigidBodyDescription:
+class RigidBodyDescription(NamedTuple):
     """A rigid body.
 
     Attributes
@@ -62,8 +68,7 @@ class RigidBodyDescription:
     marker_names: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class SkeletonDescription:
+class SkeletonDescription(NamedTuple):
     """A skeleton and its bones."""
 
     name: str
@@ -71,8 +76,7 @@ class SkeletonDescription:
     bodies: tuple[RigidBodyDescription, ...]
 
 
-@dataclass(frozen=True)
-class OtherDescription:
+class OtherDescription(NamedTuple):
     """A force plate, device, camera or asset: only what names it is kept.
 
     Attributes
@@ -126,8 +130,8 @@ def decode_model_definition(payload: bytes, version: Version) -> ModelDefinition
     """
     require_supported(version)
     reader = Reader(payload)
-    smallest = 8 if version >= (4, 1) else 4
-    return ModelDefinition(reader.items(lambda r: _read_description(r, version), smallest))
+    count = reader.count(8 if version >= (4, 1) else 4)
+    return ModelDefinition(tuple([_read(reader, version) for _ in range(count)]))
 
 
 def encode_model_definition(definition: ModelDefinition, version: Version) -> bytes:
@@ -141,105 +145,89 @@ def encode_model_definition(definition: ModelDefinition, version: Version) -> by
         If a name is too long, or a description is of a kind whose details are not kept.
     """
     require_supported(version)
-    return wire.items(_write_description(d, version) for d in definition.descriptions)
+    descriptions = [_write(description, version) for description in definition.descriptions]
+    return I32.write(len(descriptions)) + b''.join(descriptions)
 
 
-def _read_description(reader: Reader, version: Version) -> Description:
-    kind = reader.integer()
+def _read(reader: Reader, version: Version) -> Description:
+    kind = I32.read(reader)
+    codec = _codecs(min(version, NEWEST_VERSION)).get(kind)
     if version < (4, 1):
-        return _read_body_of(kind, reader, version)
-    size = reader.integer()
-    if not 0 <= size <= reader.left:
-        raise ProtocolError(f'a description of {size} bytes with {reader.left} bytes left')
-    all_bytes, reader.end = reader.end, reader.offset + size
-    description = _read_body_of(kind, reader, version)
-    reader.offset, reader.end = reader.end, all_bytes
-    return description
+        if codec is None:
+            # Without a byte size there is no way to find the next description.
+            raise ProtocolError(f'a description of the unknown kind {kind}')
+        return codec.read(reader)
+    with reader.bounded(I32.read(reader)):
+        return OtherDescription(kind, '') if codec is None else codec.read(reader)
 
 
-def _read_body_of(kind: int, reader: Reader, version: Version) -> Description:
-    if kind == MARKER_SET:
-        return MarkerSetDescription(reader.text(), reader.items(Reader.text, 1))
-    if kind == RIGID_BODY:
-        return _read_rigid_body(reader, version)
-    if kind == SKELETON:
-        name, skeleton_id = reader.text(), reader.integer()
-        bodies = reader.items(lambda r: _read_rigid_body(r, version), _BODY_HEAD.size + 1)
-        return SkeletonDescription(name, skeleton_id, bodies)
-    if version >= (3, 0) and kind in (FORCE_PLATE, DEVICE, CAMERA, ASSET):
-        return _read_other(kind, reader, version)
-    if version >= (4, 1):
-        return OtherDescription(kind, '')
-    # Without a byte size there is no way to find the next description.
-    raise ProtocolError(f'a description of the unknown kind {kind}')
-
-
-def _read_rigid_body(reader: Reader, version: Version) -> RigidBodyDescription:
-    name = reader.text()
-    body_id, parent_id, *offset = reader.unpack(_BODY_HEAD)
-    rotation = reader.unpack(wire.QUATERNION) if version >= (4, 2) else _IDENTITY
-    positions: tuple = ()
-    labels: tuple[int, ...] = ()
-    names: tuple[str, ...] = ()
-    if version >= (3, 0):
-        count = reader.count(wire.VEC3.size + wire.I32.size)
-        positions = tuple(reader.rows(wire.VEC3, count))
-        labels = reader.numbers('i', count)
-        if version >= (4, 0):
-            names = tuple(reader.text() for _ in range(count))
-    return RigidBodyDescription(
-        name, body_id, parent_id, tuple(offset), rotation, positions, labels, names
-    )
-
-
-def _read_other(kind: int, reader: Reader, version: Version) -> OtherDescription:
-    """Walk over a description of which only name and id are kept."""
-    if kind == FORCE_PLATE:
-        plate_id, serial = reader.integer(), reader.text()
-        reader.unpack(_FORCE_PLATE_BODY)
-        reader.items(Reader.text, 1)
-        return OtherDescription(kind, serial, plate_id)
-    if kind == DEVICE:
-        device_id, name, _serial = reader.integer(), reader.text(), reader.text()
-        reader.unpack(wire.TWO_I32)
-        reader.items(Reader.text, 1)
-        return OtherDescription(kind, name, device_id)
-    if kind == CAMERA:
-        name = reader.text()
-        reader.unpack(_CAMERA_POSE)
-        return OtherDescription(kind, name)
-    name = reader.text()
-    _asset_type, asset_id = reader.unpack(wire.TWO_I32)
-    reader.items(lambda r: _read_rigid_body(r, version), _BODY_HEAD.size + 1)
-    reader.items(lambda r: (r.text(), r.unpack(_ASSET_MARKER_TAIL)), _ASSET_MARKER_TAIL.size + 1)
-    return OtherDescription(kind, name, asset_id)
-
-
-def _write_description(description: Description, version: Version) -> bytes:
-    if isinstance(description, MarkerSetDescription):
-        kind = MARKER_SET
-        names = wire.items(wire.text(name) for name in description.marker_names)
-        body = wire.text(description.name) + names
-    elif isinstance(description, RigidBodyDescription):
-        kind = RIGID_BODY
-        body = _write_rigid_body(description, version)
-    elif isinstance(description, SkeletonDescription):
-        kind = SKELETON
-        bodies = wire.items(_write_rigid_body(b, version) for b in description.bodies)
-        body = wire.text(description.name) + wire.I32.pack(description.id) + bodies
-    else:
+def _write(description: Description, version: Version) -> bytes:
+    kind = _KINDS.get(type(description))
+    if kind is None:
         raise ValueError(f'only the name of {description.name!r} is kept: it cannot be encoded')
-    size = wire.I32.pack(len(body)) if version >= (4, 1) else b''
-    return wire.I32.pack(kind) + size + body
+    body = _codecs(min(version, NEWEST_VERSION))[kind].write(description)
+    size = I32.write(len(body)) if version >= (4, 1) else b''
+    return I32.write(kind) + size + body
 
 
-def _write_rigid_body(body: RigidBodyDescription, version: Version) -> bytes:
-    parts = [wire.text(body.name), _BODY_HEAD.pack(body.id, body.parent_id, *body.offset)]
-    if version >= (4, 2):
-        parts.append(wire.QUATERNION.pack(*body.offset_rotation))
+_KINDS: dict[type, int] = {
+    MarkerSetDescription: MARKER_SET,
+    RigidBodyDescription: RIGID_BODY,
+    SkeletonDescription: SKELETON,
+}
+
+
+@cache
+def _codecs(version: Version) -> dict[int, Codec]:
+    """Return how each kind of description lies in its bytes in a version."""
+    body = _rigid_body(version)
+    codecs: dict[int, Codec] = {
+        MARKER_SET: Record(MarkerSetDescription, TEXT, List(TEXT)),
+        RIGID_BODY: body,
+        SKELETON: Record(SkeletonDescription, TEXT, I32, List(body)),
+    }
     if version >= (3, 0):
-        parts.append(wire.items(wire.VEC3.pack(*p) for p in body.marker_positions))
-        parts += (wire.I32.pack(label) for label in body.marker_labels)
+        plate = Row(f'{2 + 3 + 144 + 12}f2i')
+        marker = Record(lambda *_: None, TEXT, Row('i4fH'))
+        codecs |= {
+            FORCE_PLATE: Record(
+                lambda plate_id, serial, *_: OtherDescription(FORCE_PLATE, serial, plate_id),
+                *(I32, TEXT, plate, List(TEXT)),
+            ),
+            DEVICE: Record(
+                lambda device_id, name, *_: OtherDescription(DEVICE, name, device_id),
+                *(I32, TEXT, TEXT, Row('2i'), List(TEXT)),
+            ),
+            CAMERA: Record(lambda name, _pose: OtherDescription(CAMERA, name), TEXT, Row('7f')),
+            ASSET: Record(
+                lambda name, type_and_id, *_: OtherDescription(ASSET, name, type_and_id[1]),
+                *(TEXT, Row('2i'), List(body), List(marker)),
+            ),
+        }
+    return codecs
+
+
+def _rigid_body(version: Version) -> Record:
+    """Return how a rigid body lies in its bytes: the fields were added one after the other."""
+    has_rotation, has_markers = version >= (4, 2), version >= (3, 0)
+    columns: list[Codec] = [VEC3, I32]
     if version >= (4, 0):
-        parts += (wire.text(name) for name in body.marker_names)
-    return b''.join(parts)
+        columns.append(TEXT)
+
+    def build(name: str, ids_and_offset: tuple, *rest: tuple) -> RigidBodyDescription:
+        rotation = rest[0] if has_rotation else _IDENTITY
+        markers = rest[-1] if has_markers else ()
+        body_id, parent_id, *offset = ids_and_offset
+        return RigidBodyDescription(name, body_id, parent_id, tuple(offset), rotation, *markers)
+
+    def flatten(body: RigidBodyDescription) -> list:
+        rotation = [body.offset_rotation] if has_rotation else []
+        markers = [(body.marker_positions, body.marker_labels, body.marker_names)]
+        return [body.name, (body.id, body.parent_id, *body.offset), *rotation, *markers]
+
+    parts: list[Codec] = [TEXT, Row('2i3f')]
+    if has_rotation:
+        parts.append(QUATERNION)
+    if has_markers:
+        parts.append(Columns(*columns))
+    return Record(build, *parts, flatten=flatten)

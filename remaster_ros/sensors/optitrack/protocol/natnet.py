@@ -2,8 +2,8 @@
 
 A client decodes with `decode_message` and encodes with the ``encode_…_request`` functions; a
 server decodes with `decode_request` and encodes with `encode_message` and its kin. The layout of
-frames is in `natnet_frames` and `natnet_frame_writer`, that of model definitions in
-`natnet_models`. One exception comes out of bad bytes: `ProtocolError`.
+frames is in `frames`, that of model definitions in `models`. One exception comes out of bad bytes:
+`ProtocolError`.
 """
 
 from __future__ import annotations
@@ -12,15 +12,19 @@ from dataclasses import dataclass
 from enum import IntEnum
 from struct import Struct
 
-from remaster_ros.sensors.optitrack.protocol import wire
-from remaster_ros.sensors.optitrack.protocol.frame_writer import encode_frame
-from remaster_ros.sensors.optitrack.protocol.frames import Frame, decode_frame
+from remaster_ros.sensors.optitrack.protocol.codec import F32, I32, TEXT, Row, number
+from remaster_ros.sensors.optitrack.protocol.frames import Frame, decode_frame, encode_frame
 from remaster_ros.sensors.optitrack.protocol.models import (
     ModelDefinition,
     decode_model_definition,
     encode_model_definition,
 )
-from remaster_ros.sensors.optitrack.protocol.wire import ProtocolError, Version
+from remaster_ros.sensors.optitrack.protocol.wire import (
+    NEWEST_VERSION,
+    ProtocolError,
+    Reader,
+    Version,
+)
 
 DEFAULT_COMMAND_PORT = 1510
 DEFAULT_DATA_PORT = 1511
@@ -31,12 +35,12 @@ _HEADER = Struct('<2H')
 _SENDER = Struct('<256s4B4B')
 _CONNECTION = Struct('<QHB4B')
 _OPTIONS = Struct('<B4B')
-_CLOCK = Struct('<Q')
-_TWO_CLOCKS = Struct('<2Q')
+_CLOCK = number('Q')
+_TWO_CLOCKS = Row('2Q')
 
 
 class MessageId(IntEnum):
-    """What the first two bytes of a datagram say."""
+    """Kind of a message: the first two bytes of a datagram."""
 
     CONNECT = 0
     SERVERINFO = 1
@@ -92,19 +96,19 @@ class ServerInfo:
 
 @dataclass(frozen=True)
 class Response:
-    """The answer to a REQUEST; what it means depends on what was asked."""
+    """The answer to a REQUEST; its meaning depends on the request."""
 
     payload: bytes
 
     @property
     def code(self) -> int | None:
         """The answer as an integer, 0 for success; None if it is a text."""
-        return wire.I32.unpack(self.payload)[0] if len(self.payload) == 4 else None
+        return I32.read(Reader(self.payload)) if len(self.payload) == 4 else None
 
     @property
     def value(self) -> float | None:
         """The answer as a number, such as the frame rate; None if it is a text."""
-        return wire.F32.unpack(self.payload)[0] if len(self.payload) == 4 else None
+        return F32.read(Reader(self.payload)) if len(self.payload) == 4 else None
 
     @property
     def text(self) -> str:
@@ -148,7 +152,7 @@ class ClientRequest:
     text
         The command of a REQUEST.
     wanted_version
-        The bitstream that a CONNECT asks for; None for the server's own.
+        The bitstream that a CONNECT requests; None for the server's own.
     clock
         The client's clock of an ECHOREQUEST.
     """
@@ -165,7 +169,7 @@ def split_datagram(datagram: bytes) -> tuple[int, bytes]:
     Raises
     ------
     ProtocolError
-        If the datagram is shorter than its header says.
+        If the datagram is shorter than its header states.
     """
     if len(datagram) < _HEADER.size:
         raise ProtocolError(f'a datagram of {len(datagram)} bytes has no header')
@@ -211,24 +215,23 @@ def decode_message(
         For anything that is not a whole, valid message from a server.
     """
     message_id, payload = split_datagram(datagram)
-    if message_id == MessageId.FRAMEOFDATA:
-        return decode_frame(payload, _known(version), markers_only=markers_only)
-    if message_id == MessageId.SERVERINFO:
-        return _decode_server_info(payload)
-    if message_id == MessageId.MODELDEF:
-        return decode_model_definition(payload, _known(version))
-    if message_id == MessageId.RESPONSE:
-        return Response(payload)
-    if message_id == MessageId.MESSAGESTRING:
-        return MessageString(_text(payload))
-    if message_id == MessageId.ECHORESPONSE:
-        return EchoResponse(*wire.Reader(payload).unpack(_TWO_CLOCKS))
-    if message_id in (
-        MessageId.UNRECOGNIZED_REQUEST,
-        MessageId.DISCONNECT,
-        MessageId.DISCONNECT_BY_TIMEOUT,
-    ):
-        return Notice(MessageId(message_id))
+    match message_id:
+        case MessageId.FRAMEOFDATA:
+            return decode_frame(payload, _known(version), markers_only=markers_only)
+        case MessageId.SERVERINFO:
+            return _decode_server_info(payload)
+        case MessageId.MODELDEF:
+            return decode_model_definition(payload, _known(version))
+        case MessageId.RESPONSE:
+            return Response(payload)
+        case MessageId.MESSAGESTRING:
+            return MessageString(_text(payload))
+        case MessageId.ECHORESPONSE:
+            return EchoResponse(*_TWO_CLOCKS.read(Reader(payload)))
+        case (
+            MessageId.UNRECOGNIZED_REQUEST | MessageId.DISCONNECT | MessageId.DISCONNECT_BY_TIMEOUT
+        ):
+            return Notice(MessageId(message_id))
     raise ProtocolError(f'message {message_id} is none that a server sends')
 
 
@@ -253,13 +256,13 @@ def encode_message(message: Message, version: Version) -> bytes:
     if isinstance(message, MessageString):
         return join_datagram(MessageId.MESSAGESTRING, message.text.encode() + b'\0')
     if isinstance(message, EchoResponse):
-        clocks = _TWO_CLOCKS.pack(message.client_clock, message.server_clock)
+        clocks = _TWO_CLOCKS.write((message.client_clock, message.server_clock))
         return join_datagram(MessageId.ECHORESPONSE, clocks)
     return join_datagram(message.id)
 
 
 def decode_request(datagram: bytes) -> ClientRequest:
-    """Decode what a client sent; its header's length is not trusted, clients get it wrong.
+    """Decode what a client sent; the length in its header is ignored, as clients get it wrong.
 
     Raises
     ------
@@ -274,7 +277,7 @@ def decode_request(datagram: bytes) -> ClientRequest:
     if message_id == MessageId.REQUEST:
         return ClientRequest(message_id, text=_text(payload))
     if message_id == MessageId.ECHOREQUEST:
-        return ClientRequest(message_id, clock=wire.Reader(payload).unpack(_CLOCK)[0])
+        return ClientRequest(message_id, clock=_CLOCK.read(Reader(payload)))
     return ClientRequest(message_id)
 
 
@@ -290,7 +293,7 @@ def encode_connect_request(name: str, wanted_version: Version | None = None) -> 
         server's own.
     """
     major, minor = wanted_version or (0, 0)
-    sender = _SENDER.pack(name.encode()[:255], 1, 0, 0, 0, *wire.NEWEST_VERSION, 0, 0)
+    sender = _SENDER.pack(name.encode()[:255], 1, 0, 0, 0, *NEWEST_VERSION, 0, 0)
     # Two bytes of padding, as OptiTrack's own client sends them.
     return join_datagram(
         MessageId.CONNECT, sender + _OPTIONS.pack(0, major, minor, 0, 0) + b'\0\0'
@@ -299,17 +302,12 @@ def encode_connect_request(name: str, wanted_version: Version | None = None) -> 
 
 def encode_command_request(command: str) -> bytes:
     """Encode REQUEST with a command such as ``FrameRate`` or ``Bitstream,4.1``."""
-    return join_datagram(MessageId.REQUEST, wire.text(command))
+    return join_datagram(MessageId.REQUEST, TEXT.write(command))
 
 
 def encode_echo_request(clock: int) -> bytes:
     """Encode ECHOREQUEST with the client's clock, any unsigned 64-bit number."""
-    return join_datagram(MessageId.ECHOREQUEST, _CLOCK.pack(clock))
-
-
-def encode_plain_request(message_id: MessageId) -> bytes:
-    """Encode a request without content: REQUEST_MODELDEF, KEEPALIVE, DISCONNECT."""
-    return join_datagram(message_id)
+    return join_datagram(MessageId.ECHOREQUEST, _CLOCK.write(clock))
 
 
 def parse_version(text: str) -> Version:
@@ -350,7 +348,7 @@ def _wanted_version(payload: bytes) -> Version | None:
 
 
 def _decode_server_info(payload: bytes) -> ServerInfo:
-    reader = wire.Reader(payload)
+    reader = Reader(payload)
     name, *versions = reader.unpack(_SENDER)
     app_version, natnet_version = tuple(versions[:4]), (versions[4], versions[5])
     connection = None

@@ -1,9 +1,9 @@
 """The source paper's estimator, exactly: equations 8 and 12 to 16 of Van Wyk et al.
 
-Kept to compare with: it does not converge within its 2e5 steps, and one chain alone hides that.
-Several chains run side by side, each from a three-point registration of its own, so that R-hat
-can tell. Units inside are the paper's, mm and degrees, because its proposals are one number for
-both.
+It does not converge within its 2e5 steps, which one chain alone does not show. Therefore several
+chains run side by side, each from a three-point registration of its own, and R-hat shows it.
+
+Units inside are the paper's, mm and degrees, because its proposals are one number for both.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.identifiability import Gauge, find_gauge
 from remaster_ros.calibration.initial_guess import referenced, register
 from remaster_ros.calibration.laplace import find_mode
-from remaster_ros.calibration.metropolis import Chains, random_walk_sampler
+from remaster_ros.calibration.metropolis import random_walk_sampler
 from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.priors import TIGHTEST_PRIOR
-from remaster_ros.calibration.result import Sampled
+from remaster_ros.calibration.result import Sampled, sampled_columns
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.kinematics.transforms import inverse, transform
-from remaster_ros.types import FloatArray, IntArray, Measurements
+from remaster_ros.kinematics.transforms import inverse, matrix_from_rpy, transform
+from remaster_ros.types import FloatArray, IntArray
 
 STEPS = 200_000
 BURN_IN_SHARE = 0.875
@@ -64,6 +64,21 @@ class PaperPosterior:
     markers: FloatArray
     T_N_R: FloatArray
 
+    @classmethod
+    def of(cls, problem: Problem, chains: int, rng: np.random.Generator) -> PaperPosterior:
+        """Assemble; each chain and sensor is registered by three points of its own."""
+        identity = np.tile(np.eye(4), (len(problem.sensor_names), 1, 1))
+        rows = Rows.of(problem.measurements, problem.fitted, identity)
+        measured = problem.measurements.position[rows.source]
+        nominal = problem.chain.positions(rows.q, problem.markers[rows.marker])
+        T_N_R = np.empty((chains, len(problem.sensor_names), 4, 4))
+        for sensor, span in rows.spans:
+            name = problem.sensor_names[sensor]
+            for index in range(chains):
+                three = span.start + _three_points(nominal[span], name, rng)
+                T_N_R[index, sensor] = inverse(register(nominal[three], measured[three], name))
+        return cls(problem.chain, rows, measured, problem.markers, T_N_R)
+
     @property
     def sensors(self) -> int:
         """Number of sensors."""
@@ -81,7 +96,9 @@ class PaperPosterior:
         theta_1 = states[..., :turned].reshape(*states.shape[:-1], self.sensors, 6)
         between = states.ndim - 2
         initial = self.T_N_R.reshape(len(self.T_N_R), *(1,) * between, self.sensors, 4, 4)
-        correction = transform(_euler_zyx(np.radians(theta_1[..., 3:])), 1e-3 * theta_1[..., :3])
+        # Rz(alpha) Ry(beta) Rx(gamma): yaw, pitch and roll.
+        turn = matrix_from_rpy(np.radians(theta_1[..., :2:-1]))
+        correction = transform(turn, 1e-3 * theta_1[..., :3])
         offsets = np.radians(states[..., turned : turned + len(self.chain)])
         return correction @ initial, offsets, 1e-3 * states[..., -self.sensors :]
 
@@ -104,48 +121,6 @@ class PaperPosterior:
         return np.where(positive, value, -np.inf)
 
 
-def paper_posterior(
-    chain: SerialChain,
-    measurements: Measurements,
-    rows: Rows,
-    markers: FloatArray,
-    sensor_names: tuple[str, ...],
-    chains: int,
-    rng: np.random.Generator,
-) -> PaperPosterior:
-    """Draw three points per chain and sensor for the initial registrations, and assemble."""
-    measured = measurements.position[rows.source]
-    nominal = chain.positions(rows.q, markers[rows.marker])
-    T_N_R = np.empty((chains, len(sensor_names), 4, 4))
-    for sensor, span in rows.spans:
-        for index in range(chains):
-            three = span.start + _three_points(nominal[span], sensor_names[sensor], rng)
-            T_R_N = register(nominal[three], measured[three], sensor_names[sensor])
-            T_N_R[index, sensor] = inverse(T_R_N)
-    return PaperPosterior(chain, rows, measured, markers, T_N_R)
-
-
-def sample_paper(
-    posterior: PaperPosterior,
-    *,
-    steps: int,
-    rng: np.random.Generator,
-    progress: Callable[[float], None] | None = None,
-) -> Chains:
-    """Run the paper's chain: all parameters at once by U(-0.0125, 0.0125) mm and deg, eq. 16."""
-    start = posterior.start()
-    return random_walk_sampler(
-        posterior.log_density,
-        lambda source: source.uniform(-HALF_WIDTH, HALF_WIDTH, start.shape),
-        start=start,
-        steps=steps,
-        burn_in=int(BURN_IN_SHARE * steps),
-        rng=rng,
-        trace_every=max(1, steps // 1000),
-        progress=progress,
-    )
-
-
 def fit_paper(
     problem: Problem,
     *,
@@ -155,6 +130,8 @@ def fit_paper(
     progress: Callable[[float], None] | None = None,
 ) -> Sampled:
     """Fit a problem as the paper does: markers at nominal, nothing left out, nothing held.
+
+    All parameters move at once by U(-0.0125, 0.0125) mm and degrees (eq. 16).
 
     Parameters
     ----------
@@ -167,13 +144,19 @@ def fit_paper(
     progress
         Called with the share done.
     """
-    measurements, chain = problem.measurements, problem.chain
-    identity = problem.empty_model()
-    rows = Rows.of(measurements, problem.fitted, identity.reference)
-    target = paper_posterior(
-        chain, measurements, rows, problem.markers, problem.sensor_names, chains, rng
+    measurements, identity = problem.measurements, problem.empty_model()
+    target = PaperPosterior.of(problem, chains, rng)
+    start = target.start()
+    run = random_walk_sampler(
+        target.log_density,
+        lambda source: source.uniform(-HALF_WIDTH, HALF_WIDTH, start.shape),
+        start=start,
+        steps=steps,
+        burn_in=int(BURN_IN_SHARE * steps),
+        rng=rng,
+        trace_every=max(1, steps // 1000),
+        progress=progress,
     )
-    run = sample_paper(target, steps=steps, rng=rng, progress=progress)
     # Registrations of all chains as corrections to their mean, about the data's centroid.
     T_N_R = target.split(run.draws)[0]
     model = referenced(identity, measurements, problem.fitted, inverse(T_N_R[0, -1]))
@@ -181,43 +164,37 @@ def fit_paper(
     mean = x.reshape(-1, model.size).mean(axis=0)
     model = referenced(identity, measurements, problem.fitted, model.T_R_N(mean))
     rows = Rows.of(measurements, problem.fitted, model.reference)
-    x, sigma = _paper_natural(target, model, run.draws)
-    trace, trace_sigma = _paper_natural(target, model, run.trace)
-    fitted = np.arange(model.joints + 6 * len(model.sensor_names))
     at_mean = model.vector(model.offsets(mean), problem.markers)
-    # Over the markers too: that the paper takes their places as exact tells nothing about them.
+    # Over the markers too: the paper takes their places as exact, which does not determine them.
     found = find_gauge(model, at_mean, rows, problem.marker_priors(model))
-    gauge = _paper_gauge(found, model)
-    unseen = np.zeros(model.joints, dtype=bool)
-    unseen[gauge.held] = True
+    # The parameters that the paper has: not the markers. One noise for each sensor.
+    moved = np.arange(model.joints + 6 * len(model.sensor_names))
+    nominal = model.vector(np.zeros(model.joints), problem.markers)
+    free = moved[model.joints :]
+    posterior = Posterior.of(model, rows, (), free, nominal).without_pose_sigma()
+
+    def columns(states: FloatArray) -> FloatArray:
+        x, sigma = _paper_natural(target, model, states)
+        return sampled_columns(posterior, x, np.log(sigma), moved)
+
+    x, sigma = _paper_natural(target, model, run.draws)
     z = model.pinned(x)
     fixed = z.copy()
-    fixed[..., gauge.held] = 0.0
+    fixed[..., found.held] = 0.0
     # Markers do not move here: their place is the mean in natural parameters, not in pinned ones.
     middle = model.natural(fixed).reshape(-1, model.size).mean(axis=0)
-    names = model.names[: len(fitted)]
-    names += tuple(f'noise.{sensor}.sigma' for sensor in model.sensor_names)
-    free = fitted[model.joints :]
-    flat = Posterior.of(
-        model, rows, (), free, model.vector(np.zeros(model.joints), problem.markers)
-    ).without_pose_sigma()
     return Sampled(
-        model=model,
+        posterior=posterior,
         z=z,
+        eta=np.log(sigma),
         z_mean=model.pinned(middle),
-        sigma=sigma,
-        pose_sigma=np.zeros_like(sigma),
-        total_noise=np.repeat(sigma[..., None], 2, axis=-1),
-        trace=np.concatenate((trace[..., fitted], trace_sigma), axis=-1),
-        draws=np.concatenate((x[..., fitted], sigma), axis=-1),
-        names=names,
-        separable=(),
+        moved=moved,
+        run=run._replace(draws=columns(run.draws), trace=columns(run.trace)),
         name=f'paper: random-walk Metropolis, {steps} steps, the last eighth kept',
-        acceptance_rate=run.acceptance_rate,
-        gauge=gauge,
-        unfixed=unseen,
+        precision=None,
+        gauge=_paper_gauge(found, model),
         taken_as_known=_taken_as_known(found, model, problem.marker_std_m),
-        z_before=find_mode(flat).z,
+        z_before=find_mode(posterior).z,
         left_out=(),
     )
 
@@ -234,32 +211,24 @@ def _paper_natural(
 
 
 def _paper_gauge(gauge: Gauge, model: Model) -> Gauge:
-    """Say of every direction that the paper's flat prior leaves it open."""
+    """Return the gauge with what fixes its directions in the paper, where priors are flat."""
     held = {f'{model.names[index]} = 0' for index in gauge.held}
-
-    def reworded(fixed_by: str) -> str:
-        if fixed_by in held:
-            return (
+    directions, why = [], list(gauge.why)
+    for direction in gauge.directions:
+        old = direction.fixed_by
+        new = f'taking the marker as known exactly, where there is no more than {old}'
+        if old in held:
+            new = (
                 'nothing: its prior is flat and the chain wanders along it (registrations and '
-                f'markers are given for {fixed_by})'
+                f'markers are given for {old})'
             )
-        return f'taking the marker as known exactly, where there is no more than {fixed_by}'
-
-    words = {d.fixed_by: reworded(d.fixed_by) for d in gauge.directions}
-    why = []
-    for text in gauge.why:
-        for old, new in words.items():
-            text = text.replace(f'fixed by {old}', f'fixed by {new}')
-        why.append(text)
-    return Gauge(
-        tuple(replace(d, fixed_by=words[d.fixed_by]) for d in gauge.directions),
-        gauge.held,
-        tuple(why),
-    )
+        directions.append(replace(direction, fixed_by=new))
+        why = [text.replace(f'fixed by {old}', f'fixed by {new}') for text in why]
+    return Gauge(tuple(directions), gauge.held, tuple(why))
 
 
 def _taken_as_known(gauge: Gauge, model: Model, marker_std_m: FloatArray) -> FloatArray:
-    """Return the std that markers as well as they are known leave each offset, rad, (k,)."""
+    """Return the std of each offset that follows from that of the markers, rad, (k,)."""
     variance = np.zeros(model.joints)
     for direction in gauge.directions:
         entries = direction.combination
@@ -287,19 +256,4 @@ def _three_points(points: FloatArray, sensor: str, rng: np.random.Generator) -> 
     raise InsufficientDataError(
         f"sensor '{sensor}': no three of its {len(points)} points make a triangle to register "
         'by; measure poses that are spread further'
-    )
-
-
-def _euler_zyx(angles: FloatArray) -> FloatArray:
-    """Return Rz(alpha) Ry(beta) Rx(gamma) for angles (..., 3), rad, (..., 3, 3)."""
-    (sa, sb, sg), (ca, cb, cg) = (
-        np.moveaxis(function(angles), -1, 0) for function in (np.sin, np.cos)
-    )
-    return np.stack(
-        (
-            np.stack((ca * cb, ca * sb * sg - sa * cg, ca * sb * cg + sa * sg), axis=-1),
-            np.stack((sa * cb, sa * sb * sg + ca * cg, sa * sb * cg - ca * sg), axis=-1),
-            np.stack((-sb, cb * sg, cb * cg), axis=-1),
-        ),
-        axis=-2,
     )

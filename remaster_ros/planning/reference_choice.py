@@ -1,4 +1,4 @@
-"""What can change beside an arm in mid-run, and how each change shows at reference configurations.
+"""Reference configurations: what can change beside an arm in mid-run, and where it shows best.
 
 Each cause moves the measured markers linearly in few parameters; all displacements are in the
 robot base frame R.
@@ -61,18 +61,12 @@ class Cause:
     shifts: int
 
 
-def cross_matrix(vectors: FloatArray) -> FloatArray:
-    """Return [v]× for vectors (..., 3), (..., 3, 3)."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [np.stack(row, -1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
-    return np.stack(rows, -2)
-
-
 def rigid(points: FloatArray, center: FloatArray) -> FloatArray:
     """Return how points (n, 3) move by a shift and a turn about `center`, (n, 3, 6)."""
     shift = np.broadcast_to(np.eye(3), (len(points), 3, 3))
-    return np.concatenate((shift, -cross_matrix(points - center)), axis=-1)
+    # Column i: the velocity at a turn about axis i, e_i × (point - center).
+    turn = np.cross(np.eye(3), (points - center)[:, None]).swapaxes(-1, -2)
+    return np.concatenate((shift, turn), axis=-1)
 
 
 def causes(chain: SerialChain, places: Sequence[Place]) -> list[Cause]:
@@ -134,7 +128,7 @@ def choose_references(
     Why few are enough: three marker positions off one line fix the six freedoms of a rigid move,
     so the smallest singular value of their stacked Jacobian is above zero, and a shift or turn of
     sensor or base in any direction shows. A marker's slip shows at any one configuration, in any
-    direction, since it is only turned with the tool. What the further ones add is to tell the
+    direction, since it is only turned with the tool. The further ones serve to tell the
     causes apart: a marker's slip turns with the tool, the slip of a joint is another curve in each
     joint solution. They are chosen one by one, each to add the most to the log determinant of the
     information on all these freedoms together (D-optimal), until the smallest singular value of

@@ -1,6 +1,8 @@
-"""The source paper's estimator: its equations, and its failure to converge, said aloud."""
+"""The source paper's estimator: its equations, and that it reports its failure to converge."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,21 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.fit import fit_session
-from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.metropolis import random_walk_sampler
-from remaster_ros.calibration.paper_sampler import HALF_WIDTH, PaperPosterior, paper_posterior
+from remaster_ros.calibration.paper import HALF_WIDTH, PaperPosterior
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import apply, inverse, transform
 
 
 def posterior_of(session, chains: int, seed: int) -> PaperPosterior:
-    problem = Problem.of(session)
-    identity = np.tile(np.eye(4), (len(problem.sensor_names), 1, 1))
-    rows = Rows.of(problem.measurements, problem.fitted, identity)
-    rng = np.random.default_rng(seed)
-    return paper_posterior(
-        CHAIN, problem.measurements, rows, problem.markers, problem.sensor_names, chains, rng
-    )
+    return PaperPosterior.of(Problem.of(session), chains, np.random.default_rng(seed))
 
 
 def test_density_is_equation_15() -> None:
@@ -57,7 +52,7 @@ def test_sigma_must_be_positive() -> None:
     assert np.isfinite(posterior.log_density(states)[1])
 
 
-def test_every_chain_starts_as_the_paper_says_from_three_points_of_its_own() -> None:
+def test_every_chain_starts_from_three_points_of_its_own() -> None:
     posterior = posterior_of(scene(43, poses=8)[0], chains=4, seed=3)
     start = posterior.start()
     np.testing.assert_array_equal(start[:, :-1], 0.0)
@@ -69,14 +64,11 @@ def test_every_chain_starts_as_the_paper_says_from_three_points_of_its_own() -> 
 def test_about_one_step_in_twenty_is_taken_at_the_mode() -> None:
     """The paper's noise and size; its proposals are as wide as measured there: about 5 %."""
     session, _ = scene(44, poses=36, sigma_m=0.85e-3, pose_sigma_m=0.0, marker_std_m=0.0)
-    problem = Problem.of(session)
     fitted = fit_session(session, rng=np.random.default_rng(1), draws=100)
-    identity = np.eye(4)[None]
-    rows = Rows.of(problem.measurements, problem.fitted, identity)
-    markers = np.array([fitted.marker_positions['sir']])
-    T_N_R = np.tile(inverse(fitted.T_R_N['mocap']), (4, 1, 1, 1))
-    posterior = PaperPosterior(
-        CHAIN, rows, problem.measurements.position[rows.source], markers, T_N_R
+    posterior = replace(
+        posterior_of(session, chains=4, seed=3),
+        markers=np.array([fitted.marker_positions['sir']]),
+        T_N_R=np.tile(inverse(fitted.T_R_N['mocap']), (4, 1, 1, 1)),
     )
     start = posterior.start()
     start[:, 6:13] = np.degrees(np.where(np.arange(7) == 0, 0.0, fitted.joint_offsets))
@@ -92,7 +84,7 @@ def test_about_one_step_in_twenty_is_taken_at_the_mode() -> None:
     assert 0.01 < run.acceptance_rate < 0.15
 
 
-def test_a_short_run_says_that_it_did_not_converge() -> None:
+def test_a_short_run_reports_that_it_did_not_converge() -> None:
     session, _ = scene(45, poses=15, validation=3)
     shares: list[float] = []
     result = fit_session(
@@ -110,7 +102,7 @@ def test_a_short_run_says_that_it_did_not_converge() -> None:
     assert result.sampler.r_hat.max() > 1.5
     assert not result.sampler.converged
     assert shares[-1] == pytest.approx(1.0)
-    # The gauge of joint 1 is said, and carries no tight interval; markers stay at nominal.
+    # The gauge of joint 1 is reported, with a wide interval; markers stay at nominal.
     assert result.identifiable.tolist() == [False, True, True, True, True, True, False]
     assert 'the chain wanders' in result.gauge[0].fixed_by
     np.testing.assert_allclose(np.degrees(result.joint_offsets_interval95[0]), [-180.0, 180.0])

@@ -1,0 +1,118 @@
+"""Which move comes next: the configurations of a pose, and what must come before any of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from remaster_ros.motion.actions import CheckPath, PathAnswer
+from remaster_ros.motion.limits import MotionLimits
+from remaster_ros.motion.motion_gate import WAY_OUT_TOOL_SPEED
+from remaster_ros.motion.path_check import FreePath
+from remaster_ros.types import FloatArray
+
+PROBE = -1
+"""The number of the move before the first one."""
+WAY_OUT = -2
+"""The number of a way out of a contact or a margin."""
+STANDING = -3
+"""The number of a question about where the arm stands, before it is moved at all."""
+PROBE_RAD = 1e-6
+"""How far the probe goes, rad: less than the arm repeats, more than the last bit."""
+NO_WAYPOINTS: Mapping[int, FloatArray] = {}
+
+
+class MoveQueue:
+    """The configurations of a pose in the order of visiting, and the path that is asked for.
+
+    Attributes
+    ----------
+    next
+        The number of the next solution.
+    pending
+        The number of the path that is asked for, and of the solution that it leads to.
+    must_look
+        Whether it must be found out first that the arm stands where it may.
+    must_probe
+        Whether the probe must be commanded first: it shows that reports are measured.
+    way_out
+        The way out of a contact or a margin that a person has allowed by clearing the halt.
+    """
+
+    def __init__(self) -> None:
+        self._solutions: FloatArray | tuple[()] = ()
+        self._waypoints = NO_WAYPOINTS
+        self.next = 0
+        self._requests = 0
+        self.pending: tuple[int, int] | None = None
+        self.must_look = self.must_probe = True
+        self.way_out: FreePath | None = None
+        self._offered: FreePath | None = None
+
+    def begin(self, solutions: FloatArray, waypoints: Mapping[int, FloatArray]) -> None:
+        """Begin another pose; see `ArmSupervisor.plan`."""
+        self._solutions, self._waypoints, self.next = solutions, waypoints, 0
+        self.pending = None
+
+    def start_over(self) -> None:
+        """Begin as at the start: a person has cleared the halt, and so allowed the way out."""
+        self.must_look = self.must_probe = True
+        self.way_out, self._offered = self._offered, None
+
+    @property
+    def target(self) -> FloatArray | None:
+        """The next configuration, rad, (k,); None where none is left."""
+        return self._solutions[self.next] if self.next < len(self._solutions) else None
+
+    def preparation(self, q: FloatArray, limits: MotionLimits) -> CheckPath | None:
+        """Return what must be asked for before any configuration; None if nothing is left.
+
+        Parameters
+        ----------
+        q
+            Where the arm stands, rad, (k,).
+        limits
+            For the direction of the probe.
+        """
+        if self.must_look:
+            return self.ask(STANDING, q, q)
+        if self.must_probe and self.target is not None:
+            return self.ask(PROBE, q, _probe(q, limits))
+        return None
+
+    def ask(self, solution: int, start: FloatArray, target: FloatArray) -> CheckPath:
+        """Return the question whether the way to a solution is free, rad, (k,) each."""
+        self._requests += 1
+        self.pending = self._requests, solution
+        none = np.empty((0, len(target)))
+        return CheckPath(self._requests, start, target, self._waypoints.get(solution, none))
+
+    def offer(self, answer: PathAnswer, names: Sequence[str]) -> str:
+        """Keep a way out for the person who clears the halt; return what to tell that person.
+
+        Parameters
+        ----------
+        answer
+            That the arm stands where it must not, and the way out, if one is known.
+        names
+            Of the joints.
+        """
+        self._offered = answer.way_out
+        stands = f'the arm stands where it must not: {answer.why}'
+        if answer.way_out is None:
+            return f'{stands}; no way out is known: move it by hand, then /remaster/clear_halt'
+        way = np.max(np.abs(np.diff(answer.way_out.points, axis=0)), axis=0)
+        joints = ', '.join(
+            f'{name} by {np.rad2deg(angle):.1f} deg' for name, angle in zip(names, way) if angle
+        )
+        return (
+            f'{stands}; /remaster/clear_halt and /remaster/collect let it leave slowly '
+            f'(at most {WAY_OUT_TOOL_SPEED:g} m/s): {joints}'
+        )
+
+
+def _probe(q: FloatArray, limits: MotionLimits) -> FloatArray:
+    """Return a place a microradian away: a measurement does not agree with it to the last bit."""
+    low, high = np.clip((limits.lower, limits.upper), -1e3, 1e3)
+    return q + np.where(2 * q > low + high, -PROBE_RAD, PROBE_RAD)

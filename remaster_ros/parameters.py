@@ -1,0 +1,93 @@
+"""Parameters: a frozen dataclass, each field with unit, range and description; no ROS.
+
+Nodes declare such a class to ROS (`remaster_ros.nodes.parameters`); a sensor's driver has one of
+its own, which is also checked where the driver is used without a node.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from remaster_ros.errors import InputError
+
+
+def parameter(
+    default: Any,
+    description: str,
+    *,
+    unit: str = '',
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+    live: bool = False,
+) -> Any:
+    """Return a dataclass field that describes a node parameter.
+
+    Parameters
+    ----------
+    default
+        Its value where the user gives none; its type is the parameter's type.
+    description, unit
+        For the user; shown by ``ros2 param describe``.
+    low, high
+        Smallest and largest allowed value, both included.
+    choices
+        The allowed words of a text parameter.
+    live
+        Whether it can be changed while the node runs, where the node has an `on_change`.
+    """
+    metadata = {
+        'description': description,
+        'unit': unit,
+        'low': low,
+        'high': high,
+        'choices': choices,
+        'live': live,
+    }
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def parameter_fields(kind: Any) -> dict[str, dataclasses.Field[Any]]:
+    """Return the fields of a dataclass that were made by `parameter`, by name."""
+    return {field.name: field for field in dataclasses.fields(kind) if field.metadata}
+
+
+def check(owner: str, field: dataclasses.Field[Any], value: Any) -> Any:
+    """Return `value` as the field's type.
+
+    Parameters
+    ----------
+    owner
+        Whose parameter it is, for the message.
+    field
+        Made by `parameter`.
+
+    Raises
+    ------
+    InputError
+        The value is of another type, out of range or none of the choices; one line.
+    """
+    where = f'{owner}: parameter {field.name}'
+    wanted = type(field.default)
+    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not wanted:
+        raise InputError(f'{where} is {value!r}; it must be of type {wanted.__name__}')
+    low, high = field.metadata['low'], field.metadata['high']
+    too_low = low is not None and not value >= low
+    too_high = high is not None and not value <= high
+    if too_low or too_high:
+        unit = f' {field.metadata["unit"]}' if field.metadata['unit'] else ''
+        limits = f'{"-inf" if low is None else low} to {"inf" if high is None else high}'
+        raise InputError(f'{where} is {value}; it must lie in {limits}{unit}')
+    choices = field.metadata['choices']
+    if choices and value not in choices:
+        raise InputError(f'{where} is {value!r}; it must be one of {", ".join(choices)}')
+    return value
+
+
+def check_all(owner: str, values: Any) -> None:
+    """Check every field of `values` that was made by `parameter`; errors as of `check`."""
+    for name, field in parameter_fields(values).items():
+        check(owner, field, getattr(values, name))

@@ -1,0 +1,120 @@
+"""The tours of a session: for the registration, and for the collection with its references."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.planning.candidates import Plan, PlannedPose, PlanningScene, order_solutions
+from remaster_ros.planning.free_order import free_way
+from remaster_ros.planning.reference_choice import choose_references
+from remaster_ros.planning.tour_order import (
+    REFERENCE,
+    REGISTRATION,
+    Tour,
+    registration_tour,
+)
+from remaster_ros.types import FloatArray
+
+MOST_TRIES = 5
+"""So often references are chosen anew where one has no free way to it."""
+
+
+class TourPlanner:
+    """Plans the tours of one session; equal arguments give equal tours.
+
+    Parameters
+    ----------
+    scene
+        The arm, what it can hit, and the sensors.
+    counts
+        Candidate poses of each split, the registration's among them.
+    seed
+        Of the Latin hypercube.
+    reference_every
+        How many configurations lie between two rounds of the references; 0 for no references.
+
+    Attributes
+    ----------
+    model
+        The arm and all that it must not hit.
+    """
+
+    def __init__(
+        self, scene: PlanningScene, counts: Mapping[str, int], seed: int, reference_every: int = 0
+    ) -> None:
+        self._scene, self._counts, self._seed = scene, counts, seed
+        self._every = reference_every
+        self._chain, self.model = scene.model.chain, scene.model
+
+    def registration(self) -> Tour:
+        """Plan poses for the three-point registration, before sensors at their rough places."""
+        plan = self._plan(REGISTRATION, self._scene.rough_R)
+        markers = [sight.marker_T for sight in self._scene.sights]
+        return registration_tour(self._chain, plan, markers, self.model)
+
+    def collection(self, T_R_N: Mapping[str, FloatArray]) -> Tour:
+        """Plan the poses to fit and to validate, before sensors with these registrations.
+
+        Raises
+        ------
+        InsufficientDataError
+            No pose is left to fit on.
+        """
+        sensors_R = {name: T[:3, 3] for name, T in T_R_N.items()}
+        plans = {
+            split: self._plan(split, sensors_R)
+            for split, count in self._counts.items()
+            if count and split != REGISTRATION
+        }
+        if self._every and plans['optimization'].poses:
+            plans[REFERENCE] = self._references(plans)
+        tour = Tour(self._chain, plans, model=self.model, reference_every=self._every)
+        if not plans['optimization'].poses:
+            raise InsufficientDataError(f'{tour.describe()}: no pose is left to fit on')
+        return tour
+
+    def _references(self, plans: Mapping[str, Plan]) -> Plan:
+        """Choose references among the planned configurations, each with a way from the last."""
+        poses = [
+            PlannedPose(pose.T_R_T, q[None])
+            for plan in plans.values()
+            for pose in plan.poses
+            for q in pose.solutions
+        ]
+        seen = {sight.sensor: (sight.marker, sight.marker_T) for sight in self._scene.sights}
+        chosen: list[PlannedPose] = []
+        for _ in range(MOST_TRIES):
+            q = np.array([pose.solutions[0] for pose in poses])
+            picked = choose_references(self._chain, q, seen).indices
+            chosen = [poses[i] for i in self._in_turn(q, list(picked))]
+            lost = self._without_way(chosen)
+            if not lost:
+                break
+            poses = [pose for pose in poses if all(pose is not other for other in lost)]
+        return Plan(tuple(chosen))
+
+    def _in_turn(self, q: FloatArray, left: list[int]) -> list[int]:
+        """Order the indices so that each is the nearest of those left to the one before."""
+        order = left[:1]
+        while rest := [i for i in left if i not in order]:
+            limits = self._chain.velocity_limits
+            order.append(rest[int(order_solutions(q[rest], q[order[-1]], limits)[0])])
+        return order
+
+    def _without_way(self, poses: Sequence[PlannedPose]) -> list[PlannedPose]:
+        """Return the references that no free way leads to from the one before."""
+        limits = self._chain.velocity_limits
+        return [
+            pose
+            for i, pose in enumerate(poses)
+            if free_way(self.model, poses[i - 1].solutions[0], pose.solutions[0], limits, i)
+            is None
+        ]
+
+    def _plan(self, split: str, sensors_R: Mapping[str, FloatArray]) -> Plan:
+        # Each split has its own draws: the same plan, whatever was planned before a restart.
+        rng = np.random.default_rng([self._seed, *split.encode()])
+        return self._scene.plan(self._counts[split], sensors_R, rng)

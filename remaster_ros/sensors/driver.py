@@ -1,0 +1,158 @@
+"""What the driver of a sensor gives; no ROS. `remaster_ros.nodes.sensor_node` runs any of them.
+
+A device is one folder beside this file with one class that derives from `StreamDriver` or from
+`TriggeredDriver`, and one line in `remaster_ros.sensors.registry`.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from remaster_ros.parameters import parameter
+from remaster_ros.types import FloatArray, MarkerReading
+
+
+@dataclass(frozen=True)
+class SensorParameters:
+    """Parameters of every sensor's node; a driver adds those of its device."""
+
+    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
+    sensor: str = parameter('', "its name among the cell's sensors")
+    start_timeout_s: float = parameter(
+        20.0,
+        'how long to try the first connection and, for a stream, to wait for the first reading, '
+        'wall time',
+        unit='s',
+        low=0.1,
+        high=3600.0,
+    )
+
+
+@dataclass(frozen=True)
+class SensorClock:
+    """The clock by which readings are stamped.
+
+    Attributes
+    ----------
+    now, sleep
+        Time and waiting, s.
+    simulated
+        Whether it runs at another speed than the wall clock and may stand still.
+    """
+
+    now: Callable[[], float] = time.time
+    sleep: Callable[[float], None] = time.sleep
+    simulated: bool = False
+
+
+@dataclass(frozen=True)
+class SensorState:
+    """How a sensor is now.
+
+    Attributes
+    ----------
+    ready
+        It can measure a marker that is in view. A hidden marker does not make it unready: the
+        next configuration may show the marker again.
+    trouble
+        What is wrong, with the remedy; ''.
+    message
+        What to show a person where nothing is wrong.
+    level
+        ``ok``, ``warn`` or ``error``.
+    values
+        Counts and settings for the search of a cause.
+    """
+
+    ready: bool = True
+    trouble: str = ''
+    message: str = 'ok'
+    level: str = 'ok'
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Driver(ABC):
+    """One device. The constructor refuses what waiting cannot mend; `open` connects.
+
+    Parameters
+    ----------
+    parameters
+        An instance of `parameters_type`.
+    clock
+        Gives the stamps of the readings.
+    """
+
+    parameters_type: ClassVar[type[SensorParameters]]
+    """The driver's frozen dataclass of parameters."""
+    device: ClassVar[str]
+    """What it is, for messages."""
+    phase: str = 'connecting'
+    """``connecting`` until `open` has returned, then ``ready``; set by the node. `open` may set
+    another text while it takes long."""
+
+    @abstractmethod
+    def __init__(self, parameters: Any, clock: SensorClock) -> None: ...
+
+    @property
+    def connected(self) -> bool:
+        """Whether the device can still be reached after `open`; False has it opened again."""
+        return True
+
+    @abstractmethod
+    def open(self) -> None:
+        """Connect; called again after a `DeviceError`."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Disconnect; may be repeated, and called while another thread reads or measures."""
+
+    def state(self) -> SensorState:
+        """Return how the device is; called from any thread."""
+        return SensorState()
+
+
+class StreamDriver(Driver):
+    """A device that sends readings by itself."""
+
+    @abstractmethod
+    def read(self) -> MarkerReading | None:
+        """Return the next reading, stamped with its time of capture.
+
+        Only measured positions: nothing occluded, predicted, filled in or held over. Waits some
+        tenths of a second at most, then returns None.
+
+        Raises
+        ------
+        DeviceError
+            The device is lost; it is closed and opened again.
+        """
+
+
+class TriggeredDriver(Driver):
+    """A device that measures on request."""
+
+    @abstractmethod
+    def measure(self, expected: FloatArray | None) -> MarkerReading:
+        """Measure once.
+
+        Parameters
+        ----------
+        expected
+            Where the marker should be, in the sensor's frame, m, (3,); None until the sensor is
+            registered and a pose has been announced.
+
+        Raises
+        ------
+        DeviceError
+            Why there is no reading, with the remedy. A moving target is refused.
+        """
+
+    def prepare(self, expected: FloatArray | None) -> None:
+        """Get ready for the request that follows; called when the arm has arrived.
+
+        What it raises (`DeviceError`) is shown, and the request is made all the same.
+        """

@@ -1,0 +1,120 @@
+"""A laser tracker as the sensor of a node: one ADM measurement on request, the reflector kept.
+
+The reflector is found again when the beam has broken. Once the tracker is registered, the search
+begins where the reflector should be and is narrow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.errors import DeviceError
+from remaster_ros.parameters import parameter
+from remaster_ros.sensors.driver import SensorClock, SensorParameters, SensorState, TriggeredDriver
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
+from remaster_ros.sensors.laser_tracker.link import LaserTrackerError
+from remaster_ros.sensors.laser_tracker.settings import (
+    LaserTrackerSettings,
+    TrackerReading,
+    TrackerStatus,
+)
+from remaster_ros.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Parameters(LaserTrackerSettings, SensorParameters):
+    """Parameters of the laser tracker's node."""
+
+    sensor: str = parameter('tracker', "the tracker's name among the cell's sensors")
+    host: str = parameter('192.168.0.1', 'address of the instrument')
+    port: int = parameter(700, 'TCP port of the instrument', low=1, high=65535)
+    first_search_radius_m: float = parameter(
+        0.6,
+        'how far about where it points the tracker searches before it is registered',
+        unit='m',
+        low=1e-3,
+        high=5.0,
+    )
+    attempts: int = parameter(3, 'searches and measurements tried for one request', low=1, high=20)
+    max_deviation_m: float = parameter(
+        0.05,
+        'a reading further than this from the expected place is another reflector',
+        unit='m',
+        low=1e-3,
+        high=5.0,
+    )
+
+
+class LaserTrackerDriver(TriggeredDriver):
+    """See the module's text."""
+
+    parameters_type = Parameters
+    device = 'laser tracker'
+
+    def __init__(self, parameters: Parameters, clock: SensorClock) -> None:
+        self.p = parameters
+        settings = replace(self.p, search_radius_m=self.p.first_search_radius_m)
+        self.tracker = LaserTrackerClient(
+            self.p.host, self.p.port, settings=settings, now=clock.now, sleep=clock.sleep
+        )
+        self._narrow = False
+        self._temperature_c: float | None = None
+
+    @property
+    def connected(self) -> bool:
+        """Whether the connection stands."""
+        return self.tracker.connected
+
+    def open(self) -> None:
+        """Connect and initialise, which takes as long as the instrument warms up."""
+        self.tracker.connect()
+        self.phase = 'initialising'
+        self.tracker.initialise()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.tracker.close()
+
+    def prepare(self, expected: FloatArray | None) -> None:
+        """Search once where the beam is broken."""
+        if self.tracker.status is not TrackerStatus.READY:
+            self._lock(expected)
+
+    def _lock(self, expected: FloatArray | None) -> None:
+        if expected is not None and not self._narrow:
+            self.tracker.set_search_radius(self.p.search_radius_m)
+            self._narrow = True
+        self.tracker.ensure_locked(expected, attempts=1)
+
+    def measure(self, expected: FloatArray | None) -> TrackerReading:
+        """Measure the reflector that is where it should be; see `TriggeredDriver.measure`."""
+        failure: DeviceError | None = None
+        for _ in range(self.p.attempts):
+            try:
+                self._lock(expected)
+                reading = self.tracker.measure()
+            except LaserTrackerError as error:
+                if not self.tracker.connected:
+                    raise
+                failure = error
+                continue
+            deviation = 0.0 if expected is None else np.linalg.norm(reading.position - expected)
+            if deviation <= self.p.max_deviation_m:
+                self._temperature_c = reading.temperature_c
+                return reading
+            failure = DeviceError(
+                f'{self.tracker.name}: the reading is {1e3 * deviation:.0f} mm from where the '
+                'reflector should be; is another reflector in view, or the tracker moved?'
+            )
+        assert failure is not None
+        raise failure
+
+    def state(self) -> SensorState:
+        """Return the lock, what has been counted, and the last temperature."""
+        values: dict[str, Any] = {'lock': self.tracker.status.value, **self.tracker.counts}
+        if self._temperature_c is not None:
+            values['temperature_c'] = self._temperature_c
+        return SensorState(message=self.phase, values=values)

@@ -1,0 +1,104 @@
+"""An OptiTrack bar as the sensor of a node: the measured positions of one marker.
+
+Occluded, model-filled and otherwise unmeasured frames never become a reading; they are counted
+with their reason in the state, which also states what is wrong when nothing comes.
+"""
+
+from __future__ import annotations
+
+import queue
+from dataclasses import dataclass, replace
+
+from remaster_ros.parameters import parameter
+from remaster_ros.sensors.clock_offset import ClockMapping
+from remaster_ros.sensors.driver import SensorClock, SensorParameters, SensorState, StreamDriver
+from remaster_ros.sensors.optitrack.client import NatNetClient
+from remaster_ros.sensors.optitrack.diagnosis import warning
+from remaster_ros.sensors.optitrack.frame_gate import MarkerChoice, MarkerSample
+from remaster_ros.sensors.optitrack.natnetclient_backend import NatNetClientBackend
+from remaster_ros.sensors.optitrack.settings import NatNetSettings
+from remaster_ros.types import MarkerReading
+
+WAIT_S = 0.2
+
+
+@dataclass(frozen=True)
+class Parameters(NatNetSettings, SensorParameters):
+    """Parameters of the OptiTrack node."""
+
+    sensor: str = parameter('mocap', "the bar's name among the cell's sensors")
+    server: str = parameter('192.168.0.10', 'the computer that runs Motive')
+    client: str = parameter(
+        'builtin', 'which NatNet client to use', choices=('builtin', 'natnetclient')
+    )
+    rigid_body: str = parameter('', 'name of the rigid body in Motive; empty for the only one')
+    member: int = parameter(
+        1, 'number of the marker in that body; 0 for a lone marker without a body', low=0, high=999
+    )
+    marker_id: int = parameter(
+        0, 'id of the marker on the wire instead of body and member; 0 for these', low=0
+    )
+
+
+class OptiTrackDriver(StreamDriver):
+    """See the module's text. The client begins at once: it greets the server until it answers."""
+
+    parameters_type = Parameters
+    device = 'OptiTrack'
+
+    def __init__(self, parameters: Parameters, clock: SensorClock) -> None:
+        p = parameters
+        marker = MarkerChoice(
+            rigid_body=p.rigid_body,
+            member=max(p.member, 1),
+            marker_id=p.marker_id or None,
+            lone_marker=p.member == 0,
+        )
+        self._samples: queue.SimpleQueue[MarkerSample] = queue.SimpleQueue()
+        self._mapping = ClockMapping(simulated=clock.simulated)
+        kind = NatNetClientBackend if p.client == 'natnetclient' else NatNetClient
+        self.client = kind(replace(p, marker=marker), self._samples.put, clock=clock.now)
+        self.client.start()
+
+    def open(self) -> None:
+        """Do nothing: the client of the constructor keeps trying by itself."""
+
+    def read(self) -> MarkerReading | None:
+        """Return the next measured position; see `StreamDriver.read`."""
+        try:
+            sample = self._samples.get(timeout=WAIT_S)
+        except queue.Empty:
+            return None
+        if sample.received_s <= 0.0:
+            # By a simulated clock that has not begun, no time of capture can be given.
+            return None
+        captured_s = self._mapping.capture_time(
+            sample.timestamp_s, sample.age_s, sample.received_s
+        )
+        return MarkerReading(captured_s, sample.position)
+
+    def state(self) -> SensorState:
+        """Return what the frames, and those that do not come, show."""
+        status = self.client.status()
+        diagnosis = self.client.diagnosis()
+        values = {
+            'fault': diagnosis.fault,
+            'frames': status.frames,
+            'lost': status.lost,
+            'source': status.source,
+            'sources_taken': status.sources_taken,
+            'refused_sources': ', '.join([*status.rivals, *status.contestants, *status.foreign]),
+            **{f'dropped_{reason}': count for reason, count in status.dropped.items()},
+        }
+        odd = warning(status)
+        return SensorState(
+            ready=diagnosis.fault in ('none', 'marker'),
+            trouble=diagnosis.message,
+            message=odd or 'ok',
+            level='error' if diagnosis.message else 'warn' if odd else 'ok',
+            values=values,
+        )
+
+    def close(self) -> None:
+        """Disconnect from the server."""
+        self.client.stop()

@@ -1,0 +1,167 @@
+"""What a simulated session is made from: one description for the fakes and the offline simulation.
+
+No module that estimates or moves an arm may import it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import looking_at, quaternion_xyzw, transform
+from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.types import FloatArray
+
+ROLL_RAD = 0.2
+"""Largest roll of a sensor about its optical axis."""
+
+Record = TypeVar('Record')
+
+
+@dataclass(frozen=True)
+class Warming:
+    """An arm warms up by ``kelvin`` from ``start_s`` on, with time constant ``time_s``."""
+
+    kelvin: float = 0.0
+    time_s: float = 1.0
+    start_s: float = 0.0
+
+    def at(self, t: FloatArray) -> FloatArray:
+        """Temperature above that of the beginning, K."""
+        since = np.maximum(np.asarray(t, float) - self.start_s, 0.0)
+        return self.kelvin * (1.0 - np.exp(-since / self.time_s))
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedSensor:
+    """A sensor as it truly stands and errs.
+
+    Attributes
+    ----------
+    marker
+        Name of the marker that it measures.
+    T_R_N
+        Its true frame in the robot base, (4, 4).
+    sigma_m, pose_sigma_m
+        Error of every point, and error that all points at one pose share, m per axis. They hold
+        for the offline simulation; a fake device has the errors of its own data sheet.
+    acceptance_rad
+        Largest angle between the tool's z axis and the line to the sensor at which a fake device
+        sees the marker (a retroreflector takes about 30 degrees, a sphere more).
+    """
+
+    marker: str
+    T_R_N: FloatArray
+    sigma_m: float = 0.1e-3
+    pose_sigma_m: float = 0.2e-3
+    acceptance_rad: float = np.pi
+
+    def in_sensor(self, points_R: FloatArray) -> FloatArray:
+        """Map points (..., 3) of the robot base to the sensor's frame N, m."""
+        return (points_R - self.T_R_N[:3, 3]) @ self.T_R_N[:3, :3]
+
+
+@dataclass(frozen=True, eq=False)
+class SessionTruth:
+    """What a session was made from: everything that an estimate of it is to find.
+
+    Attributes
+    ----------
+    joint_offsets
+        True joint angle minus reported one, rad, (k,).
+    markers
+        True positions in the tool frame, m, name -> (3,).
+    sensors
+        By name.
+    warming
+        How the arm, and the air around it, warms up.
+    effects
+        What else is wrong with the arm or the sensors.
+    effect_sizes_m
+        What each effect leaves after offsets, registration and marker are fitted: RMS of the 3-D
+        error over all rows.
+    outliers
+        ``observation`` of every gross error.
+    """
+
+    joint_offsets: FloatArray
+    markers: Mapping[str, FloatArray]
+    sensors: Mapping[str, SimulatedSensor]
+    warming: Warming = Warming()
+    effects: tuple[HiddenEffect, ...] = ()
+    effect_sizes_m: tuple[float, ...] = ()
+    outliers: tuple[int, ...] = ()
+
+    def without_noise(self, chain: SerialChain, sensor: str, q: FloatArray) -> FloatArray:
+        """Where a sensor measures its marker without noise and effects, m, (..., 3).
+
+        Parameters
+        ----------
+        chain
+            The nominal arm.
+        sensor
+            Name of the sensor, in whose frame N the positions are.
+        q
+            Reported joint angles, rad, (..., k).
+        """
+        placed = self.sensors[sensor]
+        points_R = chain.positions(q, self.markers[placed.marker], self.joint_offsets)
+        return placed.in_sensor(points_R)
+
+
+def place_sensor(
+    near: ArrayLike, look_at: ArrayLike, std_m: float, rng: np.random.Generator
+) -> FloatArray:
+    """Draw T_R_N of a sensor near a place (std per axis) that looks at a point of R, both in m."""
+    position = np.asarray(near, float) + rng.normal(0.0, std_m, 3)
+    turn = looking_at(position, look_at, rng.uniform(-ROLL_RAD, ROLL_RAD))
+    return transform(turn, position)
+
+
+def to_plain(record: Any) -> Any:
+    """Return a record of this package's simulation as dicts, lists and numbers, for a file."""
+    return msgspec.to_builtins(record, enc_hook=lambda array: array.tolist())
+
+
+def from_plain(data: Any, kind: type[Record]) -> Record:
+    """Undo `to_plain`."""
+    return msgspec.convert(data, kind, dec_hook=lambda _, values: np.array(values, float))
+
+
+def truth_to_dict(truth: SessionTruth, chain: SerialChain, seed: int) -> dict[str, Any]:
+    """Return the content of truth.json (``remaster-truth/1``), in the units of fit.json."""
+    sensors = truth.sensors
+    return {
+        'format': 'remaster-truth/1',
+        'seed': seed,
+        'robot': chain.name,
+        'joint_offsets': [
+            {'joint': name, 'offset_deg': float(np.rad2deg(offset))}
+            for name, offset in zip(chain.joint_names, truth.joint_offsets)
+        ],
+        'registration': {
+            name: {
+                'translation_m': sensor.T_R_N[:3, 3].tolist(),
+                'rotation_xyzw': quaternion_xyzw(sensor.T_R_N[:3, :3]).tolist(),
+            }
+            for name, sensor in sensors.items()
+        },
+        'markers': {
+            name: {'position_m': position.tolist()} for name, position in truth.markers.items()
+        },
+        'noise': {
+            name: {'sigma_m': sensor.sigma_m, 'pose_sigma_m': sensor.pose_sigma_m}
+            for name, sensor in sensors.items()
+        },
+        'outliers': list(truth.outliers),
+        'effects': [
+            {**to_plain(effect), 'size_mm': 1e3 * size}
+            for effect, size in zip(truth.effects, truth.effect_sizes_m)
+        ],
+    }

@@ -1,0 +1,289 @@
+"""The node of any sensor, around drivers without a device: what is published, retried, refused."""
+
+import os
+import sys
+import time
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+
+import rclpy
+from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped
+from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
+from sensor_msgs.msg import Temperature
+from std_srvs.srv import Trigger
+
+from remaster_ros.errors import DeviceError, InputError
+from remaster_ros.nodes.messages import seconds
+from remaster_ros.nodes.sensor_node import SensorNode
+from remaster_ros.nodes.status import LATCHED
+from remaster_ros.parameters import parameter
+from remaster_ros.sensors import registry
+from remaster_ros.sensors.driver import SensorParameters, StreamDriver, TriggeredDriver
+from remaster_ros.types import MarkerReading
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
+
+DOMAIN = 200 + os.getpid() % 15
+PLACE = np.array([0.5, -0.25, 2.0])
+
+
+@dataclass(frozen=True)
+class GaugeParameters(SensorParameters):
+    """Parameters of a gauge."""
+
+    scale: float = parameter(1.0, 'a number', low=0.5, high=2.0)
+
+
+class Device:
+    """What both drivers have in common: a device that fails as the test sets it."""
+
+    parameters_type = GaugeParameters
+    device = 'gauge'
+    refusals = 0
+    fault = None
+
+    def __init__(self, parameters, clock):
+        self.p, self.clock, self.opened, self.closed = parameters, clock, 0, 0
+
+    def open(self):
+        if type(self).refusals > self.opened:
+            self.opened += 1
+            raise DeviceError('gauge: the cable is out')
+        self.opened += 1
+
+    def close(self):
+        self.closed += 1
+
+
+class Stream(Device, StreamDriver):
+    """Gives what the test has put in."""
+
+    def __init__(self, parameters, clock):
+        super().__init__(parameters, clock)
+        self.readings = []
+
+    def read(self):
+        time.sleep(0.01)
+        if self.fault is not None:
+            fault, self.fault = self.fault, None
+            raise fault
+        return self.readings.pop(0) if self.readings else None
+
+
+class Probe(Device, TriggeredDriver):
+    """Measures where the marker is expected."""
+
+    expected = None
+    prepared = 0
+
+    def measure(self, expected):
+        self.expected = expected
+        if self.fault is not None:
+            raise self.fault
+        return MarkerReading(12.5, PLACE, temperature_c=21.5)
+
+
+class LookingProbe(Probe):
+    """The same, which looks for a lost marker when the arm has arrived."""
+
+    def prepare(self, expected):
+        self.prepared += 1
+
+
+@pytest.fixture
+def rig(monkeypatch, tmp_path):
+    """Return a function that starts the node of a driver, and a peer that listens."""
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    made = []
+
+    def start(driver, name='gauge', own_name=registry.GENERIC, **parameters):
+        where = f'{__name__}:{driver.__name__}'
+        monkeypatch.setitem(registry.DRIVERS, 'gauge', where)
+        find = registry.importlib.import_module
+        monkeypatch.setattr(
+            registry,
+            'importlib',
+            SimpleNamespace(
+                import_module=lambda module: (
+                    sys.modules[__name__] if module.endswith(f'.{__name__}') else find(module)
+                )
+            ),
+        )
+        triggered = issubclass(driver, TriggeredDriver)
+        place = 'laser_tracker' if triggered else 'optitrack'
+        parameters = {'sensor': 'tracker' if triggered else 'mocap', **parameters}
+        args = ['--ros-args', '--log-level', 'fatal', '-r', f'__node:={name}']
+        for key, value in parameters.items():
+            args += ['-p', f'{key}:={value}']
+        rclpy.init(args=args, domain_id=DOMAIN)
+        context = rclpy.Context()
+        rclpy.init(context=context, domain_id=DOMAIN)
+        peer = rclpy.create_node('peer', context=context)
+        r = SimpleNamespace(peer=peer, context=context, points=[], temperatures=[], node=None)
+        made.append(r)
+        peer.create_subscription(PointStamped, f'{place}/marker', r.points.append, 10)
+        peer.create_subscription(Temperature, f'{place}/temperature', r.temperatures.append, 10)
+        peer_executor = SingleThreadedExecutor(context=context)
+        peer_executor.add_node(peer)
+        r.node = SensorNode(own_name)
+        executor = MultiThreadedExecutor(3)
+        executor.add_node(r.node)
+
+        def wait(condition, what):
+            deadline = time.monotonic() + 20.0
+            while not condition():
+                assert time.monotonic() < deadline, what
+                executor.spin_once(timeout_sec=0.01)
+                peer_executor.spin_once(timeout_sec=0.01)
+
+        def measure():
+            client = peer.create_client(Trigger, 'laser_tracker/measure')
+            wait(client.service_is_ready, 'the service')
+            future = client.call_async(Trigger.Request())
+            wait(future.done, 'the answer')
+            return future.result()
+
+        r.wait, r.measure, r.driver = wait, measure, r.node.driver
+        r.values = lambda: r.node._summary()[2]
+        wait(lambda: peer.count_publishers(f'{place}/marker'), 'the match')
+        return r
+
+    yield start
+    for r in made:
+        if r.node is not None:
+            r.node.close()
+            r.node.destroy_node()
+        r.peer.destroy_node()
+        rclpy.shutdown(context=r.context)
+    rclpy.try_shutdown()
+
+
+def test_a_stream_is_published_under_its_time_of_capture(rig):
+    r = rig(Stream, scale=1.5)
+    assert r.driver.p.scale == 1.5
+    r.wait(lambda: r.node._readings.get_subscription_count(), 'the match')
+    r.driver.readings.append(MarkerReading(7.25, PLACE))
+    r.wait(lambda: r.points, 'the point')
+    (point,) = r.points
+    assert (seconds(point.header.stamp), point.header.frame_id) == (7.25, 'mocap')
+    assert (point.point.x, point.point.y, point.point.z) == tuple(PLACE)
+    assert {'sensor': 'mocap', 'ready': 'yes', 'published': 1}.items() <= r.values().items()
+
+
+def test_a_stream_that_is_lost_is_opened_again(rig):
+    r = rig(Stream)
+    r.driver.readings.append(MarkerReading(1.0, PLACE))
+    r.wait(lambda: r.node.published == 1, 'the first reading')
+    r.driver.fault = DeviceError('gauge: the line is dead')
+    r.wait(lambda: r.values()['ready'] == 'no', 'the loss')
+    assert r.node._summary()[:2] == ('error', 'gauge: the line is dead')
+    r.wait(lambda: r.driver.opened == 2, 'the second opening')
+    r.driver.readings.append(MarkerReading(2.0, PLACE))
+    r.wait(lambda: r.node.published == 2, 'the next reading')
+    assert (r.values()['ready'], r.driver.closed) == ('yes', 1)
+    assert r.node.failure is None
+
+
+def test_a_stream_that_never_gives_a_reading_ends_the_node(rig):
+    r = rig(Stream, start_timeout_s=0.2)
+    r.wait(lambda: r.node.failure, 'the end')
+    assert str(r.node.failure) == 'gauge: no reading of the marker'
+
+
+def test_a_device_that_never_answers_ends_the_node(rig, monkeypatch):
+    monkeypatch.setattr(Device, 'refusals', 1000)
+    r = rig(Probe, start_timeout_s=0.2)
+    r.wait(lambda: r.node.failure, 'the end')
+    assert str(r.node.failure) == 'gauge: the cable is out'
+
+
+def test_a_fault_of_the_driver_ends_the_node(rig):
+    r = rig(Stream)
+    r.driver.fault = ZeroDivisionError('no thought')
+    r.wait(lambda: r.node.failure, 'the end')
+    assert 'a fault of this program' in str(r.node.failure)
+
+
+def test_a_measurement_is_published_before_its_answer(rig, monkeypatch):
+    monkeypatch.setattr(Device, 'refusals', 3)
+    r = rig(Probe)
+    refused = r.measure()
+    assert not refused.success
+    assert refused.message == 'the gauge is connecting: gauge: the cable is out'
+    r.wait(lambda: r.values()['ready'] == 'yes', 'the connection')
+    assert r.driver.closed == 3
+    answer = r.measure()
+    assert (answer.success, answer.message) == (True, 'measured')
+    r.wait(lambda: r.points and r.temperatures, 'the point')
+    assert seconds(r.points[0].header.stamp) == 12.5
+    assert r.temperatures[0].temperature == 21.5
+    assert r.temperatures[0].header == r.points[0].header
+    assert r.driver.expected is None
+
+    r.driver.fault = DeviceError('gauge: nothing in view')
+    assert r.measure().message == 'gauge: nothing in view'
+    assert r.node._summary()[:2] == ('warn', 'gauge: nothing in view')
+    assert r.values()['ready'] == 'yes'
+    assert len(r.points) == 1
+
+
+def test_the_driver_is_given_the_expected_place(rig):
+    """Marker smr lies -0.1 m along x of the tool; the sensor stands 2 m along x, not turned."""
+    r = rig(Probe)
+    r.wait(lambda: r.values()['ready'] == 'yes', 'the connection')
+    registration = TransformStamped(child_frame_id='tracker')
+    registration.transform.translation.x = 2.0
+    registration.transform.rotation.w = 1.0
+    pose = PoseStamped()
+    pose.pose.position.z = 0.5
+    pose.pose.orientation.w = 1.0
+    r.peer.create_publisher(TransformStamped, 'remaster/registration', LATCHED).publish(
+        registration
+    )
+    publisher = r.peer.create_publisher(PoseStamped, 'remaster/target_pose', 10)
+    r.wait(publisher.get_subscription_count, 'the match')
+    publisher.publish(pose)
+
+    def expected():
+        r.measure()
+        return r.driver.expected is not None
+
+    r.wait(expected, 'the place')
+    np.testing.assert_allclose(r.driver.expected, [-2.1, 0.0, 0.5], atol=1e-12)
+
+
+def test_the_name_of_the_node_chooses_the_driver(rig, monkeypatch):
+    with pytest.raises(InputError, match='leica: the name of the node chooses its driver'):
+        rig(Probe, name='leica')
+    assert registry.kind_of('laser_tracker_markers_left') == 'laser_tracker_markers'
+    monkeypatch.setitem(registry.DRIVERS, 'laser', 'laser.driver:Laser')
+    assert registry.kind_of('laser_tracker_markers') == 'laser_tracker_markers'
+    assert registry.kind_of('laser_2') == 'laser'
+    monkeypatch.delitem(registry.DRIVERS, 'laser')
+    for kind in registry.DRIVERS:
+        if kind != 'gauge':
+            assert issubclass(registry.load_driver(kind), StreamDriver | TriggeredDriver)
+
+
+def test_a_node_that_hears_commands_is_named_so_that_the_bridge_can_tell(rig):
+    with pytest.raises(InputError, match='takes a node of this name for a controller'):
+        rig(LookingProbe, name='faro', own_name='gauge')
+
+
+@pytest.mark.parametrize(
+    ('driver', 'sensor', 'words'),
+    [
+        (Stream, 'sonar', r"sensor is 'sonar'; the cell has mocap, tracker"),
+        (Stream, 'tracker', 'tracker of demo has single_shot true, but a gauge streams'),
+        (Probe, 'mocap', 'mocap of demo has single_shot false, but a gauge measures on request'),
+    ],
+)
+def test_a_sensor_that_is_not_so_in_the_cell_is_refused(rig, driver, sensor, words):
+    with pytest.raises(InputError, match=words):
+        rig(driver, name=f'gauge_{driver.__name__}_{sensor}', sensor=sensor)
