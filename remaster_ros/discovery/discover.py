@@ -8,7 +8,7 @@ validation rows only measure the gain.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -28,6 +28,7 @@ from remaster_ros.discovery.gain import (
     noise_by_range,
     pose_common_fraction,
 )
+from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.stepwise_selection import Search, Selection
@@ -36,7 +37,7 @@ from remaster_ros.discovery.to_extension import extension_of
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Session
 
-Verdict = Literal['effects', 'none', 'undetermined']
+Verdict = Literal['effects', 'none', 'undetermined', 'unexplained']
 # Of the means, in standard deviations: 400 effective draws, enough for values of two figures.
 PRECISION = 0.05
 # A cause with this share of the gain is one of the leaders.
@@ -50,7 +51,8 @@ class Discovery:
     Attributes
     ----------
     verdict
-        'effects', 'none', or 'undetermined' where the leading explanations tie.
+        'effects', 'none', 'undetermined' where the leading explanations tie, or 'unexplained'
+        where the causes that were searched do not hold on poses never fitted.
     effects
         The causes, the largest first.
     gain
@@ -76,6 +78,8 @@ class Discovery:
     thinning
         Which part of a large session was searched, and how the causes hold on the rest; None where
         all of it was searched.
+    unexplained
+        Structure that no cause explains.
     """
 
     verdict: Verdict
@@ -91,6 +95,7 @@ class Discovery:
     residuals: Residuals
     fit: FitResult
     thinning: Thinning | None = None
+    unexplained: tuple[Unexplained, ...] = ()
 
 
 def discover_session(
@@ -122,25 +127,22 @@ def discover_session(
     """
     report = progress if progress is not None else silent
     findings = find_causes(session, rng=rng, progress=report)
+    fit, gain = _sampled(session, findings, rng, report, clock)
+    unexplained: tuple[Unexplained, ...] = ()
+    if findings.effects and is_harmful(gain):
+        unexplained = (harm_of(findings.before, fit, gain, findings.effects),)
+        findings = findings.without_causes()
+        fit, gain = _sampled(session, findings, rng, report, clock)
     residuals, solution = findings.residuals, findings.selection.solution
-    fit = fit_session(
-        session,
-        rng=rng,
-        clock=clock,
-        priors=loosened(session, findings.effects),
-        precision=PRECISION,
-        extension=extension_of(residuals, solution) if solution.cells else None,
-        progress=lambda _, share: report('sampling the extended model', share),
-    )
     effects = tuple(effect.sampled(fit) for effect in findings.effects)
-    verdict: Verdict = 'effects' if effects else 'none'
+    verdict: Verdict = 'effects' if effects else 'unexplained' if unexplained else 'none'
     # A tie over a small remainder does not put the rest in doubt.
     if any(effect.tied and (effect.share or 0.0) > LEADING_SHARE for effect in effects):
         verdict = 'undetermined'
     return Discovery(
         verdict=verdict,
         effects=effects,
-        gain=gain_of(findings.before, residuals, solution, fit, rng),
+        gain=gain,
         pose_common_fraction=pose_common_fraction(residuals, solution),
         noise_by_range=noise_by_range(residuals, solution),
         outliers=fit.left_out,
@@ -151,6 +153,7 @@ def discover_session(
         residuals=residuals,
         fit=fit,
         thinning=findings.thinning,
+        unexplained=unexplained,
     )
 
 
@@ -168,6 +171,41 @@ class Findings:
     effects: tuple[FoundEffect, ...]
     untestable: Mapping[str, str]
     thinning: Thinning | None
+
+    def without_causes(self) -> Findings:
+        """Return the same as if the search had found nothing."""
+        residuals = Residuals.of(self.before)
+        empty = solve(residuals, ())
+        assert empty is not None
+        return replace(
+            self,
+            residuals=residuals,
+            selection=Selection(empty, empty, (), None),
+            groups=(),
+            effects=(),
+            thinning=None,
+        )
+
+
+def _sampled(
+    session: Session,
+    findings: Findings,
+    rng: np.random.Generator,
+    report: Progress,
+    clock: Callable[[], float] | None,
+) -> tuple[FitResult, Gain]:
+    """Sample the model with the causes found, and measure its gain on held-out rows."""
+    residuals, solution = findings.residuals, findings.selection.solution
+    fit = fit_session(
+        session,
+        rng=rng,
+        clock=clock,
+        priors=loosened(session, findings.effects),
+        precision=PRECISION,
+        extension=extension_of(residuals, solution) if solution.cells else None,
+        progress=lambda _, share: report('sampling the extended model', share),
+    )
+    return fit, gain_of(findings.before, residuals, solution, fit, rng)
 
 
 def find_causes(session: Session, *, rng: np.random.Generator, progress: Progress) -> Findings:

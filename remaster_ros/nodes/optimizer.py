@@ -135,7 +135,8 @@ class Optimizer(RemasterNode):
             progress=self._progress,
             clock=time.perf_counter,
         )
-        names = ', '.join(effect.name for effect in found.effects) or 'nothing'
+        names = ', '.join(effect.name for effect in found.effects)
+        names = names or ('nothing' if found.verdict == 'none' else found.verdict)
         return save_discovery(found, out, figures=self.p.figures), f'discovered: {names}'
 
     def _progress(self, stage: str, share: float) -> None:

@@ -40,6 +40,7 @@ def discovery_content(
             'sensors': fit.noise,
         },
         'untestable': discovery.untestable,
+        'unexplained': discovery.unexplained,
         'joint_offsets_before': table_rows(
             joint=discovery.fit.joint_names,
             mean_deg=np.degrees(before),

@@ -274,11 +274,21 @@ class Confirmed(Struct):
     effects: list[ConfirmedEffect]
 
 
+class Unexplained(Struct):
+    """Structure that no cause explains: where it shows, its size, and what to do next."""
+
+    where: str
+    driver: str
+    size_m: float
+    p_value: float | None
+    next: str
+
+
 class Discovered(Struct):
     """discovery.json."""
 
     format: str
-    verdict: Literal['effects', 'none', 'undetermined']
+    verdict: Literal['effects', 'none', 'undetermined', 'unexplained']
     effects: list[Effect]
     gain: Gain
     noise: NoiseOfDiscovery
@@ -288,6 +298,7 @@ class Discovered(Struct):
     session: MeasuredSession | UnsetType = UNSET
     metrics: Mapping[str, Any] | UnsetType = UNSET
     untestable: dict[str, str] | UnsetType = UNSET
+    unexplained: list[Unexplained] | UnsetType = UNSET
     joint_offsets_before: list[OffsetBefore] | UnsetType = UNSET
     sampler: Sampler | UnsetType = UNSET
     rows_searched: SearchedRows | UnsetType = UNSET

@@ -161,6 +161,42 @@ def test_discover(case: str, tmp_path: Path) -> None:
             assert other['separate_by'] in page
 
 
+def test_causes_that_do_harm_on_held_out_poses_are_not_returned(tmp_path: Path) -> None:
+    """The held-out poses have the error of the fitted ones with the opposite sign."""
+    options = ('--seed', 3)
+    clean = read_session(simulated(tmp_path / 'clean', *options))
+    tilted = simulated(tmp_path / 'tilted', *options, '--effect', 'joint_axis_tilt@3:0.4')
+    assert np.array_equal(clean.measurements.q, read_session(tilted).measurements.q)
+
+    def mirrored(session: Session) -> Session:
+        held = session.measurements.is_validation[:, None]
+        opposite = 2.0 * clean.measurements.position - session.measurements.position
+        return with_positions(session, np.where(held, opposite, session.measurements.position))
+
+    out = tmp_path / 'causes'
+    process = remaster('discover', changed(tilted, tmp_path, mirrored), '--out', out)
+    assert process.returncode == 0, process.stderr
+    assert 'verdict: unexplained' in process.stdout
+    assert 'nothing beyond' not in process.stdout
+    found = json.loads((out / 'discovery.json').read_text(encoding='utf-8'))
+    assert (found['verdict'], found['effects']) == ('unexplained', [])
+    (left,) = found['unexplained']
+    assert left['where'] == 'held_out_poses'
+    assert left['p_value'] < 0.05
+    assert 'joint axis tilt' in left['next'], left['next']
+    gain = found['gain']
+    assert gain['held_out_rms_after_m'] <= 1.05 * gain['held_out_rms_before_m']
+    # The zero-offsets are those of the fit without causes.
+    tables = found['joint_offsets_before'], found['joint_offsets_after']
+    for before, after in zip(*tables, strict=True):
+        if after['identifiable']:
+            assert abs(after['mean_deg'] - before['mean_deg']) < 0.3 * after['std_deg']
+    page, mood, _ = page_of(out)
+    assert mood == 'caution'
+    assert 'Something is there that no cause explains' in page
+    assert left['next'] in page
+
+
 @pytest.mark.parametrize('case', ['none', 'effects'])
 def test_discover_with_a_session_that_confirms(case: str, tmp_path: Path) -> None:
     options = DISCOVER[case][0]

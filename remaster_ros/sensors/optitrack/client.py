@@ -32,11 +32,7 @@ from remaster_ros.sensors.optitrack.protocol.natnet import (
     ServerInfo,
 )
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.sensors.optitrack.sockets import (
-    open_multicast_socket,
-    open_socket,
-    port_is_closed,
-)
+from remaster_ros.sensors.optitrack.sockets import open_multicast_socket, open_socket
 
 RETRY_S = 0.5
 KEEPALIVE_S = 1.0
@@ -94,12 +90,12 @@ class NatNetClient(MarkerFollower):
     def _open(self) -> None:
         settings = self._settings
         self._command = open_socket(
-            self._interface, 0, purpose='local_interface', remedy='correct local_interface'
+            self._status.interface, 0, purpose='local_interface', remedy='correct local_interface'
         )
         if settings.transport == 'multicast':
             try:
                 self._data = open_multicast_socket(
-                    settings.multicast_group, settings.data_port, self._interface
+                    settings.multicast_group, settings.data_port, self._status.interface
                 )
             except DeviceError:
                 self._command.close()
@@ -130,25 +126,23 @@ class NatNetClient(MarkerFollower):
     def _keep_in_touch(self, now: float) -> None:
         """Send the requests that are due."""
         lost_touch = (
-            self._server is None
+            self._status.server is None
             or self._frame_at is None
             or now - self._frame_at > self._settings.silence_s
             or self._greet
         )
-        negotiating = self._server is not None and self._version is None
+        negotiating = self._status.server is not None and self._status.version is None
         if lost_touch and not negotiating and self._is_due('connect', now, RETRY_S):
             self._send(natnet.encode_connect_request('remaster_ros'))
-            if self._server is None:
-                self._port_closed = port_is_closed(
-                    self._server_ip, self._settings.command_port, natnet.encode_echo_request(0)
-                )
-        if self._server is None:
+            if self._status.server is None:
+                self._note_closed_port()
+        if self._status.server is None:
             return
         if negotiating and self._is_due('bitstream', now, RETRY_S):
-            self._negotiate(self._server)
-        if self._is_unicast(self._server) and self._is_due('keepalive', now, KEEPALIVE_S):
+            self._negotiate(self._status.server)
+        if self._is_unicast(self._status.server) and self._is_due('keepalive', now, KEEPALIVE_S):
             self._send(natnet.join_datagram(MessageId.KEEPALIVE))
-        if self._version and self._model_wanted and self._is_due('model', now, RETRY_S):
+        if self._status.version and self._model_wanted and self._is_due('model', now, RETRY_S):
             self._send(natnet.join_datagram(MessageId.REQUEST_MODELDEF))
 
     def _is_unicast(self, server: ServerInfo) -> bool:
@@ -167,10 +161,10 @@ class NatNetClient(MarkerFollower):
         if self._command is None:
             return
         try:
-            self._command.sendto(datagram, (self._server_ip, self._settings.command_port))
-            self._send_error = ''
+            self._command.sendto(datagram, (self._status.server_ip, self._settings.command_port))
+            self._status.send_error = ''
         except OSError as error:
-            self._send_error = error.strerror or str(error)
+            self._status.send_error = error.strerror or str(error)
 
     def _receive(self, source: socket.socket) -> None:
         """Empty a socket into the backlog.
@@ -184,7 +178,7 @@ class NatNetClient(MarkerFollower):
             except BlockingIOError:
                 return
             except OSError as error:
-                self._send_error = error.strerror or str(error)
+                self._status.send_error = error.strerror or str(error)
                 self._stopping.wait(POLL_S)
                 return
             received_s = self._clock()
@@ -225,10 +219,10 @@ class NatNetClient(MarkerFollower):
             is_frame = message_id == MessageId.FRAMEOFDATA
             if from_data_socket and not is_frame:
                 raise ProtocolError(f'message {message_id} on the data port')
-            if self._version is None and (is_frame or message_id == MessageId.MODELDEF):
+            if self._status.version is None and (is_frame or message_id == MessageId.MODELDEF):
                 self._gate.drop(Dropped.UNRESOLVED)
                 return
-            message = natnet.decode_message(datagram, self._version, markers_only=True)
+            message = natnet.decode_message(datagram, self._status.version, markers_only=True)
         except ProtocolError as error:
             self._note_malformed(error)
             self._malformed_in_a_row += 1
@@ -266,38 +260,38 @@ class NatNetClient(MarkerFollower):
             if message.id == MessageId.UNRECOGNIZED_REQUEST:
                 self._take_bitstream(None)
             else:
-                self._server = None
+                self._status.server = None
 
     def _take_server(self, server: ServerInfo) -> None:
-        self._server = server
+        self._status.server = server
         self._lock.answer()
-        self._port_closed = False
+        self._status.port_closed = False
         self._malformed_in_a_row = 0
         self._greet = False
         self._model_wanted = True
         self._negotiation_tries = 0
         # A server that was greeted again may have forgotten what was negotiated.
-        self._version = None if self._settings.wanted_version else server.natnet_version
+        self._status.version = None if self._settings.wanted_version else server.natnet_version
 
     def _negotiate(self, server: ServerInfo) -> None:
         """Request the wanted bitstream; where that fails, the server's own is read."""
         wanted = self._settings.wanted_version
         if wanted is None or self._negotiation_tries >= NEGOTIATION_TRIES:
-            self._version = server.natnet_version
+            self._status.version = server.natnet_version
             return
         self._negotiation_tries += 1
         self._send(natnet.encode_command_request(f'Bitstream,{natnet.format_version(wanted)}'))
 
     def _take_bitstream(self, answer: natnet.Response | None) -> None:
         """Take the answer to the request of `_negotiate`; None where it was refused."""
-        if self._server is None or self._version is not None:
+        if self._status.server is None or self._status.version is not None:
             return
-        self._version = self._server.natnet_version
+        self._status.version = self._status.server.natnet_version
         if answer is None:
             return
         name, _, version = answer.text.partition(',')
         if name == 'Bitstream':
             with contextlib.suppress(ValueError):
-                self._version = natnet.parse_version(version)
+                self._status.version = natnet.parse_version(version)
         elif answer.code == 0:
-            self._version = self._settings.wanted_version
+            self._status.version = self._settings.wanted_version

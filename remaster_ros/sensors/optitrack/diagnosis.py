@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from remaster_ros.sensors.optitrack.frame_gate import Dropped
+from remaster_ros.sensors.optitrack.frame_gate import Dropped, GateCounts
 from remaster_ros.sensors.optitrack.protocol import natnet
 from remaster_ros.sensors.optitrack.protocol.natnet import ProtocolError, ServerInfo, Version
 from remaster_ros.sensors.optitrack.protocol.wire import require_supported
@@ -25,9 +24,9 @@ Fault = Literal[
 ]
 
 
-@dataclass(frozen=True)
-class StreamStatus:
-    """A snapshot of a client.
+@dataclass(kw_only=True)
+class StreamStatus(GateCounts):
+    """The state of a client; its gate counts in it.
 
     Attributes
     ----------
@@ -41,14 +40,14 @@ class StreamStatus:
         The computer is there, but nothing listens on the command port.
     send_error
         Why the last request could not be sent; ''.
+    foreign
+        Addresses that sent something and are not the server (the first few).
+    last_malformed
+        What was wrong with the last datagram that could not be decoded; ''.
     silent_s
         Time since the last whole frame, s; None if there was none.
     starved_s
         Time since the last reading, s; None if there was none.
-    frames, accepted, lost, restarts, dropped, last_reason
-        See `MarkerGate`.
-    foreign
-        Addresses that sent something and are not the server (the first few).
     source
         Address and port whose frames are believed; '' while there is none.
     sources_taken
@@ -57,35 +56,18 @@ class StreamStatus:
         Other ports of the server's address that sent lately, beside the believed one; refused.
     contestants
         Sources of which none is believed, as they send at the same time.
-    last_malformed
-        What was wrong with the last datagram that could not be decoded; ''.
-    problem
-        Why the marker's id is unknown; ''.
-    marker_id
-        Its id on the wire; None while unknown, and for a lone marker.
-    labels
-        The first labels of the last frame.
     """
 
-    server_ip: str
-    interface: str
-    server: ServerInfo | None
-    version: Version | None
-    port_closed: bool
-    send_error: str
-    silent_s: float | None
-    starved_s: float | None
-    frames: int
-    accepted: int
-    lost: int
-    restarts: int
-    dropped: Mapping[Dropped, int]
-    last_reason: Dropped | None
-    foreign: tuple[str, ...]
-    last_malformed: str
-    problem: str
-    marker_id: int | None
-    labels: tuple[int, ...]
+    server_ip: str = ''
+    interface: str = ''
+    server: ServerInfo | None = None
+    version: Version | None = None
+    port_closed: bool = False
+    send_error: str = ''
+    foreign: tuple[str, ...] = ()
+    last_malformed: str = ''
+    silent_s: float | None = None
+    starved_s: float | None = None
     source: str = ''
     sources_taken: int = 0
     rivals: tuple[str, ...] = ()

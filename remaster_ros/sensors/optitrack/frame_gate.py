@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -135,13 +135,9 @@ class MarkerSample:
     received_s: float
 
 
-class MarkerGate:
-    """Lets through the readings of one marker and counts everything else with its reason.
-
-    Parameters
-    ----------
-    choice
-        Which marker.
+@dataclass(kw_only=True)
+class GateCounts:
+    """What a gate has let through and dropped.
 
     Attributes
     ----------
@@ -159,17 +155,35 @@ class MarkerGate:
         Id on the wire; None while unknown, and for a lone marker.
     problem
         Why the marker cannot be identified, with the remedy; '' if it can.
+    labels
+        The first labels of the last frame.
     """
 
-    def __init__(self, choice: MarkerChoice) -> None:
+    dropped: dict[Dropped, int] = field(default_factory=lambda: dict.fromkeys(Dropped, 0))
+    frames: int = 0
+    accepted: int = 0
+    lost: int = 0
+    restarts: int = 0
+    last_reason: Dropped | None = None
+    marker_id: int | None = None
+    problem: str = ''
+    labels: tuple[int, ...] = ()
+
+
+class MarkerGate:
+    """Lets through the readings of one marker and counts everything else with its reason.
+
+    Parameters
+    ----------
+    choice
+        Which marker.
+    counts
+        Where to count.
+    """
+
+    def __init__(self, choice: MarkerChoice, counts: GateCounts) -> None:
         self._choice = choice
-        self.dropped: dict[Dropped, int] = dict.fromkeys(Dropped, 0)
-        self.frames = 0
-        self.accepted = 0
-        self.lost = 0
-        self.restarts = 0
-        self.last_reason: Dropped | None = None
-        self.last_labels: tuple[int, ...] = ()
+        self.counts = counts
         self._last_number: int | None = None
         self._last_timestamp = -math.inf
         self._last_reading: MarkerSample | None = None
@@ -179,12 +193,12 @@ class MarkerGate:
     @property
     def resolved(self) -> bool:
         """Whether a frame can be searched for the marker."""
-        return self._choice.lone_marker or self.marker_id is not None
+        return self._choice.lone_marker or self.counts.marker_id is not None
 
     def forget_assets(self) -> None:
         """Drop what is known of the server's rigid bodies."""
-        self.marker_id = None if self._choice.lone_marker else self._choice.marker_id
-        self.problem = '' if self.resolved else 'the server has not named its rigid bodies'
+        self.counts.marker_id = None if self._choice.lone_marker else self._choice.marker_id
+        self.counts.problem = '' if self.resolved else 'the server has not named its rigid bodies'
 
     def name_assets(self, assets: Mapping[str, int]) -> None:
         """Find the marker's id among the rigid bodies that the server streams.
@@ -201,27 +215,27 @@ class MarkerGate:
         if not name and len(assets) == 1:
             (name,) = assets
         if name in assets:
-            self.marker_id = assets[name] << 16 | self._choice.member
-            self.problem = ''
+            self.counts.marker_id = assets[name] << 16 | self._choice.member
+            self.counts.problem = ''
         elif name:
-            self.problem = f'no rigid body {name!r}; the server streams: {names}'
+            self.counts.problem = f'no rigid body {name!r}; the server streams: {names}'
         elif assets:
-            self.problem = f'several rigid bodies ({names}): set rigid_body to one of them'
+            self.counts.problem = f'several rigid bodies ({names}): set rigid_body to one of them'
         else:
-            self.problem = (
+            self.counts.problem = (
                 'the server streams no rigid body: create one from the markers in Motive and '
                 'switch its streaming on, or set lone_marker for a single sphere'
             )
 
     def drop(self, reason: Dropped) -> None:
         """Count something dropped before it became a frame."""
-        self.dropped[reason] += 1
+        self.counts.dropped[reason] += 1
 
     def pass_over(self, reason: Dropped) -> None:
         """Count a whole frame that is not looked at; it is compared with no other."""
-        self.frames += 1
-        self.dropped[reason] += 1
-        self.last_reason = reason
+        self.counts.frames += 1
+        self.counts.dropped[reason] += 1
+        self.counts.last_reason = reason
 
     def begin_source(self) -> None:
         """Compare the frames to come with none before: they are another source's."""
@@ -242,25 +256,25 @@ class MarkerGate:
         ticks_per_s
             Frequency of the frame's stamps; 0 before NatNet 3.
         """
-        self.frames += 1
+        self.counts.frames += 1
         found = self._order(frame) or self._find(frame)
         if isinstance(found, LabeledMarker):
             reading = _sample(frame, found, received_s, ticks_per_s)
             found = _implausible(reading) or self._jump(reading) or self._frozen(reading) or found
         if isinstance(found, Dropped):
-            self.dropped[found] += 1
-            self.last_reason = found
+            self.counts.dropped[found] += 1
+            self.counts.last_reason = found
             return None
         self._last_reading = reading
-        self.accepted += 1
-        self.last_reason = None
+        self.counts.accepted += 1
+        self.counts.last_reason = None
         return reading
 
     def disown(self, reason: Dropped) -> None:
         """Take back the last reading, which turned out not to be one."""
-        self.accepted -= 1
-        self.dropped[reason] += 1
-        self.last_reason = reason
+        self.counts.accepted -= 1
+        self.counts.dropped[reason] += 1
+        self.counts.last_reason = reason
         self._last_reading = None
 
     def _order(self, frame: Frame) -> Dropped | None:
@@ -271,7 +285,7 @@ class MarkerGate:
             step = frame.number - self._last_number
             back_s = self._last_timestamp - frame.timestamp
             if not -REORDER_WINDOW <= step <= MOST_LOST or back_s > RESTART_S:
-                self.restarts += 1
+                self.counts.restarts += 1
                 self._last_timestamp = -math.inf
                 self._last_reading = None
             elif step == 0:
@@ -279,7 +293,7 @@ class MarkerGate:
             elif step < 0:
                 return Dropped.OUT_OF_ORDER
             else:
-                self.lost += step - 1
+                self.counts.lost += step - 1
         self._last_number = frame.number
         if frame.timestamp <= self._last_timestamp:
             return Dropped.STALE
@@ -288,11 +302,11 @@ class MarkerGate:
 
     def _find(self, frame: Frame) -> LabeledMarker | Dropped:
         """Find the marker; never one that is occluded or filled in by the model."""
-        self.last_labels = tuple(marker.id for marker in frame.labeled_markers[:8])
+        self.counts.labels = tuple(marker.id for marker in frame.labeled_markers[:8])
         if self._choice.lone_marker:
             found = [m for m in frame.labeled_markers if not m.params & (OCCLUDED | MODEL_FILLED)]
-        elif self.marker_id is not None:
-            found = [m for m in frame.labeled_markers if m.id == self.marker_id]
+        elif self.counts.marker_id is not None:
+            found = [m for m in frame.labeled_markers if m.id == self.counts.marker_id]
         else:
             return Dropped.UNRESOLVED
         if len(found) != 1:

@@ -7,6 +7,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 
 from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.optitrack.diagnosis import (
@@ -17,9 +18,9 @@ from remaster_ros.sensors.optitrack.diagnosis import (
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerGate, MarkerSample
 from remaster_ros.sensors.optitrack.frame_source import Source, SourceLock, SourceVerdict, describe
 from remaster_ros.sensors.optitrack.protocol.frames import Frame
-from remaster_ros.sensors.optitrack.protocol.natnet import ServerInfo, Version
+from remaster_ros.sensors.optitrack.protocol.natnet import encode_echo_request
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.sensors.optitrack.sockets import interface_towards, resolve
+from remaster_ros.sensors.optitrack.sockets import interface_towards, port_is_closed, resolve
 
 FOREIGN_REMEMBERED = 4
 
@@ -48,21 +49,14 @@ class MarkerFollower(ABC):
         self._settings = settings
         self._on_sample = on_sample
         self._clock = clock
-        self._gate = MarkerGate(settings.marker)
+        self._status = StreamStatus()
+        self._gate = MarkerGate(settings.marker, self._status)
         self._lock = SourceLock(settings.silence_s)
         self._believed_before: Source | None = None
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
         self._ready = threading.Event()
 
-        self._server_ip = ''
-        self._interface = ''
-        self._server: ServerInfo | None = None
-        self._version: Version | None = None
-        self._port_closed = False
-        self._send_error = ''
-        self._foreign: tuple[str, ...] = ()
-        self._last_malformed = ''
         self._frame_at: float | None = None
         self._sample_at: float | None = None
 
@@ -82,9 +76,9 @@ class MarkerFollower(ABC):
             is that of `diagnosis`. The client is stopped then.
         """
         settings = self._settings
-        self._server_ip = resolve(settings.server)
-        self._interface = settings.local_interface or interface_towards(
-            self._server_ip, settings.command_port
+        self._status.server_ip = resolve(settings.server)
+        self._status.interface = settings.local_interface or interface_towards(
+            self._status.server_ip, settings.command_port
         )
         self._stopping.clear()
         self._ready.clear()
@@ -116,31 +110,15 @@ class MarkerFollower(ABC):
     def status(self) -> StreamStatus:
         """Return a snapshot of counts and of what the server has answered."""
         now = time.monotonic()
-        gate = self._gate
-        return StreamStatus(
-            server_ip=self._server_ip,
-            interface=self._interface,
-            server=self._server,
-            version=self._version,
-            port_closed=self._port_closed,
-            send_error=self._send_error,
+        return replace(
+            self._status,
+            dropped=dict(self._status.dropped),
             silent_s=None if self._frame_at is None else now - self._frame_at,
             starved_s=None if self._sample_at is None else now - self._sample_at,
-            frames=gate.frames,
-            accepted=gate.accepted,
-            lost=gate.lost,
-            restarts=gate.restarts,
-            dropped=dict(gate.dropped),
-            last_reason=gate.last_reason,
-            foreign=self._foreign,
             source='' if self._lock.source is None else describe(self._lock.source),
             sources_taken=self._lock.taken,
             rivals=tuple(map(describe, self._lock.rivals(now)[:FOREIGN_REMEMBERED])),
             contestants=tuple(map(describe, self._lock.contestants(now)[:FOREIGN_REMEMBERED])),
-            last_malformed=self._last_malformed,
-            problem=gate.problem,
-            marker_id=gate.marker_id,
-            labels=gate.last_labels,
         )
 
     def diagnosis(self) -> Diagnosis:
@@ -161,11 +139,11 @@ class MarkerFollower(ABC):
 
     def _is_foreign(self, address: str) -> bool:
         """Count and remember a sender that is not the server."""
-        if address == self._server_ip:
+        if address == self._status.server_ip:
             return False
         self._gate.drop(Dropped.FOREIGN)
-        if address not in self._foreign and len(self._foreign) < FOREIGN_REMEMBERED:
-            self._foreign = (*self._foreign, address)
+        if address not in self._status.foreign and len(self._status.foreign) < FOREIGN_REMEMBERED:
+            self._status.foreign = (*self._status.foreign, address)
         return True
 
     def _is_refused(self, source: Source) -> bool:
@@ -187,9 +165,15 @@ class MarkerFollower(ABC):
         )
         return True
 
+    def _note_closed_port(self) -> None:
+        """Find out whether the server's computer is there without its command port."""
+        self._status.port_closed = port_is_closed(
+            self._status.server_ip, self._settings.command_port, encode_echo_request(0)
+        )
+
     def _note_malformed(self, what: object) -> None:
         self._gate.drop(Dropped.MALFORMED)
-        self._last_malformed = str(what)
+        self._status.last_malformed = str(what)
 
     def _take_whole_frame(
         self, frame: Frame, received_s: float, source: Source
@@ -206,9 +190,9 @@ class MarkerFollower(ABC):
             return None
         if before is None:
             self._begin_source(source)
-        self._last_malformed = ''
+        self._status.last_malformed = ''
         self._frame_at = now
-        connection = self._server.connection if self._server is not None else None
+        connection = self._status.server.connection if self._status.server is not None else None
         ticks_per_s = connection.clock_frequency if connection is not None else 0
         sample = self._gate.admit(frame, received_s, ticks_per_s)
         if self._gate.resolved:

@@ -31,7 +31,7 @@ from remaster_ros.sensors.optitrack.protocol.frames import (
 from remaster_ros.sensors.optitrack.protocol.natnet import ProtocolError
 from remaster_ros.sensors.optitrack.protocol.wire import OLDEST_VERSION
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.sensors.optitrack.sockets import open_socket, port_is_closed
+from remaster_ros.sensors.optitrack.sockets import open_socket
 
 NEWEST_READ = (2, 10)
 POLL_S = 0.2
@@ -88,7 +88,7 @@ class NatNetClientBackend(MarkerFollower):
     def _open(self) -> None:
         # It binds the server's own address; better to find out before it leaves sockets behind.
         open_socket(
-            self._server_ip,
+            self._status.server_ip,
             self._settings.data_port,
             purpose='frames for natnetclient, which needs the server on this computer',
             remedy='set client to builtin',
@@ -104,11 +104,13 @@ class NatNetClientBackend(MarkerFollower):
                 client = self._kind.__new__(self._kind)
                 try:
                     client.__init__(
-                        self._server_ip, self._settings.data_port, self._settings.command_port
+                        self._status.server_ip,
+                        self._settings.data_port,
+                        self._settings.command_port,
                     )
                     self._follow(client)
                 except Exception as error:  # natnetclient raises whatever its bugs raise
-                    self._last_malformed = f'natnetclient: {error!r}'
+                    self._status.last_malformed = f'natnetclient: {error!r}'
                 finally:
                     _close_sockets(client)
             self._stopping.wait(POLL_S)
@@ -119,19 +121,17 @@ class NatNetClientBackend(MarkerFollower):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as command:
             command.settimeout(POLL_S)
             try:
-                command.sendto(request, (self._server_ip, self._settings.command_port))
+                command.sendto(request, (self._status.server_ip, self._settings.command_port))
                 answer = natnet.decode_message(command.recv(1 << 16), None)
             except (OSError, ProtocolError):
                 answer = None
         if not isinstance(answer, natnet.ServerInfo):
-            self._server = None
-            self._port_closed = port_is_closed(
-                self._server_ip, self._settings.command_port, natnet.encode_echo_request(0)
-            )
+            self._status.server = None
+            self._note_closed_port()
             return False
-        self._server, self._port_closed = answer, False
+        self._status.server, self._status.port_closed = answer, False
         self._lock.answer()
-        self._version = answer.natnet_version
+        self._status.version = answer.natnet_version
         self._refusal = ''
         if not OLDEST_VERSION <= answer.natnet_version <= NEWEST_READ:
             version = natnet.format_version(answer.natnet_version)
@@ -162,7 +162,7 @@ class NatNetClientBackend(MarkerFollower):
             if self._is_foreign(sender[0]) or self._is_refused(sender):
                 continue
             try:
-                frame = natnet.decode_message(datagram, self._version, markers_only=True)
+                frame = natnet.decode_message(datagram, self._status.version, markers_only=True)
                 if not isinstance(frame, Frame):
                     raise ProtocolError('a message on the data port that is no frame')
             except ProtocolError as error:
@@ -182,7 +182,7 @@ class NatNetClientBackend(MarkerFollower):
         if theirs is not None and any(
             marker.position == tuple(sample.position) and not marker.params
             for marker in theirs
-            if self._gate.marker_id in (None, marker.id)
+            if self._status.marker_id in (None, marker.id)
         ):
             self._hand_on(sample)
         else:

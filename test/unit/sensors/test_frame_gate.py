@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from remaster_ros.errors import InputError
-from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice, MarkerGate
+from remaster_ros.sensors.optitrack.frame_gate import Dropped, GateCounts, MarkerChoice, MarkerGate
 from remaster_ros.sensors.optitrack.protocol.frames import NOT_LIVE, Frame, LabeledMarker
 
 MARKER_ID = 3 << 16 | 2
@@ -24,7 +24,7 @@ def frame(number, *markers, **fields):
 
 
 def gate_for(**choice):
-    gate = MarkerGate(MarkerChoice(**({'marker_id': MARKER_ID} | choice)))
+    gate = MarkerGate(MarkerChoice(**({'marker_id': MARKER_ID} | choice)), GateCounts())
     return gate, lambda f: gate.admit(f, 50.0, 10_000_000)
 
 
@@ -38,8 +38,8 @@ def test_a_measured_marker_is_a_reading():
     assert (sample.frame_number, sample.timestamp_s, sample.received_s) == (1, 0.01, 50.0)
     assert (sample.mid_exposure_s, sample.residual_m) == (2.0, 2e-4)
     assert sample.age_s == pytest.approx(0.01)
-    assert (gate.frames, gate.accepted, gate.last_reason) == (1, 1, None)
-    assert not any(gate.dropped.values())
+    assert (gate.counts.frames, gate.counts.accepted, gate.counts.last_reason) == (1, 1, None)
+    assert not any(gate.counts.dropped.values())
 
 
 def test_without_a_mid_exposure_clock_the_frame_time_remains():
@@ -47,7 +47,7 @@ def test_without_a_mid_exposure_clock_the_frame_time_remains():
     sample = admit(frame(1, marker(), data_received=10_000_000, transmitted=10_050_000))
     assert sample.mid_exposure_s is None
     assert sample.age_s == pytest.approx(0.005)
-    old = MarkerGate(MarkerChoice(marker_id=MARKER_ID)).admit(
+    old = MarkerGate(MarkerChoice(marker_id=MARKER_ID), GateCounts()).admit(
         frame(1, marker()._replace(residual=None), software_latency=0.004), 50.0, 0
     )
     assert (old.mid_exposure_s, old.age_s) == (None, 0.004)
@@ -58,7 +58,7 @@ def test_a_marker_that_repeats_itself_to_the_last_bit_is_frozen():
     gate, admit = gate_for()
     taken = [admit(frame(number, marker())) is not None for number in range(1, 31)]
     assert taken == [True] * 10 + [False] * 20
-    assert gate.dropped[Dropped.FROZEN] == 20
+    assert gate.counts.dropped[Dropped.FROZEN] == 20
     assert admit(frame(31, marker(x=0.5 + 1e-7))) is not None
 
 
@@ -84,10 +84,10 @@ def test_everything_else_is_counted_with_its_reason(bad, reason):
     gate, admit = gate_for()
     assert admit(frame(1, marker())) is not None
     assert admit(bad) is None
-    assert gate.last_reason == reason
-    assert {r: n for r, n in gate.dropped.items() if n} == {reason: 1}
+    assert gate.counts.last_reason == reason
+    assert {r: n for r, n in gate.counts.dropped.items() if n} == {reason: 1}
     assert admit(frame(3, marker())) is not None, 'the next good frame is taken'
-    assert (gate.frames, gate.accepted) == (3, 2)
+    assert (gate.counts.frames, gate.counts.accepted) == (3, 2)
 
 
 @pytest.mark.parametrize('flag', range(16))
@@ -101,11 +101,11 @@ def test_lost_frames_are_counted_and_a_restarted_stream_is_followed():
     gate, admit = gate_for()
     for number in (100, 101, 105):
         assert admit(frame(number, marker())) is not None
-    assert gate.lost == 3
+    assert gate.counts.lost == 3
     assert admit(frame(1, marker(x=0.9))) is not None, 'frame numbers began again'
     assert admit(frame(2, marker(x=0.9), timestamp=5.0)) is not None
     assert admit(frame(3, marker(x=0.1), timestamp=0.0)) is not None, 'the time began again'
-    assert (gate.restarts, gate.lost) == (2, 3)
+    assert (gate.counts.restarts, gate.counts.lost) == (2, 3)
 
 
 def test_a_first_reading_that_cannot_be_keeps_no_later_one_out():
@@ -113,7 +113,7 @@ def test_a_first_reading_that_cannot_be_keeps_no_later_one_out():
     assert admit(frame(1, marker(x=3e38))) is None
     old = frame(2, marker(), mid_exposure=1, transmitted=2**63)
     assert admit(old) is None, 'it says that it took thousands of years'
-    assert gate.dropped[Dropped.IMPLAUSIBLE] == 2
+    assert gate.counts.dropped[Dropped.IMPLAUSIBLE] == 2
     assert admit(frame(3, marker())) is not None
 
 
@@ -121,8 +121,8 @@ def test_a_damaged_frame_number_is_not_taken_for_lost_frames():
     gate, admit = gate_for()
     for number in (1, 2, 2**31 - 1, 3, 5):
         admit(frame(number, marker(), timestamp=0.01 * min(number, 3)))
-    assert gate.lost == 1
-    assert gate.restarts == 2
+    assert gate.counts.lost == 1
+    assert gate.counts.restarts == 2
 
 
 def test_a_fast_but_possible_move_is_no_jump():
@@ -147,19 +147,19 @@ def test_a_fast_but_possible_move_is_no_jump():
     ],
 )
 def test_the_marker_is_found_by_name_and_member(choice, assets, expected):
-    gate = MarkerGate(MarkerChoice(**choice))
+    gate = MarkerGate(MarkerChoice(**choice), GateCounts())
     gate.name_assets(assets)
     if isinstance(expected, int):
-        assert (gate.marker_id, gate.problem) == (expected, '')
+        assert (gate.counts.marker_id, gate.counts.problem) == (expected, '')
     else:
-        assert gate.marker_id is None
-        assert expected in gate.problem
+        assert gate.counts.marker_id is None
+        assert expected in gate.counts.problem
 
 
 def test_an_unknown_marker_is_unresolved_until_its_body_is_named():
-    gate = MarkerGate(MarkerChoice(member=2))
+    gate = MarkerGate(MarkerChoice(member=2), GateCounts())
     assert gate.admit(frame(1, marker()), 0.0, 0) is None
-    assert gate.last_reason == Dropped.UNRESOLVED
+    assert gate.counts.last_reason == Dropped.UNRESOLVED
     gate.name_assets({'tool': 3})
     assert gate.admit(frame(2, marker()), 0.0, 0) is not None
 
@@ -169,9 +169,9 @@ def test_a_lone_marker_is_taken_only_while_it_is_alone():
     hidden = marker(5, 8.0, 0x09)
     assert admit(frame(1, marker(99, params=STRAY), hidden)) is not None
     assert admit(frame(2, marker(99, params=STRAY), marker(98, 3.0, STRAY))) is None
-    assert gate.last_reason == Dropped.AMBIGUOUS
+    assert gate.counts.last_reason == Dropped.AMBIGUOUS
     assert admit(frame(3)) is None
-    assert gate.last_reason == Dropped.NOT_PRESENT
+    assert gate.counts.last_reason == Dropped.NOT_PRESENT
 
 
 @pytest.mark.parametrize('bad', [{'member': 0}, {'member': 65536}, {'max_speed_m_s': 0.0},

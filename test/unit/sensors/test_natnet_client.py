@@ -382,7 +382,7 @@ def test_another_address_is_counted_and_never_believed(peer_and_client):
 def received(frames, on_sample):
     """Return a client without sockets that has received frames and digested none."""
     client = NatNetClient(NatNetSettings(marker=MarkerChoice(marker_id=1 << 16 | 1)), on_sample)
-    client._server_ip, client._version = LOCAL, (3, 1)
+    client._status.server_ip, client._status.version = LOCAL, (3, 1)
     client._lock.source = (LOCAL, 1511)
     client._data = source = DatagramSource()
     for number in range(1, frames + 1):

@@ -1,0 +1,93 @@
+"""No causes that do worse than the zero-offsets alone: the last check, on poses never fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import ttest_1samp
+
+from remaster_ros.calibration.estimate import Estimate
+from remaster_ros.calibration.result import FitResult, predicted_rows
+from remaster_ros.discovery.explain import FoundEffect
+from remaster_ros.discovery.gain import Gain
+from remaster_ros.types import FloatArray
+
+# Causes with an error on the held-out poses of so many times that of the offsets are not returned.
+MOST_HARM = 1.05
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """Structure that no cause explains; fields as in discovery.json.
+
+    Attributes
+    ----------
+    where, driver
+        Where it shows, and what it follows as far as that is known.
+    size_m
+        RMS of the 3-D error, m.
+    p_value
+        Of seeing as much by chance; NaN where too few poses are held out to tell.
+    next
+        What it means and what to do next, one or two sentences.
+    """
+
+    where: str
+    driver: str
+    size_m: float
+    p_value: float
+    next: str
+
+
+def is_harmful(gain: Gain) -> bool:
+    """Return whether the causes make the error on held-out poses larger by more than 5 %."""
+    before, after = gain.held_out_rms_before_m, gain.held_out_rms_after_m
+    return before is not None and after is not None and after > MOST_HARM * before
+
+
+def harm_of(
+    found: Estimate, fit: FitResult, gain: Gain, effects: Sequence[FoundEffect]
+) -> Unexplained:
+    """Return what is left unexplained where causes are discarded because they do harm.
+
+    Parameters
+    ----------
+    found
+        The fit without causes.
+    fit, gain
+        The sampled fit with the causes, and what it does on held-out rows.
+    effects
+        The causes.
+    """
+    measurements = found.problem.measurements
+    rows = measurements.is_validation
+    pose = np.unique(measurements.pose[rows], return_inverse=True)[1]
+
+    def by_pose(errors: FloatArray) -> FloatArray:
+        return np.bincount(pose, np.sum(errors[rows] ** 2, axis=1)) / np.bincount(pose)
+
+    before = by_pose(
+        measurements.position - predicted_rows(found.problem, found.model, found.mode.z)
+    )
+    change = np.log(by_pose(fit.residuals_after) / before)
+    p_value = np.nan
+    if len(change) > 1 and np.ptp(change) > 0.0:
+        p_value = ttest_1samp(change, 0.0, alternative='greater').pvalue
+    names = ', '.join(dict.fromkeys(effect.name.replace('_', ' ') for effect in effects))
+    assert gain.held_out_rms_before_m is not None
+    assert gain.held_out_rms_after_m is not None
+    return Unexplained(
+        where='held_out_poses',
+        driver='unknown',
+        size_m=gain.held_out_rms_before_m,
+        p_value=float(p_value),
+        next=(
+            f'The residuals suggest {names}, but with that the error on the held-out poses goes '
+            f'from {1e3 * gain.held_out_rms_before_m:.3f} to '
+            f'{1e3 * gain.held_out_rms_after_m:.3f} mm RMS: it is not taken as a cause. Measure '
+            'poses that are spread as the arm is used, over the whole region and with the tool '
+            'turned, and search again.'
+        ),
+    )
