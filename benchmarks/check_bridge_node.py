@@ -35,6 +35,7 @@ from coverage import Coverage, CoverageData
 from diagnostic_msgs.msg import DiagnosticArray
 from mutants import Mutant, mutants_of
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
@@ -60,8 +61,9 @@ BEFORE = (
     'rclpy.executors',
     'rclpy.node',
     'remaster_ros.kinematics.free_paths',
+    'remaster_ros.collection.events',
     'remaster_ros.motion.arm_supervisor',
-    'remaster_ros.nodes.pose_tracker',
+    'remaster_ros.nodes.waypoints',
     'remaster_ros.nodes.parameters',
     'remaster_ros.nodes.running',
     'remaster_ros.nodes.status',
@@ -107,7 +109,7 @@ def main() -> int:
     sys.path[:0] = [str(ROOT), str(ROOT / 'test'), str(ROOT / NODES)]
     for name in BEFORE:
         importlib.import_module(name)
-    for kind in (JointState, JointTrajectory, DiagnosticArray, Trigger):
+    for kind in (JointState, JointTrajectory, DiagnosticArray, String, Trigger):
         # Else rclpy loads the libraries of a message when it is first used.
         type(kind).__import_type_support__()
     explained = yaml.safe_load(EXPLAINED.read_text()) if EXPLAINED.exists() else {}

@@ -5,6 +5,7 @@ import socket
 import numpy as np
 from ros_rig import ROOT, call, node_arguments, wait_until
 
+from remaster_ros.collection.events import ConfigurationEnded
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.demo import free_ports
 from remaster_ros.session.journal import read_journal
@@ -25,7 +26,7 @@ class Cell:
         print('seed', SEED)
         self.world = make_world(folder / 'world', read_cell('demo'), SEED, 10.0)
         self.said, self.messages, self.results, self.events = {}, {}, [], []
-        listen(client, self._event, self._summary)
+        listen(client, self._record, self._summary)
         command, data, tracker = free_ports(
             socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM
         )
@@ -69,10 +70,10 @@ class Cell:
     def _summary(self, node, message, values):
         self.said[node], self.messages[node] = values, message
 
-    def _event(self, event):
-        self.events.append(event)
-        if (event.node, event.event) == ('recorder', 'configuration'):
-            self.results.append(event.values['result'])
+    def _record(self, record):
+        self.events.append(record.body)
+        if isinstance(record.body, ConfigurationEnded):
+            self.results.append(record.body.result)
 
     def until(self, condition, what, timeout_s=120):
         def turn():

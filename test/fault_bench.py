@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from fault_observer import Observer
 
+from remaster_ros.collection.events import ConfigurationEnded, PoseAnnounced
 from remaster_ros.nodes.demo import free_ports
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.workcell import config_path, read_cell
@@ -385,20 +386,16 @@ class Bench:
         pairs = list(zip(m.configuration.tolist(), m.sensor.tolist()))
         assert len(set(pairs)) == len(pairs), 'recorded twice'
         poses = {
-            event.values['stamp']: (event.values['pose'], event.values['ids'].split())
-            for _, event in self.observer.find('pose_planner', 'pose')
-            if event.values['split'] != 'registration'
+            event.stamp: event
+            for _, event in self.observer.find(PoseAnnounced)
+            if event.split != 'registration'
         }
         recorded = set()
-        for _, event in self.observer.find('recorder', 'configuration'):
-            pose, ids = poses.get(event.values['stamp'], ('', []))
+        for _, event in self.observer.find(ConfigurationEnded):
+            announced = poses.get(event.stamp)
             # A stranger's answers, which are among what is injected, are no recording.
-            if (
-                pose
-                and event.values['result'] == 'recorded'
-                and event.values['solution'].isdecimal()
-            ):
-                recorded.add((pose, ids[int(event.values['solution'])]))
+            if announced is not None and event.result == 'recorded':
+                recorded.add((announced.pose, announced.ids[event.solution]))
         assert len(set(m.configuration.tolist())) >= len(recorded), 'lost'
         for log in (self.folder / 'log').iterdir():
             assert 'Traceback' not in log.read_text(), log

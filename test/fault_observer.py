@@ -15,6 +15,14 @@ from itertools import pairwise
 
 import numpy as np
 
+from remaster_ros.collection.events import (
+    STATES,
+    ArmHalted,
+    ArmStopped,
+    ConfigurationEnded,
+    Event,
+    SolutionFailed,
+)
 from remaster_ros.simulation.arm_motion import Motion, ServoPoint, spline
 from remaster_ros.simulation.world import START_S
 
@@ -105,10 +113,10 @@ class Observer:
         self.world, self.chain, self.speed_share = world, world.chain, speed_share
         self._messages: list = []
         self._commands: list[Command] = []
-        self.events: list[tuple[float, object]] = []
+        self.events: list[tuple[float, Event]] = []
         self.summaries: list[tuple[float, str, str, dict[str, str]]] = []
         self.latest: dict[str, tuple[float, str, dict[str, str]]] = {}
-        listen(node, self._event, self._summary)
+        listen(node, self._record, self._summary)
         node.create_subscription(
             JointTrajectory,
             COMMANDS,
@@ -116,8 +124,9 @@ class Observer:
             RELIABLE,
         )
 
-    def _event(self, event) -> None:
-        self.events.append((time.monotonic(), event))
+    def _record(self, record) -> None:
+        if not isinstance(record.body, STATES):
+            self.events.append((time.monotonic(), record.body))
 
     def _summary(self, node: str, message: str, values: dict[str, str]) -> None:
         now = time.monotonic()
@@ -187,12 +196,12 @@ class Observer:
         """Return a value of a node's last summary."""
         return self.latest.get(node, (0.0, '', {}))[2].get(key, '')
 
-    def find(self, node: str, *kinds: str, since_s: float = 0.0) -> list[tuple[float, object]]:
-        """Return the events of a node since a wall time, with theirs."""
+    def find(self, kind: type, since_s: float = 0.0) -> list[tuple[float, Event]]:
+        """Return the events of a kind since a wall time, with theirs."""
         return [
             (wall_s, event)
             for wall_s, event in list(self.events)
-            if wall_s > since_s and event.node == node and event.event in kinds
+            if wall_s > since_s and isinstance(event, kind)
         ]
 
     def reasons(self, since_s: float, until_s: float = np.inf) -> list[str]:
@@ -201,12 +210,12 @@ class Observer:
         for wall_s, event in list(self.events):
             if not since_s < wall_s <= until_s:
                 continue
-            if event.node == 'robot_bridge' and event.event in ('stopped', 'halted', 'failed'):
-                found.setdefault(event.message, 0)
-            elif (event.node, event.event) == ('recorder', 'configuration'):
-                for part in event.values.get('reason', '').split('; '):
+            if isinstance(event, ArmStopped | ArmHalted | SolutionFailed):
+                found.setdefault(event.reason, 0)
+            elif isinstance(event, ConfigurationEnded):
+                for part in event.reason.split('; '):
                     # What is absent or was not waited for is said elsewhere, and is no refusal.
-                    if ': ' in part and event.values['result'] in ('partial', 'rejected'):
+                    if ': ' in part and event.result in ('partial', 'rejected'):
                         found.setdefault(part, 1)
         for wall_s, node, message, values in list(self.summaries):
             if not since_s < wall_s <= until_s or node not in ('robot_bridge', 'pose_planner'):

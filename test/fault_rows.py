@@ -9,6 +9,7 @@ until a person has cleared it, and a collection that goes on once the fault is o
 from __future__ import annotations
 
 import copy
+import json
 import signal
 import time
 from collections.abc import Callable
@@ -16,6 +17,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from fault_bench import RATE, SENSOR_OF, Bench
+
+from remaster_ros.collection.events import (
+    VERSION,
+    ArmHalted,
+    ArmStopped,
+    ConfigurationEnded,
+    HaltCleared,
+    SolutionSettled,
+)
 
 HALT_S = 0.3
 """A command may be on its way when a halt is published, s."""
@@ -127,9 +137,9 @@ def _observe(bench: Bench, row: Row) -> Seen:
         # What is over does not let the arm go.
         _wait(bench, time.monotonic() + 1.0)
     goes_on = _go_on(bench)
-    halts = observer.find('robot_bridge', 'halted', since_s=began)
-    stops = observer.find('robot_bridge', 'stopped', since_s=began)
-    cleared = [at for at, _ in observer.find('robot_bridge', 'halt_cleared', since_s=began)]
+    halts = observer.find(ArmHalted, since_s=began)
+    stops = observer.find(ArmStopped, since_s=began)
+    cleared = [at for at, _ in observer.find(HaltCleared, since_s=began)]
     commands = observer.since(began)
     observer.judge(commands)
     stop = next((c for c in commands if c.points == 1 and c.wall_s < ended + 1.0), None)
@@ -193,8 +203,8 @@ def _go_on(bench: Bench) -> str:
             steps = bench.operate()
             took += [step for step in steps if step not in took]
             since = time.monotonic()
-        done = bench.observer.find('recorder', 'configuration', since_s=since)
-        if any(event.values['result'] == 'recorded' for _, event in done):
+        done = bench.observer.find(ConfigurationEnded, since_s=since)
+        if any(event.result == 'recorded' for _, event in done):
             break
         _wait(bench, time.monotonic() + 0.1)
     return f'after {" and ".join(took)}' if took else 'by itself'
@@ -538,25 +548,24 @@ def _relayed() -> tuple[Row, ...]:
     )
 
 
-def answers(**wrong: str) -> Callable[[Bench], None]:
+def answers(**wrong: object) -> Callable[[Bench], None]:
     """Return answers in the recorder's name, each time the arm has settled."""
 
     def begin(bench: Bench) -> None:
-        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+        from std_msgs.msg import String
 
-        publisher = bench.foreign('remaster/status', DiagnosticArray)
+        publisher = bench.foreign('remaster/events', String)
         time.sleep(0.3)
         until, answered = time.monotonic() + 6.0, 0.0
         while time.monotonic() < until:
-            for at, event in bench.observer.find('robot_bridge', 'settled', since_s=answered):
+            for at, event in bench.observer.find(SolutionSettled, since_s=answered):
                 answered = max(answered, at)
-                values = {
-                    'stamp': event.values['stamp'], 'solution': event.values['solution'],
+                body = {
+                    'kind': 'configuration', 'stamp': event.stamp, 'solution': event.solution,
                     'result': 'recorded', **wrong,
                 }  # fmt: skip
-                pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-                status = DiagnosticStatus(name='recorder: configuration', values=pairs)
-                publisher.publish(DiagnosticArray(status=[status]))
+                record = {'version': VERSION, 'node': '/recorder', 'body': body}
+                publisher.publish(String(data=json.dumps(record)))
             time.sleep(0.01)
 
     return begin

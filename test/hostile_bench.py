@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from hostile_arm import Command, HostileArm
 from hostile_lines import (
@@ -36,10 +36,22 @@ from hostile_lines import (
 from hostile_process import BridgeProcess
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool
+from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from remaster_ros.collection.events import (
+    STATES,
+    ConfigurationEnded,
+    Event,
+    EventRecord,
+    PlannerState,
+    RecorderState,
+    SolutionSettled,
+    State,
+    decode,
+    encode,
+)
 from remaster_ros.types import FloatArray
 
 
@@ -108,7 +120,7 @@ class Bench(BridgeProcess):
         self.node = node = rclpy.create_node('hostile_controller', context=self._context)
         self.intruder = rclpy.create_node(INTRUDER, context=self._context)
         self._states = node.create_publisher(JointState, '/joint_states', RELIABLE)
-        self._status = node.create_publisher(DiagnosticArray, '/remaster/status', RELIABLE)
+        self._records = node.create_publisher(String, '/remaster/events', RELIABLE)
         self._poses = node.create_publisher(PoseStamped, '/remaster/target_pose', LEASED)
         self._solutions = node.create_publisher(
             JointTrajectory, '/remaster/joint_solutions', LEASED
@@ -126,6 +138,7 @@ class Bench(BridgeProcess):
             RELIABLE,
         )
         node.create_subscription(DiagnosticArray, '/remaster/status', self._on_status, RELIABLE)
+        node.create_subscription(String, '/remaster/events', self._on_record, RELIABLE)
         self._clear = node.create_client(Trigger, '/remaster/clear_halt')
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(node)
@@ -184,7 +197,7 @@ class Bench(BridgeProcess):
 
     def _say_plan(self) -> None:
         run = f'hostile {self._runs}' if self.planner == 'running' else ''
-        self._say('pose_planner', state=self.planner, run=run, phase='collection')
+        self._say(PlannerState(state=self.planner, run=run))
 
     def was_running(self, time_s: float) -> bool:
         """Whether the planner's newest state at a time was running."""
@@ -276,7 +289,7 @@ class Bench(BridgeProcess):
         if 'pose_planner' not in self.silent:
             self._say_plan()
         if 'recorder' not in self.silent:
-            self._say('recorder', state='waiting', run='hostile', waiting_for=self.waiting_for)
+            self._say(RecorderState(run='hostile', waiting_for=self.waiting_for))
         if self.emergency_shown is not None:
             self._emergency.publish(Bool(data=self.emergency_shown))
 
@@ -285,11 +298,9 @@ class Bench(BridgeProcess):
         self.emergency_shown = stopped
         self._emergency.publish(Bool(data=stopped))
 
-    def _say(self, name: str, **values: str) -> None:
-        pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-        message = DiagnosticArray(status=[DiagnosticStatus(name=name, values=pairs)])
-        message.header.stamp = self._stamp(0.0)
-        self._status.publish(message)
+    def _say(self, body: State | Event) -> None:
+        record = EventRecord(node=f'/{body.sender}', body=body, stamp_ns=time.time_ns())
+        self._records.publish(String(data=encode(record)))
 
     def _stamp(self, ahead_s: float) -> Time:
         ns = time.time_ns() + round(1e9 * ahead_s)
@@ -373,19 +384,21 @@ class Bench(BridgeProcess):
     def _on_status(self, array: DiagnosticArray) -> None:
         now = time.monotonic()
         for status in array.status:
-            name, _, event = status.name.partition(': ')
-            if name != 'robot_bridge':
-                continue
-            values = {pair.key: pair.value for pair in status.values}
-            if not event:
+            if status.name == 'robot_bridge':
+                values = {pair.key: pair.value for pair in status.values}
                 self.seen.summaries.append((now, status.message, values))
-                continue
-            self.seen.events.append((now, event, status.message, values))
-            if event == 'settled' and self.answers:
-                self._say(
-                    'recorder: configuration',
-                    stamp=values.get('stamp', ''),
-                    solution=values.get('solution', ''),
-                    result='recorded',
-                    reason='',
-                )
+
+    def _on_record(self, message: String) -> None:
+        now = time.monotonic()
+        if '"/robot_bridge"' not in message.data:
+            return
+        event = decode(message.data).body
+        if isinstance(event, STATES):
+            return
+        self.seen.events.append((now, event))
+        if isinstance(event, SolutionSettled) and self.answers:
+            self.answer(event.stamp, event.solution)
+
+    def answer(self, stamp: str, solution: int) -> None:
+        """Say in the recorder's name that a configuration is recorded."""
+        self._say(ConfigurationEnded(stamp=stamp, solution=solution, result='recorded'))

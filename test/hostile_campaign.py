@@ -15,6 +15,8 @@ from hostile_lines import EMERGENCY
 from hostile_outcomes import Outcome
 from hostile_scene import HOME, Scene, begin, bench_of, demo_body, target
 
+from remaster_ros.collection.events import SolutionFailed
+
 HALT_WITHIN_S = 4.0
 """A halt not shown so long after the injection was not made, s: see `hostile_scene.FAST`."""
 
@@ -134,7 +136,9 @@ class Campaign:
         else:
             # Why not, in the bridge's own words.
             failed = [
-                text for t, event, text, _ in bench.seen.events if t > began and event == 'failed'
+                event.reason
+                for t, event in bench.seen.events
+                if t > began and isinstance(event, SolutionFailed)
             ]
             scene.note = '; '.join(
                 [*failed[-2:], *(text for _, text, _ in bench.seen.summaries[-1:])]

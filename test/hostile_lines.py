@@ -8,6 +8,7 @@ import numpy as np
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
+from remaster_ros.collection.events import Event
 from remaster_ros.types import FloatArray
 
 COMMANDS = '/joint_trajectory_controller/joint_trajectory'
@@ -78,7 +79,7 @@ class Seen:
     """What the bridge showed of itself: its summaries and events with their monotonic times."""
 
     summaries: list[tuple[float, str, dict[str, str]]] = field(default_factory=list)
-    events: list[tuple[float, str, str, dict[str, str]]] = field(default_factory=list)
+    events: list[tuple[float, Event]] = field(default_factory=list)
     settled: list[tuple[float, FloatArray]] = field(default_factory=list)
 
     def halted(self, since_s: float = 0.0) -> str:

@@ -6,25 +6,24 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 
+from remaster_ros.collection.events import EventRecord, RecorderBegan, encode
 from remaster_ros.errors import DiskError, InputError
-from remaster_ros.nodes.status import LATCHED, TOPIC
+from remaster_ros.nodes.status import EVENTS, LATCHED, TOPIC
 from remaster_ros.session.bag import RECORDED
 from remaster_ros.session.bag_writer import BagWriter
 
 DEEP = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 """What a busy recorder has not yet taken is kept for it: seconds of the fastest stream."""
-STATUS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 MOST_EARLY = 20_000
 """Messages that are kept while there is no clock: some ten seconds of the fastest streams."""
-BEGAN = 'began'
-"""The event by which a bag says that its recorder was started (again)."""
 
 
 class BagRecorder:
@@ -41,7 +40,7 @@ class BagRecorder:
     Attributes
     ----------
     notes
-        What a user should know of the bag as it was found.
+        How the bag was found, for the user.
     dropped
         Messages that found no room, neither on the disk nor in memory.
     """
@@ -49,7 +48,7 @@ class BagRecorder:
     def __init__(self, node: Node, folder: Path | None) -> None:
         self._node, self._folder = node, folder
         self._writer: BagWriter | None = None
-        # Heard while the node's clock, a simulated one, was not known: topic, type, bytes.
+        # Received while the node's clock, a simulated one, had no time: topic, type, bytes.
         self._early: list[tuple[str, str, bytes]] = []
         self.notes: list[str] = []
         self.dropped = 0
@@ -67,10 +66,9 @@ class BagRecorder:
             self.notes.append(f'{error}; recording into {self._folder}')
             self._writer = BagWriter(self._folder)
         # First in each file, so that a replay forgets the reading that was under way before it.
-        status = DiagnosticStatus(name=f'{self._node.get_name()}: {BEGAN}', message=BEGAN)
-        self._write(
-            name_in_bag(TOPIC), STATUS_TYPE, serialize_message(DiagnosticArray(status=[status]))
-        )
+        began = EventRecord(node=self._node.get_fully_qualified_name(), body=RecorderBegan())
+        data = serialize_message(String(data=encode(began)))
+        self._write(name_in_bag(EVENTS), 'std_msgs/msg/String', data)
 
     def _write(self, topic: str, type_name: str, data: bytes) -> None:
         """Write a message under the node's time; what came before there was one comes first.
@@ -122,6 +120,7 @@ class BagRecorder:
         if self._folder is None:
             return
         self.subscribe(PoseStamped, 'remaster/target_pose')
+        self.subscribe(DiagnosticArray, TOPIC)
         self.subscribe(TransformStamped, 'remaster/registration', qos=LATCHED)
         self.subscribe(JointState, 'remaster/joint_offsets', qos=LATCHED)
         self.subscribe(JointState, 'remaster/joint_offsets_std', qos=LATCHED)

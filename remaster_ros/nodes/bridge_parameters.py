@@ -4,9 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.actions import SupervisorRules
+from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.nodes.parameters import parameter
+from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
+from remaster_ros.types import FloatArray
+
+KNOWN_OFFSET_RAD = float(np.deg2rad(0.1))
+"""What may still be wrong with a joint whose offset is in use, for the clearance of paths."""
+OFFSET_STDS = 3.0
+"""Or so many standard deviations of the offset that is known least."""
 
 
 @dataclass(frozen=True)
@@ -99,4 +110,30 @@ class Parameters:
             stall_s=self.stall_s,
             reaction_s=self.reaction_s,
             lag_s=self.lag_s,
+        )
+
+    def known_offsets(self, chain: SerialChain) -> tuple[FloatArray | None, float | None]:
+        """Return the offsets in use, rad, (k,), and what a joint's may still be off by, rad.
+
+        An offset that the fit could not identify counts as 0, and is known as little as before:
+        the clearance of the cell file remains then (None).
+        """
+        if not self.offsets:
+            return None, None
+        offsets, std = joint_offsets_rad(read_fit(self.offsets), chain.joint_names)
+        known = std > 0.0
+        left = max(KNOWN_OFFSET_RAD, OFFSET_STDS * float(np.max(std))) if known.all() else None
+        return np.where(known, offsets, 0.0), left
+
+    def limits(
+        self, chain: SerialChain, offsets: FloatArray | None, acceleration: FloatArray | float
+    ) -> MotionLimits:
+        """Return the limits of every motion: offsets in use, rad, acceleration, rad/s^2, (k,)."""
+        return MotionLimits.of(
+            chain,
+            self.speed_share,
+            offsets,
+            acceleration,
+            self.cartesian_speed_limit_m_s or np.inf,
+            float(np.deg2rad(self.limit_margin_deg)),
         )

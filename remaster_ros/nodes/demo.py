@@ -28,6 +28,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from std_srvs.srv import Trigger
 
+from remaster_ros.collection.events import EventRecord, TourPlanned
 from remaster_ros.errors import DeviceError, InputError, RemasterError
 from remaster_ros.nodes.demo_summary import (
     ConfigurationTimes,
@@ -39,7 +40,7 @@ from remaster_ros.nodes.launching import ALL_NODES, CORE, SENSORS
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.processes import NodeProcesses
 from remaster_ros.nodes.running import report
-from remaster_ros.nodes.status import Event, listen
+from remaster_ros.nodes.status import listen
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import read_fit
 from remaster_ros.session.files import cannot_write
@@ -81,16 +82,16 @@ class Conductor(Node):
         self.summaries: dict[str, dict[str, str]] = {}
         self.times = ConfigurationTimes(self.p.rate)
         self.planned = ''
-        listen(self, self._on_event, self._on_summary)
+        listen(self, self._on_record, self._on_summary)
         self._clients_by_name: dict[str, Any] = {}
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
         self.summaries[node] = {'message': message, **values}
 
-    def _on_event(self, event: Event) -> None:
-        if event.event == 'planned':
-            self.planned = event.message
-        self.times.add(event)
+    def _on_record(self, record: EventRecord) -> None:
+        if isinstance(record.body, TourPlanned):
+            self.planned = record.body.description
+        self.times.add(record.body)
 
     def call(self, service: str) -> Any:
         """Begin a call of a std_srvs/Trigger service; returns the future."""

@@ -8,7 +8,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from remaster_ros.nodes.status import Event
+from remaster_ros.collection.events import (
+    ConfigurationEnded,
+    Event,
+    PoseAnnounced,
+    ShotMeasured,
+    SolutionCommanded,
+    SolutionSettled,
+    State,
+)
 from remaster_ros.simulation.expected_findings import causes, describe, named_cause
 from remaster_ros.simulation.hidden_effects import true_parameters
 from remaster_ros.simulation.truth import SessionTruth
@@ -30,32 +38,33 @@ class ConfigurationTimes:
     def __init__(self, rate: float) -> None:
         self._rate = rate
         self._instrument_s = 0.0
-        self._open: dict[tuple[str, str], dict[str, float]] = {}
+        self._open: dict[tuple[str, int], dict[str, float]] = {}
         self._last: dict[str, float] | None = None
         self._registration: set[str] = set()
         self.rows: list[dict[str, float]] = []
 
-    def add(self, event: Event) -> None:
-        """Take an event of the planner, the bridge or the recorder."""
-        values = event.values
-        if event.event == 'pose' and values['split'] == 'registration':
-            self._registration.add(values['stamp'])
-        key = (values.get('stamp', ''), values.get('solution', ''))
-        if event.event == 'commanded':
-            if self._last is not None:
-                self._last['until_command'] = float(values['since_settled_wall_s'])
-            # A registration pose is followed by planning, which is no configuration's time.
-            self._last = None if key[0] in self._registration else self._open.setdefault(key, {})
-        elif event.event == 'settled' and key in self._open:
-            self._open[key].update(
-                motion=float(values['motion_s']), settle=float(values['settle_s'])
-            )
-        elif event.event == 'measured':
-            self._instrument_s = float(values['instrument_wall_s']) * self._rate
-        elif event.event == 'configuration' and 'measuring_s' in values and key in self._open:
-            self._open[key]['measuring'] = max(float(values['measuring_s']), self._instrument_s)
-            self._instrument_s = 0.0
-            self.rows.append(self._open[key])
+    def add(self, event: Event | State) -> None:
+        """Take what a node published; only events of a configuration count."""
+        match event:
+            case PoseAnnounced(split='registration', stamp=stamp):
+                self._registration.add(stamp)
+            case SolutionCommanded(stamp=stamp, solution=solution, since_settled_wall_s=since_s):
+                if self._last is not None:
+                    self._last['until_command'] = since_s
+                self._last = None
+                if stamp not in self._registration:
+                    # A registration pose is followed by planning, which is not of its time.
+                    self._last = self._open.setdefault((stamp, solution), {})
+            case SolutionSettled(stamp=stamp, solution=solution):
+                if (row := self._open.get((stamp, solution))) is not None:
+                    row.update(motion=event.motion_s, settle=event.settle_s)
+            case ShotMeasured(instrument_wall_s=wall_s):
+                self._instrument_s = wall_s * self._rate
+            case ConfigurationEnded(stamp=stamp, solution=solution, measuring_s=float(reading_s)):
+                if (row := self._open.get((stamp, solution))) is not None:
+                    row['measuring'] = max(reading_s, self._instrument_s)
+                    self._instrument_s = 0.0
+                    self.rows.append(row)
 
     def columns(self) -> dict[str, np.ndarray]:
         """Return motion, settle, measuring (world s) and software (wall s) of complete rows."""

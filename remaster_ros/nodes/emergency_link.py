@@ -12,7 +12,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
 PERIODIC = 6
-"""So many messages tell whether they come regularly."""
+"""By so many messages it is judged whether they come regularly."""
 
 
 class EmergencyLink:
@@ -40,7 +40,7 @@ class EmergencyLink:
         if not topic:
             return
         # The last value of a publisher that keeps it, and whatever any publisher sends from now
-        # on: one subscription cannot ask for both.
+        # on: one subscription cannot have both.
         for durability, reliability in (
             (DurabilityPolicy.TRANSIENT_LOCAL, ReliabilityPolicy.RELIABLE),
             (DurabilityPolicy.VOLATILE, ReliabilityPolicy.BEST_EFFORT),
@@ -55,7 +55,7 @@ class EmergencyLink:
         if not self._stamps:
             return f'{self.topic} (emergency_stop_topic) is silent: nothing moves without it'
         if not self._node.count_publishers(self.topic):
-            return f'nobody publishes {self.topic} (emergency_stop_topic) any more'
+            return f'{self.topic} (emergency_stop_topic) has no publisher any more'
         if len(self._stamps) == PERIODIC:
             longest = max(later - earlier for earlier, later in pairwise(self._stamps))
             silent_s = time.monotonic() - self._stamps[-1]

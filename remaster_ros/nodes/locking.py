@@ -1,8 +1,8 @@
 """One process per node name and ROS domain on this computer, by a lock that the kernel keeps.
 
 The lock (flock) goes with the process, however that ends: a node that was killed can be started
-again at once. What runs on another computer, or for another user, is told apart by
-/remaster/status (see `remaster_ros.nodes.status.NodeStatus`).
+again at once. What runs on another computer, or for another user, is distinguished by
+/remaster/events (see `remaster_ros.nodes.status.NodeStatus`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PATIENCE_S = 1.0
 
 
 def runtime_folder() -> Path:
-    """Return this user's folder of locks; made where there is none, readable by nobody else.
+    """Return this user's folder of locks; made where there is none, readable by no other user.
 
     Always below /tmp: XDG_RUNTIME_DIR is set in one shell and not in the other (ssh, services),
     and two processes must find the same folder.

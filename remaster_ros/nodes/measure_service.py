@@ -18,6 +18,7 @@ from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
+from remaster_ros.collection.events import ShotMeasured
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.messages import stamp_of, temperature_topic, transform_array
@@ -151,7 +152,7 @@ class MeasureService:
         node.trouble = ''
         self._publish_temperature(reading)
         # For the report of times: what the instrument took is not the software's.
-        node.status.event('measured', 'measured', instrument_wall_s=f'{took:.6f}')
+        node.status.event(ShotMeasured(took))
         node.publish_reading(reading)
         response.success, response.message = True, 'measured'
         return response

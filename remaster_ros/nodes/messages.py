@@ -8,6 +8,7 @@ import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics import transforms
@@ -78,6 +79,31 @@ class JointOrder:
         if len(positions) != len(names):
             raise InputError(f'joint_states has {len(positions)} positions for {len(names)} names')
         return np.array([positions[column] for column in self._columns])
+
+
+def solutions_of(message: JointTrajectory, joint_names: Sequence[str]) -> FloatArray:
+    """Return the joint solutions in remaster/joint_solutions, rad, (m, k); m = 0 for a stop.
+
+    Parameters
+    ----------
+    joint_names
+        The wanted order of joints.
+
+    Raises
+    ------
+    InputError
+        The solutions are for other joints, or a point has not one position for each.
+    """
+    given = list(message.joint_names)
+    if not message.points:
+        # A stop, whatever joints it names.
+        return np.empty((0, len(joint_names)))
+    if not set(joint_names) <= set(given):
+        raise InputError(f'they are for {", ".join(given)}, the cell has {", ".join(joint_names)}')
+    if any(len(point.positions) != len(given) for point in message.points):
+        raise InputError(f'a point has not as many positions as joints, {len(given)}')
+    columns = [given.index(name) for name in joint_names]
+    return np.array([point.positions for point in message.points])[:, columns]
 
 
 def transform_message(parent: str, child: str, T_parent_child: FloatArray) -> TransformStamped:

@@ -28,7 +28,7 @@ from remaster_ros.calibration.fit import (
 from remaster_ros.errors import RemasterError
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import LATCHED, NodeStatus
+from remaster_ros.nodes.status import LATCHED, NodeStatus, Summary
 from remaster_ros.reports.fit_json import FIT_FILE, prepare_folder, read_fit, save_fit
 from remaster_ros.session.priors import read_priors
 from remaster_ros.session.reader import read_session
@@ -60,7 +60,7 @@ class Parameters:
 class Optimizer(RemasterNode):
     """See the module's text."""
 
-    # It moves nothing, and nobody counts on it: what fails is asked for again.
+    # It moves nothing, and no node depends on it: what fails can be called again.
     outlives_faults = True
 
     def __init__(self) -> None:
@@ -101,7 +101,7 @@ class Optimizer(RemasterNode):
         return response
 
     def _fit(self) -> tuple[Path, str]:
-        """Return what to open, and what to say in the status."""
+        """Return the file to open, and the text for the status."""
         out = Path(self.p.out)
         session = read_session(self.p.session)
         prepare_folder(out)
@@ -122,7 +122,7 @@ class Optimizer(RemasterNode):
         return report, '; '.join(('fitted', *result.implausible))
 
     def _discover(self) -> tuple[Path, str]:
-        # What takes a second to import comes when it is asked for: a node is there at once.
+        # Imported when it is needed, as it takes a second: the node is there at once.
         from remaster_ros.discovery.discover import discover_session
         from remaster_ros.reports.discovery_json import save_discovery
 
@@ -171,8 +171,8 @@ class Optimizer(RemasterNode):
         """End a fit under way at its next step."""
         self._ending = True
 
-    def _summary(self) -> tuple[str, str, dict[str, Any]]:
-        return 'ok', self._state, {'session': self.p.session, 'out': self.p.out}
+    def _summary(self) -> Summary:
+        return Summary('ok', self._state, {'session': self.p.session, 'out': self.p.out})
 
 
 def main(args: list[str] | None = None) -> int:

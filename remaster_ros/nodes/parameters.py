@@ -1,6 +1,6 @@
 """A node's parameters: one frozen dataclass, each field with unit, range and description.
 
-A value of the wrong type, outside its range, or a name that the node does not know is refused at
+A value of the wrong type, outside its range, or the name of no parameter is refused at
 start with one line. While the node runs, what is declared `live` can be changed, with the same
 checks; everything else is read-only, `use_sim_time` as well: what was answered "successful" and
 changed nothing would be believed.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,10 +21,9 @@ class PlanningThread:
     """Does one thing at a time beside the callbacks: a stop must not wait for the planning."""
 
     def __init__(self) -> None:
-        self._thread: threading.Thread | None = None
         self._q: FloatArray = np.empty(0)
         self._what: object = None
-        self._outcome: list[Callable[[], Any]] = []
+        self._future: Future[Any] | None = None
 
     def ask(self, what: object, q: FloatArray, job: Callable[[], Result]) -> tuple[Result] | None:
         """Return what a job found, in a tuple; None while it works.
@@ -31,41 +31,33 @@ class PlanningThread:
         Parameters
         ----------
         what
-            Tells jobs apart: what another job, or an arm that has moved since, was asked for is
+            Identifies the job: the result of another job, or for an arm that has moved since, is
             forgotten.
         q
             Where the arm stands, rad, (k,).
         job
             Called in a thread of its own; what it raises is raised here.
         """
-        if self._thread is None:
+        future = self._future
+        if future is not None and not future.done():
+            return None
+        is_same = self._what == what and np.max(np.abs(self._q - q)) <= MOVED_RAD
+        if future is None or not is_same:
             self._start(what, q, job)
             return None
-        if self._thread.is_alive():
-            return None
-        self._thread = None
-        if self._what != what or np.max(np.abs(self._q - q)) > MOVED_RAD:
-            self._start(what, q, job)
-            return None
-        return (self._outcome.pop()(),)
+        self._future = None
+        return (future.result(),)
 
     def _start(self, what: object, q: FloatArray, job: Callable[[], Any]) -> None:
-        self._what, self._q, self._outcome = what, q, []
-        outcome = self._outcome
+        self._what, self._q = what, q
+        future: Future[Any] = Future()
+        self._future = future
 
         def work() -> None:
             try:
-                found = job()
-                outcome.append(lambda: found)
+                future.set_result(job())
             except Exception as error:
-                # Raised where it is asked for; the name is gone after this block.
-                problem = error
-                outcome.append(lambda: _raise(problem))
+                future.set_exception(error)
 
-        # A daemon: the node need not wait for it at its end.
-        self._thread = threading.Thread(target=work, name='planning', daemon=True)
-        self._thread.start()
-
-
-def _raise(error: Exception) -> None:
-    raise error
+        # A daemon, which no executor's thread is: the node need not wait for it at its end.
+        threading.Thread(target=work, name='planning', daemon=True).start()

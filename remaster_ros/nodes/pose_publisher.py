@@ -1,44 +1,29 @@
-"""Announce a pose to bridge and recorder, and again until both know it."""
+"""Publish a pose with all its joint solutions to bridge and recorder."""
 
 from __future__ import annotations
-
-import time
-from dataclasses import dataclass
 
 from geometry_msgs.msg import PoseStamped
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from remaster_ros.collection.events import PoseAnnounced
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.messages import duration_of, stamp_key
-from remaster_ros.nodes.pose_tracker import waypoints_message
 from remaster_ros.nodes.running import RemasterNode
 from remaster_ros.nodes.status import LEASED, NodeStatus
+from remaster_ros.nodes.waypoints import waypoints_message
 from remaster_ros.planning.tour_order import PoseVisit
-
-PEERS = ('robot_bridge', 'recorder')
-ANNOUNCE_WALL_S = 5.0
-"""Who does not know an announcement so long after it has missed it, wall time."""
-MATCH_WALL_S = 0.5
-"""The other side of a match comes so much later than ours at most, wall time."""
-
-
-@dataclass(frozen=True)
-class _Peer:
-    """The last summary of a node that must know the pose under way."""
-
-    last_seen_wall: float
-    values: dict[str, str]
 
 
 class PosePublisher:
-    """Publishes poses with their joint solutions, and follows who knows them.
+    """Publishes poses, and the stop that takes them back.
 
-    Attributes
+    Parameters
     ----------
-    stamp
-        Of the last announcement, by which the others name it; '' where the pose is to be announced
-        anew.
+    node
+        The planner.
+    chain
+        Its arm.
     """
 
     def __init__(self, node: RemasterNode, chain: SerialChain) -> None:
@@ -50,87 +35,36 @@ class PosePublisher:
         self._solutions = node.create_publisher(
             JointTrajectory, 'remaster/joint_solutions', LEASED
         )
-        self._peers: dict[str, _Peer] = {}
-        # Stamp of each announcement of the open pose -> its solutions, in the order announced.
-        self._ids: dict[str, tuple[int, ...]] = {}
-        self.stamp, self._published_wall = '', 0.0
-        # Which start of each peer was there to hear it.
-        self._told: dict[str, str] = {}
-        self._matched_wall: float | None = None
 
-    def take_summary(self, node: str, values: dict[str, str]) -> None:
-        """Take the summary of a node."""
-        if node in PEERS:
-            self._peers[node] = _Peer(time.monotonic(), values)
-
-    def value(self, node: str, key: str) -> str:
-        """Return a value of a peer's last summary; '' where it is not there."""
-        peer = self._peers.get(node)
-        return peer.values.get(key, '') if peer else ''
-
-    def matched(self) -> bool:
-        """Whether bridge and recorder are there for the next pose; DDS takes its time to match."""
-        if self._solutions.get_subscription_count() < 2 or len(self._peers) < len(PEERS):
-            self._matched_wall = None
-            return False
-        if self._matched_wall is None:
-            self._matched_wall = time.monotonic()
-        return time.monotonic() - self._matched_wall > MATCH_WALL_S
-
-    def ids(self, stamp: str) -> tuple[int, ...] | None:
-        """Return the solutions of an announcement of the open pose; None if it is none."""
-        return self._ids.get(stamp)
-
-    def close(self) -> None:
-        """Be done with the open pose."""
-        self._ids, self.stamp = {}, ''
+    @property
+    def subscribers(self) -> int:
+        """How many nodes subscribe to the solutions."""
+        return int(self._solutions.get_subscription_count())
 
     def stop(self) -> None:
-        """Tell the bridge to stop; whoever goes on announces what is left of the pose again."""
+        """Take the pose back, on which the bridge stops the arm."""
         self._solutions.publish(JointTrajectory(joint_names=list(self._chain.joint_names)))
-        self.stamp = ''
 
-    def is_lost(self) -> bool:
-        """Whether the open pose is to be announced (again): somebody does not know it."""
-        if not self.stamp:
-            return True
-        if self.value('recorder', 'state') == 'measuring':
-            return False
-        missed_wall = self._published_wall + ANNOUNCE_WALL_S
-        return any(
-            peer.values.get('pose') != self.stamp
-            and (
-                peer.values.get('started') != self._told[node] or peer.last_seen_wall > missed_wall
-            )
-            for node, peer in self._peers.items()
-        )
-
-    def announce(self, stop: PoseVisit, plan: str, status: NodeStatus, last: bool = False) -> None:
-        """Publish a pose with what is left of its solutions.
+    def announce(self, stop: PoseVisit, plan: str, status: NodeStatus, *, last: bool) -> str:
+        """Publish a pose with what is left of its solutions; return the announcement's stamp.
 
         Parameters
         ----------
+        plan
+            The plan that poses and solutions are numbered by.
         last
             Whether it is the last reference of a round.
         """
-        stamp = self._node.get_clock().now().to_msg()
-        self.stamp, self._published_wall = stamp_key(stamp), time.monotonic()
-        self._ids[self.stamp] = stop.ids
-        self._told = {node: peer.values.get('started', '') for node, peer in self._peers.items()}
-        # The event goes first: the recorder must know the pose before the arm gets there.
-        status.event(
-            'pose',
-            f'pose {stop.pose} ({stop.split}): {len(stop.solutions)} solutions',
-            stamp=self.stamp,
-            pose=stop.pose,
-            split=stop.split,
-            solutions=len(stop.solutions),
-            ids=' '.join(map(str, stop.ids)),
-            plan=plan,
-            last='yes' if last else 'no',
-        )
         pose = PoseStamped()
-        pose.header.stamp, pose.header.frame_id = stamp, self._chain.base_link
+        pose.header.stamp = self._node.get_clock().now().to_msg()
+        pose.header.frame_id = self._chain.base_link
+        key = stamp_key(pose.header.stamp)
+        # The event goes first: the recorder must have the pose before the arm gets there.
+        status.event(
+            PoseAnnounced(
+                stamp=key, pose=stop.pose, split=stop.split, ids=stop.ids, plan=plan, last=last
+            )
+        )
         position, orientation = pose.pose.position, pose.pose.orientation
         position.x, position.y, position.z = map(float, stop.T_R_T[:3, 3])
         quaternion = transforms.quaternion_xyzw(stop.T_R_T[:3, :3])
@@ -145,3 +79,4 @@ class PosePublisher:
             for i, q in enumerate(stop.solutions)
         ]
         self._solutions.publish(message)
+        return key

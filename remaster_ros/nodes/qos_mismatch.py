@@ -10,7 +10,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 def mismatch(offered: QoSProfile, wanted: QoSProfile) -> str:
     """Return why a subscriber gets nothing of a publisher; '' where it does.
 
-    Leases and deadlines are not looked at: `nodes.rivals` asks for a lease that foreign publishers
+    Leases and deadlines are not looked at: `nodes.rivals` requires a lease that foreign publishers
     do not offer, in order to leave them out.
     """
     best_effort = offered.reliability == ReliabilityPolicy.BEST_EFFORT
@@ -23,7 +23,7 @@ def mismatch(offered: QoSProfile, wanted: QoSProfile) -> str:
 
 
 def mismatches(node: Node) -> str:
-    """Return what a node's topics lose by QoS, in words; '' where nothing.
+    """Return what a node's topics lose by QoS, as text; '' where nothing.
 
     By the graph, not by events of the middleware: rclpy looks at each event handler for every
     message, half of what a message costs.

@@ -1,73 +1,58 @@
 """Pair settled joints with marker readings; write the session and the bag; register the sensors.
 
-What becomes of each configuration is said as an event on /remaster/status, after its observations
-are on disk; the bridge moves on only then. While the disk is full the arm is held, and what is to
-be written is kept and tried again.
+What is read when, and what becomes of it, is decided in `collection.recording`. The event of a
+configuration goes out after its observations are on disk; the bridge moves on only then. While
+the disk is full the arm is held, and what is to be written is kept and tried again.
 """
 
 from __future__ import annotations
 
-import time
-from collections import Counter, deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from collections import Counter
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PointStamped
+from geometry_msgs.msg import TransformStamped
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
-from sensor_msgs.msg import JointState, Temperature
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from remaster_ros.collection.pairing import PairedReading, Pairing, Rejection
+from remaster_ros.collection import events
+from remaster_ros.collection.first_registration import FirstRegistration
+from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.collection.plausibility import Plausibility
+from remaster_ros.collection.recording import BY_HAND, EndedReading, Recording
+from remaster_ros.collection.setup_changes import SetupChanges
 from remaster_ros.errors import DiskError, InputError
-from remaster_ros.motion.liveness import Liveness
-from remaster_ros.nodes.bagging import BEGAN, BagRecorder
-from remaster_ros.nodes.messages import JointOrder, seconds, temperature_topic
+from remaster_ros.nodes.cell_sensors import CellSensors
+from remaster_ros.nodes.messages import (
+    JointOrder,
+    seconds,
+    solutions_of,
+    stamp_key,
+    transform_message,
+)
 from remaster_ros.nodes.parameters import declare
-from remaster_ros.nodes.pose_tracker import PoseTracker, PublishedPose
-from remaster_ros.nodes.recorder_parameters import Parameters, sensor_rules
-from remaster_ros.nodes.registering import Registrar
-from remaster_ros.nodes.retrying_writer import RetryingWriter
+from remaster_ros.nodes.recorder_parameters import Parameters, sensor_rules, session_header
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import JOINT_STATES, Event, NodeStatus, receiver, run_after
-from remaster_ros.nodes.status import TOPIC as STATUS
-from remaster_ros.nodes.triggered_sensors import TriggeredSensors
-from remaster_ros.nodes.watching import Watching
+from remaster_ros.nodes.session_keeper import SessionKeeper
+from remaster_ros.nodes.status import (
+    EVENTS,
+    JOINT_STATES,
+    LATCHED,
+    NodeStatus,
+    Summary,
+    receiver,
+)
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
-from remaster_ros.session.session_journal import SessionJournal
 from remaster_ros.session.session_yaml import ExitStatus
 from remaster_ros.session.workcell import read_cell
-from remaster_ros.types import FloatArray, MarkerReading, Measurements, Session
-
-TEMPERATURE_S = 600.0
-"""A temperature older than this says nothing of a reading, s."""
-CHECK_S = 1.0
-"""How often it is looked whether the session's files are still the ones that are written, s."""
-SET_BACK_S = 1.0
-"""Stamps of joint_states that go back by more than this are those of a clock that was set, s."""
-PAUSED = 'paused'
-"""In place of a run that was paused, and whose token was lost with the recorder."""
-BY_HAND = -1_000_000
-"""The number of poses that a user drove to for a registration: no planner's."""
-
-
-@dataclass
-class _Taking:
-    """A reading under way: of a configuration, or (`future`) asked for by /remaster/register."""
-
-    pairing: Pairing
-    solution: int
-    pose: PublishedPose
-    from_q: FloatArray | None
-    future: Future | None = None
+from remaster_ros.types import FloatArray
 
 
 class Recorder(RemasterNode):
@@ -78,56 +63,33 @@ class Recorder(RemasterNode):
         self.p = declare(self, Parameters)
         self.cell = read_cell(self.p.cell)
         self.chain = self.cell.chain()
-        self.rules = sensor_rules(self.cell, self.p)
-        if self.p.require not in ('all', 'any', *self.cell.sensors):
-            raise InputError(
-                f'recorder: parameter require is {self.p.require!r}; it must be all, any or one '
-                f'of {", ".join(self.cell.sensors)}'
-            )
-        streams = [name for name, sensor in self.cell.sensors.items() if not sensor.single_shot]
-        self._liveness = Liveness(
-            self.cell.sensors, self.p.heartbeat_s, streams, since_s=time.monotonic()
-        )
         self._waited_s = dict.fromkeys(self.cell.sensors, 0.0)
         self._order = JointOrder(self.chain.joint_names)
-        folder = Path(self.p.session)
-        header = Session(
-            urdf=self.cell.urdf_text,
-            base_link=self.chain.base_link,
-            tip_link=self.chain.tip_link,
-            markers={name: np.array(position) for name, position in self.cell.markers.items()},
-            sensors={name: sensor.marker for name, sensor in self.cell.sensors.items()},
-            measurements=Measurements.empty(len(self.chain)),
-            marker_std_m=self.cell.marker_std_m,
-            settle_s=self.p.settle_s,
-            created=datetime.now(UTC).isoformat(timespec='seconds'),
-        )
-        self.journal = SessionJournal(folder, header)
+        markers = {name: np.array(position) for name, position in self.cell.markers.items()}
         self.counts: Counter[str] = Counter()
-        self._trouble = self._restored = ''
-        self._pose_tracker = PoseTracker(self.chain.joint_names)
-        self._taking: _Taking | None = None
-        self._due: deque[tuple[FloatArray, float, int, PublishedPose]] = deque(maxlen=100)
-        # Topics come in no common order: what belongs to a dwell may be here before /settled is.
-        self._recent_joints: deque[tuple[float, FloatArray]] = deque(maxlen=4000)
-        self._recent_readings: deque[tuple[str, MarkerReading]] = deque(maxlen=4000)
-        self._q: FloatArray | None = None
-        self._now = 0.0
-        self._from_q: FloatArray | None = None
-        self._temperatures: deque[tuple[float, float]] = deque(maxlen=500)
+        self._trouble = ''
         self._was_waiting = False
         # The token of the planner's run; in memory alone, so that it lives no longer than this.
         self._run = ''
-        # Settled where no announced pose has a solution (yet): joints, rad, and when.
-        self._unknown: tuple[FloatArray, float] | None = None
-        self._checked_wall = time.monotonic()
-        self._disk = RetryingWriter(lambda why: self.get_logger().error(f'the arm is held: {why}'))
-        self.registrar = Registrar(self, self.cell, self.chain, self.p.max_deviation_m / 2)
-        markers = {name: np.array(position) for name, position in self.cell.markers.items()}
-        self._plausibility = Plausibility(self.chain, markers, self.p.max_deviation_m)
-        self._watching = Watching(self.chain, markers, self.p.reference_stop_m)
-        recording = self.p.bag and not self.journal.closed
-        self._bag = BagRecorder(self, folder / 'bag' if recording else None)
+        self.recording = Recording(
+            sensor_rules(self.cell, self.p),
+            self.p.motion_tolerance,
+            self.p.require,
+            Plausibility(self.chain, markers, self.p.max_deviation_m),
+        )
+        self.sensors = CellSensors(self, self.p, self.cell, self.recording, self._end_reading)
+        self.registration = FirstRegistration(
+            self.chain, markers, self.cell.sensors, self.p.max_deviation_m / 2
+        )
+        self._registrations = self.create_publisher(
+            TransformStamped, 'remaster/registration', LATCHED
+        )
+        # Of /remaster/register, while the reading that it has begun is under way.
+        self._by_hand: Future | None = None
+        self._changes = SetupChanges(self.chain, markers, self.p.reference_stop_m)
+        header = session_header(self.cell, self.p.settle_s)
+        self.keeper = SessionKeeper(self, Path(self.p.session), header, with_bag=self.p.bag)
+        self.journal = self.keeper.journal
         self._subscribe()
         # A group of its own: while it waits for the reading, what makes the reading goes on.
         self.create_service(
@@ -137,455 +99,268 @@ class Recorder(RemasterNode):
             callback_group=ReentrantCallbackGroup(),
         )
         self.status = NodeStatus(self, self._summary)
-        for note in (*self.journal.notes, *self._bag.notes):
+        for note in (*self.journal.notes, *self.keeper.bag.notes):
             self.get_logger().warning(note)
-        self.registrar.add(self.journal.registration)
-        self._watching.take_back(self.journal.watched, self.registrar.T_R_N)
+        self._register(self.journal.registration)
+        self._changes.take_back(self.journal.watched, self.registration.T_R_N)
         self.create_timer(0.05, self._look, clock=self.status.steady)
 
     def _subscribe(self) -> None:
         """Take each topic once, raw: into the bag as it came, then decoded."""
-        bag = self._bag
+        bag = self.keeper.bag
         bag.subscribe(JointState, 'joint_states', self._on_joint_state, JOINT_STATES)
         bag.subscribe(JointState, 'remaster/settled', self._on_settled)
-        poses = self._pose_tracker
-        bag.subscribe(JointTrajectory, 'remaster/joint_solutions', poses.take_solutions)
+        bag.subscribe(JointTrajectory, 'remaster/joint_solutions', self._on_solutions)
         bag.subscribe(JointTrajectory, 'joint_trajectory_controller/joint_trajectory')
-        clients = {}
-        for name, sensor in self.cell.sensors.items():
-            bag.subscribe(PointStamped, sensor.topic, self._on_point(name))
-            bag.subscribe(Temperature, temperature_topic(sensor.topic), self._on_temperature)
-            if sensor.single_shot and sensor.measure_service and self.p.call_measure:
-                clients[name] = self.create_client(Trigger, sensor.measure_service)
-        self._shots = TriggeredSensors(clients)
-        bag.subscribe(DiagnosticArray, STATUS, receiver(self._on_event, self._on_summary))
+        self.sensors.subscribe(bag)
+        bag.subscribe(String, EVENTS, receiver(self, self._on_record))
         bag.subscribe_rest()
 
     # What comes in
 
-    def _on_point(self, sensor: str) -> Callable[[PointStamped], None]:
-        def receive(message: PointStamped) -> None:
-            point = message.point
-            position = np.array([point.x, point.y, point.z])
-            if not np.all(np.isfinite(position)):
-                self.counts[f'{sensor}_not_finite'] += 1
-                return
-            self._liveness.reads(sensor, time.monotonic())
-            reading = MarkerReading(seconds(message.header.stamp), position)
-            self._recent_readings.append((sensor, reading))
-            if self._taking is not None:
-                self._taking.pairing.add_reading(sensor, reading)
-                self._finish_if_complete()
-
-        return receive
-
-    def _on_joint_state(self, message: JointState) -> None:
+    def _positions(self, message: JointState) -> FloatArray | None:
+        """Return the positions of the cell's joints, rad, (k,); None, with a reason, without."""
         try:
-            self._q = self._order.positions(message)
+            return self._order.positions(message)
         except InputError as error:
             self._trouble = str(error)
+            return None
+
+    def _on_joint_state(self, message: JointState) -> None:
+        if (q := self._positions(message)) is not None:
+            self._trouble = ''
+            self.recording.take_joints(seconds(message.header.stamp), q)
+            self._end_reading()
+
+    def _on_solutions(self, message: JointTrajectory) -> None:
+        try:
+            solutions = solutions_of(message, self.chain.joint_names)
+        except InputError as error:
+            self._trouble = f'joint_solutions dropped: {error}'
+            solutions = np.empty((0, len(self.chain)))
+        self.recording.take_solutions(stamp_key(message.header.stamp), solutions)
+
+    def _on_settled(self, message: JointState) -> None:
+        if (q := self._positions(message)) is None:
             return
-        now = seconds(message.header.stamp)
-        if now < self._now - SET_BACK_S:
-            # The robot's clock was set back: what is kept lies in the future of all that comes.
-            self._recent_joints.clear()
-            self._recent_readings.clear()
-        self._now, self._trouble = now, ''
-        self._recent_joints.append((self._now, self._q))
-        if self._taking is not None:
-            self._taking.pairing.add_joint_state(self._now, self._q)
-            self._finish_if_complete()
+        if self.recording.take_settled(seconds(message.header.stamp), q):
+            # The bridge waits for an answer, but a bag at ten times the speed does not: a reading
+            # under way is finished first, by the stamps of its own messages.
+            self._take_next()
+        else:
+            self.counts['settled_unknown'] += 1
+            self._trouble = 'settled at no joint solution of an announced pose'
 
-    def _on_temperature(self, message: Temperature) -> None:
-        if np.isfinite(message.temperature):
-            self._temperatures.append((seconds(message.header.stamp), message.temperature))
+    def _on_record(self, record: events.EventRecord) -> None:
+        match record.body:
+            case events.PoseAnnounced() as pose:
+                self._on_pose(pose)
+            case events.PlannerState() as planner:
+                self._on_planner(planner)
+            case events.SensorReport() as sensor:
+                self.sensors.take(record, sensor)
+            case events.RecorderBegan():
+                # From a bag: that recorder was started again here, with no reading under way.
+                self.recording.forget()
+            case events.ArmStopped():
+                self.recording.take_stop()
 
-    def _temperature_c(self, stamp_s: float) -> float | None:
-        """Return the last temperature measured before a time, if that is not long ago."""
-        known = [item for item in self._temperatures if 0.0 <= stamp_s - item[0] < TEMPERATURE_S]
-        return max(known)[1] if known else None
+    def _on_pose(self, pose: events.PoseAnnounced) -> None:
+        self.recording.announced = pose
+        if pose.split not in (REFERENCE, REGISTRATION):
+            self._report_change(self._changes.leave(self.registration.T_R_N))
+        if not self.keeper.full and not self.journal.closed:
+            # Before the arm gets there: it is held where there is no room.
+            self.keeper.write(partial(self.journal.follow, pose.plan))
 
-    def _on_event(self, event: Event) -> None:
-        if (event.node, event.event) == ('pose_planner', 'pose'):
-            self._pose_tracker.take_pose(event.values)
-            if event.values['split'] not in (REFERENCE, REGISTRATION):
-                self._say_change(self._watching.leave(self.registrar.T_R_N))
-            if not self._disk.full and not self.journal.closed:
-                # Before the arm gets there: it is held where there is no room.
-                self._disk.write(partial(self.journal.follow, event.values.get('plan', '')))
-        elif (event.node, event.event) == ('recorder', BEGAN):
-            # From a bag: that recorder was started anew here, and knew of no reading under way.
-            self._taking = None
-            self._due.clear()
-        elif (event.node, event.event) == ('robot_bridge', 'stopped'):
-            # On its way: nobody knows what it will come from next.
-            self._from_q = None
-
-    def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
-        if 'sensor' in values:
-            self._liveness.node_reports(
-                values['sensor'],
-                values.get('ready') == 'yes',
-                message,
-                time.monotonic(),
-                values.get('started', ''),
-                hidden=values.get('fault') == 'marker',
-            )
-        if node == 'pose_planner':
-            self._run = run_after(self._run, values)
-            self._follow_stop(values.get('state', ''))
-        if node == 'pose_planner' and not self._busy() and not self._due:
-            state = values.get('state')
-            if state == 'complete':
-                self._disk.write(partial(self._close, 'complete'))
-            elif state == 'stopped' and self.journal.observations:
-                self._disk.write(partial(self._close, 'stopped'))
-            elif state == 'running' and self.journal.closed == 'stopped':
-                self._disk.write(self._reopen)
+    def _on_planner(self, planner: events.PlannerState) -> None:
+        self._run = planner.run_held(self._run)
+        accepted = self._changes.follow(planner.state, self._run)
+        if accepted and not self.keeper.full and not self.journal.closed:
+            self.keeper.write(self._accept_change)
+        if self.keeper.full or not self.recording.is_idle:
+            return
+        if planner.state == 'complete':
+            self.keeper.write(partial(self._close, 'complete'))
+        elif planner.state == 'stopped' and self.journal.observations:
+            self.keeper.write(partial(self._close, 'stopped'))
+        elif planner.state == 'running' and self.journal.closed == 'stopped':
+            self.keeper.write(self.keeper.reopen)
 
     # A configuration
 
-    def _on_settled(self, message: JointState) -> None:
-        try:
-            q = self._order.positions(message)
-        except InputError as error:
-            self._trouble = str(error)
-            return
-        pose, solution = self._pose_tracker.now, self._pose_tracker.which(q)
-        if pose is None or solution is None:
-            # The planner sees by the summary what is not known here, and announces it again. Or it
-            # is on its way: topics overtake each other.
-            self._unknown = q, seconds(message.header.stamp)
-            self.counts['settled_unknown'] += 1
-            self._trouble = 'settled at no joint solution of an announced pose'
-            return
-        self._unknown = None
-        # The bridge waits for an answer, but a bag at ten times the speed does not: what is read
-        # now is finished first, by the stamps of its own messages.
-        self._due.append((q, seconds(message.header.stamp), solution, pose))
-        self._take_next()
-
-    def _look_again(self) -> None:
-        """Take up a settled configuration that was not known, if the arm still stands there."""
-        pose = self._pose_tracker.now
-        if self._unknown is None or pose is None:
-            return
-        q, settled_s = self._unknown
-        since = [joints for stamp_s, joints in self._recent_joints if stamp_s > settled_s]
-        stands = all(np.max(np.abs(joints - q)) <= self.p.motion_tolerance for joints in since)
-        solution = self._pose_tracker.which(q) if stands else None
-        if solution is not None:
-            self._due.append((q, settled_s, solution, pose))
-        if solution is not None or not stands:
-            self._unknown = None
-
     def _take_next(self) -> None:
-        """Begin the reading that is due, unless one is under way."""
-        while self._due and not self._busy():
-            q, settled_s, solution, pose = self._due.popleft()
+        """Begin the reading that is due, unless one is under way or written down."""
+        while not self.keeper.full and (settled := self.recording.next()) is not None:
+            pose = settled.pose
             if self.journal.closed or not self.journal.follow(pose.plan):
                 self._trouble = (
                     'settled, but the session is closed, or was begun with another plan'
                 )
                 continue
-            known = self.journal.result(pose.pose, pose.ids[solution])
-            if known:
-                self._report(
-                    pose.stamp, solution, known, 'recorded before', registered=self._registered()
-                )
+            known = self.journal.result(pose.pose, settled.id)
+            if known is None:
+                self.recording.begin(settled)
+                self.sensors.trigger()
                 continue
-            self._take(q, settled_s, solution, pose)
-
-    def _registered(self) -> str:
-        """Whether every sensor that the arm waits for is registered, in a word."""
-        known = [name in self.registrar.T_R_N for name in self._wanted()]
-        enough = any(known) if self.p.require == 'any' else all(known)
-        return 'yes' if enough else 'no'
-
-    def _wanted(self) -> list[str]:
-        """Return the sensors that the arm waits for, or for one of them."""
-        return [name for name in self.cell.sensors if self.p.require in ('all', 'any', name)]
-
-    def _absent(self) -> dict[str, str]:
-        """Return why, for each sensor that is not there (`Liveness.absent`)."""
-        return self._liveness.absent(time.monotonic(), self._wanted())
-
-    def _take(
-        self,
-        q: FloatArray,
-        settled_s: float,
-        solution: int,
-        pose: PublishedPose,
-        future: Future | None = None,
-    ) -> None:
-        pairing = Pairing(settled_s, q, self.rules, self.p.motion_tolerance, self.p.require)
-        # Now, not when the reading is done: a stop may come in between.
-        self._taking = _Taking(pairing, solution, pose, self._from_q, future)
-        self._from_q = q
-        for stamp_s, recent in self._recent_joints:
-            pairing.add_joint_state(stamp_s, recent)
-        for sensor, reading in self._recent_readings:
-            pairing.add_reading(sensor, reading)
-        self._shots.look(pairing, self._absent())
+            registered = self.sensors.required.are_among(self.registration.T_R_N)
+            self._report(settled.recorded_before(known, registered=registered))
 
     def _look(self) -> None:
-        """Ask, give up, and say at once when a required sensor goes or comes back."""
-        absent = self._absent()
-        self._disk.look()
-        self._check_files()
-        if self._taking is not None:
-            self._shots.look(self._taking.pairing, absent)
-            self._taking.pairing.give_up(self._now, absent, self._liveness.reports)
-            self._finish_if_complete()
-        self._look_again()
+        """Trigger sensors, give up readings, and publish at once what the arm has to wait for."""
+        if self.keeper.look():
+            self.status.publish()
+        self.sensors.trigger()
+        self.sensors.give_up()
+        self._end_reading()
+        self.recording.look_again()
         self._take_next()
-        waiting_for = self._waiting_for(absent)
-        if bool(waiting_for) != self._was_waiting:
-            self._was_waiting = bool(waiting_for)
+        is_waiting = bool(self.keeper.full or self.sensors.missing())
+        if is_waiting != self._was_waiting:
+            self._was_waiting = is_waiting
             self.status.publish()
 
-    def _waiting_for(self, absent: Mapping[str, str]) -> str:
-        """Say what is missing, and why: room on the disk, required sensors; '' if nothing is."""
-        if self._disk.full:
-            return self._disk.why
-        wanted = self._wanted()
-        gone = [name for name in wanted if name in absent]
-        if not gone or (self.p.require == 'any' and len(gone) < len(wanted)):
-            return ''
-        return '; '.join(f'{name}: {absent[name]}' for name in gone)
-
-    def _finish_if_complete(self) -> None:
-        taking = self._taking
-        if taking is None or not taking.pairing.complete:
+    def _end_reading(self) -> None:
+        ended = self.recording.end(self.registration.T_R_N)
+        if ended is None:
             return
-        self._taking = None
-        taking.pairing.finish()
-        of_reference = taking.pose.split == REFERENCE
-        decided = [self._judged(item, of_reference) for item in taking.pairing.decided.values()]
-        waited_s = taking.pairing.waited_s()
-        for name, seconds_waited in waited_s.items():
-            self._waited_s[name] += seconds_waited
-        good = [item for item in decided if isinstance(item, PairedReading)]
-        bad = [item for item in decided if not isinstance(item, PairedReading)]
-        for rejection in bad:
-            self.counts[f'{rejection.sensor}_{rejection.reason}'] += 1
-        for reading in good:
-            self.counts[f'{reading.sensor}_accepted'] += 1
-        self._disk.write(partial(self._write_down, taking, good, bad, waited_s))
+        for name, waited_s in ended.waited_s.items():
+            self._waited_s[name] += waited_s
+        self.counts.update(f'{item.sensor}_{item.reason}' for item in ended.rejected)
+        self.counts.update(f'{item.sensor}_accepted' for item in ended.accepted)
+        self.keeper.write(partial(self._write_down, ended))
 
-    def _write_down(
-        self,
-        taking: _Taking,
-        good: list[PairedReading],
-        bad: list[Rejection],
-        waited_s: Mapping[str, float],
-    ) -> None:
-        """Write what became of a configuration; then, and only then, say it."""
-        why = '; '.join(f'{r.sensor}: {r.reason}: {r.detail}' for r in bad)
-        missed = [item for item in bad if item.reason not in ('not_waited', 'absent')]
-        result = 'rejected' if not good else 'partial' if missed else 'recorded'
-        number = self._write(good, taking, result, why)
-        if taking.pose.split == REGISTRATION:
-            self.registrar.add(good)
-        if taking.pose.split == REFERENCE:
-            # Before the planner hears that it may go on.
-            known, ends = self.registrar.T_R_N, taking.pose.last
-            self._say_change(self._watching.read(number, good, known, ends))
-        if taking.future is not None:
-            taking.future.set_result((good, why))
-            return
-        last = max((reading.stamp_s for reading in good), default=self._now)
-        self._report(
-            taking.pose.stamp,
-            taking.solution,
-            result,
-            why,
-            registered=self._registered(),
-            measuring_s=f'{last - taking.pairing.settled_stamp_s:.6f}',
-            **{f'waited_s_{name}': f'{waited:.3f}' for name, waited in waited_s.items()},
+    def _write_down(self, ended: EndedReading) -> None:
+        """Write what became of a configuration; publish it after that, and not before."""
+        settled, pose = ended.settled, ended.settled.pose
+        number = self.journal.write(
+            pose=pose.pose,
+            solution=settled.id,
+            split=pose.split,
+            result=ended.result,
+            reason=ended.why,
+            readings=ended.accepted,
+            from_q=ended.from_q,
+            temperatures_c=[ended.temperature_c] * len(ended.accepted),
         )
+        if pose.split == REGISTRATION:
+            self._register(ended.accepted)
+        if pose.split == REFERENCE:
+            # Before the planner learns that it may go on.
+            known = self.registration.T_R_N
+            self._report_change(self._changes.read(number, ended.accepted, known, pose.last))
+        if pose == BY_HAND:
+            if self._by_hand is not None:
+                self._by_hand.set_result(ended)
+            return
+        registered = self.sensors.required.are_among(self.registration.T_R_N)
+        self._report(ended.event(registered=registered))
         self._take_next()
 
-    def _judged(
-        self, item: PairedReading | Rejection, of_reference: bool
-    ) -> PairedReading | Rejection:
-        if isinstance(item, Rejection):
-            return item
-        T_R_N = self.registrar.T_R_N.get(item.sensor)
-        return self._plausibility.judge(item, T_R_N, anywhere=of_reference)
+    def _register(self, readings: Sequence[PairedReading]) -> None:
+        """Take readings at registration poses; publish what they register."""
+        for name in self.registration.add(readings):
+            message = transform_message(self.chain.base_link, name, self.registration.T_R_N[name])
+            message.header.stamp = self.get_clock().now().to_msg()
+            self._registrations.publish(message)
+            self.get_logger().info(f'{name} is registered; {self.registration.describe()}')
+        for name in {reading.sensor for reading in readings} & self.registration.troubles.keys():
+            self.get_logger().warning(self.registration.troubles[name])
 
-    def _write(self, good: list[PairedReading], taking: _Taking, result: str, reason: str) -> int:
-        """Write what became of one configuration; on disk when this returns."""
-        return self.journal.write(
-            pose=taking.pose.pose,
-            solution=taking.pose.ids[taking.solution],
-            split=taking.pose.split,
-            result=result,
-            reason=reason,
-            readings=good,
-            from_q=taking.from_q,
-            # Not that of this very reading: a topic of its own, it may come after the point, and
-            # a replay must write what the recording wrote.
-            temperatures_c=[self._temperature_c(taking.pairing.settled_stamp_s)] * len(good),
-        )
-
-    def _report(self, stamp: str, solution: int, result: str, why: str, **values: str) -> None:
-        self.counts[f'configurations_{result}'] += 1
-        self.status.event(
-            'configuration',
-            why or result,
-            level='ok' if result == 'recorded' else 'warn',
-            stamp=stamp,
-            solution=solution,
-            result=result,
-            reason=why,
-            **values,
-        )
+    def _report(self, end: events.ConfigurationEnded) -> None:
+        self.counts[f'configurations_{end.result}'] += 1
+        self.status.event(end)
 
     # The references
 
-    def _say_change(self, new: bool) -> None:
-        """Say what has changed at the references, and have the planner pause where it is large."""
-        watching = self._watching
-        if not new or watching.change is None:
-            return
-        text, stops = watching.describe(), watching.stops
-        if stops:
-            watching.stopped_run = self._run
-        self.get_logger().error(text)
-        self.status.event(
-            'changed',
-            text,
-            level='error' if stops else 'warn',
-            stops='yes' if stops else 'no',
-            cause=watching.change.kind,
-            size_m=f'{watching.change.size_m:.6f}',
-        )
-        self.status.publish()
-
-    def _follow_stop(self, state: str) -> None:
-        """Take it that a person has looked once another run has begun, as /remaster/collect does.
-
-        A recorder that was started again does not know which run was stopped: the one it finds
-        running is, and after a pause none.
-        """
-        watching = self._watching
-        if watching.stopped_run == '':
-            watching.stopped_run = (
-                self._run if state == 'running' else PAUSED * (state == 'paused')
-            )
-        elif (
-            watching.stopped_run not in (None, self._run)
-            and self._run
-            and not self._disk.full
-            and not self.journal.closed
-        ):
-            self._disk.write(self._accept_change)
+    def _report_change(self, new: bool) -> None:
+        """Report what has changed at the references; the planner pauses where it is large."""
+        event = self._changes.report(self._run) if new else None
+        if event is not None:
+            self.get_logger().error(event.text)
+            self.status.event(event)
+            self.status.publish()
 
     def _accept_change(self) -> None:
         self.journal.note_accepted()
-        self._watching.accept()
+        self._changes.accept()
         self.status.publish()
 
     # Registration by hand
 
     async def _on_register(self, request: Trigger.Request, response: Trigger.Response) -> Any:
         """Take the point where the arm stands now; the third point completes the registration."""
-        if self._busy():
+        if self.keeper.full or self.recording.pairing is not None:
             response.message = 'a reading is under way; try again when it is done'
             return response
-        if self._q is None:
+        if self.recording.q is None:
             response.message = 'no joint_states yet: is the robot running?'
             return response
         if self.journal.closed:
             response.message = f'the session is closed ({self.journal.closed})'
             return response
-        future: Future = Future()
-        pose = PublishedPose(BY_HAND, REGISTRATION, (0,), '')
-        self._take(self._q, self._now, 0, pose, future)
-        good, why = await future
-        response.success = bool(good)
-        response.message = why or self.registrar.describe()
+        self._by_hand = future = Future()
+        self.recording.begin_here()
+        self.sensors.trigger()
+        ended = await future
+        response.success = bool(ended.accepted)
+        response.message = ended.why or self.registration.describe()
         return response
 
     # State
 
-    def _summary(self) -> tuple[str, str, dict[str, Any]]:
-        state = 'closed' if self.journal.closed else 'measuring' if self._busy() else 'waiting'
-        now, sensors = time.monotonic(), self.cell.sensors
-        waiting_for = self._waiting_for(self._absent())
-        trouble = self._trouble or (f'waiting for {waiting_for}' if waiting_for else '')
-        trouble = trouble or self.journal.beyond_repair or self._restored
-        trouble = trouble or self._watching.describe()
-        pose, stopped = self._pose_tracker.now, self._watching.stopped_run
+    def _summary(self) -> Summary:
+        busy = self.keeper.full or self.recording.pairing is not None
+        state = 'closed' if self.journal.closed else 'measuring' if busy else 'waiting'
+        waiting_for = self.keeper.waits_for or self.sensors.missing()
+        changed, pose = self._changes.describe(), self.recording.pose
+        reasons = (
+            self._trouble,
+            f'waiting for {waiting_for}' if waiting_for else '',
+            self.journal.beyond_repair,
+            self.keeper.restored,
+            changed,
+        )
+        trouble = next(filter(None, reasons), '')
         values = {
-            'state': state,
-            'exit_status': self.journal.closed,
-            'session': self.p.session,
-            'observations': self.journal.observations,
-            # By these the planner, or one that was started again, takes up where this one is.
-            'pose': '' if pose is None else pose.stamp,
-            'plan': self.journal.plan_id,
-            'run': self._run,
-            'decided': self.journal.decided(),
-            'registration': self.registrar.describe(),
-            'require': self.p.require,
-            'waiting_for': waiting_for,
             **{f'waited_s_{name}': f'{s:.1f}' for name, s in self._waited_s.items()},
-            **{f'read_age_s_{n}': f'{self._liveness.read_age_s(n, now):.1f}' for n in sensors},
-            'bag_dropped': self._bag.dropped,
-            'restored': self._restored,
-            'changed': self._watching.describe(),
-            'changed_run': 'none' if stopped is None else stopped or 'unknown',
-            'reference_rounds': self._watching.rounds,
+            'bag_dropped': self.keeper.bag.dropped,
+            'restored': self.keeper.restored,
+            'reference_rounds': self._changes.rounds,
+            **{f'{name}_not_finite': n for name, n in self.sensors.not_finite.items()},
             **dict(sorted(self.counts.items())),
         }
-        return ('warn' if trouble else 'ok'), trouble or state, values
-
-    # The disk
-
-    def _busy(self) -> bool:
-        """Whether a configuration is being read or written down."""
-        return self._taking is not None or bool(self._disk.full)
-
-    def _check_files(self) -> None:
-        """Notice within a second or two what others did to the session's files."""
-        if time.monotonic() - self._checked_wall < CHECK_S:
-            return
-        self._checked_wall = time.monotonic()
-        if not self._disk.full:
-            self._disk.write(self.journal.check)
-        self._say_restored()
-
-    def _say_restored(self) -> None:
-        for line in self.journal.take_restored():
-            self.get_logger().error(line)
-            self._restored = line
-            self.status.publish()
-
-    def _reopen(self) -> None:
-        self.journal.reopen()
-        self._bag.reopen()
+        report = events.RecorderState(
+            state=state,
+            exit_status=self.journal.closed,
+            session=self.p.session,
+            observations=self.journal.observations,
+            pose='' if pose is None else pose.stamp,
+            plan=self.journal.plan_id,
+            run=self._run,
+            decided=self.journal.decided(),
+            registration=self.registration.describe(),
+            require=self.p.require,
+            waiting_for=waiting_for,
+            read_age_s=self.sensors.read_age_s(),
+            changed=changed,
+            changed_run=self._changes.stopped_run,
+        )
+        return Summary('warn' if trouble else 'ok', trouble or state, values, report)
 
     def _close(self, exit_status: ExitStatus) -> None:
-        if not self.journal.closed:
-            self._say_change(self._watching.judge(self.registrar.T_R_N))
-            self.journal.close(exit_status)
-            self._say_restored()
-            if self.journal.closed != exit_status:
-                self.get_logger().error(
-                    f'the session is closed as {self.journal.closed}, not as {exit_status}: '
-                    f'{self.journal.beyond_repair}; its observations are all there'
-                )
-            self._bag.close()
-            waited = ', '.join(f'{name} {s:.1f} s' for name, s in self._waited_s.items())
-            self.get_logger().info(f'the arm stood waiting for {waited}')
-            self.status.publish()
+        if self.journal.closed:
+            return
+        self._report_change(self._changes.judge(self.registration.T_R_N))
+        self.keeper.close(exit_status)
+        waited = ', '.join(f'{name} {s:.1f} s' for name, s in self._waited_s.items())
+        self.get_logger().info(f'the arm stood waiting for {waited}')
+        self.status.publish()
 
     def close(self) -> None:
         """Close the session; what is recorded so far stays readable."""
-        if self._taking is not None and self._taking.future is not None:
-            self._taking.future.cancel()
+        if self._by_hand is not None:
+            self._by_hand.cancel()
         try:
             self._close('stopped')
         except DiskError as error:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
 
 from remaster_ros.collection.pairing import SensorRules
 from remaster_ros.nodes.parameters import parameter
 from remaster_ros.session.workcell import Workcell
+from remaster_ros.types import Measurements, Session
 
 
 @dataclass(frozen=True)
@@ -74,4 +78,20 @@ def sensor_rules(cell: Workcell, p: Parameters) -> tuple[SensorRules, ...]:
             timeout_s=p.shot_timeout_s if sensor.single_shot else p.stream_timeout_s,
         )
         for name, sensor in cell.sensors.items()
+    )
+
+
+def session_header(cell: Workcell, settle_s: float) -> Session:
+    """Return a session of this cell without observations."""
+    chain = cell.chain()
+    return Session(
+        urdf=cell.urdf_text,
+        base_link=chain.base_link,
+        tip_link=chain.tip_link,
+        markers={name: np.array(position) for name, position in cell.markers.items()},
+        sensors={name: sensor.marker for name, sensor in cell.sensors.items()},
+        measurements=Measurements.empty(len(chain)),
+        marker_std_m=cell.marker_std_m,
+        settle_s=settle_s,
+        created=datetime.now(UTC).isoformat(timespec='seconds'),
     )

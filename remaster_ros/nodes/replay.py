@@ -20,8 +20,10 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from remaster_ros.errors import InputError, RemasterError
 from remaster_ros.nodes.messages import stamp_of
+from remaster_ros.nodes.old_bags import records_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.status import EVENTS
 from remaster_ros.nodes.status import TOPIC as STATUS
 from remaster_ros.session.bag import LATCHED_TOPICS, RECORDED, BagReader, live_name
 
@@ -86,6 +88,12 @@ class Replay(RemasterNode):
             left_out = name == COMMANDS and not self.p.with_commands
             if not left_out and (topic != CLOCK or self._clock_publisher is None):
                 self._publishers_by_topic[topic] = self._publisher(name, type_name)
+        # Bags of older versions have the events among the status messages.
+        self._old_events = (
+            self._publisher(f'/{EVENTS}', 'std_msgs/msg/String')
+            if f'/{EVENTS}' not in self._reader.topics
+            else None
+        )
         self._thread = threading.Thread(target=self._play, daemon=True)
         self._thread.start()
 
@@ -184,6 +192,9 @@ class Replay(RemasterNode):
                     self._look_who_listens(publisher)
                 publisher.publish(data)
                 self.sent += 1
+            if self._old_events is not None and topic == f'/{STATUS}':
+                for message in records_of(data):
+                    self._old_events.publish(message)
         self.get_logger().info(f'{self.sent} messages published')
 
     def _publish_clock(self, time_ns: float) -> None:

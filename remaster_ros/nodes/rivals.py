@@ -1,8 +1,8 @@
-"""Who else publishes on a topic that moves the arm, or that tells where it is.
+"""Who else publishes on a topic that moves the arm, or that reports where it is.
 
 The graph lists the publishers of a killed process for some 20 s more. Those with a liveliness
-lease (ours have one) are told from the living by the lease: where several are listed, a
-subscription that asks for the lease counts those that are alive. Publishers without one count as
+lease (ours have one) are distinguished from the living by the lease: where several are listed, a
+subscription that requires the lease counts those that are alive. Publishers without one count as
 long as they are listed: a driver that was killed is gone for good, or was started again, and then
 a person has to look at the arm anyway.
 """
@@ -66,7 +66,7 @@ class OnlyPublisher:
     def _count(self) -> None:
         """Begin to count those that are alive.
 
-        It is never ended: Fast DDS tells a subscription that is made again nothing of publishers
+        It is never ended: Fast DDS reports to a subscription that is made again no publishers
         whose lease it has seen before.
         """
         if self._counter is None:

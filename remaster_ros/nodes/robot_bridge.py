@@ -1,4 +1,4 @@
-"""Command the joint solutions of a pose one by one; tell when the arm has settled.
+"""Command the joint solutions of a pose one by one; publish when the arm has settled.
 
 Every command comes from the motion gate (`remaster_ros.motion`); this is the ROS shell of its
 rules. After a configuration has settled the arm stays until the recorder has answered what became
@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,8 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from remaster_ros.collection import events
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.actions import (
     Action,
     CheckPath,
@@ -33,31 +34,35 @@ from remaster_ros.motion.actions import (
 )
 from remaster_ros.motion.arm_supervisor import ArmSupervisor
 from remaster_ros.motion.joint_reports import JointReport, JointReports
-from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import Admitted, MotionGate
 from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.motion.path_search import PathSearch
 from remaster_ros.nodes.background import Background
 from remaster_ros.nodes.bridge_parameters import Parameters
 from remaster_ros.nodes.emergency_link import EmergencyLink
-from remaster_ros.nodes.messages import JointOrder, duration_of, seconds, stamp_key, stamp_of
+from remaster_ros.nodes.messages import (
+    JointOrder,
+    duration_of,
+    seconds,
+    solutions_of,
+    stamp_key,
+    stamp_of,
+)
 from remaster_ros.nodes.parameters import declare
-from remaster_ros.nodes.pose_tracker import waypoints_by_solution
 from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import LEASED, RELIABLE, Event, NodeStatus, listen
-from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
+from remaster_ros.nodes.status import LEASED, RELIABLE, NodeStatus, Summary, listen
+from remaster_ros.nodes.waypoints import waypoints_by_solution
 from remaster_ros.sensors.registry import kind_of
 from remaster_ros.session.halt_file import HaltFile
 from remaster_ros.session.workcell import read_cell
-from remaster_ros.types import FloatArray
 
 COMMANDS = 'joint_trajectory_controller/joint_trajectory'
 JOINTS = 'joint_states'
 SOLUTIONS = 'remaster/joint_solutions'
 WAYPOINTS = 'remaster/joint_waypoints'
 NEWEST_STATES = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""A bridge that is kept busy drops what is old: it has to know where the arm is now."""
+"""A bridge that is kept busy drops what is old: it needs where the arm is now."""
 MATCHED_WALL_S = 0.5
 """So much later than ours the controller's side of a DDS match may come."""
 LATE_WALL_S = {Stop: 0.1, Drive: 0.5}
@@ -68,12 +73,8 @@ longer with it, a paused process may not.
 """
 WATCH_WALL_S = 0.05
 """How often silence and the graph are looked at."""
-KNOWN_OFFSET_RAD = float(np.deg2rad(0.1))
-"""What may still be wrong with a joint whose offset is in use, for the clearance of paths."""
-OFFSET_STDS = 3.0
-"""Or so many standard deviations of the offset that is known least."""
 LISTENERS = ('robot_bridge', 'recorder')
-"""Nodes of ours that listen to what a controller is told; those of sensors do so as well."""
+"""Nodes of this package that subscribe to the commands; those of sensors do so as well."""
 
 
 class RobotBridge(RemasterNode):
@@ -90,16 +91,16 @@ class RobotBridge(RemasterNode):
         cell = read_cell(self.p.cell)
         self.chain = cell.chain()
         self._order = JointOrder(self.chain.joint_names)
-        offsets, unknown_rad = self._offsets(self.chain)
+        offsets, unknown_rad = self.p.known_offsets(self.chain)
         # Paths are checked where the arm is, not where its encoders put it.
         true_arm = self.chain if offsets is None else self.chain.with_offsets(offsets)
         model = cell.collision_model(true_arm, unknown_rad)
         speeds = PointSpeeds(true_arm, model.extent_points)
+        self._offsets = offsets
         self._acceleration = cell.acceleration_limits(self.chain)
-        self._limits = partial(self._make_limits, offsets)
         self._halt_file = HaltFile(self.get_fully_qualified_name())
         self.supervisor = ArmSupervisor(
-            MotionGate(self._limits(self.p), speeds),
+            MotionGate(self.p.limits(self.chain, offsets, self._acceleration), speeds),
             JointReports(self.chain.lower, self.chain.upper, self.chain.velocity_limits),
             self.p.rules(),
             self._halt_file.read(),
@@ -115,7 +116,7 @@ class RobotBridge(RemasterNode):
         # Since when a controller listens; a command before that would be lost.
         self._listened_wall: float | None = None
         self._settled = self.create_publisher(JointState, 'remaster/settled', RELIABLE)
-        self.status = NodeStatus(self, self._summary)
+        self.status = NodeStatus(self, self._summary, Path(cell.robot.urdf).stem)
         self.create_subscription(JointState, JOINTS, self._on_joint_state, NEWEST_STATES)
         self.create_subscription(JointTrajectory, WAYPOINTS, self._on_waypoints, RELIABLE)
         self.create_subscription(JointTrajectory, SOLUTIONS, self._on_solutions, RELIABLE)
@@ -132,7 +133,7 @@ class RobotBridge(RemasterNode):
             )
         ]
         self.create_service(Trigger, 'remaster/clear_halt', self._on_clear_halt)
-        listen(self, self._on_event, self._on_summary)
+        listen(self, self._on_record)
         self.create_timer(WATCH_WALL_S, self._watch, clock=self.status.steady)
         if self.supervisor.halted:
             self.get_logger().error(f'halted: {self.supervisor.halted}')
@@ -144,33 +145,11 @@ class RobotBridge(RemasterNode):
                 'limit the speed of the arm'
             )
 
-    def _offsets(self, chain: SerialChain) -> tuple[FloatArray | None, float | None]:
-        """Return the offsets in use, rad, (k,), and what a joint's may still be off by, rad.
-
-        What a fit could not tell counts as no offset, and as little is known of it as before: the
-        clearance of the cell file remains then (None).
-        """
-        if not self.p.offsets:
-            return None, None
-        offsets, std = joint_offsets_rad(read_fit(self.p.offsets), chain.joint_names)
-        told = std > 0.0
-        unknown = max(KNOWN_OFFSET_RAD, OFFSET_STDS * float(np.max(std))) if told.all() else None
-        return np.where(told, offsets, 0.0), unknown
-
-    def _make_limits(self, offsets: FloatArray | None, p: Parameters) -> MotionLimits:
-        return MotionLimits.of(
-            self.chain,
-            p.speed_share,
-            offsets,
-            self._acceleration,
-            p.cartesian_speed_limit_m_s or np.inf,
-            float(np.deg2rad(p.limit_margin_deg)),
-        )
-
     def _on_parameters(self, p: Parameters) -> None:
         """Go on with other speeds."""
         self.p = p
-        self._do(self.supervisor.use_limits(self._limits(p), time.monotonic()))
+        limits = p.limits(self.chain, self._offsets, self._acceleration)
+        self._do(self.supervisor.use_limits(limits, time.monotonic()))
         self.get_logger().info(
             f'speed_share is {p.speed_share:g}, cartesian_speed_limit_m_s '
             f'{p.cartesian_speed_limit_m_s:g}'
@@ -178,30 +157,25 @@ class RobotBridge(RemasterNode):
 
     # What comes in
 
-    def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
+    def _on_record(self, record: events.EventRecord) -> None:
         now = time.monotonic()
-        if node == 'pose_planner':
-            state = values.get('state', 'unknown')
-            if state == 'running':
-                # By it a planner that is started again sees that this bridge was there all along.
-                self._run = values.get('run', '')
-            self._do(self.supervisor.planner_is(state, now, values.get('run', '')))
-        elif node == 'recorder':
-            self._do(self.supervisor.recorder_waits(values.get('waiting_for', ''), now))
-
-    def _on_event(self, event: Event) -> None:
-        if (event.node, event.event) != ('recorder', 'configuration'):
-            return
-        solution = event.values.get('solution', '')
-        if event.values.get('stamp') == self._pose_stamp and solution.isdecimal():
-            self._do(self.supervisor.answered(int(solution), time.monotonic()))
+        match record.body:
+            case events.PlannerState(state=state, run=run):
+                if state == 'running':
+                    # By it a planner that is started again sees that this bridge was there.
+                    self._run = run
+                self._do(self.supervisor.planner_is(state, now, run))
+            case events.RecorderState(waiting_for=waiting_for):
+                self._do(self.supervisor.recorder_waits(waiting_for, now))
+            case events.ConfigurationEnded(stamp=self._pose_stamp, solution=solution):
+                self._do(self.supervisor.answered(solution, now))
 
     def _on_waypoints(self, message: JointTrajectory) -> None:
         self._waypoints = message
 
     def _on_solutions(self, message: JointTrajectory) -> None:
         try:
-            targets = self._targets(message)
+            targets = solutions_of(message, self.chain.joint_names)
             belongs = self._waypoints.header.stamp == message.header.stamp
             names = self.chain.joint_names
             waypoints = waypoints_by_solution(self._waypoints, names) if belongs else {}
@@ -210,19 +184,6 @@ class RobotBridge(RemasterNode):
             return
         self._pose_stamp = stamp_key(message.header.stamp)
         self._do(self.supervisor.plan(targets, time.monotonic(), waypoints))
-
-    def _targets(self, message: JointTrajectory) -> FloatArray:
-        """Return the solutions by the names of the cell's joints, rad, (m, k)."""
-        names, given = self.chain.joint_names, list(message.joint_names)
-        if not message.points:
-            # A stop, whatever joints it names.
-            return np.empty((0, len(names)))
-        if not set(names) <= set(given):
-            raise InputError(f'they are for {", ".join(given)}, the cell has {", ".join(names)}')
-        if any(len(point.positions) != len(given) for point in message.points):
-            raise InputError(f'a point has not as many positions as joints, {len(given)}')
-        columns = [given.index(name) for name in names]
-        return np.array([point.positions for point in message.points])[:, columns]
 
     def _on_joint_state(self, message: JointState) -> None:
         now = time.monotonic()
@@ -246,7 +207,7 @@ class RobotBridge(RemasterNode):
         response.message = refusal or 'cleared; /remaster/collect goes on'
         if not refusal:
             self._disk.submit(self._halt_file.clear, self._on_written)
-            self._event('halt_cleared', 'the halt was cleared by a person')
+            self.status.event(events.HaltCleared(stamp=self._pose_stamp))
             self.status.publish()
         return response
 
@@ -300,16 +261,20 @@ class RobotBridge(RemasterNode):
                 case Stop(admitted, reason):
                     self._publish(admitted)
                     self.counts['stopped'] += 1
-                    self._event('stopped', reason, 'warn')
+                    self.status.event(events.ArmStopped(stamp=self._pose_stamp, reason=reason))
                     self.get_logger().info(f'stopping the arm: {reason}')
                 case Settled():
                     self._announce(action)
                 case Failed(solution, reason):
                     self.counts['failed'] += 1
-                    self._event('failed', reason, 'warn', solution=solution, reason=reason)
+                    self.status.event(
+                        events.SolutionFailed(
+                            stamp=self._pose_stamp, solution=solution, reason=reason
+                        )
+                    )
                 case Halted(reason):
                     self._disk.submit(partial(self._halt_file.write, reason), self._on_written)
-                    self._event('halted', reason, 'error')
+                    self.status.event(events.ArmHalted(stamp=self._pose_stamp, reason=reason))
                     self.status.publish()
                     self.get_logger().error(f'halted: {reason}')
 
@@ -332,11 +297,12 @@ class RobotBridge(RemasterNode):
         if solution < 0:
             return
         self.counts['commanded'] += 1
-        self._event(
-            'commanded',
-            f'solution {solution} commanded',
-            solution=solution,
-            since_settled_wall_s=f'{time.monotonic() - self._settled_wall:.6f}',
+        self.status.event(
+            events.SolutionCommanded(
+                stamp=self._pose_stamp,
+                solution=solution,
+                since_settled_wall_s=time.monotonic() - self._settled_wall,
+            )
         )
 
     def _on_path(self, number: int, answer: PathAnswer | Exception) -> None:
@@ -355,35 +321,35 @@ class RobotBridge(RemasterNode):
         message = JointState(name=list(self.chain.joint_names), position=settled.q.tolist())
         message.header.stamp = stamp_of(settled.stamp_s)
         self._settled.publish(message)
-        self._event(
-            'settled',
-            f'solution {settled.solution} settled',
-            solution=settled.solution,
-            motion_s=f'{settled.motion_s:.6f}',
-            settle_s=f'{settled.settle_s:.6f}',
+        self.status.event(
+            events.SolutionSettled(
+                stamp=self._pose_stamp,
+                solution=settled.solution,
+                motion_s=settled.motion_s,
+                settle_s=settled.settle_s,
+            )
         )
 
-    def _event(self, event: str, message: str, level: str = 'ok', **values: Any) -> None:
-        self.status.event(event, message, level=level, stamp=self._pose_stamp, **values)
-
-    def _summary(self) -> tuple[str, str, dict[str, Any]]:
+    def _summary(self) -> Summary:
         supervisor, now = self.supervisor, time.monotonic()
         blocked = supervisor.blocked(now)
         text = 'moving or measuring' if supervisor.busy else 'waiting for a pose'
         refused = supervisor.reports.refused
         values = {
             **self.counts,
-            'halted': supervisor.halted,
-            'joints_age_s': f'{supervisor.report_age_s(now):.1f}',
-            'joints_trouble': supervisor.trouble,
             **{f'joints_refused_{reason}': count for reason, count in sorted(refused.items())},
             'moves_refused': supervisor.gate.refused,
-            # By it the planner sees whether a bridge that was started again knows the pose.
-            'pose': self._pose_stamp,
-            'run': self._run,
         }
+        age_s = supervisor.report_age_s(now)
+        state = events.BridgeState(
+            halted=supervisor.halted,
+            pose=self._pose_stamp,
+            run=self._run,
+            joints_age_s=age_s if np.isfinite(age_s) else None,
+            joints_trouble=supervisor.trouble,
+        )
         level = 'error' if supervisor.halted else 'warn' if blocked else 'ok'
-        return level, blocked or text, values
+        return Summary(level, blocked or text, values, state)
 
     def close(self) -> None:
         """Leave the arm standing still."""

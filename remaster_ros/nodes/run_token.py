@@ -1,8 +1,8 @@
 """The token of a collection under way, and the sign of life of the planner that runs it.
 
 A planner that was killed may go on by itself only where it is certain that the same collection is
-still under way: the same boot of this computer, a short time by a clock that nobody sets, and
-recorder and bridge that hold the token in memory. Dates of files say nothing of that.
+still under way: the same boot of this computer, a short time by a clock that cannot be set, and
+recorder and bridge that hold the token in memory. Dates of files prove nothing of that.
 """
 
 from __future__ import annotations
@@ -29,13 +29,18 @@ def since_boot_s() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
+def new_token() -> str:
+    """Return a token for a run that begins now."""
+    return uuid.uuid4().hex[:12]
+
+
 class LivingRun:
     """A run under way in this process; its sign of life is a file outside of every session.
 
     Parameters
     ----------
     token
-        Of the run to go on with; empty for a new one.
+        Names the run.
 
     Attributes
     ----------
@@ -43,13 +48,13 @@ class LivingRun:
         The run's name.
     """
 
-    def __init__(self, token: str = '') -> None:
-        self.token = token or uuid.uuid4().hex[:12]
+    def __init__(self, token: str) -> None:
+        self.token = token
         self._renewed = float('-inf')
         self.stay_alive()
 
     def stay_alive(self) -> None:
-        """Renew the sign of life, at most once a second; where it cannot be, nobody goes on."""
+        """Renew the sign of life, at most once a second; where that fails, no planner goes on."""
         now = since_boot_s()
         if now - self._renewed < ALIVE_S:
             return
@@ -62,7 +67,7 @@ class LivingRun:
             os.replace(new, path)
 
     def end(self) -> None:
-        """Let nobody go on with this run."""
+        """End the run: no planner goes on with it."""
         with contextlib.suppress(OSError):
             _path(self.token).unlink()
 

@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from functools import wraps
 from typing import Any
 
@@ -50,7 +50,7 @@ class RemasterNode(Node):
     outlives_faults
         True for a node that a fault of this program in one of its services does not end. It is
         ended otherwise: a node that others count on is better gone, which they notice and hold
-        the arm for, than there in a state that nobody has thought of.
+        the arm for, than there in an unforeseen state.
     """
 
     failure: RemasterError | None = None
@@ -67,7 +67,7 @@ class RemasterNode(Node):
         self._name_lock.release()
 
     # rclpy gives every endpoint an event handler that only warns of QoS mismatches, and looks at
-    # each of them for every message: half of what a message costs. The status says now and then
+    # each of them for every message: half of what a message costs. The status shows now and then
     # what the graph shows not to match (`qos_mismatch`).
 
     def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
@@ -92,11 +92,10 @@ class RemasterNode(Node):
         """
         if srv_type is not Trigger:  # Those of rclpy itself, for parameters.
             return super().create_service(srv_type, srv_name, callback, **kwargs)
-        serve = _answering_later if inspect.iscoroutinefunction(callback) else _answering
-        return super().create_service(srv_type, srv_name, serve(self, callback), **kwargs)
+        return super().create_service(srv_type, srv_name, _answering(self, callback), **kwargs)
 
     def failed(self, error: Exception, response: Any) -> Any:
-        """Return a Trigger response that says why a service has failed, in one line."""
+        """Return a Trigger response with the reason why a service has failed, in one line."""
         response.success, response.message = False, str(error)
         if not isinstance(error, RemasterError):
             fault = fault_of_this_program(error)
@@ -112,7 +111,7 @@ class RemasterNode(Node):
 
     @property
     def clock_trouble(self) -> str:
-        """Why the node's clock says nothing: a simulated one that has not been heard; ''."""
+        """Why the node's clock has no time: a simulated one that was not received yet; ''."""
         if self.get_clock().now().nanoseconds > 0:
             return ''
         topic = self.resolve_topic_name('/clock')
@@ -125,7 +124,7 @@ class RemasterNode(Node):
 
 
 def fault_of_this_program(error: Exception) -> RemasterError:
-    """Return what to say of an exception that nobody has thought of."""
+    """Return the error to report for an exception that was not foreseen."""
     if os.environ.get(TRACEBACK):
         traceback.print_exception(error)
     return RemasterError(
@@ -135,27 +134,13 @@ def fault_of_this_program(error: Exception) -> RemasterError:
 
 
 def _answering(node: RemasterNode, callback: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the callback of a service with `RemasterNode.failed` where it raises."""
-
-    @wraps(callback)
-    def serve(request: Any, response: Any) -> Any:
-        try:
-            return callback(request, response)
-        except Exception as error:
-            return node.failed(error, response)
-
-    return serve
-
-
-def _answering_later(
-    node: RemasterNode, callback: Callable[..., Awaitable[Any]]
-) -> Callable[..., Awaitable[Any]]:
-    """Return the same of a callback that waits for others."""
+    """Return the callback of a service, one that waits for others or not, with `failed`."""
 
     @wraps(callback)
     async def serve(request: Any, response: Any) -> Any:
         try:
-            return await callback(request, response)
+            answer = callback(request, response)
+            return await answer if inspect.isawaitable(answer) else answer
         except Exception as error:
             return node.failed(error, response)
 
@@ -222,7 +207,7 @@ def run(
 
 
 def report(error: RemasterError) -> int:
-    """Print an error as one line on stderr; return the exit status it asks for.
+    """Print an error as one line on stderr; return its exit status.
 
     2 for wrong usage, bad input or a device that does not do its part; 1 where the data do not
     allow an answer.

@@ -10,17 +10,17 @@ from __future__ import annotations
 import threading
 import time
 from functools import partial
-from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PointStamped
 
+from remaster_ros.collection.events import SensorReport
 from remaster_ros.errors import DeviceError, InputError, RemasterError
 from remaster_ros.nodes.measure_service import MeasureService
 from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.running import RemasterNode, fault_of_this_program, run
-from remaster_ros.nodes.status import RELIABLE, NodeStatus
+from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary
 from remaster_ros.sensors.driver import SensorClock, StreamDriver, TriggeredDriver
 from remaster_ros.sensors.registry import kind_of, load_driver
 from remaster_ros.session.workcell import read_cell
@@ -86,7 +86,7 @@ class SensorNode(RemasterNode):
             self._step = MeasureService(self, self.driver, cell, self._ending).step
         elif isinstance(self.driver, StreamDriver):
             self._step = partial(self._read, self.driver)
-        self.status = NodeStatus(self, self._summary)
+        self.status = NodeStatus(self, self._summary, self.sensor)
         self._thread = threading.Thread(target=self._work, name=self.sensor, daemon=True)
         self._thread.start()
 
@@ -158,7 +158,7 @@ class SensorNode(RemasterNode):
         self._readings.publish(message)
         self.published += 1
 
-    def _summary(self) -> tuple[str, str, dict[str, Any]]:
+    def _summary(self) -> Summary:
         state = self.driver.state()
         open_now = self.driver.phase == 'ready' and self.driver.connected
         trouble, level = state.trouble, state.level
@@ -167,15 +167,15 @@ class SensorNode(RemasterNode):
         if self.clock_trouble:
             trouble, level = self.clock_trouble, 'error'
         ready = open_now and state.ready and not self.clock_trouble
-        values = {
-            'sensor': self.sensor,
-            'ready': 'yes' if ready else 'no',
-            'trouble': trouble,
-            'state': self.driver.phase,
-            'published': self.published,
-            **state.values,
-        }
-        return level, trouble or state.message, values
+        report = SensorReport(
+            sensor=self.sensor,
+            ready=ready,
+            trouble=trouble,
+            message=trouble or state.message,
+            hidden=state.values.get('fault') == 'marker',
+        )
+        values = {'state': self.driver.phase, 'published': self.published, **state.values}
+        return Summary(level, report.message, values, report)
 
     def close(self) -> None:
         """Disconnect from the device."""

@@ -1,9 +1,8 @@
-"""remaster/status: every node's state, counts and reasons, and the events of a configuration.
+"""How a node reports: records to the other nodes, and its state to people.
 
-A DiagnosticArray carries either a node's *summary* (name = the node; published twice a second and
-at each change; what rqt_robot_monitor shows) or an *event* (name = ``node: event``), by which the
-nodes keep step: the planner announces a pose, the bridge and the recorder say what became of each
-of its joint solutions. Events are identified by the pose's stamp and the solution's number.
+`remaster/events` carries the records of `remaster_ros.collection.events`, on which the nodes act.
+`remaster/status` and `diagnostics` show people the same states, with counts and reasons; no node
+reads them.
 """
 
 from __future__ import annotations
@@ -11,22 +10,35 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import msgspec
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
 
+from remaster_ros.collection.events import (
+    STATES,
+    Alive,
+    Event,
+    EventRecord,
+    State,
+    decode,
+    encode,
+)
 from remaster_ros.errors import InputError
 from remaster_ros.motion.rivalry import DuplicateNodeCheck
 from remaster_ros.nodes.qos_mismatch import mismatches
 from remaster_ros.session.bag_metadata import LATCHED_DEPTH
 
 TOPIC = 'remaster/status'
+EVENTS = 'remaster/events'
+DIAGNOSTICS = 'diagnostics'
+"""Relative like every name: a cell in a namespace has its own, for an aggregator of its own."""
 RELIABLE = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 JOINT_STATES = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Of subscribers of joint_states: it matches reliable and best-effort publishers alike, and keeps
@@ -44,6 +56,10 @@ LEASED = QoSProfile(
 )
 """Of publishers whose commands move the arm: a killed one stays in the graph for some 20 s, but is
 no longer alive for its subscribers 2 s after its end."""
+STATE_EVERY_S = 0.5
+"""How often the state is published without a change, wall time: a node that starts late has it
+then, and a node that is silent for longer than its heartbeat is missed."""
+DIAGNOSTICS_EVERY_S = 1.0
 QOS_EVERY_S = 3.0
 """How often the graph is looked at for endpoints that do not match, wall time."""
 LEVELS = {
@@ -53,55 +69,73 @@ LEVELS = {
 }
 
 
-@dataclass(frozen=True)
-class Event:
-    """One event: which node, what happened, in words, with values."""
+class Summary(NamedTuple):
+    """What a node reports of itself now.
 
-    node: str
-    event: str
+    Attributes
+    ----------
+    level
+        ``ok``, ``warn`` or ``error``.
+    message
+        For people.
+    values
+        Counts and settings, for people.
+    state
+        For the other nodes; people are shown its fields too.
+    """
+
+    level: str
     message: str
-    values: dict[str, str]
+    values: Mapping[str, Any]
+    state: State = Alive()
 
 
 class NodeStatus:
-    """Publish a node's summary and events; end the node where another of its name is longer there.
+    """Publish a node's state and events; end the node where another of its name is longer there.
 
     Parameters
     ----------
     node
         The node that reports. Its `failure` is set where it must end.
     summary
-        Returns (level, message, values) now; level is ``ok``, ``warn`` or ``error``.
+        Returns what to report now.
+    hardware_id
+        In /diagnostics: the device that the node is for.
     """
 
-    def __init__(self, node: Node, summary: Callable[[], tuple[str, str, dict[str, Any]]]) -> None:
-        self._node = node
-        self._summary = summary
-        # Tells a node that was started again from the one before it.
+    def __init__(
+        self, node: Node, summary: Callable[[], Summary], hardware_id: str = 'none'
+    ) -> None:
+        self._node, self._summary, self._hardware_id = node, summary, hardware_id
+        # Distinguishes a node that was started again from the one before it.
         self._started, self._started_wall = str(time.time_ns()), time.monotonic()
         self._duplicates = DuplicateNodeCheck(self._started)
+        self._events = node.create_publisher(String, EVENTS, RELIABLE)
         self._publisher = node.create_publisher(DiagnosticArray, TOPIC, RELIABLE)
+        self._diagnostics = node.create_publisher(DiagnosticArray, DIAGNOSTICS, RELIABLE)
         # Where the executor has threads, heartbeats go on while a callback plans or writes.
         group = MutuallyExclusiveCallbackGroup()
         # What is published last must have been true last.
         self._order = threading.Lock()
         # A wall timer: status must go on when the simulated clock stands still.
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(0.5, self.publish, callback_group=group, clock=self.steady)
         self._qos_trouble = ''
-        self._qos_timer = node.create_timer(
-            QOS_EVERY_S, self._look_at_qos, callback_group=group, clock=self.steady
-        )
-        receive = receiver(lambda event: None, self._on_summary)
-        node.create_subscription(DiagnosticArray, TOPIC, receive, RELIABLE, callback_group=group)
+        for period_s, callback in (
+            (STATE_EVERY_S, self.publish),
+            (DIAGNOSTICS_EVERY_S, self._publish_diagnostics),
+            (QOS_EVERY_S, self._look_at_qos),
+        ):
+            node.create_timer(period_s, callback, callback_group=group, clock=self.steady)
+        receive = receiver(node, self._on_record)
+        node.create_subscription(String, EVENTS, receive, RELIABLE, callback_group=group)
 
     @property
     def alone_since(self) -> float | None:
-        """Since when no other of this name was heard, `time.monotonic`; None where not yet."""
+        """Since when no other of this name was found, `time.monotonic`; None where not yet."""
         return self._duplicates.alone_since_s
 
     def alone(self, now: float) -> bool:
-        """Whether this node has listened for 1.5 s and heard of no other of its name.
+        """Whether this node has listened for 1.5 s and found no other of its name.
 
         Parameters
         ----------
@@ -113,23 +147,19 @@ class NodeStatus:
     def _look_at_qos(self) -> None:
         self._qos_trouble = mismatches(self._node)
 
-    def _on_summary(self, name: str, message: str, values: dict[str, str]) -> None:
+    def _on_record(self, record: EventRecord) -> None:
         own = self._node.get_fully_qualified_name()
-        started = values.get('started', '')
-        if name != self._node.get_name() or values.get('node', own) != own or not started:
+        if record.node != own or not record.started or not isinstance(record.body, STATES):
             return
         now = time.monotonic()
-        if started == self._started:
+        if record.started == self._started:
             self._duplicates.update_own(now)
             return
-        try:
-            uptime_s = float(values['uptime_s'])
-        except (KeyError, ValueError):
-            return
-        # A replay publishes what a node of this name once said, and is another node.
+        # A replay publishes the records of a node of this name, and is another node.
         if self._namesakes() < 2:
             return
-        if self._duplicates.update_other(started, uptime_s, now - self._started_wall, now):
+        uptime_s = record.uptime_s
+        if self._duplicates.update_other(record.started, uptime_s, now - self._started_wall, now):
             self._node.failure = InputError(  # type: ignore[attr-defined]
                 f'{own} is running already in this ROS domain, for {uptime_s:.0f} s, on another '
                 'computer or for another user; end that one, or give this one a namespace '
@@ -137,87 +167,131 @@ class NodeStatus:
             )
 
     def _namesakes(self) -> int:
-        """Return how many publishers of this topic are of nodes with this node's name."""
+        """Return how many publishers of the records are of nodes with this node's name."""
         own = self._node.get_name(), self._node.get_namespace()
-        found = self._node.get_publishers_info_by_topic(self._publisher.topic_name)
+        found = self._node.get_publishers_info_by_topic(self._events.topic_name)
         return sum((info.node_name, info.node_namespace) == own for info in found)
 
     def publish(self) -> None:
-        """Publish the summary now; from any thread."""
+        """Publish the state now; from any thread."""
         with self._order:
-            level, message, values = self._summary()
-            if self._qos_trouble and level == 'ok':
-                level, message = 'warn', self._qos_trouble
-            own = {
-                'qos_trouble': self._qos_trouble,
-                'node': self._node.get_fully_qualified_name(),
-                'started': self._started,
-                'uptime_s': f'{time.monotonic() - self._started_wall:.3f}',
-            }
-            self._send(self._node.get_name(), level, message, {**values, **own})
+            summary = self._summary()
+            self._publish_record(summary.state)
+            self._publish_status(self._publisher, summary)
 
-    def event(self, event: str, message: str, level: str = 'ok', **values: Any) -> None:
+    def event(self, event: Event) -> None:
         """Publish an event now."""
-        self._send(f'{self._node.get_name()}: {event}', level, message, values)
+        self._publish_record(event)
 
-    def _send(self, name: str, level: str, message: str, values: dict[str, Any]) -> None:
+    def _publish_record(self, body: State | Event) -> None:
+        record = EventRecord(
+            node=self._node.get_fully_qualified_name(),
+            body=body,
+            started=self._started,
+            uptime_s=time.monotonic() - self._started_wall,
+            stamp_ns=self._node.get_clock().now().nanoseconds,
+        )
+        self._events.publish(String(data=encode(record)))
+
+    def _publish_diagnostics(self) -> None:
+        with self._order:
+            self._publish_status(self._diagnostics, self._summary())
+
+    def _publish_status(self, publisher: Any, summary: Summary) -> None:
+        level, message = summary.level, summary.message
+        if self._qos_trouble and level == 'ok':
+            level, message = 'warn', self._qos_trouble
+        own = self._node.get_fully_qualified_name()
+        values = {
+            **pairs(summary.state),
+            **summary.values,
+            'qos_trouble': self._qos_trouble,
+            'node': own,
+            'started': self._started,
+            'uptime_s': f'{time.monotonic() - self._started_wall:.3f}',
+        }
+        name, hardware_id = self._node.get_name(), 'remaster_ros'
+        if publisher is self._diagnostics:
+            name, hardware_id = f'{own.lstrip("/")}: state', self._hardware_id
         status = DiagnosticStatus(
             name=name,
             level=LEVELS[level],
             message=message,
-            hardware_id='remaster_ros',
+            hardware_id=hardware_id,
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
         )
-        message_out = DiagnosticArray(status=[status])
-        message_out.header.stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(message_out)
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        publisher.publish(array)
 
 
-def receiver(
-    on_event: Callable[[Event], None],
-    on_summary: Callable[[str, str, dict[str, str]], None] | None = None,
-) -> Callable[[DiagnosticArray], None]:
-    """Return a callback that calls `on_event` for every event in a message.
+def pairs(state: State) -> dict[str, str]:
+    """Return the fields of a state as text for people, one pair for each entry of a table."""
+    found = {}
+    for name, value in msgspec.structs.asdict(state).items():
+        if isinstance(value, dict):
+            found.update({f'{name}_{key}': _text(entry) for key, entry in value.items()})
+        elif not isinstance(value, msgspec.Struct):
+            found[name] = _text(value)
+    return found
 
-    `on_summary(node, message, values)` is called for every summary.
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return 'yes' if value else 'no'
+    return f'{value:.1f}' if isinstance(value, float) else 'none' if value is None else str(value)
+
+
+def receiver(node: Node, on_record: Callable[[EventRecord], None]) -> Callable[[String], None]:
+    """Return a callback that decodes a message and calls `on_record`.
+
+    What cannot be decoded is left out, with an error in the node's log, once for each reason.
     """
+    reasons: set[str] = set()
 
-    def receive(array: DiagnosticArray) -> None:
-        for status in array.status:
-            values = {pair.key: pair.value for pair in status.values}
-            name, separator, event = status.name.partition(': ')
-            if separator:
-                on_event(Event(name, event, status.message, values))
-            elif on_summary is not None:
-                on_summary(name, status.message, values)
+    def receive(message: String) -> None:
+        try:
+            record = decode(message.data)
+        except InputError as error:
+            # A stranger that invents reasons must not fill the memory.
+            if str(error) not in reasons and len(reasons) < 100:
+                reasons.add(str(error))
+                node.get_logger().error(f'{EVENTS}: {error}')
+            return
+        on_record(record)
 
     return receive
 
 
 def listen(
     node: Node,
-    on_event: Callable[[Event], None],
+    on_record: Callable[[EventRecord], None] | None = None,
     on_summary: Callable[[str, str, dict[str, str]], None] | None = None,
 ) -> None:
-    """Subscribe `node` to /remaster/status with a `receiver` of these callbacks."""
-    node.create_subscription(DiagnosticArray, TOPIC, receiver(on_event, on_summary), RELIABLE)
-
-
-def run_after(run: str, planner: Mapping[str, str]) -> str:
-    """Return the token to hold after a summary of the planner.
-
-    The recorder and the bridge hold it in memory and publish it as `run`: by that a planner which
-    is started again finds whether its run still lives. A pause or a stop ends the run; a planner
-    that has just been started and has not decided yet (``idle``) does not.
+    """Subscribe to the records of all nodes, or to what they show to people.
 
     Parameters
     ----------
-    run
-        The token held so far, '' for none.
-    planner
-        The values of the planner's summary.
+    on_record
+        Called with every record.
+    on_summary
+        Called with (node, message, values) of every status; for programs that show them.
     """
-    state = planner.get('state', '')
-    if state in ('running', 'held'):
-        return planner.get('run', '') or run
-    return run if state in ('idle', '') else ''
+    if on_record is not None:
+        node.create_subscription(String, EVENTS, receiver(node, on_record), RELIABLE)
+    if on_summary is not None:
+        receive = summary_receiver(on_summary)
+        node.create_subscription(DiagnosticArray, TOPIC, receive, RELIABLE)
+
+
+def summary_receiver(
+    on_summary: Callable[[str, str, dict[str, str]], None],
+) -> Callable[[DiagnosticArray], None]:
+    """Return a callback that calls `on_summary` with (node, message, values) of every status."""
+
+    def receive(array: DiagnosticArray) -> None:
+        for status in array.status:
+            values = {pair.key: pair.value for pair in status.values}
+            on_summary(status.name, status.message, values)
+
+    return receive

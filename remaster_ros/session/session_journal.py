@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from remaster_ros.collection.events import Decided, Outcome
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.session.files import read_limited
@@ -24,7 +25,7 @@ from remaster_ros.types import FloatArray, Observation, Session, Split
 SHIFT_S = 1.0
 """Time that is put between two rows where the clock ran backwards, s."""
 
-_FINAL = ('recorded', 'partial')
+_FINAL: tuple[Outcome, ...] = ('recorded', 'partial')
 
 
 class SessionJournal:
@@ -129,21 +130,21 @@ class SessionJournal:
         self.plan_id, self._results = plan_id, {}
         return True
 
-    def result(self, pose: int, solution: int) -> str:
-        """Return what a configuration was recorded as, '' where it is still to be recorded."""
-        result = self._results.get((pose, solution), '')
-        return result if result in _FINAL else ''
+    def result(self, pose: int, solution: int) -> Outcome | None:
+        """Return what a configuration was recorded as, None where it is still to be recorded."""
+        result = self._results.get((pose, solution))
+        return next((final for final in _FINAL if final == result), None)
 
-    def decided(self) -> str:
-        """Return the solutions recorded at the last pose, as ``pose: solution solution …``."""
+    def decided(self) -> Decided | None:
+        """Return the solutions recorded at the last pose; None before the first."""
         if self._last_pose is None:
-            return ''
+            return None
         solutions = [
-            str(solution)
+            solution
             for (pose, solution), result in self._results.items()
             if pose == self._last_pose and result in _FINAL
         ]
-        return f'{self._last_pose}: {" ".join(solutions)}'
+        return Decided(self._last_pose, tuple(solutions))
 
     def write(
         self,

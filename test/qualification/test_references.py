@@ -7,6 +7,7 @@ import pytest
 from collection_rig import Cell
 from ros_rig import call
 
+from remaster_ros.collection.events import SetupChanged
 from remaster_ros.session.journal import read_journal
 from remaster_ros.session.reader import read_session
 from remaster_ros.simulation.faults import inject
@@ -30,24 +31,24 @@ def test_a_bumped_sensor_is_named_and_pauses_the_collection(start, client, tmp_p
     cell.until(lambda: int(reading()['configurations_done']) > done, 'another configuration')
     assert cell.recorder('changed') == ''
     inject(cell.world.folder, {'tracker': {'bumped': BUMP_M}})
-    found = lambda: [e for e in cell.events if e.event == 'changed']  # noqa: E731
+    found = lambda: [e for e in cell.events if isinstance(e, SetupChanged)]  # noqa: E731
     cell.until(found, 'the change', 200)
     event = found()[0]
-    print(event.message)
-    assert event.values['stops'] == 'yes'
-    assert event.values['cause'] == 'sensor'
-    assert event.message.startswith('tracker was moved between configurations')
-    assert float(event.values['size_m']) == pytest.approx(BUMP_M, rel=0.25)
+    print(event.text)
+    assert event.stops
+    assert event.cause == 'sensor'
+    assert event.text.startswith('tracker was moved between configurations')
+    assert event.size_m == pytest.approx(BUMP_M, rel=0.25)
     cell.until(lambda: reading()['state'] == 'paused', 'the pause', 10)
-    assert cell.messages['pose_planner'] == event.message
-    assert event.message in cell.recorder('changed')
+    assert cell.messages['pose_planner'] == event.text
+    assert event.text in cell.recorder('changed')
 
     # Nobody has looked: it stays so, also with another recorder.
     recorded = cell.recorder('observations')
     cell.kill_and_start('recorder')
     cell.said.pop('recorder')
     cell.until(lambda: cell.recorder('changed'), 'the recorder that was started again')
-    assert cell.recorder('changed') == event.message
+    assert cell.recorder('changed') == event.text
     assert (reading()['state'], cell.recorder('observations')) == ('paused', recorded)
 
     # It must have learned that the planner is paused: what runs after that is a person's word.

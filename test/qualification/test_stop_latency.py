@@ -6,6 +6,7 @@ import time
 import pytest
 from ros_rig import node_arguments
 
+from remaster_ros.collection.events import BridgeState, RecorderState, SensorReport
 from remaster_ros.session.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(200)]
@@ -42,7 +43,7 @@ class Around:
         from sensor_msgs.msg import JointState
         from trajectory_msgs.msg import JointTrajectory
 
-        from remaster_ros.nodes.status import RELIABLE, NodeStatus, listen
+        from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary, listen
 
         self.client, self.said = client, said
         self.names = list(read_cell('demo').chain().joint_names)
@@ -53,14 +54,14 @@ class Around:
                 JointTrajectory, 'remaster/joint_solutions', self.solutions.append, RELIABLE
             )
         facts = {
-            'robot_bridge': {'joints_age_s': '0.0', 'halted': ''},
-            'recorder': {'require': 'mocap', 'read_age_s_mocap': '0.0', 'observations': '0'},
-            'bar': {'sensor': 'mocap', 'ready': 'yes'},
+            'robot_bridge': BridgeState(halted='', joints_age_s=0.0),
+            'recorder': RecorderState(waiting_for='', require='mocap', read_age_s={'mocap': 0.0}),
+            'bar': SensorReport(sensor='mocap', ready=True),
         }
         self.nodes = [rclpy.create_node(name, context=client.context) for name in facts]
         self.statuses = [
-            NodeStatus(node, lambda values=values: ('ok', '', values))
-            for node, values in zip(self.nodes, facts.values())
+            NodeStatus(node, lambda state=state: Summary('ok', '', {}, state))
+            for node, state in zip(self.nodes, facts.values())
         ]
         listen(client, lambda event: None, self._summary)
         self._spoken = 0.0

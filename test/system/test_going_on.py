@@ -8,6 +8,12 @@ import pytest
 from collection_rig import SEED, Cell
 from ros_rig import call, node_arguments, wait_until
 
+from remaster_ros.collection.events import (
+    ConfigurationEnded,
+    EventRecord,
+    PoseAnnounced,
+    encode,
+)
 from remaster_ros.session.bag import BagReader
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.workcell import read_cell
@@ -96,17 +102,22 @@ def test_a_settled_arm_is_measured_though_its_pose_arrives_later(start, client, 
     """Topics overtake each other: /remaster/settled comes before what the planner announced."""
     from geometry_msgs.msg import PointStamped
     from sensor_msgs.msg import JointState
+    from std_msgs.msg import String
     from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
     from remaster_ros.nodes.messages import stamp_key
-    from remaster_ros.nodes.status import RELIABLE, NodeStatus, listen
+    from remaster_ros.nodes.status import RELIABLE, listen
 
     cell = read_cell('demo')
     names, rng = cell.chain().joint_names, np.random.default_rng(SEED)
     print('seed', SEED)
     q = np.array([0.0, 0.3, 0.0, 1.0, 0.0, 0.5, 0.0])
     heard, counts = [], {}
-    listen(client, heard.append, lambda node, message, values: counts.update(values))
+    listen(
+        client,
+        lambda record: heard.append(record.body),
+        lambda node, message, values: counts.update(values),
+    )
     publishers = {
         topic: client.create_publisher(kind, topic, RELIABLE)
         for topic, kind in (
@@ -144,11 +155,12 @@ def test_a_settled_arm_is_measured_though_its_pose_arrives_later(start, client, 
     solutions.header.stamp = client.get_clock().now().to_msg()
     solutions.points = [JointTrajectoryPoint(positions=q.tolist())]
     publishers['/remaster/joint_solutions'].publish(solutions)
-    status = NodeStatus(client, lambda: ('ok', '', {}))
-    until(lambda: client.count_subscribers('/remaster/status') > 1, 'the status')
+    records = client.create_publisher(String, '/remaster/events', RELIABLE)
+    until(lambda: records.get_subscription_count() > 1, 'the recorder and this test')
     stamp = stamp_key(solutions.header.stamp)
-    values = {'pose': 0, 'split': 'optimization', 'solutions': 1, 'ids': '0', 'plan': 'p'}
-    status._send('pose_planner: pose', 'ok', '', {**values, 'stamp': stamp})
-    until(lambda: any(event.event == 'configuration' for event in heard), 'its end')
-    (end,) = (event for event in heard if event.event == 'configuration')
-    assert (end.values['stamp'], end.values['result']) == (stamp, 'recorded'), end
+    pose = PoseAnnounced(stamp=stamp, pose=0, split='optimization', ids=(0,), plan='p')
+    records.publish(String(data=encode(EventRecord(node='/pose_planner', body=pose))))
+    ends = lambda: [body for body in heard if isinstance(body, ConfigurationEnded)]  # noqa: E731
+    until(ends, 'its end')
+    (end,) = ends()
+    assert (end.stamp, end.result) == (stamp, 'recorded'), end

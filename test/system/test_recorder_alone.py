@@ -11,6 +11,13 @@ import numpy as np
 import pytest
 from ros_rig import ROOT, node_arguments, wait_until
 
+from remaster_ros.collection.events import (
+    ArmStopped,
+    ConfigurationEnded,
+    EventRecord,
+    PoseAnnounced,
+    encode,
+)
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import (
     apply,
@@ -50,12 +57,12 @@ class Rig:
     """A recorder of one sensor, and everybody it listens to."""
 
     def __init__(self, start, client, folder, sensor):
-        from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import PointStamped
         from sensor_msgs.msg import JointState
+        from std_msgs.msg import String
         from trajectory_msgs.msg import JointTrajectory
 
-        from remaster_ros.nodes.status import RELIABLE, NodeStatus, listen
+        from remaster_ros.nodes.status import RELIABLE, listen
 
         self.client, self.sensor, self.session = client, sensor, folder / 'session'
         cell = folder / 'cell.yaml'
@@ -68,15 +75,14 @@ class Rig:
             *node_arguments(cell=cell, session=self.session, call_measure=False, bag=False),
         )
         self.events, self.summary, self.message = [], {}, ''
-        listen(client, self._event, self._summary)
+        listen(client, self._record, self._summary)
         self.joints = client.create_publisher(JointState, '/joint_states', 100)
         self.settled = client.create_publisher(JointState, '/remaster/settled', RELIABLE)
         self.solutions = client.create_publisher(
             JointTrajectory, '/remaster/joint_solutions', RELIABLE
         )
         self.points = client.create_publisher(PointStamped, TOPICS[sensor], 100)
-        self.says = client.create_publisher(DiagnosticArray, '/remaster/status', RELIABLE)
-        self.Status = NodeStatus
+        self.says = client.create_publisher(String, '/remaster/events', RELIABLE)
         self.t = 1000.0
         self.pose = itertools.count()
         publishers = (self.joints, self.settled, self.solutions, self.points)
@@ -87,9 +93,9 @@ class Rig:
         )
         wait_until(lambda: client.spin_some() or self.summary, 30, 'its status')
 
-    def _event(self, event):
-        if (event.node, event.event) == ('recorder', 'configuration'):
-            self.events.append(event.values)
+    def _record(self, record):
+        if isinstance(record.body, ConfigurationEnded):
+            self.events.append(record.body)
 
     def _summary(self, node, message, values):
         if node == 'recorder':
@@ -117,12 +123,11 @@ class Rig:
         message.point.x, message.point.y, message.point.z = map(float, seen)
         self.points.publish(message)
 
-    def event(self, node, event, **values):
-        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+    def event(self, body):
+        from std_msgs.msg import String
 
-        pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        status = DiagnosticStatus(name=f'{node}: {event}', values=pairs)
-        self.says.publish(DiagnosticArray(status=[status]))
+        record = EventRecord(node=f'/{body.sender}', body=body)
+        self.says.publish(String(data=encode(record)))
 
     def announce(self, *solutions):
         """Announce the next pose with these joint solutions; return its number."""
@@ -134,9 +139,10 @@ class Rig:
         message = self.header(JointTrajectory(joint_names=list(CHAIN.joint_names)), self.t)
         message.points = [JointTrajectoryPoint(positions=q.tolist()) for q in solutions]
         self.event(
-            'pose_planner', 'pose', pose=number, split='optimization', plan='a',
-            stamp=stamp_key(message.header.stamp), solutions=len(solutions),
-            ids=' '.join(map(str, range(len(solutions)))),
+            PoseAnnounced(
+                stamp=stamp_key(message.header.stamp), pose=number, split='optimization', plan='a',
+                ids=tuple(range(len(solutions))),
+            )
         )  # fmt: skip
         self.solutions.publish(message)
         key = stamp_key(message.header.stamp)
@@ -195,23 +201,23 @@ def test_what_is_recorded_and_never_twice_and_from_where(rig):
     third = Q - 0.1
     number = rig.announce(Q, elsewhere, third)
     reports = rig.stand(Q)
-    assert rig.decided(1)['result'] == 'recorded'
+    assert rig.decided(1).result == 'recorded'
 
     # Told again that it has settled there, as after a planner was started anew: nothing new.
     rig.stand(Q)
     again = rig.decided(2)
-    assert (again['result'], again['reason']) == ('recorded', 'recorded before')
+    assert (again.result, again.reason) == ('recorded', 'recorded before')
     rig.spin()
     assert rig.summary['observations'] == '1'
 
     rig.stand(elsewhere)
-    assert rig.decided(3)['reason'] == ''
+    assert rig.decided(3).reason == ''
     # Stopped on its way: where it comes from next, nobody knows.
-    rig.event('robot_bridge', 'stopped')
+    rig.event(ArmStopped(stamp='', reason='another pose'))
     for _ in range(10):
         rig.spin()
     rig.stand(third)
-    assert rig.decided(4)['result'] == 'recorded'
+    assert rig.decided(4).result == 'recorded'
 
     rows = rig.rows()
     assert rows.pose.tolist() == [number] * 3
@@ -239,7 +245,7 @@ def test_the_first_of_two_shots_counts(rig):
         rig.spin()
     rig.t += 0.02
     rig.report(Q)
-    assert rig.decided(1)['result'] == 'recorded'
+    assert rig.decided(1).result == 'recorded'
     rows = rig.rows()
     assert len(rows) == 1
     expected = apply(inverse(T_R_N), CHAIN.positions(Q, MARKERS['smr']))

@@ -3,6 +3,7 @@
 import pytest
 from ros_rig import node_arguments, wait_until
 
+from remaster_ros.collection.events import Alive, PoseAnnounced, RecorderBegan
 from remaster_ros.session.bag import BagReader
 from remaster_ros.session.bag_writer import BagWriter
 from remaster_ros.session.workcell import read_cell
@@ -76,6 +77,30 @@ def test_commands_are_left_out(start, client, bag):
     until(client, lambda: process.poll() is not None, 60, 'the end')
     assert process.returncode == 0, process.communicate()
     assert len(heard) == 40
+
+
+def test_the_events_of_an_old_bag_are_published_as_records(start, client, tmp_path):
+    """They stood as pairs of text among the status messages."""
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+    from rclpy.serialization import serialize_message
+
+    from remaster_ros.nodes.status import listen
+
+    pairs = {'stamp': '5.000000001', 'pose': '3', 'split': 'optimization', 'solutions': '2'}
+    values = [KeyValue(key=key, value=value) for key, value in pairs.items()]
+    with BagWriter(tmp_path / 'bag') as writer:
+        for number, name in enumerate(('recorder: began', 'pose_planner: pose', 'a stranger')):
+            status = DiagnosticStatus(name=name, values=values)
+            data = serialize_message(DiagnosticArray(status=[status]))
+            kind = 'diagnostic_msgs/msg/DiagnosticArray'
+            writer.write('/remaster/status', kind, data, 10**18 + number * 10**8)
+    found = []
+    listen(client, lambda record: found.append(record.body))
+    wait_for = ('--wait-for', '/remaster/events')
+    process = start('remaster_ros.cli.main', 'replay', tmp_path / 'bag', *wait_for)
+    assert spun(client, process).returncode == 0, process.communicate()
+    pose = PoseAnnounced(stamp='5.000000001', pose=3, split='optimization', ids=(0, 1))
+    assert found == [RecorderBegan(), pose, Alive()]
 
 
 @pytest.mark.parametrize('more', [(), ('--with-commands',)])

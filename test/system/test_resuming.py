@@ -7,6 +7,8 @@ import pytest
 from collection_rig import Cell
 from ros_rig import call, node_arguments
 
+from remaster_ros.collection.events import BridgeState
+
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 
 
@@ -102,12 +104,12 @@ def test_a_halted_arm_is_not_collected_with(start, client, tmp_path):
     import rclpy
     from sensor_msgs.msg import JointState
 
-    from remaster_ros.nodes.status import RELIABLE, NodeStatus, listen
+    from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary, listen
     from remaster_ros.session.workcell import read_cell
 
-    halted = {'halted': 'the robot does not follow'}
+    halted = 'the robot does not follow'
     bridge = rclpy.create_node('robot_bridge', context=client.context)
-    status = NodeStatus(bridge, lambda: ('ok', '', dict(halted)))
+    status = NodeStatus(bridge, lambda: Summary('ok', '', {}, BridgeState(halted=halted)))
     said = {}
     listen(
         client, lambda event: None, lambda node, text, values: said.update({node: (text, values)})
@@ -131,15 +133,15 @@ def test_a_halted_arm_is_not_collected_with(start, client, tmp_path):
     assert refused.message == (
         'the arm is halted: the robot does not follow; /remaster/clear_halt, then collect'
     )
-    halted['halted'] = ''
+    halted = ''
     status.publish()
     response = call(client, '/remaster/collect')
     until(lambda: said['pose_planner'][1]['state'] == 'running' or not response.success, 'running')
     assert response.success, response.message
-    halted['halted'] = 'emergency stop'
+    halted = 'emergency stop'
     until(lambda: said['pose_planner'][1]['state'] == 'paused', 'the pause')
     assert said['pose_planner'][0] == 'emergency stop'
-    halted['halted'] = ''
+    halted = ''
     until_later = time.monotonic() + 1.5
     until(lambda: time.monotonic() > until_later, 'time')
     assert said['pose_planner'][1]['state'] == 'paused', 'no status message ends a halt'

@@ -145,8 +145,8 @@ def test_a_bag_begins_with_the_clock_and_keeps_what_came_before(start, client, s
     assert reader.whole.last_ns - reader.whole.first_ns < 20 * 10**9
     messages = list(reader)
     # The first says that the recorder began, which a replay must know first.
-    assert messages[0][0] == '/remaster/status'
-    assert b'recorder: began' in messages[0][2]
+    assert messages[0][0] == '/remaster/events'
+    assert b'"kind":"began"' in messages[0][2]
     assert sum(topic == '/remaster/target_pose' for topic, *_ in messages) == 5
     text = (session / 'bag' / 'metadata.yaml').read_text(encoding='utf-8')
     information = yaml.safe_load(text)['rosbag2_bagfile_information']

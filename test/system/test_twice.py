@@ -145,16 +145,19 @@ def test_two_started_at_once_on_two_computers(start_elsewhere, client, said):
 
 def test_alone(client):
     """True after 1.5 s of listening, without a rival; what was recorded of one is none."""
-    from remaster_ros.nodes.status import NodeStatus
+    from std_msgs.msg import String
 
-    status = NodeStatus(client, lambda: ('ok', '', {}))
+    from remaster_ros.collection.events import Alive, EventRecord, encode
+    from remaster_ros.nodes.status import NodeStatus, Summary
+
+    status = NodeStatus(client, lambda: Summary('ok', '', {}))
     until(client, lambda: status.alone_since is not None, 10, 'its own summary')
     assert not status.alone(time.monotonic())
     until(client, lambda: status.alone(time.monotonic()), 10, 'to be alone')
     assert 1.5 <= time.monotonic() - status.alone_since < 3.0
     # As a replay publishes it: the name is this node's, the publisher is not.
-    values = {'node': '/test_client', 'started': '1', 'uptime_s': '5000'}
-    for uptime in ('5000', '5001', '5002'):
-        status._send('test_client', 'ok', '', {**values, 'uptime_s': uptime})
+    for uptime_s in (5000.0, 5001.0, 5002.0):
+        record = EventRecord(node='/test_client', body=Alive(), started='1', uptime_s=uptime_s)
+        status._events.publish(String(data=encode(record)))
         client.spin_some()
     assert status.alone(time.monotonic())

@@ -28,13 +28,13 @@ class OneCell:
     def __init__(self, start, client, folder, name):
         from diagnostic_msgs.msg import DiagnosticArray
 
-        from remaster_ros.nodes.status import RELIABLE, receiver
+        from remaster_ros.nodes.status import RELIABLE, summary_receiver
 
         self.name, self.session, self.said = name, folder / name, {}
         client.create_subscription(
             DiagnosticArray,
             f'/{name}/remaster/status',
-            receiver(lambda event: None, self._summary),
+            summary_receiver(self._summary),
             RELIABLE,
         )
         command, data = free_ports(socket.SOCK_DGRAM, socket.SOCK_DGRAM)

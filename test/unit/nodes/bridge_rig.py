@@ -12,14 +12,24 @@ from types import SimpleNamespace
 import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray
 from hostile_arm import HostileArm
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from remaster_ros.collection.events import (
+    STATES,
+    ConfigurationEnded,
+    EventRecord,
+    PlannerState,
+    RecorderState,
+    decode,
+    encode,
+)
 from remaster_ros.nodes import emergency_link, rivals, robot_bridge, status
 from remaster_ros.nodes.messages import seconds
 from remaster_ros.session.workcell import read_cell
@@ -57,7 +67,7 @@ class CountedBridge(robot_bridge.RobotBridge):
     """The bridge, which counts what it has taken in and sent."""
 
     def __init__(self):
-        self.taken = dict.fromkeys(('states', 'summaries', 'events', 'solutions', 'ways'), 0)
+        self.taken = dict.fromkeys(('states', 'records', 'solutions', 'ways'), 0)
         self.published = self.sent = 0
         self.logged = []
         try:
@@ -66,6 +76,13 @@ class CountedBridge(robot_bridge.RobotBridge):
             # A process would end now, and its lock with it.
             self.destroy_node()
             raise
+        publish = self.status.event
+
+        def event(body):
+            publish(body)
+            self.sent += 1
+
+        self.status.event = event
 
     def get_logger(self):
         return LogBook(super().get_logger(), self.logged)
@@ -74,13 +91,9 @@ class CountedBridge(robot_bridge.RobotBridge):
         super()._on_joint_state(message)
         self.taken['states'] += 1
 
-    def _on_summary(self, node, message, values):
-        super()._on_summary(node, message, values)
-        self.taken['summaries'] += node != 'robot_bridge'
-
-    def _on_event(self, event):
-        super()._on_event(event)
-        self.taken['events'] += event.node != 'robot_bridge'
+    def _on_record(self, record):
+        super()._on_record(record)
+        self.taken['records'] += record.node != '/robot_bridge'
 
     def _on_solutions(self, message):
         super()._on_solutions(message)
@@ -97,10 +110,6 @@ class CountedBridge(robot_bridge.RobotBridge):
     def _summary(self):
         self.summarised = super()._summary()
         return self.summarised
-
-    def _event(self, *args, **values):
-        super()._event(*args, **values)
-        self.sent += 1
 
 
 class Rig:
@@ -153,7 +162,7 @@ class Rig:
         self._spinner.add_node(node)
         leased = status.LEASED
         self.states = node.create_publisher(JointState, 'joint_states', 200)
-        self.said = node.create_publisher(DiagnosticArray, 'remaster/status', 200)
+        self.said = node.create_publisher(String, 'remaster/events', 200)
         self.solutions = node.create_publisher(JointTrajectory, 'remaster/joint_solutions', leased)
         self.ways = node.create_publisher(JointTrajectory, 'remaster/joint_waypoints', leased)
         self.controller = None
@@ -163,6 +172,7 @@ class Rig:
             JointState, 'remaster/settled', lambda m: self.settled.append(m), 200
         )
         node.create_subscription(DiagnosticArray, 'remaster/status', self._on_status, 200)
+        node.create_subscription(String, 'remaster/events', self._on_record, 200)
         self.clear = node.create_client(Trigger, 'remaster/clear_halt')
 
     def open_controller(self, **qos):
@@ -199,7 +209,8 @@ class Rig:
                     publisher.get_subscription_count()
                     for publisher in (self.states, self.said, self.solutions, self.ways)
                 )
-                and self.bridge.status._publisher.get_subscription_count() > 1
+                and self.bridge.status._publisher.get_subscription_count()
+                and self.bridge.status._events.get_subscription_count() > 2
                 and self.bridge._settled.get_subscription_count()
             ),
             'the nodes to find each other',
@@ -259,7 +270,7 @@ class Rig:
             if 'planner' in self.alive:
                 self.say_planner()
             if 'recorder' in self.alive:
-                self.say('recorder', waiting_for=self.waiting_for)
+                self.say(RecorderState(waiting_for=self.waiting_for))
         if 'robot' in self.alive:
             self.report()
         if self.wall - self._watched >= robot_bridge.WATCH_WALL_S:
@@ -320,12 +331,10 @@ class Rig:
         if message is not None:
             self.taken(self.states, message, 'states')
 
-    def say(self, name, **values):
-        """Publish a summary, or an event where the name is one."""
-        array = DiagnosticArray()
-        pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        array.status = [DiagnosticStatus(name=name, values=pairs)]
-        self.taken(self.said, array, 'events' if ': ' in name else 'summaries')
+    def say(self, body):
+        """Publish a state or an event in the name of the node that publishes it."""
+        record = EventRecord(node=f'/{body.sender or "optimizer"}', body=body)
+        self.taken(self.said, String(data=encode(record)), 'records')
 
     def say_planner(self, state=None):
         if state == 'running' != self.state:
@@ -333,7 +342,7 @@ class Rig:
             self.run_token += ', another'
         self.state = state or self.state
         token = self.run_token if self.state == 'running' else ''
-        self.say('pose_planner', state=self.state, run=token)
+        self.say(PlannerState(state=self.state, run=token))
 
     def plan(self, *targets, names=None, ways=None, ways_stamp=None):
         """Publish a pose with these solutions, and waypoints by solution; returns its stamp."""
@@ -352,8 +361,8 @@ class Rig:
         self.flush()
         return f'{self.pose}.000000000'
 
-    def answer(self, stamp_key, solution, node='recorder', event='configuration'):
-        self.say(f'{node}: {event}', stamp=stamp_key, solution=solution, result='recorded')
+    def answer(self, stamp_key, solution):
+        self.say(ConfigurationEnded(stamp=stamp_key, solution=solution, result='recorded'))
 
     def call_clear(self):
         self.wait(self.clear.service_is_ready, 'the service')
@@ -367,8 +376,9 @@ class Rig:
         """Let it publish its summary; return level, message, values."""
         count = len(self.summaries)
         self.bridge.status.publish()
-        level, message, values = self.bridge.summarised
-        told = level, message, {key: str(value) for key, value in values.items()}
+        level, message, values, state = self.bridge.summarised
+        shown = {**status.pairs(state), **{key: str(value) for key, value in values.items()}}
+        told = level, message, shown
 
         def has_come():
             # An older one may still be on its way.
@@ -379,8 +389,8 @@ class Rig:
         self.wait(has_come, 'a summary')
         return self.summaries[-1]
 
-    def named(self, event):
-        return [values for name, _, _, values in self.events if name == event]
+    def named(self, kind):
+        return [event for event in self.events if isinstance(event, kind)]
 
     def moves(self):
         """The commands of more than the micrometre of the probe."""
@@ -420,14 +430,14 @@ class Rig:
     def _on_status(self, array):
         for item in array.status:
             values = {pair.key: pair.value for pair in item.values}
-            name, _, event = item.name.partition(': ')
-            if name != 'robot_bridge':
-                continue
-            level = {b'\x00': 'ok', b'\x01': 'warn', b'\x02': 'error'}[item.level]
-            if event:
-                self.events.append((event, level, item.message, values))
-            else:
+            if item.name == 'robot_bridge':
+                level = {b'\x00': 'ok', b'\x01': 'warn', b'\x02': 'error'}[item.level]
                 self.summaries.append((level, item.message, values))
+
+    def _on_record(self, message):
+        if '"/robot_bridge"' in message.data:
+            body = decode(message.data).body
+            self.events += [] if isinstance(body, STATES) else [body]
 
 
 def stamp(time_s):

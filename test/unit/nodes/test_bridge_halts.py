@@ -15,6 +15,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory
 
+from remaster_ros.collection.events import HaltCleared, PlannerState, RecorderState
 from remaster_ros.motion.actions import Drive, Stop
 from remaster_ros.nodes import robot_bridge
 from remaster_ros.nodes.status import LEASED
@@ -145,7 +146,7 @@ def test_an_emergency_stop_halts_and_is_cleared_only_after_its_end(rig):
     assert r.bridge.published == sent
     answer = r.call_clear()
     assert (answer.success, answer.message) == (False, 'the robot reports an emergency stop')
-    assert not r.named('halt_cleared')
+    assert not r.named(HaltCleared)
     assert r.halted()
     show(r, publisher, False)
     assert r.halted(), 'its end alone ends no halt'
@@ -252,13 +253,7 @@ def test_a_halt_is_kept_shown_and_cleared_by_a_person(rig, tmp_path):
     assert (answer.success, answer.message) == (True, 'cleared; /remaster/collect goes on')
     r.wait(lambda: not path.exists(), 'the end of the file')
     r.flush()
-    (event,) = [event for event in r.events if event[0] == 'halt_cleared']
-    assert event == (
-        'halt_cleared',
-        'ok',
-        'the halt was cleared by a person',
-        {'stamp': named},
-    )
+    assert r.named(HaltCleared) == [HaltCleared(stamp=named)]
     # It is shown at once.
     r.wait(lambda: any(not s[2]['halted'] for s in r.summaries[count:]), 'a summary')
     # And nothing moves before the collection goes on.
@@ -268,7 +263,7 @@ def test_a_halt_is_kept_shown_and_cleared_by_a_person(rig, tmp_path):
     again = r.call_clear()
     assert (again.success, again.message) == (False, 'the arm is not halted')
     r.flush()
-    assert len(r.named('halt_cleared')) == 1
+    assert len(r.named(HaltCleared)) == 1
     assert not r.commands
     assert not any(level == 'error' and 'halt is not' in text for level, text in r.bridge.logged)
 
@@ -360,10 +355,8 @@ def test_every_rule_is_asked_at_the_time_it_is(rig):
 
     r.bridge.supervisor = Watched(r.bridge.supervisor)
     r.wall += 0.125
-    r.say('recorder', waiting_for='x')
-    r.say('pose_planner', state='running', run='its')
-    r.say('pose_planner')
-    r.say('recorder')
+    r.say(RecorderState(waiting_for='x'))
+    r.say(PlannerState(state='running', run='its'))
     r.report()
     r.report(name=[])
     r.plan(HOME + 0.05)
@@ -380,9 +373,6 @@ def test_every_rule_is_asked_at_the_time_it_is(rig):
     }
     for name, args in wanted.items():
         assert seen[name][0] == args, name
-    # What a summary leaves out.
-    assert seen['planner_is'][1] == ('unknown', r.wall, '')
-    assert seen['recorder_waits'][1] == ('', r.wall)
     assert [args[0] for args in seen['observe'][:4]] == [
         'rivals',
         'controller',

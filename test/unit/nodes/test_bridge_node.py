@@ -14,8 +14,19 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from simple_cells import write_cell
+from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
+from remaster_ros.collection.events import (
+    Alive,
+    ArmHalted,
+    ArmStopped,
+    PlannerState,
+    RecorderState,
+    SolutionCommanded,
+    SolutionFailed,
+    SolutionSettled,
+)
 from remaster_ros.errors import InputError
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.path_check import PointSpeeds
@@ -118,8 +129,7 @@ def test_other_speeds_are_taken_while_it_runs(rig):
     np.testing.assert_allclose(limits.velocity, 0.25 * CHAIN.velocity_limits)
     assert limits.tool_speed == 0.125
     assert (r.bridge.p.speed_share, r.bridge.p.cartesian_speed_limit_m_s) == (0.25, 0.125)
-    stops = [event[2] for event in r.events if event[0] == 'stopped']
-    assert stops == ['other limits']
+    assert [stop.reason for stop in r.named(ArmStopped)] == ['other limits']
     text = 'speed_share is 0.25, cartesian_speed_limit_m_s 0.125'
     assert ('info', text) in r.logged()
     r.run(30.0, lambda: r.settled)
@@ -252,26 +262,22 @@ def test_a_configuration_is_commanded_settles_and_is_announced(rig):
     assert message.header.stamp == stamp(r.wall)
 
     commanded, settled = r.events
-    assert commanded[:3] == ('commanded', 'ok', 'solution 0 commanded')
-    since = commanded[3].pop('since_settled_wall_s')
-    assert since == f'{move.arrival_s - 1000.0:.6f}'
-    assert commanded[3] == {'stamp': named, 'solution': '0'}
-    assert settled[:3] == ('settled', 'ok', 'solution 0 settled')
-    assert settled[3].keys() == {'stamp', 'solution', 'motion_s', 'settle_s'}
-    assert (settled[3]['stamp'], settled[3]['solution']) == (named, '0')
-    motion, still = float(settled[3]['motion_s']), float(settled[3]['settle_s'])
+    assert isinstance(commanded, SolutionCommanded)
+    assert commanded.since_settled_wall_s == pytest.approx(move.arrival_s - 1000.0, abs=1e-6)
+    assert (commanded.stamp, commanded.solution) == (named, 0)
+    assert isinstance(settled, SolutionSettled)
+    assert (settled.stamp, settled.solution) == (named, 0)
+    motion, still = settled.motion_s, settled.settle_s
     assert motion + still == pytest.approx(r.wall - move.arrival_s, abs=0.03)
     assert 0.3 <= still < 0.35
-    assert len(settled[3]['motion_s'].partition('.')[2]) == 6
-    assert len(settled[3]['settle_s'].partition('.')[2]) == 6
     # From there on the time is counted until the next command.
     settled_at = r.wall
     r.answer(named, 0)
     named = r.settle(HOME)
-    assert r.named('commanded')[1]['since_settled_wall_s'] == (
-        f'{r.commands[-1].arrival_s - settled_at:.6f}'
-    )
-    assert r.named('commanded')[1]['stamp'] == named
+    commanded = r.named(SolutionCommanded)[1]
+    since_s = r.commands[-1].arrival_s - settled_at
+    assert commanded.since_settled_wall_s == pytest.approx(since_s, abs=1e-6)
+    assert commanded.stamp == named
     assert before < settled_at
 
 
@@ -280,12 +286,9 @@ def test_what_cannot_be_reached_is_named_and_the_next_one_is_commanded(rig):
     outside = HOME.copy()
     outside[1] = CHAIN.upper[1] + np.deg2rad(0.1)
     named = r.settle(outside, TARGET)
-    (failed,) = r.named('failed')
-    assert failed['solution'] == '0'
-    assert failed['stamp'] == named
-    assert failed['reason'].startswith('joint_2 at ')
-    (event,) = [event for event in r.events if event[0] == 'failed']
-    assert event[1:3] == ('warn', failed['reason'])
+    (failed,) = r.named(SolutionFailed)
+    assert (failed.stamp, failed.solution) == (named, 0)
+    assert failed.reason.startswith('joint_2 at ')
     np.testing.assert_allclose(r.moves()[0].q[-1], TARGET, atol=1e-12)
     level, text, values = r.summary()
     assert (level, text) == ('ok', 'moving or measuring')
@@ -293,23 +296,29 @@ def test_what_cannot_be_reached_is_named_and_the_next_one_is_commanded(rig):
     assert counts == ['1', '1', '1', '0']
 
 
+ANSWER = {'kind': 'configuration', 'solution': 0, 'result': 'recorded'}
+
+
 @pytest.mark.parametrize(
-    'answer',
+    ('node', 'change'),
     [
-        {'stamp_key': '77.000000000', 'solution': 0},
-        {'solution': 1},
-        {'solution': 'none'},
-        {'solution': ''},
-        {'solution': 0, 'node': 'optimizer'},
-        {'solution': 0, 'event': 'reading'},
+        ('recorder', {'stamp': '77.000000000'}),
+        ('recorder', {'solution': 1}),
+        ('recorder', {'solution': -1}),
+        ('recorder', {'solution': '0'}),
+        ('recorder', {'solution': None}),
+        ('recorder', {'kind': 'reading'}),
+        ('recorder', {'result': 'lost'}),
+        ('optimizer', {}),
     ],
 )
-def test_only_the_recorders_answer_for_this_pose_and_solution_counts(rig, answer):
+def test_only_the_recorders_answer_for_this_pose_and_solution_counts(rig, node, change):
     r = rig()
     named = r.settle(TARGET, HOME)
-    r.answer(**{'stamp_key': named, **answer})
-    r.say('recorder: configuration', stamp=named)
-    r.say('recorder: configuration', solution=0)
+    for left_out in ('', 'stamp', 'solution', 'result'):
+        body = {'stamp': named, **ANSWER, **change}
+        body.pop(left_out, None)
+        r.said.publish(String(data=json.dumps({'version': 1, 'node': f'/{node}', 'body': body})))
     r.run(1.0, dt=0.1)
     assert len(r.moves()) == 1, 'it went on'
     r.answer(named, 0)
@@ -321,9 +330,7 @@ def test_another_pose_stops_the_arm_and_is_gone_to(rig):
     r = rig()
     named = r.go(AWAY, speed=0.2)
     later = r.plan(HOME)
-    (stopped,) = [event for event in r.events if event[0] == 'stopped']
-    assert stopped[1:3] == ('warn', 'another pose')
-    assert stopped[3] == {'stamp': later}
+    assert r.named(ArmStopped) == [ArmStopped(stamp=later, reason='another pose')]
     assert later != named
     assert ('info', 'stopping the arm: another pose') in r.bridge.logged
     assert r.bridge.counts['stopped'] == 1
@@ -336,7 +343,7 @@ def test_no_solutions_are_a_stop_whatever_joints_they_name(rig, names):
     r = rig()
     r.go(AWAY, speed=0.2)
     r.plan(names=names)
-    assert [event[2] for event in r.events if event[0] == 'stopped'] == ['stopped']
+    assert [stop.reason for stop in r.named(ArmStopped)] == ['stopped']
     r.run(3.0)
     assert r.arm.speed() < 1e-6
     assert r.arm.q[0] < 0.55
@@ -431,11 +438,11 @@ def test_a_target_that_is_not_free_is_given_up(rig, tmp_path):
     r = rig(cell=write_cell(tmp_path / 'cell.yaml', obstacles={'box': box}))
     r.plan(LOW, HOME + 0.01)
     r.run(20.0, lambda: r.settled)
-    (failed,) = r.named('failed')
-    assert failed['solution'] == '0'
-    assert failed['reason'].startswith('no free path: ')
-    assert 'box' in failed['reason']
-    assert [values['solution'] for values in r.named('commanded')] == ['1']
+    (failed,) = r.named(SolutionFailed)
+    assert failed.solution == 0
+    assert failed.reason.startswith('no free path: ')
+    assert 'box' in failed.reason
+    assert [commanded.solution for commanded in r.named(SolutionCommanded)] == [1]
 
 
 def test_a_path_that_cannot_be_checked_is_not_gone(rig, monkeypatch):
@@ -448,8 +455,8 @@ def test_a_path_that_cannot_be_checked_is_not_gone(rig, monkeypatch):
     monkeypatch.setattr(r.bridge._search, 'find', fails)
     r.plan(HOME)
     r.run(1.0)
-    (failed,) = r.named('failed')
-    assert failed['reason'] == 'no free path: it could not be checked (boom)'
+    (failed,) = r.named(SolutionFailed)
+    assert failed.reason == 'no free path: it could not be checked (boom)'
     assert ('error', "the path could not be checked: ValueError('boom')") in r.bridge.logged
     assert len(r.moves()) == 1
 
@@ -470,7 +477,7 @@ def test_an_arm_in_a_margin_is_halted_and_leaves_slowly_when_a_person_says_so(ri
     _, v, _ = r.commands[0].spline().sample()
     assert np.all(np.abs(v) <= 0.1 * CHAIN.velocity_limits * 1.001)
     # It is no solution of a pose: no event names it.
-    assert not r.named('commanded')
+    assert not r.named(SolutionCommanded)
     assert r.bridge.counts['commanded'] == 0
 
 
@@ -505,18 +512,18 @@ def test_the_summary(rig):
     assert r.summary()[2]['joints_refused_not_finite'] == '2'
     assert r.summary()[2]['joints_age_s'] == '0.4'
     r.waiting_for = 'mocap'
-    r.say('recorder', waiting_for='mocap')
+    r.say(RecorderState(waiting_for='mocap'))
     level, text, _ = r.summary()
     assert (level, text) == ('warn', 'waiting for mocap')
 
 
 def test_the_token_of_a_run_is_the_running_planners(rig):
     r = rig()
-    r.say('pose_planner', state='running', run='first')
+    r.say(PlannerState(state='running', run='first'))
     assert r.summary()[2]['run'] == 'first'
-    r.say('pose_planner', state='idle', run='second')
+    r.say(PlannerState(state='idle', run='second'))
     assert r.summary()[2]['run'] == 'first'
-    r.say('pose_planner', state='running')
+    r.say(PlannerState(state='running', run=''))
     assert r.summary()[2]['run'] == ''
 
 
@@ -525,13 +532,13 @@ def test_others_summaries_are_no_sign_of_planner_or_recorder(rig):
     r.alive = {'robot'}
     for _ in range(12):
         r.run(0.1, dt=0.1)
-        r.say('optimizer', state='stopped', waiting_for='x')
+        r.say(Alive())
     assert r.summary()[:2] == ('warn', 'no sign of planner, recorder for 1 s')
-    r.say('pose_planner')
+    r.say(PlannerState(state='unknown', run=''))
     assert r.summary()[1] == 'no sign of recorder for 1 s'
-    r.say('recorder')
+    r.say(RecorderState(waiting_for=''))
     assert r.summary()[1] == 'planner is unknown'
-    r.say('pose_planner', state='running')
+    r.say(PlannerState(state='running', run=''))
     assert r.summary()[:2] == ('ok', 'waiting for a pose')
 
 
@@ -540,7 +547,7 @@ def test_a_planner_that_pauses_stops_the_arm(rig):
     r.go(AWAY, speed=0.2)
     r.say_planner('paused')
     r.run(1.5)
-    assert [event[2] for event in r.events if event[0] == 'stopped'] == ['planner is paused']
+    assert [stop.reason for stop in r.named(ArmStopped)] == ['planner is paused']
     assert r.arm.speed() < 1e-6
     r.say_planner('running')
     r.run(20.0, lambda: r.settled)
@@ -565,9 +572,7 @@ def test_reports_without_a_joint_halt_a_collection(rig):
         'does the cell file name the robot that is running?'
     )
     assert r.halted() == wanted
-    (event,) = [event for event in r.events if event[0] == 'halted']
-    assert event[1:3] == ('error', wanted)
-    assert event[3] == {'stamp': '1.000000000'}
+    assert r.named(ArmHalted) == [ArmHalted(stamp='1.000000000', reason=wanted)]
     assert ('error', f'halted: {wanted}') in r.bridge.logged
 
 
@@ -722,7 +727,7 @@ def test_the_end_of_the_bridge_stops_an_arm_on_its_way(rig):
     bridge.close()
     assert bridge.published == sent + 1
     r.wait(lambda: len(r.commands) == sent + 1 and len(r.events) > events, 'the stop')
-    assert r.events[-1][:3] == ('stopped', 'warn', 'planner is gone: the bridge stops')
+    assert r.events[-1].reason == 'planner is gone: the bridge stops'
     stop = r.commands[-1]
     assert np.all(stop.v[-1] == 0.0)
     r.arm.advance(r.wall + 3.0)

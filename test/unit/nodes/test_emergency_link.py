@@ -126,7 +126,7 @@ def test_a_publisher_that_is_gone_is_missed(bench):
     assert link.trouble() == ''
     bench.robot.destroy_publisher(publisher)
     bench.spin(lambda: not bench.node.count_publishers(TOPIC))
-    assert link.trouble() == f'nobody publishes /{TOPIC} (emergency_stop_topic) any more'
+    assert link.trouble() == f'/{TOPIC} (emergency_stop_topic) has no publisher any more'
 
 
 def tick(bench, publisher, gaps):

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from remaster_ros.nodes import locking, run_token
-from remaster_ros.nodes.run_token import LivingRun, silence_s
+from remaster_ros.nodes.run_token import LivingRun, new_token, silence_s
 
 
 @pytest.fixture(autouse=True)
@@ -16,7 +16,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_the_silence_is_counted_from_the_last_sign(monkeypatch):
-    run = LivingRun()
+    run = LivingRun(new_token())
     assert 0.0 <= silence_s(run.token) < 0.5
     now = run_token.since_boot_s()
     monkeypatch.setattr(run_token, 'since_boot_s', lambda: now + 20.0)
@@ -30,14 +30,14 @@ def test_the_silence_is_counted_from_the_last_sign(monkeypatch):
 
 
 def test_another_boot_and_an_ended_run_are_not_gone_on_with(monkeypatch):
-    run = LivingRun()
+    run = LivingRun(new_token())
     monkeypatch.setattr(run_token, 'boot_id', lambda: 'another')
     assert silence_s(run.token) is None
     monkeypatch.undo()
 
 
 def test_an_ended_or_unknown_run_has_no_silence():
-    run = LivingRun()
+    run = LivingRun(new_token())
     run.end()
     run.end()
     assert silence_s(run.token) is None
@@ -46,7 +46,7 @@ def test_an_ended_or_unknown_run_has_no_silence():
 
 
 def test_the_date_of_the_file_says_nothing(folder):
-    run = LivingRun()
+    run = LivingRun(new_token())
     path = folder / f'run_{run.token}'
     for then in (0.0, time.time() + 1e6):
         os.utime(path, (then, then))
@@ -54,7 +54,7 @@ def test_the_date_of_the_file_says_nothing(folder):
 
 
 def test_a_sign_that_is_damaged_is_none(folder):
-    run = LivingRun()
+    run = LivingRun(new_token())
     for text in ('', 'x', f'{run_token.boot_id()} soon'):
         (folder / f'run_{run.token}').write_text(text)
         assert silence_s(run.token) is None

@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.nodes.messages import seconds
 from remaster_ros.nodes.sensor_node import SensorNode
-from remaster_ros.nodes.status import LATCHED
+from remaster_ros.nodes.status import LATCHED, pairs
 from remaster_ros.parameters import parameter
 from remaster_ros.sensors import registry
 from remaster_ros.sensors.driver import SensorParameters, StreamDriver, TriggeredDriver
@@ -95,6 +95,11 @@ class LookingProbe(Probe):
         self.prepared += 1
 
 
+def shown(summary):
+    """Return what people are shown of a node."""
+    return {**pairs(summary.state), **summary.values}
+
+
 @pytest.fixture
 def rig(monkeypatch, tmp_path):
     """Return a function that starts the node of a driver, and a peer that listens."""
@@ -150,7 +155,7 @@ def rig(monkeypatch, tmp_path):
             return future.result()
 
         r.wait, r.measure, r.driver = wait, measure, r.node.driver
-        r.values = lambda: r.node._summary()[2]
+        r.values = lambda: shown(r.node._summary())
         wait(lambda: peer.count_publishers(f'{place}/marker'), 'the match')
         return r
 

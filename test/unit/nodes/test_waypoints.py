@@ -11,7 +11,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.errors import InputError
 from remaster_ros.nodes.planning_thread import PlanningThread
-from remaster_ros.nodes.pose_tracker import waypoints_by_solution, waypoints_message
+from remaster_ros.nodes.waypoints import waypoints_by_solution, waypoints_message
 from remaster_ros.planning.tour_order import PoseVisit
 
 NAMES = ('a', 'b', 'c')

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from remaster_ros.collection.events import Decided
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.errors import InputError
 from remaster_ros.session.reader import read_session
@@ -46,8 +47,8 @@ def test_a_recorder_started_again_knows_what_it_decided(session, tmp_path):
     assert 'after 3 observations' in book.notes[0]
     assert book.plan_id == 'plan a'
     results = [book.result(0, solution) for solution in range(4)]
-    assert results == ['', '', 'partial', 'recorded']
-    assert book.decided() == '0: 3 2'
+    assert results == [None, None, 'partial', 'recorded']
+    assert book.decided() == Decided(0, (3, 2))
     assert [r.sensor for r in book.registration] == ['mocap', 'tracker']
     np.testing.assert_array_equal(book.registration[0].q, points[0].q)
     write(book, 0, 1, [reading('tracker', 12.0)])

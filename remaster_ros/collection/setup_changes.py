@@ -1,9 +1,10 @@
-"""What the recorder makes of the references: what has changed, said once, and whether to stop."""
+"""What has changed in the setup, by the references: reported once, and whether to stop."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+from remaster_ros.collection.events import SetupChanged
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.collection.reference_readings import ReferenceReading, SetupChange
 from remaster_ros.collection.reference_watch import ReferenceWatch
@@ -11,10 +12,12 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray
 
 GROWN = 1.5
-"""A change that was said is said again where it has grown so many times."""
+"""A change that was reported is reported again where it has grown so many times."""
+PAUSED = 'paused'
+"""In place of a run that was paused, and whose token was lost with the recorder."""
 
 
-class Watching:
+class SetupChanges:
     """Follow the references of a session, and remember what a person has not seen to yet.
 
     Parameters
@@ -38,7 +41,7 @@ class Watching:
     ) -> None:
         self._stop_m = stop_m
         self._watch = ReferenceWatch(chain, markers, **({'stop_m': stop_m} if stop_m else {}))
-        self._said: SetupChange | None = None
+        self._reported: SetupChange | None = None
         self.change: SetupChange | None = None
         self.stopped_run: str | None = None
 
@@ -90,7 +93,7 @@ class Watching:
         T_R_N: Mapping[str, FloatArray],
         last: bool = False,
     ) -> bool:
-        """Take the readings at a reference; return whether something new is to be said.
+        """Take the readings at a reference; return whether something new is to be reported.
 
         Parameters
         ----------
@@ -114,15 +117,51 @@ class Watching:
     def judge(self, T_R_N: Mapping[str, FloatArray]) -> bool:
         """Judge the round so far, once; return as `read`."""
         self.change = self._watch.judge(T_R_N)
-        if self.change is None or self.change is self._said:
+        if self.change is None or self.change is self._reported:
             return False
-        said, now = self._said, self.change
-        new = said is None or now.size_m > GROWN * said.size_m or now.subject != said.subject
+        before, now = self._reported, self.change
+        new = before is None or now.size_m > GROWN * before.size_m or now.subject != before.subject
         if new or self.stops:
-            self._said = now
+            self._reported = now
         return new or self.stops
+
+    def report(self, run: str) -> SetupChanged | None:
+        """Return the event of the change, if there is one; a large change stops the run.
+
+        Parameters
+        ----------
+        run
+            Token of the run under way, '' for none.
+        """
+        if self.change is None:
+            return None
+        if self.stops:
+            self.stopped_run = run
+        return SetupChanged(
+            stops=self.stops,
+            text=self.describe(),
+            cause=self.change.kind,
+            size_m=self.change.size_m,
+        )
 
     def accept(self) -> None:
         """Take it that a person has seen to the change: the next round is a new beginning."""
         self._watch.accept()
-        self.change = self._said = self.stopped_run = None
+        self.change = self._reported = self.stopped_run = None
+
+    def follow(self, state: str, run: str) -> bool:
+        """Take what the planner does; return whether a person has seen to the change.
+
+        A person has where another run has begun, as /remaster/collect does. A recorder that was
+        started again has no record of which run was stopped: the one that it finds running is,
+        and after a pause none.
+
+        Parameters
+        ----------
+        state, run
+            The planner's state and the token of its run, '' for none.
+        """
+        if self.stopped_run == '':
+            self.stopped_run = run if state == 'running' else PAUSED * (state == 'paused')
+            return False
+        return bool(run) and self.stopped_run not in (None, run)

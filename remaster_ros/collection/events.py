@@ -1,0 +1,396 @@
+"""What the nodes act on: one record, typed and versioned, as JSON on ``remaster/events``.
+
+A record carries either the *state* of a node (twice a second and at each change, so that a node
+which starts late has it at once) or an *event* of a configuration. An event names the pose by the
+stamp of its announcement and the solution by its index there.
+
+A field without which an arm could move wrongly has no default: a record that lacks it is refused.
+Unknown fields are ignored, so that fields can be added. A change of what
+a field means, or a field that is taken away, needs another `VERSION`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal, get_args
+
+import msgspec
+import numpy as np
+
+from remaster_ros.errors import InputError
+
+VERSION = 1
+
+Index = Annotated[int, msgspec.Meta(ge=0)]
+Outcome = Literal['recorded', 'partial', 'rejected']
+
+
+class Body(msgspec.Struct, frozen=True, tag_field='kind'):
+    """What a record carries; ``kind`` names its type.
+
+    Attributes
+    ----------
+    sender
+        The name of the only node that may publish it; '' for any.
+    """
+
+    sender: ClassVar[str] = ''
+
+
+class Alive(Body, frozen=True, tag='alive'):
+    """State of a node of which the others need nothing else."""
+
+
+class PlannerState(Body, frozen=True, kw_only=True, tag='planner'):
+    """State of the planner.
+
+    Attributes
+    ----------
+    state
+        ``running`` while the arm may move; ``held`` (by a full disk), ``idle``, ``paused``,
+        ``stopped``, ``complete`` or ``failed``.
+    run
+        Token of the run under way, '' for none. Each /remaster/collect begins another one.
+    """
+
+    sender: ClassVar[str] = 'pose_planner'
+    state: str
+    run: str
+
+    def run_held(self, before: str) -> str:
+        """Return the token that recorder and bridge hold after this state.
+
+        They keep it in memory and publish it: by that a planner which is started again finds
+        whether its run still lives. A pause or a stop ends the run; a planner that was just
+        started and has not decided yet (``idle``) does not.
+
+        Parameters
+        ----------
+        before
+            The token held so far, '' for none.
+        """
+        if self.state in ('running', 'held'):
+            return self.run or before
+        return before if self.state == 'idle' else ''
+
+
+class BridgeState(Body, frozen=True, kw_only=True, tag='bridge'):
+    """State of the bridge.
+
+    Attributes
+    ----------
+    halted
+        Why the arm is halted until a person clears it; ''.
+    pose
+        Stamp of the pose whose solutions the bridge has, '' for none.
+    run
+        Token of the last run that the bridge has seen running.
+    joints_age_s, joints_trouble
+        Time since the last usable joint_states, None for never, s; what is wrong with them.
+    """
+
+    sender: ClassVar[str] = 'robot_bridge'
+    halted: str
+    pose: str = ''
+    run: str = ''
+    joints_age_s: float | None = None
+    joints_trouble: str = ''
+
+
+class Decided(msgspec.Struct, frozen=True):
+    """The solutions of a pose that are recorded, by the planner's own numbers."""
+
+    pose: int
+    solutions: tuple[int, ...]
+
+
+class RecorderState(Body, frozen=True, kw_only=True, tag='recorder'):
+    """State of the recorder.
+
+    Attributes
+    ----------
+    waiting_for
+        What the arm has to wait for (room on the disk, a required sensor), and why; ''.
+    state
+        ``waiting``, ``measuring`` or ``closed``.
+    exit_status
+        Of a session that is closed; ''.
+    session, observations, plan
+        The folder, how many rows it has, and the plan that they belong to.
+    pose, run
+        Stamp of the announced pose and token of the run, as the recorder has them.
+    decided
+        What is recorded of the last pose; None before the first.
+    registration
+        How far the first registration of the sensors is, as text.
+    require
+        Which sensors the arm waits for: ``all``, ``any`` or the name of one.
+    read_age_s
+        Time since the last reading of each sensor, s; None for never.
+    changed
+        What has changed at the reference configurations; ''.
+    changed_run
+        Token of the run that this change has paused; None for none, '' for one that a recorder
+        which was started again has not learned yet.
+    """
+
+    sender: ClassVar[str] = 'recorder'
+    waiting_for: str
+    state: str = 'waiting'
+    exit_status: str = ''
+    session: str = ''
+    observations: int = 0
+    plan: str = ''
+    pose: str = ''
+    run: str = ''
+    decided: Decided | None = None
+    registration: str = ''
+    require: str = 'all'
+    read_age_s: dict[str, float | None] = {}
+    changed: str = ''
+    changed_run: str | None = None
+
+
+class SensorReport(Body, frozen=True, kw_only=True, tag='sensor'):
+    """State of a sensor's node.
+
+    Attributes
+    ----------
+    sensor
+        The sensor's name in the cell.
+    ready
+        Whether it can measure a marker that it sees.
+    trouble
+        What is wrong, with the remedy; ''.
+    message
+        What the node shows to people.
+    hidden
+        The sensor does not see its marker: no reading comes before the arm has moved on.
+    """
+
+    sensor: str
+    ready: bool
+    trouble: str = ''
+    message: str = ''
+    hidden: bool = False
+
+
+class TourPlanned(Body, frozen=True, tag='planned'):
+    """The planner has planned the collection; described as text."""
+
+    sender: ClassVar[str] = 'pose_planner'
+    description: str
+
+
+class PoseAnnounced(Body, frozen=True, kw_only=True, tag='pose'):
+    """The planner announces a pose, whose solutions follow on ``remaster/joint_solutions``.
+
+    Attributes
+    ----------
+    stamp
+        Of the messages that belong to this announcement; the same pose announced again has
+        another one.
+    pose, split
+        As in the session.
+    ids
+        The planner's own numbers of the joint solutions, in the order published.
+    plan
+        The plan that both are numbered by.
+    last
+        Whether it is the last reference of a round.
+    """
+
+    sender: ClassVar[str] = 'pose_planner'
+    stamp: str
+    pose: int
+    split: str
+    ids: tuple[Index, ...]
+    plan: str = ''
+    last: bool = False
+
+
+class SolutionCommanded(Body, frozen=True, kw_only=True, tag='commanded'):
+    """The bridge sends the arm to a solution, this long after it last settled, wall time."""
+
+    sender: ClassVar[str] = 'robot_bridge'
+    stamp: str
+    solution: Index
+    since_settled_wall_s: float
+
+
+class SolutionSettled(Body, frozen=True, kw_only=True, tag='settled'):
+    """The arm stands at a solution, after so much time of motion and of settling."""
+
+    sender: ClassVar[str] = 'robot_bridge'
+    stamp: str
+    solution: Index
+    motion_s: float = 0.0
+    settle_s: float = 0.0
+
+
+class SolutionFailed(Body, frozen=True, kw_only=True, tag='failed'):
+    """The bridge does not get the arm to a solution."""
+
+    sender: ClassVar[str] = 'robot_bridge'
+    stamp: str
+    solution: Index
+    reason: str
+
+
+class ArmStopped(Body, frozen=True, kw_only=True, tag='stopped'):
+    """The bridge has stopped the arm on its way."""
+
+    sender: ClassVar[str] = 'robot_bridge'
+    stamp: str
+    reason: str
+
+
+class ArmHalted(Body, frozen=True, kw_only=True, tag='halted'):
+    """The bridge has halted the arm until a person clears the halt."""
+
+    sender: ClassVar[str] = 'robot_bridge'
+    stamp: str
+    reason: str
+
+
+class HaltCleared(Body, frozen=True, kw_only=True, tag='halt_cleared'):
+    """A person has cleared the halt."""
+
+    sender: ClassVar[str] = 'robot_bridge'
+    stamp: str
+
+
+class ConfigurationEnded(Body, frozen=True, kw_only=True, tag='configuration'):
+    """The recorder has written down what became of a configuration; the arm may go on.
+
+    Attributes
+    ----------
+    result, reason
+        What became of it, and why where it is not ``recorded``.
+    registered
+        Whether every sensor that the arm waits for is registered.
+    measuring_s
+        From settling to the last reading; None where nothing was read, s.
+    waited_s
+        How long each sensor was waited for, s.
+    """
+
+    sender: ClassVar[str] = 'recorder'
+    stamp: str
+    solution: Index
+    result: Outcome
+    reason: str = ''
+    registered: bool = False
+    measuring_s: float | None = None
+    waited_s: dict[str, float] = {}
+
+
+class SetupChanged(Body, frozen=True, kw_only=True, tag='changed'):
+    """The references show that something has moved.
+
+    Attributes
+    ----------
+    stops
+        Whether the collection pauses until a person has looked.
+    text, cause, size_m
+        The message; the kind of change; its size, m.
+    """
+
+    sender: ClassVar[str] = 'recorder'
+    stops: bool
+    text: str = ''
+    cause: str = ''
+    size_m: float = 0.0
+
+
+class RecorderBegan(Body, frozen=True, tag='began'):
+    """In a bag: its recorder was started (again) here, with no reading under way."""
+
+    sender: ClassVar[str] = 'recorder'
+
+
+class ShotMeasured(Body, frozen=True, tag='measured'):
+    """A single-shot sensor has measured; search and integration took so much wall time."""
+
+    instrument_wall_s: float
+
+
+State = Alive | PlannerState | BridgeState | RecorderState | SensorReport
+Event = (
+    TourPlanned
+    | PoseAnnounced
+    | SolutionCommanded
+    | SolutionSettled
+    | SolutionFailed
+    | ArmStopped
+    | ArmHalted
+    | HaltCleared
+    | ConfigurationEnded
+    | SetupChanged
+    | RecorderBegan
+    | ShotMeasured
+)
+STATES = get_args(State)
+
+
+class EventRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """A state or an event, and which node published it when.
+
+    Attributes
+    ----------
+    node
+        The node with its namespace, such as ``/left/recorder``.
+    started, uptime_s
+        Identifies this start of the node; how long it has been running, s.
+    stamp_ns
+        Time of the node's clock, ns.
+    """
+
+    node: str
+    body: State | Event
+    started: str = ''
+    uptime_s: float = 0.0
+    stamp_ns: int = 0
+    version: int = VERSION
+
+
+class _Version(msgspec.Struct):
+    version: int
+
+
+def encode(record: EventRecord) -> str:
+    """Return a record as JSON."""
+    return _ENCODER.encode(record).decode()
+
+
+def decode(text: str) -> EventRecord:
+    """Return the record in a message.
+
+    Raises
+    ------
+    InputError
+        It is no JSON, of another version, not complete, or from a node that cannot have sent it.
+    """
+    try:
+        version = _VERSION.decode(text).version
+        if version != VERSION:
+            raise InputError(
+                f'a record of version {version}, and this program reads version {VERSION}: run '
+                'all nodes with the same version of remaster_ros'
+            )
+        record = _RECORD.decode(text)
+    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+        raise InputError(f'a damaged record ({error}): {text[:80]!r}') from None
+    sender, name = record.body.sender, record.node.rpartition('/')[2]
+    if sender not in ('', name):
+        kind = type(record.body).__name__
+        raise InputError(f'{kind} is not for {record.node} to publish, but for {sender}')
+    return record
+
+
+def _plain(value: np.generic) -> object:
+    return value.item()
+
+
+_ENCODER = msgspec.json.Encoder(enc_hook=_plain)
+_VERSION = msgspec.json.Decoder(_Version)
+_RECORD = msgspec.json.Decoder(EventRecord)

@@ -1,0 +1,309 @@
+"""Which settled configuration is read next, by which messages, and what becomes of it.
+
+Stamps come with the messages. Nothing here uses clocks, files or ROS: the recorder's node
+hands the messages in, takes what has ended, and writes it down.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.collection.events import ConfigurationEnded, Outcome, PoseAnnounced
+from remaster_ros.collection.pairing import PairedReading, Pairing, Rejection, SensorRules
+from remaster_ros.collection.plausibility import Plausibility
+from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, nearest_solution
+from remaster_ros.types import FloatArray, MarkerReading
+
+TEMPERATURE_S = 600.0
+"""A temperature that is older than this is not used for a reading, s."""
+SET_BACK_S = 1.0
+"""Stamps of joint_states that go back by more than this are those of a clock that was set, s."""
+BY_HAND = PoseAnnounced(stamp='', pose=-1_000_000, split=REGISTRATION, ids=(0,))
+"""Where a user has driven the arm for a registration: the number is no planner's."""
+
+
+@dataclass(frozen=True)
+class SettledArm:
+    """The arm stands at a joint solution of a pose: joints, rad, (k,), and since when, s."""
+
+    q: FloatArray
+    stamp_s: float
+    pose: PoseAnnounced
+    solution: int
+
+    @property
+    def id(self) -> int:
+        """The planner's own number of the solution."""
+        return self.pose.ids[self.solution]
+
+    def recorded_before(self, result: Outcome, *, registered: bool) -> ConfigurationEnded:
+        """Return the event of a configuration that needs no other reading."""
+        return ConfigurationEnded(
+            stamp=self.pose.stamp,
+            solution=self.solution,
+            result=result,
+            reason='recorded before',
+            registered=registered,
+        )
+
+
+@dataclass(frozen=True)
+class EndedReading:
+    """What became of a configuration.
+
+    Attributes
+    ----------
+    settled
+        Which one.
+    from_q
+        Where the arm came from, rad, (k,); None where that is not known.
+    accepted, rejected
+        What each sensor gave, or why not.
+    waited_s
+        How long the arm stood for each sensor, s.
+    last_s
+        Stamp of the last reading that was accepted; of the last joint states where none was, s.
+    temperature_c
+        The last one from before the arm settled, degrees Celsius; None where that is long ago.
+    """
+
+    settled: SettledArm
+    from_q: FloatArray | None
+    accepted: Sequence[PairedReading]
+    rejected: Sequence[Rejection]
+    waited_s: Mapping[str, float]
+    last_s: float
+    temperature_c: float | None
+
+    @property
+    def result(self) -> Outcome:
+        """``partial`` where a sensor that was waited for has no reading."""
+        if not self.accepted:
+            return 'rejected'
+        missed = any(item.reason not in ('not_waited', 'absent') for item in self.rejected)
+        return 'partial' if missed else 'recorded'
+
+    @property
+    def why(self) -> str:
+        """Why sensors have no reading; ''."""
+        return '; '.join(f'{r.sensor}: {r.reason}: {r.detail}' for r in self.rejected)
+
+    def event(self, *, registered: bool) -> ConfigurationEnded:
+        """Return the event by which the others learn of it."""
+        return ConfigurationEnded(
+            stamp=self.settled.pose.stamp,
+            solution=self.settled.solution,
+            result=self.result,
+            reason=self.why,
+            registered=registered,
+            measuring_s=self.last_s - self.settled.stamp_s,
+            waited_s=dict(self.waited_s),
+        )
+
+
+class Recording:
+    """Read one settled configuration after the other.
+
+    Parameters
+    ----------
+    rules
+        How each sensor is read.
+    motion_tolerance
+        Largest joint movement during a reading, rad.
+    require
+        ``all``, ``any``, or the name of the sensor that the arm waits for.
+    plausibility
+        Judges readings by where the robot has the marker.
+
+    Attributes
+    ----------
+    announced
+        The planner's last announcement; set from outside.
+    pairing
+        The reading under way; None where there is none.
+    q, now_s
+        The last joint states, rad, (k,), and their stamp, s.
+    """
+
+    def __init__(
+        self,
+        rules: tuple[SensorRules, ...],
+        motion_tolerance: float,
+        require: str,
+        plausibility: Plausibility,
+    ) -> None:
+        self._rules, self._tolerance, self._require = rules, motion_tolerance, require
+        self._plausibility = plausibility
+        self.announced: PoseAnnounced | None = None
+        self._solutions: FloatArray | None = None
+        self._solutions_stamp = ''
+        self.pairing: Pairing | None = None
+        self._settled: SettledArm | None = None
+        self._came_from: FloatArray | None = None
+        self._due: deque[SettledArm] = deque(maxlen=100)
+        # Topics come in no common order: what belongs to a dwell may come before the settling.
+        self._joints: deque[tuple[float, FloatArray]] = deque(maxlen=4000)
+        self._readings: deque[tuple[str, MarkerReading]] = deque(maxlen=4000)
+        self._temperatures: deque[tuple[float, float]] = deque(maxlen=500)
+        self.q: FloatArray | None = None
+        self.now_s = 0.0
+        self._from_q: FloatArray | None = None
+        # Settled where no announced pose has a solution (yet): joints, rad, and when, s.
+        self._unknown: tuple[FloatArray, float] | None = None
+
+    # What comes in
+
+    def take_solutions(self, stamp: str, solutions: FloatArray) -> None:
+        """Take the joint solutions of an announcement, rad, (m, k); none take the pose back."""
+        self._solutions_stamp = stamp if len(solutions) else ''
+        self._solutions = solutions if len(solutions) else None
+
+    def take_joints(self, stamp_s: float, q: FloatArray) -> None:
+        """Take joint states, rad, (k,)."""
+        if stamp_s < self.now_s - SET_BACK_S:
+            # The robot's clock was set back: what is kept lies in the future of all that comes.
+            self._joints.clear()
+            self._readings.clear()
+        self.now_s, self.q = stamp_s, q
+        self._joints.append((stamp_s, q))
+        if self.pairing is not None:
+            self.pairing.add_joint_state(stamp_s, q)
+
+    def take_reading(self, sensor: str, reading: MarkerReading) -> None:
+        """Take a reading of a sensor."""
+        self._readings.append((sensor, reading))
+        if self.pairing is not None:
+            self.pairing.add_reading(sensor, reading)
+
+    def take_temperature(self, stamp_s: float, temperature_c: float) -> None:
+        """Take a temperature, degrees Celsius."""
+        self._temperatures.append((stamp_s, temperature_c))
+
+    def take_settled(self, stamp_s: float, q: FloatArray) -> bool:
+        """Take it that the arm has settled; return whether it is at a known solution.
+
+        Where it is not, either the planner finds by the recorder's state that the pose is not
+        known here and announces it again, or the announcement is on its way.
+        """
+        self._unknown = None
+        if self._queue(q, stamp_s):
+            return True
+        self._unknown = q, stamp_s
+        return False
+
+    def take_stop(self) -> None:
+        """Take it that the arm was stopped on its way: where it comes from next is not known."""
+        self._from_q = None
+
+    def forget(self) -> None:
+        """Drop what is under way: in a bag, its recorder was started again here."""
+        self.pairing = self._settled = None
+        self._due.clear()
+
+    # What is known
+
+    @property
+    def pose(self) -> PoseAnnounced | None:
+        """The pose under way; None where its event or its solutions have not come."""
+        pose = self.announced
+        return pose if pose is not None and pose.stamp == self._solutions_stamp else None
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether no reading is under way and none is due."""
+        return self.pairing is None and not self._due
+
+    def _queue(self, q: FloatArray, stamp_s: float) -> bool:
+        """Queue a configuration; return False where no solution of the pose is there."""
+        pose = self.pose
+        if pose is None or self._solutions is None:
+            return False
+        solution = nearest_solution(self._solutions, q)
+        if solution is None:
+            return False
+        self._due.append(SettledArm(q, stamp_s, pose, solution))
+        return True
+
+    # The readings, one after the other
+
+    def look_again(self) -> None:
+        """Take up an unknown configuration whose pose has come, if the arm still stands there."""
+        if self._unknown is None or self.pose is None:
+            return
+        q, settled_s = self._unknown
+        since = [joints for stamp_s, joints in self._joints if stamp_s > settled_s]
+        stands = all(np.max(np.abs(joints - q)) <= self._tolerance for joints in since)
+        if not stands or self._queue(q, settled_s):
+            self._unknown = None
+
+    def next(self) -> SettledArm | None:
+        """Return the configuration that is to be read now, once; None where none is."""
+        return self._due.popleft() if self._due and self.pairing is None else None
+
+    def begin(self, settled: SettledArm) -> None:
+        """Begin to read a configuration, with the messages that came before as well."""
+        self.pairing, self._settled = self._new_pairing(settled), settled
+        # Now, not when the reading is done: a stop may come in between.
+        self._came_from, self._from_q = self._from_q, settled.q
+
+    def begin_here(self) -> None:
+        """Begin to read where the arm stands now, for a registration by hand."""
+        assert self.q is not None
+        self.begin(SettledArm(self.q, self.now_s, BY_HAND, 0))
+
+    def _new_pairing(self, settled: SettledArm) -> Pairing:
+        pairing = Pairing(settled.stamp_s, settled.q, self._rules, self._tolerance, self._require)
+        for stamp_s, joints in self._joints:
+            pairing.add_joint_state(stamp_s, joints)
+        for sensor, reading in self._readings:
+            pairing.add_reading(sensor, reading)
+        return pairing
+
+    def give_up(self, absent: Collection[str], words: Mapping[str, int]) -> None:
+        """Reject what does not come in time; see `Pairing.give_up`."""
+        if self.pairing is not None:
+            self.pairing.give_up(self.now_s, absent, words)
+
+    def end(self, T_R_N: Mapping[str, FloatArray]) -> EndedReading | None:
+        """Return what became of the configuration, once it is decided; None before.
+
+        Parameters
+        ----------
+        T_R_N
+            The registrations so far: sensor -> (4, 4).
+        """
+        pairing, settled = self.pairing, self._settled
+        if pairing is None or settled is None or not pairing.complete:
+            return None
+        self.pairing = self._settled = None
+        pairing.finish()
+        at_reference = settled.pose.split == REFERENCE
+        decided = [
+            item
+            if isinstance(item, Rejection)
+            else self._plausibility.judge(item, T_R_N.get(item.sensor), anywhere=at_reference)
+            for item in pairing.decided.values()
+        ]
+        accepted = [item for item in decided if isinstance(item, PairedReading)]
+        return EndedReading(
+            settled,
+            self._came_from,
+            accepted,
+            [item for item in decided if isinstance(item, Rejection)],
+            pairing.waited_s(),
+            max((reading.stamp_s for reading in accepted), default=self.now_s),
+            self._temperature_c(settled.stamp_s),
+        )
+
+    def _temperature_c(self, stamp_s: float) -> float | None:
+        """Return the last temperature from before a time, if that is not long ago.
+
+        Not that of the reading itself: it is on a topic of its own and may come after the point,
+        and a replay must write what the recording wrote.
+        """
+        known = [item for item in self._temperatures if 0.0 <= stamp_s - item[0] < TEMPERATURE_S]
+        return max(known)[1] if known else None

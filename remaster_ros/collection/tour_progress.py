@@ -1,0 +1,245 @@
+"""Which pose is next, and with which of its solutions: registration first, then the collection."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection
+from typing import Any, Protocol, TypeVar
+
+from remaster_ros.collection.events import RecorderState
+from remaster_ros.collection.required_sensors import RequiredSensors
+from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, PoseVisit, Tour
+from remaster_ros.planning.tour_planner import TourPlanner
+from remaster_ros.types import FloatArray
+
+Result = TypeVar('Result')
+
+
+class PlanMemory(Protocol):
+    """What of a plan outlives the planner; see `session.plan_journal.PlanJournal`."""
+
+    id: str
+    tour: Tour | None
+    stop: PoseVisit | None
+    trouble: str
+    outcomes: Counter[str]
+
+    def begin(self, tour: Tour) -> None:
+        """Remember a new tour."""
+
+    def open_stop(self, stop: PoseVisit) -> None:
+        """Remember the next stop."""
+
+    def reroute(self, stop: PoseVisit) -> None:
+        """Remember other ways to what is left of the stop."""
+
+    def outcome(self, solution: int, result: str) -> None:
+        """Remember what became of a solution of the stop."""
+
+
+class Planning(Protocol):
+    """Does one thing at a time beside the callbacks; see `nodes.planning_thread`."""
+
+    def ask(self, what: object, q: FloatArray, job: Callable[[], Result]) -> tuple[Result] | None:
+        """Return what a job found, in a tuple; None while it works."""
+
+
+class TourProgress:
+    """Go from pose to pose.
+
+    Parameters
+    ----------
+    memory
+        The plan, the open pose, and what became of each configuration.
+    tours
+        Plans the tours.
+    planning
+        Where that is done, as it takes a while.
+
+    Attributes
+    ----------
+    phase
+        ``registration`` or ``collection``.
+    resumed
+        Whether poses were visited by a planner before this one.
+    T_R_N
+        The registrations so far: sensor -> (4, 4).
+    is_complete
+        Whether all of the tour was visited.
+    standing
+        Why the next pose cannot be planned from where the arm stands; ''.
+    """
+
+    def __init__(self, memory: PlanMemory, tours: TourPlanner, planning: Planning) -> None:
+        self._memory, self._tours, self._planning = memory, tours, planning
+        tour = memory.tour
+        self.resumed = tour is not None and tour.visited > 0
+        collecting = tour is not None and REGISTRATION not in tour.plans
+        self.phase = 'collection' if collecting else REGISTRATION
+        self.T_R_N: dict[str, FloatArray] = {}
+        # What the recorder has reported; its transforms come on a topic of their own.
+        self._registered = False
+        self.is_complete = False
+        self.standing = ''
+
+    def describe(self) -> str:
+        """Return how far the collection is, as text."""
+        tour = self._memory.tour
+        poses = f'{tour.poses_begun} of {sum(tour.poses.values())}' if tour else 'none'
+        done = self._memory.outcomes.total()
+        return f'{poses} {self.phase} poses begun, {done} configurations done'
+
+    # What became of configurations
+
+    def ended(self, solution: int, result: str, *, registered: bool) -> bool:
+        """Take what became of a solution; return whether it belongs to the open pose."""
+        if self._memory.stop is None or solution not in self._memory.stop.ids:
+            return False
+        self._registered = registered
+        self._memory.outcome(solution, result)
+        return True
+
+    def catch_up(self, recorder: RecorderState) -> bool:
+        """Take what was recorded while this planner was not there; return whether anything was."""
+        stop, decided = self._memory.stop, recorder.decided
+        if stop is None or decided is None or recorder.plan != self._memory.id:
+            return False
+        if decided.pose != stop.pose:
+            return False
+        found = [solution for solution in decided.solutions if solution in stop.ids]
+        for solution in found:
+            self._memory.outcome(solution, 'recorded')
+        return bool(found)
+
+    # What is next
+
+    def check_session(self, recorder: RecorderState, path: object) -> None:
+        """Refuse to add another plan's poses to a session.
+
+        Raises
+        ------
+        InputError
+            The recorder's session holds observations of another plan than the one in `path`.
+        """
+        if recorder.plan not in ('', self._memory.id) and recorder.observations:
+            raise InputError(
+                f'the session {recorder.session} holds observations of another plan than '
+                f'{path}; give the planner the same session folder as the recorder, '
+                'or begin a new session'
+            )
+
+    @property
+    def open_pose(self) -> PoseVisit | None:
+        """The pose with solutions that have no outcome yet; None where there is none."""
+        stop = self._memory.stop
+        return stop if stop is not None and stop.ids else None
+
+    def rest(self, q: FloatArray) -> PoseVisit | None:
+        """Return what is left of the open pose, by ways that begin at `q`; None while planned.
+
+        Parameters
+        ----------
+        q
+            Where the arm stands, rad, (k,).
+        """
+        tour, stop = self._memory.tour, self._memory.stop
+        assert tour is not None
+        assert stop is not None
+        self.standing = ''
+        what = (tour, stop.split, stop.pose, stop.ids)
+        found = self._planning.ask(what, q, lambda: tour.reroute(stop, q))
+        if found is None:
+            return None
+        self._memory.reroute(found[0])
+        return found[0]
+
+    def next(self, q: FloatArray, sensors: RequiredSensors, words: str) -> PoseVisit | None:
+        """Open the next pose and return it; None while it is planned, and at the end.
+
+        Parameters
+        ----------
+        q
+            Where the arm stands, rad, (k,).
+        sensors
+            Those that must be registered before the collection.
+        words
+            How far the recorder's registration is, for the error.
+
+        Raises
+        ------
+        InsufficientDataError
+            No registration after all poses for it, or no pose is left to fit on.
+        """
+        self.standing = ''
+        if self.phase == REGISTRATION and not sensors.are_among(self.T_R_N):
+            return self._next_registration(q, sensors.names, words)
+        self.phase = 'collection'
+        if self._memory.tour is None or REGISTRATION in self._memory.tour.plans:
+            T_R_N = dict(self.T_R_N)
+            planned = self._planning.ask('plan', q, lambda: self._tours.collection(T_R_N))
+            if planned is None:
+                return None
+            self._memory.begin(planned[0])
+        found = self._open(q)
+        self.is_complete = found == (None,)
+        return found[0] if found else None
+
+    def _next_registration(
+        self, q: FloatArray, sensors: Collection[str], words: str
+    ) -> PoseVisit | None:
+        if self._registered:
+            return None
+        if self._memory.tour is None:
+            planned = self._planning.ask('register', q, self._tours.registration)
+            if planned is None:
+                return None
+            self._memory.begin(planned[0])
+        found = self._open(q)
+        if found == (None,):
+            missing = ', '.join(name for name in sensors if name not in self.T_R_N)
+            visited = self._memory.tour.visited if self._memory.tour else 0
+            raise InsufficientDataError(
+                f'no registration of {missing} after {visited} poses ({words}); the recorder '
+                'counts why readings were rejected'
+            )
+        return found[0] if found else None
+
+    def _open(self, q: FloatArray) -> tuple[PoseVisit | None] | None:
+        """Open the next stop, in a tuple; None in it at the end; None while it is planned."""
+        tour = self._memory.tour
+        assert tour is not None
+        standing = self._tours.model.trouble(q)
+        if standing:
+            # The bridge halts such an arm and offers a way out; after it the arm is elsewhere.
+            self.standing = f'the arm stands too near to something: {standing}'
+            return None
+        found = self._planning.ask((tour, tour.visited), q, lambda: tour.propose(q))
+        if found is None or found[0] is None:
+            return found
+        stop = tour.take(found[0])
+        self._memory.open_stop(stop)
+        return (stop,)
+
+    def is_last_reference(self, stop: PoseVisit) -> bool:
+        """Whether a stop is the last reference of its round."""
+        tour = self._memory.tour
+        return tour is not None and stop.split == REFERENCE and stop.index == tour.references - 1
+
+    def counts(self) -> dict[str, Any]:
+        """Return figures of the tour for people."""
+        tour, outcomes = self._memory.tour, self._memory.outcomes
+        values: dict[str, Any] = {
+            'phase': self.phase,
+            'poses_done': tour.poses_begun if tour else 0,
+            'poses': sum(tour.poses.values()) if tour else 0,
+            'configurations_done': outcomes.total(),
+            'configurations': sum(tour.configurations.values()) if tour else 0,
+            'references': tour.references if tour else 0,
+        }
+        tables = {'outcome': outcomes}
+        if tour is not None and self.phase != REGISTRATION:
+            tables |= {'dropped': tour.dropped, 'dropped_solutions': tour.dropped_solutions}
+        for table, counts in tables.items():
+            values |= {f'{table}_{name}': count for name, count in sorted(counts.items())}
+        return values

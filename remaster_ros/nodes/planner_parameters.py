@@ -1,0 +1,59 @@
+"""Parameters of the planner."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from remaster_ros.nodes.parameters import parameter
+from remaster_ros.session.workcell import Workcell
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the planner."""
+
+    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
+    optimization_candidates: int = parameter(
+        60, 'candidate poses that the offsets are fitted on', low=1, high=10000
+    )
+    validation_candidates: int = parameter(
+        60, 'candidate poses that the gain is proved on', low=0, high=10000
+    )
+    registration_candidates: int = parameter(
+        12, 'candidate poses for the three-point registration', low=3, high=1000
+    )
+    seed: int = parameter(0, 'seed of the Latin hypercube', low=0)
+    reference_every: int = parameter(
+        25,
+        'how many configurations lie between two visits to the reference configurations, by which '
+        'a moved sensor or base, a slipped marker or encoder and drift are seen; 0 for none',
+        low=0,
+        high=100000,
+    )
+    session: str = parameter(
+        'session', "folder of the recorder's session, where the plan is kept (plan.jsonl)"
+    )
+    resume_within_s: float = parameter(
+        30.0,
+        'a planner killed while collecting that is started again within this time goes on by '
+        'itself; later it waits for /remaster/collect',
+        unit='s',
+        low=0.0,
+        high=3600.0,
+    )
+    limit_margin_deg: float = parameter(
+        1.0, 'distance kept from the joint limits', unit='deg', low=0.0, high=45.0
+    )
+
+    def plan_settings(self, cell: Workcell) -> dict[str, Any]:
+        """Return what the plan depends on."""
+        return {
+            'cell': cell.fingerprint(),
+            'optimization_candidates': self.optimization_candidates,
+            'validation_candidates': self.validation_candidates,
+            'registration_candidates': self.registration_candidates,
+            'seed': self.seed,
+            'reference_every': self.reference_every,
+            'limit_margin_deg': self.limit_margin_deg,
+        }

@@ -1,0 +1,126 @@
+"""A pose that bridge or recorder missed is announced again; times are arguments."""
+
+import pytest
+
+from remaster_ros.collection.announcements import ANNOUNCE_WALL_S, MATCH_WALL_S, Announcements
+from remaster_ros.collection.events import (
+    Alive,
+    BridgeState,
+    EventRecord,
+    PlannerState,
+    RecorderState,
+)
+
+
+class Bench:
+    """The planner's side, with both peers there and matched."""
+
+    def __init__(self):
+        self.known, self.now = Announcements(), 100.0
+        self.started = {'robot_bridge': 'first', 'recorder': 'first'}
+        self.bridge()
+        self.recorder()
+
+    def take(self, body):
+        record = EventRecord(node=f'/{body.sender}', body=body, started=self.started[body.sender])
+        self.known.take(record, self.now)
+
+    def bridge(self, pose=''):
+        self.take(BridgeState(halted='', pose=pose))
+
+    def recorder(self, pose='', state='waiting'):
+        self.take(RecorderState(waiting_for='', pose=pose, state=state))
+
+    def announce(self, stamp='7.0', ids=(4, 2)):
+        self.known.announced(stamp, ids, self.now)
+
+
+def test_it_waits_until_both_are_matched_for_a_while():
+    known = Announcements()
+    assert not known.matched(2, 0.0)
+    bench = Bench()
+    assert not bench.known.matched(1, 100.0)
+    assert not bench.known.matched(2, 101.0)
+    assert not bench.known.matched(2, 101.0 + MATCH_WALL_S)
+    assert bench.known.matched(2, 101.1 + MATCH_WALL_S)
+    assert not bench.known.matched(1, 102.0)
+    assert not bench.known.matched(2, 103.0), 'from the beginning again'
+
+
+def test_other_nodes_are_no_peers():
+    known = Announcements()
+    for name, body in (('optimizer', Alive()), ('pose_planner', PlannerState(state='', run=''))):
+        known.take(EventRecord(node=f'/{name}', body=body), 0.0)
+    known.matched(2, 0.0)
+    assert not known.matched(2, 9.0)
+    assert (known.bridge, known.recorder) == (None, None)
+
+
+def test_a_pose_that_both_know_is_not_lost():
+    bench = Bench()
+    bench.announce()
+    assert not bench.known.is_lost(), 'their states are still on their way'
+    bench.now += ANNOUNCE_WALL_S + 1.0
+    bench.bridge('7.0')
+    bench.recorder('7.0')
+    assert not bench.known.is_lost()
+
+
+@pytest.mark.parametrize('name', ['bridge', 'recorder'])
+def test_who_does_not_know_it_after_a_while_has_missed_it(name):
+    bench = Bench()
+    bench.announce()
+    bench.bridge('7.0')
+    bench.recorder('7.0')
+    getattr(bench, name)('')
+    assert not bench.known.is_lost()
+    bench.now += ANNOUNCE_WALL_S + 0.1
+    getattr(bench, name)('')
+    assert bench.known.is_lost()
+
+
+@pytest.mark.parametrize('node', ['robot_bridge', 'recorder'])
+def test_who_was_started_after_it_has_missed_it(node):
+    bench = Bench()
+    bench.announce()
+    bench.bridge('7.0')
+    bench.recorder('7.0')
+    bench.started[node] = 'second'
+    bench.bridge('' if node == 'robot_bridge' else '7.0')
+    bench.recorder('' if node == 'recorder' else '7.0')
+    assert bench.known.is_lost()
+    bench.announce('8.0')
+    assert not bench.known.is_lost()
+
+
+def test_nothing_is_announced_while_the_recorder_measures():
+    bench = Bench()
+    bench.announce()
+    bench.now += ANNOUNCE_WALL_S + 1.0
+    bench.bridge('')
+    bench.recorder('7.0', state='measuring')
+    assert not bench.known.is_lost()
+    bench.recorder('7.0')
+    assert bench.known.is_lost()
+
+
+def test_a_pose_that_was_taken_back_is_announced_anew():
+    bench = Bench()
+    assert bench.known.is_lost(), 'not announced yet'
+    bench.announce()
+    bench.known.retract()
+    assert bench.known.is_lost()
+    assert bench.known.solution('7.0', 0) == 4, 'what became of it still counts'
+
+
+def test_solutions_are_named_by_announcement_and_index():
+    bench = Bench()
+    bench.announce('7.0', (4, 2))
+    bench.announce('8.0', (2,))
+    assert bench.known.stamp == '8.0'
+    assert [bench.known.solution('7.0', i) for i in range(3)] == [4, 2, None]
+    assert bench.known.solution('8.0', 0) == 2
+    assert bench.known.solution('9.0', 0) is None
+    bench.known.close()
+    assert bench.known.solution('8.0', 0) is None
+    assert bench.known.stamp == ''

@@ -1,0 +1,50 @@
+"""Three points register a sensor; further ones refine it; those that do not agree tell so."""
+
+import numpy as np
+
+from remaster_ros.collection.first_registration import FirstRegistration
+from remaster_ros.collection.pairing import PairedReading
+from remaster_ros.kinematics.transforms import (
+    apply,
+    inverse,
+    rotation_vector_to_matrix,
+    transform,
+)
+from remaster_ros.session.workcell import read_cell
+
+CHAIN = read_cell('demo').chain()
+MARKERS = {'sir': np.array([0.1, 0.0, 0.0])}
+T_R_N = transform(rotation_vector_to_matrix(np.array([0.3, -0.2, 2.5])), (1.9, 0.0, 1.3))
+PLACES = np.random.default_rng(2).uniform(-0.6, 0.6, (5, len(CHAIN)))
+
+
+def reading(q, shift=(0.0, 0.0, 0.0)):
+    seen = apply(inverse(T_R_N), CHAIN.positions(q, MARKERS['sir'])) + np.asarray(shift)
+    return PairedReading('mocap', 'sir', 1.0, q, seen, None, 1)
+
+
+def begun():
+    return FirstRegistration(CHAIN, MARKERS, ['mocap', 'tracker'], 0.025)
+
+
+def test_the_third_point_registers_and_the_others_refine():
+    registration = begun()
+    assert [registration.add([reading(q)]) for q in PLACES] == [[], [], *[['mocap']] * 3]
+    np.testing.assert_allclose(registration.T_R_N['mocap'], T_R_N, atol=1e-9)
+    assert registration.describe() == 'mocap: point 5 of 3; tracker: point 0 of 3'
+
+
+def test_what_was_measured_before_registers_at_once():
+    registration = begun()
+    assert registration.add([reading(q) for q in PLACES[:3]]) == ['mocap']
+
+
+def test_points_that_do_not_agree_register_nothing_until_enough_do():
+    registration = begun()
+    for q, shift in zip(PLACES[:3], ((0, 0, 0), (0, 0, 0.15), (0, 0, 0))):
+        assert registration.add([reading(q, shift)]) == []
+    assert 'mocap' in registration.troubles
+    assert registration.troubles['mocap'] in registration.describe()
+    assert registration.add([reading(PLACES[3])]) == ['mocap']
+    assert not registration.troubles
+    np.testing.assert_allclose(registration.T_R_N['mocap'], T_R_N, atol=1e-6)

@@ -1,0 +1,242 @@
+"""Which pose is next, with the journal of a real session and tours of a few poses."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from remaster_ros.collection.events import Decided, RecorderState
+from remaster_ros.collection.required_sensors import RequiredSensors
+from remaster_ros.collection.tour_progress import TourProgress
+from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.planning.candidates import Plan, PlannedPose
+from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, Tour
+from remaster_ros.session.plan_journal import PlanJournal
+from remaster_ros.session.workcell import read_cell
+
+CHAIN = read_cell('demo').chain()
+Q = np.zeros(len(CHAIN))
+SENSORS = RequiredSensors(['mocap'], 'all')
+
+
+def plan_of(seed, poses, solutions):
+    q = np.random.default_rng(seed).uniform(-1.5, 1.5, (poses, solutions, len(CHAIN)))
+    return Plan(tuple(PlannedPose(CHAIN.forward(own[0]), own) for own in q), {'unseen': 4})
+
+
+class Tours:
+    """Plans of a few poses; the arm stands where nothing is near unless told otherwise."""
+
+    def __init__(self, references=0):
+        self.references, self.standing, self.seen = references, '', []
+
+    def registration(self):
+        return Tour(CHAIN, {REGISTRATION: plan_of(1, 2, 1)}, in_order=True)
+
+    def collection(self, T_R_N):
+        self.seen.append(T_R_N)
+        plans = {'optimization': plan_of(2, 2, 2)}
+        if self.references:
+            plans[REFERENCE] = plan_of(3, self.references, 1)
+        return Tour(CHAIN, plans, reference_every=100 * bool(self.references))
+
+    @property
+    def model(self):
+        return SimpleNamespace(trouble=lambda q: self.standing)
+
+
+class Planning:
+    """Does each thing at the second time it is asked for, as a thread would."""
+
+    def __init__(self):
+        self.what = None
+
+    def ask(self, what, q, job):
+        if self.what != what:
+            self.what = what
+            return None
+        self.what = None
+        return (job(),)
+
+
+class Bench:
+    """A planner's progress in a session folder."""
+
+    def __init__(self, folder, **options):
+        self.folder, self.tours = folder, Tours(**options)
+        self.open()
+
+    def open(self):
+        self.journal = PlanJournal(self.folder, {'cell': 'a'}, CHAIN)
+        self.progress = TourProgress(self.journal, self.tours, Planning())
+
+    def restart(self):
+        T_R_N = self.progress.T_R_N
+        self.journal.close()
+        self.open()
+        self.progress.T_R_N = T_R_N
+
+    def register(self):
+        self.progress.T_R_N['mocap'] = np.eye(4)
+
+    def next(self, sensors=SENSORS, words='point 2 of 3'):
+        """Return the next pose, however long it is planned; None at the end."""
+        for _ in range(6):
+            stop = self.progress.next(Q, sensors, words)
+            if stop is not None or self.progress.is_complete:
+                return stop
+        return None
+
+    def visit(self, stop, result='recorded'):
+        for solution in stop.ids:
+            assert self.progress.ended(solution, result, registered=False)
+        assert self.progress.open_pose is None
+
+
+@pytest.fixture
+def bench(tmp_path):
+    made = []
+
+    def make(**options):
+        made.append(Bench(tmp_path / 'session', **options))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.journal.close()
+
+
+def test_the_registration_comes_first_then_the_collection_to_its_end(bench):
+    b = bench()
+    stop = b.next()
+    assert (stop.split, stop.pose, b.progress.phase) == (REGISTRATION, -1, REGISTRATION)
+    b.visit(stop)
+    b.register()
+    for number in range(2):
+        stop = b.next()
+        assert (stop.split, stop.pose, len(stop.ids)) == ('optimization', number, 2)
+        b.visit(stop)
+    assert b.progress.phase == 'collection'
+    assert b.next() is None
+    assert b.progress.is_complete
+    assert b.tours.seen[0].keys() == {'mocap'}
+    counts = b.progress.counts()
+    assert (counts['poses_done'], counts['poses']) == (2, 2)
+    assert (counts['configurations_done'], counts['configurations']) == (4, 4)
+    assert counts['outcome_recorded'] == 4
+    assert counts['dropped_unseen'] == 4
+    assert b.progress.describe() == '2 of 2 collection poses begun, 4 configurations done'
+
+
+def test_a_pose_is_in_the_journal_before_it_is_returned(bench):
+    b = bench()
+    b.register()
+    stop = b.next()
+    b.restart()
+    assert b.progress.open_pose.ids == stop.ids
+    assert b.progress.resumed
+    assert b.progress.phase == 'collection'
+
+
+def test_nothing_is_planned_on_while_a_registration_is_on_its_way(bench):
+    """The recorder has reported it; its transforms come on a topic of their own."""
+    b = bench()
+    stop = b.next()
+    assert b.progress.ended(stop.ids[0], 'recorded', registered=True)
+    assert b.next() is None
+    b.register()
+    assert b.next().split == 'optimization'
+
+
+def test_poses_that_register_nothing_are_an_error_with_the_reason(bench):
+    b = bench()
+    for _ in range(2):
+        b.visit(b.next())
+    with pytest.raises(InsufficientDataError, match=r'mocap after 2 poses \(point 2 of 3\)'):
+        b.next()
+
+
+def test_one_of_the_sensors_may_be_enough(bench):
+    b = bench()
+    b.register()
+    assert b.next(RequiredSensors(['mocap', 'tracker'], 'any')).split == 'optimization'
+
+
+def test_what_is_no_solution_of_the_open_pose_changes_nothing(bench):
+    b = bench()
+    assert not b.progress.ended(0, 'recorded', registered=True)
+    b.register()
+    stop = b.next()
+    assert not b.progress.ended(7, 'recorded', registered=True)
+    assert b.progress.open_pose.ids == stop.ids
+
+
+def test_what_is_left_of_a_pose_is_reached_from_where_the_arm_stands(bench):
+    b = bench()
+    b.register()
+    stop = b.next()
+    b.progress.ended(stop.ids[0], 'failed', registered=False)
+    elsewhere = Q + 0.3
+    assert b.progress.rest(elsewhere) is None, 'it is planned'
+    rest = b.progress.rest(elsewhere)
+    assert (rest.pose, rest.ids) == (stop.pose, stop.ids[1:])
+    b.restart()
+    assert b.progress.open_pose.ids == stop.ids[1:]
+
+
+@pytest.mark.parametrize(
+    ('plan', 'pose', 'taken'), [('', 0, True), ('another', 0, False), ('', 9, False)]
+)
+def test_what_was_recorded_meanwhile_is_caught_up(bench, plan, pose, taken):
+    b = bench()
+    b.register()
+    stop = b.next()
+    decided = Decided(pose, (stop.ids[1], 99))
+    recorder = RecorderState(waiting_for='', plan=plan or b.journal.id, decided=decided)
+    assert b.progress.catch_up(recorder) == taken
+    assert b.progress.open_pose.ids == (stop.ids[:1] if taken else stop.ids)
+    assert not b.progress.catch_up(recorder), 'once'
+    assert not b.progress.catch_up(RecorderState(waiting_for='', plan=b.journal.id))
+
+
+@pytest.mark.parametrize(
+    ('plan', 'observations', 'refused'), [('other', 3, True), ('other', 0, False), ('', 3, False)]
+)
+def test_the_session_of_another_plan_is_refused(bench, plan, observations, refused):
+    b = bench()
+    b.register()
+    b.next()
+    recorder = RecorderState(
+        waiting_for='', plan=plan, observations=observations, session='their session'
+    )
+    if not refused:
+        b.progress.check_session(recorder, b.journal.path)
+        return
+    with pytest.raises(InputError, match=r'their session holds .* of another plan than .*plan'):
+        b.progress.check_session(recorder, b.journal.path)
+
+
+def test_an_arm_that_stands_too_near_is_not_planned_for(bench):
+    b = bench()
+    b.register()
+    b.tours.standing = 'tool and floor'
+    assert b.next() is None
+    assert b.progress.standing == 'the arm stands too near to something: tool and floor'
+    b.tours.standing = ''
+    assert b.next() is not None
+    assert b.progress.standing == ''
+
+
+def test_the_last_reference_of_a_round_is_known(bench):
+    b = bench(references=2)
+    b.register()
+    last = []
+    for _ in range(4):
+        stop = b.next()
+        assert stop.split == REFERENCE
+        last.append(b.progress.is_last_reference(stop))
+        b.visit(stop)
+    assert last == [False, True, False, True]
+    stop = b.next()
+    assert stop.split == 'optimization'
+    assert not b.progress.is_last_reference(stop)
