@@ -27,7 +27,12 @@ EFFECT = FoundEffect(
 def found(effects, gain, untestable, thinning=None):
     verdict = 'effects' if effects else 'none'
     return types.SimpleNamespace(
-        verdict=verdict, effects=effects, gain=gain, untestable=untestable, thinning=thinning
+        verdict=verdict,
+        effects=effects,
+        gain=gain,
+        untestable=untestable,
+        thinning=thinning,
+        unexplained=(),
     )
 
 
