@@ -354,7 +354,7 @@ class Recorder(RemasterNode):
         self._report_change(self._changes.judge(self.registration.T_R_N))
         self.keeper.close(exit_status)
         waited = ', '.join(f'{name} {s:.1f} s' for name, s in self._waited_s.items())
-        self.get_logger().info(f'the arm stood waiting for {waited}')
+        self.get_logger().info(f'the arm stood still for measuring: {waited} (sum)')
         self.status.publish()
 
     def close(self) -> None:
