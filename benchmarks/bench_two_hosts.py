@@ -244,7 +244,7 @@ class Watch:
 
     def standing(self, seconds: float) -> tuple[float, int]:
         """Watch the arm; return when it last moved, s after now, and how many commands it got."""
-        motions = self._world.folder / 'motion.jsonl'
+        motions = self._world.folder / MOTION_FILE
         begin, last_moved = time.monotonic(), 0.0
         before = len(motions.read_text().splitlines())
         while (elapsed := time.monotonic() - begin) < seconds:

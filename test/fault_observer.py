@@ -24,7 +24,8 @@ from remaster_ros.collection.events import (
     SolutionFailed,
 )
 from remaster_ros.simulation.arm_motion import Motion, ServoPoint, spline
-from remaster_ros.simulation.world import START_S
+from remaster_ros.simulation.truth import from_plain
+from remaster_ros.simulation.world import MOTION_FILE, START_S
 
 TOUCHED_RAD = 1e-4
 """The probe before the first move goes a micrometre; no other command does."""
@@ -142,18 +143,15 @@ class Observer:
 
     def _start(self, wall_s: float, points: int, end: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return where the arm was, and how fast, when a command to `end` began."""
-        lines = (self.world.folder / 'motion.jsonl').read_text().splitlines()
+        lines = (self.world.folder / MOTION_FILE).read_text().splitlines()
         motion, came_s = Motion(START_S, self.world.start_q), self._world_time(wall_s)
         nearest_s, begun = SAME_WALL_S * self.world.rate, None
-        for line in map(json.loads, lines):
-            since_s = abs(line['start_s'] - came_s)
-            off = np.max(np.abs(np.array(line['points'][-1][1]) - end))
-            if len(line['points']) == points and off < SAME_RAD and since_s < nearest_s:
-                nearest_s, begun = since_s, motion.at(line['start_s'])
-            motion.follow(
-                line['start_s'],
-                [ServoPoint(t, np.array(q), v and np.array(v)) for t, q, v in line['points']],
-            )
+        for start_s, plain in map(json.loads, lines):
+            waypoints = from_plain(plain, list[ServoPoint])
+            since_s, off = abs(start_s - came_s), np.max(np.abs(waypoints[-1].q - end))
+            if len(waypoints) == points and off < SAME_RAD and since_s < nearest_s:
+                nearest_s, begun = since_s, motion.at(start_s)
+            motion.follow(start_s, waypoints)
         # One that the arm has dropped began when it came.
         return begun or motion.at(came_s)
 

@@ -26,7 +26,7 @@ def free_domains() -> Iterator[int]:
     A domain is reserved by a socket of its name, which the kernel removes with the process. The
     last few are held; those before them are free again.
     """
-    held = deque[socket.socket](maxlen=DOMAINS_HELD)
+    held: deque[socket.socket] = deque()
     # Each run begins elsewhere: a domain that was given back a moment ago is not taken at once.
     for domain in cycle(1 + (os.getpid() + i) % LAST_DOMAIN for i in range(LAST_DOMAIN)):
         reservation = socket.socket(socket.AF_UNIX)
@@ -36,6 +36,8 @@ def free_domains() -> Iterator[int]:
             reservation.close()
             continue
         held.append(reservation)
+        if len(held) > DOMAINS_HELD:
+            held.popleft().close()
         yield domain
 
 
