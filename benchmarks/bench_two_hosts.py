@@ -33,7 +33,7 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.workcell import config_path, read_cell
 from remaster_ros.simulation.setup import make_world
-from remaster_ros.simulation.world import World
+from remaster_ros.simulation.world import MOTION_FILE, World
 
 SENSORS = ('fake_optitrack', 'fake_laser_tracker', 'optitrack_markers', 'laser_tracker_markers')
 REST = ('fake_robot', 'pose_planner', 'robot_bridge', 'recorder')
