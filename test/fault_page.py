@@ -68,7 +68,9 @@ def allows(page: list[tuple[str, ...]], seen: tuple[str, ...], said: int) -> boo
 
 
 def _parts(said: str) -> set[str]:
-    return {part.lower() for part in _masked(said).split('; ')}
+    # Of several sensors that are waited for, any may be the first, which follows these two words.
+    parts = _masked(said).lower().split('; ')
+    return {part.removeprefix('waiting for ') for part in parts}
 
 
 def _masked(cell: str) -> str:
