@@ -142,6 +142,9 @@ def start_wrongly(executable: str, installed: tuple[Path, dict[str, str]], cwd: 
     """Expect one line for an argument that is none: so it was found, and imports."""
     prefix, env = installed
     wrong = ['--nonsense'] if executable == 'demo' else ['--ros-args', '-p', 'nonsense:=1']
+    if executable == 'sensor_markers':
+        # The name of this node chooses what it is.
+        wrong += ['-r', '__node:=optitrack_markers']
     env = {**env, 'ROS_DOMAIN_ID': '77', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     done = run([str(prefix / 'lib' / 'remaster_ros' / executable), *wrong], env, cwd)
     assert done.returncode == 2
