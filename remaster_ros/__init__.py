@@ -59,7 +59,7 @@ def fit(session: Session, *, seed: int = 0, priors: Priors | None = None) -> Fit
     seed
         Of the sampler.
     priors
-        What is known beforehand, instead of what the session says.
+        What is known beforehand, in place of what the session states.
 
     Raises
     ------

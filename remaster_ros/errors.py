@@ -31,7 +31,7 @@ class MovedError(DiskError):
 
 
 class InsufficientDataError(RemasterError):
-    """The data do not allow an answer; says why, and what to measure."""
+    """The data do not allow an answer; the message has the reason, and what to measure."""
 
 
 class DeviceError(RemasterError):

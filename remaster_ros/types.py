@@ -42,7 +42,7 @@ class MarkerReading:
 
 @dataclass(frozen=True)
 class Observation:
-    """One row of ``observations.csv``: where the robot says it is, where a sensor saw a marker.
+    """One row of ``observations.csv``: the reported joint angles, and a measured marker.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class BasePrior:
 
 @dataclass(frozen=True)
 class Priors:
-    """What a user knows before a fit, beyond what the session says, and instead of it.
+    """What is known before a fit, in place of what the session states.
 
     Attributes
     ----------
@@ -207,7 +207,7 @@ class Session:
     base_prior
         Sensor name -> registration known beforehand.
     exit_status
-        ``complete``, ``stopped``, ``aborted`` or '' where the file does not say.
+        ``complete``, ``stopped``, ``aborted`` or '' where the file has none.
     extra
         Keys of session.yaml this version does not know, kept as they are.
     """
@@ -229,7 +229,7 @@ class Session:
 
     @property
     def urdf_sha256(self) -> str:
-        """SHA-256 of the URDF's text, which tells whose offsets a result holds."""
+        """SHA-256 of the URDF's text, which identifies the robot that a result belongs to."""
         return hashlib.sha256(self.urdf.encode()).hexdigest()
 
     @property

@@ -114,7 +114,7 @@ def find_gauge(
             fixed_by = resolving_priors(priors, x, null[:, column], model)
         directions.append(GaugeDirection(_entries(model, combination), words, fixed_by))
         for joint in np.flatnonzero(combination[: model.joints]):
-            text = f'the data cannot see it: {words}; fixed by {fixed_by}'
+            text = f'the data do not determine it: {words}; fixed by {fixed_by}'
             why[joint] = f'{why[joint]}; {text}' if why[joint] else text
     directions += [_badly_determined(model, *found, scale) for found in weak]
     return Gauge(tuple(directions), np.array(sorted(held), dtype=np.int64), tuple(why))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.calibration.evaluate_offsets import OffsetsJudgement, accuracy_with_offsets
-from remaster_ros.cli.console import progress_bar, say
+from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
 from remaster_ros.session.files import make_folder, write_atomically
@@ -74,9 +74,9 @@ def run(args: argparse.Namespace) -> int:
         }
         make_folder(args.out.parent)
         write_atomically(args.out, json.dumps(content, indent=2) + '\n')
-    say(args.quiet, table(judged))
+    show(args.quiet, table(judged))
     if args.out is not None:
-        say(args.quiet, f'written: {args.out}')
+        show(args.quiet, f'written: {args.out}')
     return 0
 
 

@@ -23,7 +23,7 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
         yield lambda stage, share: bar.update(task, description=stage, completed=share)
 
 
-def say(quiet: bool, text: str) -> None:
+def show(quiet: bool, text: str) -> None:
     """Print unless --quiet was given."""
     if not quiet:
         print(text)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from remaster_ros.cli.console import progress_bar, say
+from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.discovery.confirmation import (
     Confirmation,
     confirm,
@@ -54,8 +54,8 @@ def run(args: argparse.Namespace) -> int:
             confirmation = confirm(found, other)
         progress('writing', 0.0)
         report = save_discovery(found, args.out, confirmation, figures=not args.no_figures)
-    say(args.quiet, summary(found, confirmation))
-    say(args.quiet, f'written: {report}')
+    show(args.quiet, summary(found, confirmation))
+    show(args.quiet, f'written: {report}')
     return 0
 
 
@@ -68,7 +68,7 @@ def summary(found: Discovery, confirmation: Confirmation | None = None) -> str:
         lines.append(f'{effect.name}{joints}: {1e3 * effect.size_m:.3f} mm{share}; {effect.cause}')
         for alike in effect.confusable_with:
             where = f' {list(alike.joints)}' if alike.joints else ''
-            lines.append(f'    could be {alike.name}{where}; to tell: {alike.separate_by}')
+            lines.append(f'    could be {alike.name}{where}; to distinguish: {alike.separate_by}')
     lines += [f'unexplained: {left.next}' for left in found.unexplained]
     if found.verdict == 'none':
         lines.append('nothing beyond the zero-offsets and the noise was found')

@@ -16,7 +16,7 @@ from remaster_ros.calibration.fit import (
     FitResult,
     fit_session,
 )
-from remaster_ros.cli.console import progress_bar, say
+from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.options import integer, number
 from remaster_ros.collection.reference_session import changes
 from remaster_ros.reports.fit_json import prepare_folder, save_fit
@@ -84,8 +84,8 @@ def run(args: argparse.Namespace) -> int:
         report = save_fit(result, args.out, figures=not args.no_figures)
     for line in result.implausible:
         log.warning('%s', line)
-    say(args.quiet, summary(result))
-    say(args.quiet, f'written: {report}')
+    show(args.quiet, summary(result))
+    show(args.quiet, f'written: {report}')
     return 0
 
 

@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             level=logging.ERROR if args.quiet else logging.WARNING,
         )
         if not os.environ.get(TRACEBACK):
-            # NumPy warns of overflows; the error or verdict that follows says why in words.
+            # NumPy warns of overflows; the error or verdict that follows has the reason.
             warnings.simplefilter('ignore', RuntimeWarning)
         status = args.run(args)
         # Here and not at exit, where it could not be caught: the reader may have gone.

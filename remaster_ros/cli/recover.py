@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from remaster_ros.cli.console import say
+from remaster_ros.cli.console import show
 from remaster_ros.session.recovery import recover_session
 
 LOST = 3
@@ -27,5 +27,5 @@ def run(args: argparse.Namespace) -> int:
     for line in recovery.lost:
         print(f'lost: {line}')
     done = 'recovered' if recovery.finished else 'at rest, nothing to recover'
-    say(args.quiet, f'{args.session}: {done}')
+    show(args.quiet, f'{args.session}: {done}')
     return LOST if recovery.lost else 0

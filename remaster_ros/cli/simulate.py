@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from remaster_ros.cli.console import progress_bar, say
+from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.options import integer, names, number
 from remaster_ros.session.files import write_atomically
 from remaster_ros.session.reader import write_session
@@ -115,6 +115,6 @@ def run(args: argparse.Namespace) -> int:
         write_session(args.out, made.session)
         truth = truth_to_dict(made.truth, chain, args.seed)
         write_atomically(args.out / TRUTH_FILE, json.dumps(truth, indent=2) + '\n')
-    say(args.quiet, made.tour.describe())
-    say(args.quiet, f'written: {args.out}, {len(made.session.measurements)} observations')
+    show(args.quiet, made.tour.describe())
+    show(args.quiet, f'written: {args.out}, {len(made.session.measurements)} observations')
     return 0

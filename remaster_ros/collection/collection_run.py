@@ -2,7 +2,7 @@
 
 Each /remaster/collect begins a run, named by a token. Recorder and bridge hold the token in
 memory. A planner that was killed goes on by itself only in a run that still lives, which both of
-them must confirm: somebody may stand beside an arm that has not moved for a while.
+them must confirm: a person may stand beside an arm that has not moved for a while.
 """
 
 from __future__ import annotations

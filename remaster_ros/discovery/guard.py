@@ -29,7 +29,7 @@ class Unexplained:
     size_m
         RMS of the 3-D error, m.
     p_value
-        Of seeing as much by chance; NaN where too few poses are held out to tell.
+        Of seeing as much by chance; NaN where too few poses are held out.
     next
         What it means and what to do next, one or two sentences.
     """

@@ -150,7 +150,7 @@ def print_hidden(console: Console, discovery: dict[str, Any], truth: SessionTrut
         console.print(effect['cause'])
         for other in effect['confusable_with']:
             console.print(
-                f'  looks like {other["name"]}; tell them apart by: {other["separate_by"]}'
+                f'  looks like {other["name"]}; to distinguish them: {other["separate_by"]}'
             )
     gain = discovery['gain']
     if gain['held_out_rms_before_m'] is not None:

@@ -29,7 +29,7 @@ def runtime_folder() -> Path:
     Raises
     ------
     InputError
-        It belongs to somebody else, or cannot be made.
+        It belongs to another user, or cannot be made.
     """
     folder = Path('/tmp') / f'remaster_ros_{os.getuid()}'
     try:

@@ -218,7 +218,7 @@ class PosePlanner(RemasterNode):
         self._announcements.take(record, now)
         match record.body:
             case events.ArmHalted(reason=why) | events.BridgeState(halted=why) if why:
-                # It goes on when somebody has looked at the arm and calls /remaster/collect.
+                # It goes on when a person has looked at the arm and calls /remaster/collect.
                 self._end('paused', why)
             case events.SetupChanged(stops=True, text=why):
                 self._end('paused', why)

@@ -237,7 +237,7 @@ class RobotBridge(RemasterNode):
         return ''
 
     def _controller_is_listed(self) -> bool:
-        """Whether somebody else than nodes of ours listens to the commands."""
+        """Whether a node other than ours subscribes to the commands."""
         found = self.get_subscriptions_info_by_topic(self.resolve_topic_name(COMMANDS))
         names = [info.node_name for info in found]
         return any(name not in LISTENERS and not kind_of(name) for name in names)

@@ -117,7 +117,7 @@ class RemasterNode(Node):
         topic = self.resolve_topic_name('/clock')
         inside = self.get_namespace() != '/' and topic == '/clock'
         hint = ' (that of a fake cell in this namespace: -r /clock:=clock)' if inside else ''
-        return f'the simulated clock has not been heard: who publishes {topic}?{hint}'
+        return f'no message of the simulated clock has come: which node publishes {topic}?{hint}'
 
     def close(self) -> None:
         """Finish: files closed, threads joined. Called once, before the node is destroyed."""

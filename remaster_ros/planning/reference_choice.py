@@ -193,7 +193,7 @@ def _exchanged(
     -------
     chosen, smallest
         What was chosen last, and its smallest singular value; as soon as that is `wanted`, no more
-        is exchanged, since the first choice tells the causes apart best.
+        is exchanged, since the first choice distinguishes the causes best.
     """
     best, smallest = list(chosen), min(_smallest(move[list(chosen)]) for move in moves)
     for _ in range(MOST_EXCHANGES):

@@ -29,7 +29,7 @@ NOTICEABLE_GAIN = 1.1
 
 
 class Headline(NamedTuple):
-    """The result for somebody who did not make it.
+    """The result for a reader who did not measure it.
 
     Attributes
     ----------

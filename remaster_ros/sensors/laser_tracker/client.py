@@ -109,7 +109,7 @@ class LaserTrackerClient:
 
     @property
     def connected(self) -> bool:
-        """Whether the connection stands, as far as this end knows."""
+        """Whether the connection stands, as far as this end can determine."""
         return self._link.connected
 
     @property

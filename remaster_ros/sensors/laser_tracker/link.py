@@ -106,7 +106,7 @@ class TrackerLink:
 
     @property
     def connected(self) -> bool:
-        """Whether the connection stands, as far as this end knows."""
+        """Whether the connection stands, as far as this end can determine."""
         return not self._lost
 
     def count(self, what: str, times: int = 1) -> None:

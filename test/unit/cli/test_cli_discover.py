@@ -40,7 +40,7 @@ def test_causes_look_alikes_and_gain_are_said():
     text = summary(found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {}))
     assert 'verdict: effects' in text
     assert 'joint_compliance [2, 4]: 0.500 mm, 100 % of the gain' in text
-    assert 'could be encoder_scale [2]; to tell: a payload' in text
+    assert 'could be encoder_scale [2]; to distinguish: a payload' in text
     assert '1.000 mm RMS before, 0.300 mm after; the noise alone is 0.280 mm' in text
 
 

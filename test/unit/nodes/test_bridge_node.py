@@ -627,7 +627,7 @@ def test_lateness_is_told_by_the_nodes_clock_and_the_stamps(rig):
 
 def test_without_the_simulated_clock_nothing_is_believed(rig):
     r = rig(ready=False, use_sim_time=True)
-    wanted = 'the simulated clock has not been heard: who publishes /clock?'
+    wanted = 'no message of the simulated clock has come: which node publishes /clock?'
     assert r.bridge.clock_trouble == wanted
     seen, observe = [], r.bridge.supervisor.observe
     r.quiet()
