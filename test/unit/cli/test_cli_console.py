@@ -11,11 +11,11 @@ import pytest
 
 SCRIPT = """
 import sys
-from remaster_ros.cli.console import progress_bar, say
+from remaster_ros.cli.console import progress_bar, show
 quiet = 'quiet' in sys.argv
 with progress_bar(quiet) as progress:
     progress('sampling', 0.5)
-say(quiet, 'the result')
+show(quiet, 'the result')
 print('rich' in sys.modules)
 """
 
