@@ -9,6 +9,7 @@ import msgspec
 from remaster_ros.discovery.confirmation import Confirmation, in_words
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.stepwise_selection import DRAWS
 from remaster_ros.reports import schemas
 from remaster_ros.reports.discovery_figures import draw_discovery
 from remaster_ros.reports.pages import inlined, page, write_report
@@ -48,6 +49,7 @@ def write_discovery_report(
         equations={name: effect.equation for name, effect in EFFECTS.items()},
         sources={name: effect.source for name, effect in EFFECTS.items()},
         most_parameters=MOST_PARAMETERS,
+        least_p=1.0 / (1.0 + DRAWS),
         confirmed=in_words(discovery, confirmation) if confirmation else (),
         drawings={name: inlined(name, text) for name, text in drawings.items()},
     )
