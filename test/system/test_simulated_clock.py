@@ -65,7 +65,7 @@ def follow_the_clock(client, said, node):
     """Check what a node reports before there is a clock, and when there is one."""
     from rosgraph_msgs.msg import Clock
 
-    until_it_says(client, said, node, 'no', 'who publishes /clock?')
+    until_it_says(client, said, node, 'no', 'which node publishes /clock?')
     clock, ticks = client.create_publisher(Clock, '/clock', 10), iter(range(10**6))
 
     def turn():
@@ -89,7 +89,7 @@ def test_the_laser_tracker_measures_nothing_without_it(start, client, said, worl
     until_it_says(client, said, node, 'no', '')
     response = call(client, '/laser_tracker/measure')
     assert not response.success
-    assert 'who publishes /clock?' in response.message
+    assert 'which node publishes /clock?' in response.message
     follow_the_clock(client, said, node)
 
 
