@@ -1,5 +1,7 @@
 """Stops, late and lost messages, pauses of this process, clocks that differ or run fast."""
 
+import re
+
 import numpy as np
 import pytest
 from supervisor_rig import LIMITS, RULES, SPEED, Rig
@@ -263,6 +265,18 @@ def test_after_a_pause_longer_than_a_heartbeat_nobody_has_seen_the_arm(rig, wher
     rig.run(1.0, lambda: rig.said(Halted))
     assert rig.last(Halted).reason == 'the robot was not observed for 3.8 s'
     assert not rig.said(Stop)
+
+
+def test_a_gap_is_given_in_wall_time_where_the_clock_of_the_robot_runs_faster():
+    rig = Rig(rate=2.0)
+    rig.run(4.0)
+    rig.plan([0.9, -1.9], [-0.9, 1.9])
+    rig.run(1.0)
+    paused_for(rig, 8.0)
+    rig.run(2.0, lambda: rig.said(Halted))
+    found = re.fullmatch(r'the robot was not observed for (\d\.\d) s', rig.last(Halted).reason)
+    assert found is not None
+    assert 3.5 < float(found[1]) < 4.2
 
 
 @pytest.mark.parametrize('first', ['planner', 'recorder', 'robot'])
