@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.types import FloatArray
 
 Place = Literal[
@@ -67,8 +68,9 @@ class Cell:
         What a unit of each does.
     drawn_from
         How many cells like it are tried: its prior probability is that of its kind over this.
-    penalty
-        For free forms: precision of the parameters, (m, m), up to the smoothness; None else.
+    curve
+        For free forms: their splines, one parameter each, or one for each of three axes, those of
+        a spline next to each other; None else.
     variant
         Distinguishes cells of the same name and joints: the order of a harmonic, an axis.
     subject
@@ -84,9 +86,18 @@ class Cell:
     columns: Callable[[Context], Design]
     joints: tuple[int, ...] = ()
     drawn_from: int = 1
-    penalty: FloatArray | None = None
+    curve: Curve | None = None
     variant: str = ''
     subject: str = ''
+
+    @cached_property
+    def penalty(self) -> FloatArray | None:
+        """For free forms: precision of the parameters, (m, m), up to the smoothness; None else."""
+        if self.curve is None:
+            return None
+        penalty = self.curve.penalty
+        axes = self.size // len(penalty)
+        return np.kron(penalty, np.eye(axes)).astype(float)
 
     @property
     def size(self) -> int:

@@ -25,11 +25,12 @@ from remaster_ros.discovery.effects.drivers import (
     slow_drivers,
     torque_of,
 )
-from remaster_ros.discovery.effects.splines import basis, knot_vector, roughness
-from remaster_ros.types import FloatArray
+from remaster_ros.discovery.effects.splines import Curve
+from remaster_ros.types import BoolArray, FloatArray
 
 # All causes without a name together are this many times less likely than one that has a name.
 RARITY = 3
+# Knots of a free form over the range of its driver.
 FREE_KNOTS = 10
 # Something may have slipped or been bumped at any time: so many moments are tried.
 MOMENTS = 24
@@ -53,13 +54,17 @@ class _Form:
     features: Feature
     suffixes: tuple[str, ...]
     unit: str = ''
-    penalty: FloatArray | None = None
+    curve: Curve | None = None
     variant: str = ''
 
 
-def _forms(context: Context, driver: Driver, *names: str) -> Iterator[_Form]:
-    """Give forms of a driver; none where it hardly varies."""
-    values = driver.value(context)
+def _forms(
+    context: Context, driver: Driver, *names: str, rows: BoolArray | None = None
+) -> Iterator[_Form]:
+    """Give forms of a driver that enter in all or some ``rows``; none where it hardly varies."""
+    values = driver.value(context)[context.to_fit if rows is None else context.to_fit & rows]
+    if not len(values):
+        return
     low, high = float(values.min()), float(values.max())
     if high - low < 1e-9:
         return
@@ -68,11 +73,9 @@ def _forms(context: Context, driver: Driver, *names: str) -> Iterator[_Form]:
         if name == 'sin/cos':
             yield form(partial(_sine_cosine, value=driver.value), ('_sin', '_cos'))
         elif name == 'free':
-            knots = knot_vector(low, high, (high - low) / FREE_KNOTS)
-            count = len(knots) - 4
-            features = partial(_spline, value=driver.value, knots=knots)
-            suffixes = tuple(f'_{i}' for i in range(count))
-            yield form(features, suffixes, penalty=roughness(count))
+            curve = driver.curve(context, 1.0 / FREE_KNOTS, rows=rows)
+            features = partial(_spline, value=driver.value, curve=curve)
+            yield form(features, tuple(f'_{i}' for i in range(len(curve.places))), curve=curve)
         else:
             power = 2 if name == 'quadratic' else 1
             unit = '' if driver.unit == '1' else f'/{driver.unit}' + ('^2' if power == 2 else '')
@@ -101,8 +104,8 @@ def _after(context: Context, moment: float) -> FloatArray:
     return (context.elapsed_s > moment).astype(float)[:, None]
 
 
-def _spline(context: Context, value: Feature, knots: FloatArray) -> FloatArray:
-    return basis(value(context), knots)
+def _spline(context: Context, value: Feature, curve: Curve) -> FloatArray:
+    return curve.columns(value(context))
 
 
 def _cell(
@@ -122,7 +125,7 @@ def _cell(
         driver=form.driver,
         form=form.name,
         unit=f'{unit}{form.unit}',
-        penalty=form.penalty,
+        curve=form.curve,
         variant=form.variant,
         subject=subject,
     )
@@ -267,7 +270,7 @@ def _frames(context: Context) -> Iterator[Cell]:
         )
     for index, sensor in enumerate(context.sensor_names):
         axes = [f'{sensor}_{axis}' for axis in 'xyz']
-        for form in _sensor_forms(context):
+        for form in _sensor_forms(context, index):
             columns = partial(_shifted, turn=partial(_sensor_turn, sensor=index), form=form)
             yield _cell('sensor_frame', form, axes, 'm', columns, subject=sensor)
         for name, power, unit in (('constant', 0, 'm'), ('quadratic', 2, '1/m')):
@@ -282,16 +285,12 @@ def _frames(context: Context) -> Iterator[Cell]:
             )
 
 
-def _sensor_forms(context: Context) -> Iterator[_Form]:
+def _sensor_forms(context: Context, sensor: int) -> Iterator[_Form]:
     """Give what may drive a sensor's shift; one that is linear in time has a name."""
     yield from _steps(context)
     for driver in slow_drivers(context):
-        for form in _forms(context, driver, 'linear', 'free'):
-            if form.penalty is not None:
-                # The three axes of a knot stand next to each other.
-                penalty: FloatArray = np.kron(form.penalty, np.eye(3)).astype(float)
-                yield replace(form, penalty=penalty)
-            elif form.driver != 'time':
+        for form in _forms(context, driver, 'linear', 'free', rows=context.seen_by(sensor)):
+            if form.curve is not None or form.driver != 'time':
                 yield form
 
 

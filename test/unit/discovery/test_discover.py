@@ -8,6 +8,7 @@ import pytest
 from calibration_scenes import CHAIN
 from discovery_scenes import at_joint, residuals_of, session_with
 
+from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
 from remaster_ros.discovery.confirmation import confirm, in_words
@@ -79,8 +80,14 @@ def test_an_error_of_any_shape_is_a_curve_of_its_joint():
         q = session.measurements.q[:, 1]
         return at_joint(2, 4 * ARC_MINUTE * (np.exp(-((q - 0.3) ** 2) / 0.02) + np.cos(7.3 * q)))
 
-    found = findings(session_with(23, curve))
+    session = session_with(23, curve)
+    found = discover_session(session, rng=np.random.default_rng(0))
     assert ('joint_error_curve', (2,)) in {(e.name, e.joints) for e in found.effects}
+    # The curve is no constant: the zero-offset beside it stays measured.
+    plain = fit_session(session, rng=np.random.default_rng(0))
+    np.testing.assert_array_equal(found.fit.identifiable, plain.identifiable)
+    assert found.fit.identifiable[1]
+    assert found.fit.joint_offsets_std[1] < 2.0 * plain.joint_offsets_std[1]
 
 
 def test_an_unnamed_cause_is_located():
