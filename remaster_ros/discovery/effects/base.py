@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -68,13 +68,15 @@ class Cell:
         What a unit of each does.
     drawn_from
         How many cells like it are tried: its prior probability is that of its kind over this.
-    curve
-        For free forms: their splines, one parameter each, or one for each of three axes, those of
-        a spline next to each other; None else.
+    penalty
+        For free forms: precision of the parameters, (m, m), up to the smoothness; None else.
     variant
         Distinguishes cells of the same name and joints: the order of a harmonic, an axis.
     subject
         The sensor or marker it is about; '' where it is about joints or the whole arm.
+    curve
+        For free forms of one driver: their splines, one parameter each, or one for each of three
+        axes, those of a spline next to each other; None else.
     """
 
     name: str
@@ -86,18 +88,10 @@ class Cell:
     columns: Callable[[Context], Design]
     joints: tuple[int, ...] = ()
     drawn_from: int = 1
-    curve: Curve | None = None
+    penalty: FloatArray | None = None
     variant: str = ''
     subject: str = ''
-
-    @cached_property
-    def penalty(self) -> FloatArray | None:
-        """For free forms: precision of the parameters, (m, m), up to the smoothness; None else."""
-        if self.curve is None:
-            return None
-        penalty = self.curve.penalty
-        axes = self.size // len(penalty)
-        return np.kron(penalty, np.eye(axes)).astype(float)
+    curve: Curve | None = None
 
     @property
     def size(self) -> int:

@@ -30,6 +30,7 @@ def cells(context: Context) -> Iterator[Cell]:
             [f'curve_{joint}_at_{angle:+.1f}deg' for angle in np.degrees(curve.places)],
             joints=(joint,),
             drawn_from=RARITY * context.joints,
+            penalty=curve.penalty,
             curve=curve,
         )
 

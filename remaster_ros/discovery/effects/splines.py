@@ -13,7 +13,7 @@ others (Wood 2017, Generalized Additive Models, sec. 5.4.1)::
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -73,8 +73,8 @@ class Curve:
         """
         start = np.nan
         if turns_over:
-            start = _start_of_turn(values)
-            values = _in_turn(values, start)
+            start = start_of_turn(values)
+            values = in_turn(values, start)
         low, high = float(values.min()), float(values.max())
         spacing = max(finest, share * (high - low))
         closed = turns_over and high - low > TURN - CLOSED_GAP * spacing
@@ -85,6 +85,10 @@ class Curve:
         found = cls(knots, start, closed, np.unique(values), np.zeros(0))
         weights = found.splines(values).mean(axis=0)
         return cls(knots, start, closed, found.visited, weights)
+
+    def among(self, values: FloatArray) -> Curve:
+        """Return the same curve as visited at other values (n,)."""
+        return replace(self, visited=np.unique(self.in_turn(values)))
 
     @property
     def step(self) -> float:
@@ -133,7 +137,7 @@ class Curve:
 
     def in_turn(self, values: FloatArray) -> FloatArray:
         """Return values (n,) brought to the turn of the curve."""
-        return values if np.isnan(self.start) else _in_turn(values, self.start)
+        return values if np.isnan(self.start) else in_turn(values, self.start)
 
     def seen(self, values: FloatArray, reach: float = 1.0) -> BoolArray:
         """Return which values (n,) lie within so many knots of one that was visited."""
@@ -150,17 +154,18 @@ class Curve:
         return np.delete(values, self._pivot, axis=-1)
 
 
-def _start_of_turn(values: FloatArray) -> float:
+def start_of_turn(values: FloatArray) -> float:
     """Return the middle of the largest gap between angles, such that most of them stay."""
     at = np.sort(np.mod(values, TURN))
     gaps = np.append(at[1:], at[0] + TURN) - at
     widest = int(np.argmax(gaps))
     start = float(at[widest] + 0.5 * gaps[widest])
-    moved = _in_turn(values, start) - values
+    moved = in_turn(values, start) - values
     return start - float(np.median(np.round(moved / TURN))) * TURN
 
 
-def _in_turn(values: FloatArray, start: float) -> FloatArray:
+def in_turn(values: FloatArray, start: float) -> FloatArray:
+    """Return angles (n,) brought to the turn that begins at ``start``, rad."""
     found: FloatArray = start + np.mod(values - start, TURN)
     return found
 

@@ -54,6 +54,7 @@ class _Form:
     features: Feature
     suffixes: tuple[str, ...]
     unit: str = ''
+    penalty: FloatArray | None = None
     curve: Curve | None = None
     variant: str = ''
 
@@ -75,7 +76,8 @@ def _forms(
         elif name == 'free':
             curve = driver.curve(context, 1.0 / FREE_KNOTS, rows=rows)
             features = partial(_spline, value=driver.value, curve=curve)
-            yield form(features, tuple(f'_{i}' for i in range(len(curve.places))), curve=curve)
+            suffixes = tuple(f'_{i}' for i in range(len(curve.places)))
+            yield form(features, suffixes, penalty=curve.penalty, curve=curve)
         else:
             power = 2 if name == 'quadratic' else 1
             unit = '' if driver.unit == '1' else f'/{driver.unit}' + ('^2' if power == 2 else '')
@@ -125,6 +127,7 @@ def _cell(
         driver=form.driver,
         form=form.name,
         unit=f'{unit}{form.unit}',
+        penalty=form.penalty,
         curve=form.curve,
         variant=form.variant,
         subject=subject,
@@ -290,7 +293,11 @@ def _sensor_forms(context: Context, sensor: int) -> Iterator[_Form]:
     yield from _steps(context)
     for driver in slow_drivers(context):
         for form in _forms(context, driver, 'linear', 'free', rows=context.seen_by(sensor)):
-            if form.curve is not None or form.driver != 'time':
+            if form.penalty is not None:
+                # The three axes of a knot stand next to each other.
+                penalty: FloatArray = np.kron(form.penalty, np.eye(3)).astype(float)
+                yield replace(form, penalty=penalty)
+            elif form.driver != 'time':
                 yield form
 
 
