@@ -274,11 +274,16 @@ NAMED = {
         'approach',
         'step',
         _backlash,
-        one_value(15 * ARC_MINUTE),
+        one_value(15 * ARC_MINUTE, positive=True),
         named('half_backlash_{j}', factor=0.5),
     ),
     'settling': HiddenKind(
-        'joint_angle', 'last_move', 'linear', _settling, one_value(3e-3), named('settling_{j}')
+        'joint_angle',
+        'last_move',
+        'linear',
+        _settling,
+        one_value(3e-3, positive=True),
+        named('settling_{j}'),
     ),
     'joint_coupling': HiddenKind(
         'joint_angle',
@@ -349,7 +354,7 @@ UNNAMED = {
         'step',
         _slip,
         at_some_time(one_value(15 * ARC_MINUTE, 2)),
-        named('joint_{j}_by_time'),
+        named('joint_{j}_step'),
     ),
     'warm_joint': HiddenKind(
         'joint_angle',
