@@ -30,6 +30,10 @@ PLACES = {
     'tracker': ('smr', np.array([1.9, 0.3, 1.0]), 45.0),
 }
 CANDIDATES = {'lwr4plus': 60, 'iiwa14': 60, 'iiwa7': 75, 'six': 95}
+# A small region, and how many candidates fill it.
+REGION = PoseRanges((-0.25, 0.25), (0.42, 0.55), (0.5, 0.62))
+# Markers on a plane before the sensor, to within so much.
+PLANE_X_M, PLANE_STD_M = 0.35, 2e-3
 # Repeatability of the arm, rad: no two visits report the very same angles.
 REPEATABILITY_RAD = 2e-5
 
@@ -44,7 +48,11 @@ def robot(name: str) -> str:
 
 @cache
 def visits(
-    name: str, seed: int, candidates: int | None = None, held: tuple[float, ...] = (0.0,)
+    name: str,
+    seed: int,
+    candidates: int | None = None,
+    held: tuple[float, ...] = (0.0,),
+    where: str = 'all',
 ) -> Visits:
     """Plan and order a tour; the same arguments give the same one.
 
@@ -59,6 +67,9 @@ def visits(
         None for as many as leave about 175 configurations of each split.
     held
         Values of joint 3 of an arm with seven, rad.
+    where
+        ``all``: the paper's poses; ``region``: a small part of them; ``plane``: the marker of the
+        camera lies on a plane.
     """
     candidates = CANDIDATES[name] if candidates is None else candidates
     rng = np.random.default_rng([seed, candidates])
@@ -74,7 +85,7 @@ def visits(
         split: plan_poses(
             inverse,
             arm,
-            candidate_poses(candidates, PoseRanges(), PLACES['tracker'][1], rng),
+            _candidates(candidates, where, rng),
             sights,
             np.deg2rad(1.0),
         )
@@ -92,6 +103,15 @@ def visits(
     reported = np.concatenate(q)
     reported = reported + REPEATABILITY_RAD * rng.standard_normal(reported.shape)
     return Visits(reported, np.array(pose), np.array(is_validation), home)
+
+
+def _candidates(count: int, where: str, rng: np.random.Generator) -> FloatArray:
+    ranges = REGION if where == 'region' else PoseRanges()
+    poses = candidate_poses(count, ranges, PLACES['tracker'][1], rng)
+    if where == 'plane':
+        marker_x = (poses[:, :3, :3] @ MARKERS['sir'])[:, 0] + poses[:, 0, 3]
+        poses[:, 0, 3] += PLANE_X_M + PLANE_STD_M * rng.standard_normal(count) - marker_x
+    return poses
 
 
 def world(
