@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from hidden_oracle import Oracle
 from hidden_tours import CANDIDATES, visits, world
-from hidden_world import HiddenTruth, HiddenWorld, Noise, Visits
+from hidden_world import MARKER_STD_M, HiddenTruth, HiddenWorld, Noise, Visits
 
 from remaster_ros.simulation.effect_sampling import draw_effect
 from remaster_ros.simulation.hidden_effect import HiddenEffect
@@ -54,6 +54,10 @@ class Recipe:
         Poses drawn, of which about half can be reached; None for some 350 observations to fit.
     where
         See `hidden_tours.visits`.
+    marker_std_m
+        See `hidden_tours.world`.
+    further, further_multiple
+        Kinds hidden beside these, and their size as `multiple`.
     """
 
     seed: int
@@ -67,6 +71,9 @@ class Recipe:
     held_out_outliers: bool = False
     candidates: int | None = None
     where: str = 'all'
+    marker_std_m: float = MARKER_STD_M
+    further: tuple[str, ...] = ()
+    further_multiple: float = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +103,13 @@ def hidden_session(recipe: Recipe) -> HiddenSession:
     _, plain = hidden.measure((), noise, np.random.default_rng(noise_seed))
     oracle = Oracle(hidden, plain)
     effects, best = [], []
-    for kind in recipe.kinds:
+    multiples = [(kind, recipe.multiple) for kind in recipe.kinds]
+    multiples += [(kind, recipe.further_multiple) for kind in recipe.further]
+    for kind, multiple in multiples:
         effect = draw_effect(hidden, kind, rng, recipe.size_m or VISIBLE_M)
         now = hidden.size_m(effect)
         best.append(now * oracle.size_for_power(effect))
-        effects.append(
-            effect if recipe.size_m else hidden.of_size(effect, recipe.multiple * best[-1])
-        )
+        effects.append(effect if recipe.size_m else hidden.of_size(effect, multiple * best[-1]))
     session, truth = hidden.measure(effects, noise, np.random.default_rng(noise_seed))
     return HiddenSession(session, hidden, truth, tuple(best))
 
@@ -112,7 +119,13 @@ def _world(recipe: Recipe, rng: np.random.Generator) -> HiddenWorld:
     rounds = 2 // len(recipe.sensors)
     candidates = recipe.candidates or rounds * CANDIDATES[recipe.robot]
     tour = visits(recipe.robot, int(rng.integers(8)), candidates, where=recipe.where)
-    return world(recipe.robot, rng, sensors=recipe.sensors, tour=tour)
+    return world(
+        recipe.robot,
+        rng,
+        sensors=recipe.sensors,
+        tour=tour,
+        marker_std_m=recipe.marker_std_m,
+    )
 
 
 def third_visits(recipe: Recipe) -> Visits:

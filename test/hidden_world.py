@@ -158,8 +158,10 @@ class HiddenWorld(WorldModel):
     sensors, markers
         By name; true places, and nominal positions in the tool frame, m.
     rng
-        Draws the offsets (0.3° each), the true markers (0.5 mm per axis), the times (10 s and
-        more per configuration) and the temperature (a warming by 3 to 10 K and a slow swing).
+        Draws the offsets (0.3° each), the true markers, the times (10 s and more per
+        configuration) and the temperature (a warming by 3 to 10 K and a slow swing).
+    marker_std_m
+        How far the true markers are from the nominal ones, per axis, m, as the session states it.
     """
 
     def __init__(
@@ -169,14 +171,16 @@ class HiddenWorld(WorldModel):
         sensors: Mapping[str, SimulatedSensor],
         markers: Mapping[str, FloatArray],
         rng: np.random.Generator,
+        marker_std_m: float = MARKER_STD_M,
     ) -> None:
         m, k = visits.q.shape
         joint_offsets = np.deg2rad(0.3) * rng.standard_normal(k)
         true_markers = {
-            name: position + MARKER_STD_M * rng.standard_normal(3)
+            name: position + marker_std_m * rng.standard_normal(3)
             for name, position in markers.items()
         }
         self.urdf, self.visits, self.nominal_markers = urdf, visits, markers
+        self.marker_std_m = marker_std_m
         self._came_from = np.concatenate((visits.home[None], visits.q[:-1]))
         travel = np.max(np.abs(visits.q - self._came_from), axis=1) / 0.5
         self.stamp_s = np.cumsum(10.0 + travel + rng.uniform(0.0, 3.0, m))
@@ -241,9 +245,8 @@ class HiddenWorld(WorldModel):
 
     def on(self, visits: Visits) -> HiddenWorld:
         """Return the same arm, sensors and markers on other visits, spread over the same time."""
-        other = HiddenWorld(
-            self.urdf, visits, self.sensors, self.nominal_markers, np.random.default_rng(0)
-        )
+        rng = np.random.default_rng(0)
+        other = HiddenWorld(self.urdf, visits, self.sensors, self.nominal_markers, rng)
         m, since = len(visits.q), self.visited.time_s
         time_s = np.linspace(0.0, since[-1], m)
         warming_k = np.interp(time_s, since, self.visited.warming_k)
@@ -251,6 +254,7 @@ class HiddenWorld(WorldModel):
         other.stamp_s = self.stamp_s[0] + time_s
         other.temperature_c = np.interp(time_s, since, self.temperature_c)
         other.joint_offsets, other.markers = self.joint_offsets, self.markers
+        other.marker_std_m = self.marker_std_m
         return other
 
     def without_noise(self, effects: Sequence[HiddenEffect]) -> Session:
@@ -284,6 +288,6 @@ class HiddenWorld(WorldModel):
             markers=dict(self.nominal_markers),
             sensors={name: sensor.marker for name, sensor in self.sensors.items()},
             measurements=measurements,
-            marker_std_m=MARKER_STD_M,
+            marker_std_m=self.marker_std_m,
             exit_status='complete',
         )
