@@ -17,7 +17,7 @@ from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.splines import basis, centers, knot_vector, roughness
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, rotation_vector_to_matrix, transform
-from remaster_ros.simulation.hidden_effects import NAMED
+from remaster_ros.simulation.hidden_effects import KINDS, NAMED
 
 STEP = 1e-6
 DISCOVERY = Path(__file__).parents[3] / 'remaster_ros' / 'discovery'
