@@ -64,6 +64,8 @@ class Residuals:
         Errors of every row of the session, m, (all rows, 3).
     full_jacobian
         Derivative of the prediction by the model's natural parameters, (all rows, 3, size).
+    reference
+        T_R_N of every sensor that `errors` are relative to, (sensors, 4, 4).
     noise_model
         Which errors of the rows have which variance.
     noise
@@ -77,6 +79,7 @@ class Residuals:
     full_base: FloatArray
     full_errors: FloatArray
     full_jacobian: FloatArray
+    reference: FloatArray
     noise_model: NoiseModel
     noise: Noise
 
@@ -120,6 +123,7 @@ class Residuals:
             full_base,
             full_errors,
             full_jacobian,
+            model.reference,
             noise_model,
             noise_model.of_sensors(*noise),
         )
@@ -135,15 +139,15 @@ class Residuals:
         left = self.full_errors - shift
         return replace(self, full_errors=left, errors=left[self.rows.source])
 
-    def only(self, source: IntArray, reference: FloatArray) -> Residuals:
+    def only(self, source: IntArray) -> Residuals:
         """Return the same on other rows of the session."""
-        rows = Rows.of(self.context.measurements, np.sort(source), reference)
+        rows = Rows.of(self.context.measurements, np.sort(source), self.reference)
         return replace(
             self,
             rows=rows,
             errors=self.full_errors[rows.source],
             base=self.full_base[rows.source],
-            noise_model=NoiseModel.of(rows, reference, self.noise_model.split),
+            noise_model=NoiseModel.of(rows, self.reference, self.noise_model.split),
         )
 
     def __len__(self) -> int:

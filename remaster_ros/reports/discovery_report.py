@@ -59,7 +59,7 @@ def write_discovery_report(
 
 def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
     """Whether poses that were never fitted, and the other session if there is one, agree."""
-    if discovery.verdict in ('undetermined', 'unexplained'):
+    if discovery.verdict in ('undetermined', 'unexplained') or discovery.unexplained:
         return False
     if confirmation is not None and not confirmation.same_offsets:
         return False
@@ -83,9 +83,7 @@ def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> 
     if discovery.verdict == 'none':
         return 'Nothing is there beyond the zero-offsets and the noise.'
     if discovery.verdict == 'unexplained':
-        return (
-            'Something is there that no cause explains: nothing but the zero-offsets is returned.'
-        )
+        return f'Something is there that no cause explains.{change}'
     count = len(discovery.effects)
     causes = 'one cause' if count == 1 else f'{count} causes'
     if discovery.verdict == 'undetermined':

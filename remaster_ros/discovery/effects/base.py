@@ -21,6 +21,8 @@ Place = Literal[
     'joint_angle', 'link_translation', 'link_rotation', 'base_rotation', 'marker', 'sensor_frame'
 ]
 PLACES: tuple[Place, ...] = get_args(Place)
+# RMS displacement of the marker that a cause without a plausible range is taken to have at most.
+LARGEST_M = 10e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +100,15 @@ class Cell:
         axes, those of a spline next to each other; None else.
     model_change
         The same as a change of the robot model, where it is one; None else.
+    largest
+        Standard deviation of the prior on each parameter about 0, in ``unit``: the largest that is
+        plausible. None: what displaces the marker by `LARGEST_M`.
+    sign
+        Of the parameters, where physics has only one: 1 or -1; 0 for both.
+    moment
+        When it happened, s since the first row; NaN for what does not happen at one moment.
+    moment_std
+        How well the rows date it, s; NaN as long as that was not judged.
     """
 
     name: str
@@ -114,6 +125,10 @@ class Cell:
     subject: str = ''
     curve: Curve | None = None
     model_change: ModelChange | None = None
+    largest: float | None = None
+    sign: int = 0
+    moment: float = np.nan
+    moment_std: float = np.nan
 
     @property
     def size(self) -> int:
@@ -127,8 +142,9 @@ class Cell:
 
     @property
     def label(self) -> str:
-        """Subject and variant in one."""
-        return f'{self.subject} {self.variant}'.strip()
+        """Subject, variant and moment in one."""
+        moment = '' if np.isnan(self.moment) else f'{self.moment:.3f} s'
+        return ' '.join(part for part in (self.subject, self.variant, moment) if part)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +162,10 @@ class Effect:
     unit
         Of its parameters.
     plausible
-        Range of size that real machines have, in ``unit``.
+        Range of size that real machines have, in ``unit``; its upper end is the standard deviation
+        of the prior on each parameter. None where nothing is known.
+    sign
+        Of its parameters, as of `Cell`.
     sentence
         For a technician; ``{subject}`` (its joints or sensor), ``{other}`` (the joint that
         drives) and ``{driver}`` are filled in.
@@ -169,6 +188,13 @@ class Effect:
     moves_the_fit
         The offsets model absorbs it: it is judged by how far that fit moved the markers
         (`marker_offsets`), not by the residuals.
+    reported_as
+        Name in discovery.json, where it is another: 'unnamed' for what has no name of its own.
+    is_cause
+        False for structure that is located without a cause: it is reported as unexplained.
+    between
+        For what happened at one moment: its cells at all moments between two, s since the first
+        row.
     driven_by_joint
         Its cells' second joint is the one that drives; the sentence is about the first.
     """
@@ -180,7 +206,7 @@ class Effect:
     equation: str
     source: str
     unit: str
-    plausible: tuple[float, float]
+    plausible: tuple[float, float] | None
     sentence: str
     separate_by: str
     cells: Callable[[Context], Iterable[Cell]]
@@ -191,12 +217,18 @@ class Effect:
     costly: bool = False
     moves_the_fit: bool = False
     driven_by_joint: bool = False
+    sign: int = 0
+    reported_as: str = ''
+    is_cause: bool = True
+    between: Callable[[Context, float, float], Iterable[Cell]] | None = None
 
     def cell(
         self, columns: Callable[[Context], Design], parameters: Iterable[str], **more: Any
     ) -> Cell:
         """Return a cell of this effect; ``more`` are further arguments of `Cell`."""
-        own = {name: getattr(self, name) for name in ('name', 'place', 'driver', 'form', 'unit')}
+        names = ('name', 'place', 'driver', 'form', 'unit', 'sign')
+        own = {name: getattr(self, name) for name in names}
+        own['largest'] = self.plausible[1] if self.plausible else None
         return Cell(columns=columns, parameters=tuple(parameters), **{**own, **more})
 
     def at_joints(

@@ -156,6 +156,13 @@ class Context:
         return self.measurements.stamp_s - self.measurements.stamp_s.min()
 
     @cached_property
+    def progress(self) -> FloatArray:
+        """Place of each row in the order of time, from 0 (the first) to 1 (the last), (n,)."""
+        _, rank = np.unique(self.elapsed_s, return_inverse=True)
+        progress: FloatArray = rank / max(1, int(rank.max()))
+        return progress
+
+    @cached_property
     def has_time(self) -> bool:
         """Whether the rows lie apart in time."""
         return bool(np.ptp(self.elapsed_s) > 0.0)
@@ -294,6 +301,11 @@ class PartOfContext(Context):
     def elapsed_s(self) -> FloatArray:
         """Time since the first row of the whole, s, (n,)."""
         return self.whole.elapsed_s[self.rows]
+
+    @cached_property
+    def progress(self) -> FloatArray:
+        """As of the whole, (n,)."""
+        return self.whole.progress[self.rows]
 
     @cached_property
     def has_time(self) -> bool:

@@ -18,6 +18,7 @@ from remaster_ros.discovery.effects.base import (
 )
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import (
+    TIME,
     Driver,
     angle_of,
     approach_of,
@@ -32,8 +33,6 @@ from remaster_ros.types import BoolArray, FloatArray
 RARITY = 3
 # Knots of a free form over the range of its driver.
 FREE_KNOTS = 10
-# Something may have slipped or been bumped at any time: so many moments are tried.
-MOMENTS = 24
 
 Feature = Callable[[Context], FloatArray]
 
@@ -56,7 +55,7 @@ class _Form:
     unit: str = ''
     penalty: FloatArray | None = None
     curve: Curve | None = None
-    variant: str = ''
+    sign: int = 0
 
 
 def _forms(
@@ -84,26 +83,12 @@ def _forms(
             yield form(partial(_power, value=driver.value, power=power), ('',), unit)
 
 
-def _steps(context: Context) -> Iterator[_Form]:
-    """Give steps at moments spread over the session, between rows."""
-    times = np.unique(context.elapsed_s)
-    if not context.has_time:
-        return
-    for i in np.unique(np.linspace(0, len(times) - 1, MOMENTS + 2).astype(int)[1:-1]):
-        after = partial(_after, moment=float(times[i]))
-        yield _Form('time', 'step', after, ('',), variant=f'{times[i]:.0f} s')
-
-
 def _power(context: Context, value: Feature, power: int) -> FloatArray:
     return value(context)[:, None] ** power
 
 
 def _sine_cosine(context: Context, value: Feature) -> FloatArray:
     return np.stack((np.sin(value(context)), np.cos(value(context))), axis=-1)
-
-
-def _after(context: Context, moment: float) -> FloatArray:
-    return (context.elapsed_s > moment).astype(float)[:, None]
 
 
 def _spline(context: Context, value: Feature, curve: Curve) -> FloatArray:
@@ -129,7 +114,7 @@ def _cell(
         unit=f'{unit}{form.unit}',
         penalty=form.penalty,
         curve=form.curve,
-        variant=form.variant,
+        sign=form.sign,
         subject=subject,
     )
 
@@ -143,6 +128,14 @@ def _joint_forms(context: Context, joint: int) -> Iterator[tuple[tuple[int, ...]
 
     if joint in context.moving:
         yield from by(angle_of(joint), 'quadratic')
+        if context.has_approach:
+            # The other sign has a name: backlash and settling.
+            for driver, sign in (
+                (approach_of(joint, 'approach'), -1),
+                (last_move_of(joint, 'last_move'), 1),
+            ):
+                for joints, form in by(driver, 'linear'):
+                    yield joints, replace(form, sign=sign)
     for driver in slow_drivers(context):
         yield from by(driver, 'linear', 'quadratic', 'free')
     if context.has_gravity:
@@ -157,7 +150,6 @@ def _joint_forms(context: Context, joint: int) -> Iterator[tuple[tuple[int, ...]
         if context.has_approach and other in context.moving:
             yield from by(approach_of(other, f'approach_of_joint_{other}'), 'linear')
             yield from by(last_move_of(other, f'last_move_of_joint_{other}'), 'linear')
-    yield from (((joint,), step) for step in _steps(context))
 
 
 def _joint_angles(context: Context) -> Iterator[Cell]:
@@ -289,15 +281,16 @@ def _frames(context: Context) -> Iterator[Cell]:
 
 
 def _sensor_forms(context: Context, sensor: int) -> Iterator[_Form]:
-    """Give what may drive a sensor's shift; one that is linear in time has a name."""
-    yield from _steps(context)
+    """Give what may drive a sensor's shift; over time, a line and a wander have names."""
     for driver in slow_drivers(context):
+        if driver == TIME:
+            continue
         for form in _forms(context, driver, 'linear', 'free', rows=context.seen_by(sensor)):
             if form.penalty is not None:
                 # The three axes of a knot stand next to each other.
                 penalty: FloatArray = np.kron(form.penalty, np.eye(3)).astype(float)
                 yield replace(form, penalty=penalty)
-            elif form.driver != 'time':
+            else:
                 yield form
 
 
@@ -309,7 +302,7 @@ EFFECT = Effect(
     equation='δ = Σ θ_i f_i(driver) at the place',
     source='the systematic table of places, drivers and forms',
     unit='',
-    plausible=(0.0, np.inf),
+    plausible=None,
     sentence='No named cause: {place} follows {driver}.',
     separate_by='poses in which {driver} changes and all else is held',
     cells=cells,
