@@ -17,6 +17,7 @@ from scipy.spatial.distance import cdist
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import up_to
 from remaster_ros.discovery.effects.splines import basis, knot_vector, mean_penalty, roughness
 from remaster_ros.types import FloatArray
 
@@ -105,6 +106,9 @@ EFFECT = Effect(
     plausible=(1e-6, 5e-3),
     sentence='The errors follow the place in the view of the sensor {subject}.',
     separate_by='the same poses measured with the sensor moved and turned',
+    remedy='Measure with the sensor somewhere else, and calibrate its lenses; the errors '
+    'follow its volume.',
+    size=up_to('{subject} errs'),
     cells=cells,
     is_cause=False,
 )
