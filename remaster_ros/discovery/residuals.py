@@ -112,12 +112,7 @@ class Residuals:
             full_jacobian[block.source] = model.natural_jacobian(x, block)
 
         rows = Rows.of(problem.measurements, found.kept, model.reference)
-        flat = full_jacobian[rows.source].reshape(-1, model.size)
-        scale = np.linalg.norm(flat, axis=0)
-        scale = np.where(scale > 0.0, scale, 1.0)
-        _, singular, vectors = np.linalg.svd(flat / scale, full_matrices=False)
-        seen = singular > ROUNDING * singular[0]
-        full_base = full_jacobian @ ((vectors[seen] / scale).T / singular[seen])
+        full_base = full_jacobian @ _orthonormal(full_jacobian[rows.source])
         noise_model = NoiseModel.of(rows, model.reference, found.posterior.noise_model.split)
         noise = robust_noise(rows, full_errors[rows.source], np.ones(len(rows), bool))
         return cls(
@@ -132,6 +127,17 @@ class Residuals:
             noise_model,
             noise_model.of_sensors(*noise),
         )
+
+    def holding(self, parameters: IntArray) -> Residuals:
+        """Return the same where some parameters (of ``full_jacobian``) absorb nothing."""
+        jacobian = np.delete(self.full_jacobian, parameters, axis=2)
+        full_base = jacobian @ _orthonormal(jacobian[self.rows.source])
+        return replace(self, full_base=full_base, base=full_base[self.rows.source])
+
+    def less(self, shift: FloatArray) -> Residuals:
+        """Return the same with displacements (all rows, 3), m, taken off the errors."""
+        left = self.full_errors - shift
+        return replace(self, full_errors=left, errors=left[self.rows.source])
 
     def only(self, source: IntArray) -> Residuals:
         """Return the same on other rows of the session."""
@@ -204,3 +210,14 @@ class Residuals:
         """Return the same in the rows worked on, m, (n, 3)."""
         explained: FloatArray = self.base @ fit.base + self.columns(fit.cells) @ fit.parameters
         return self.errors - explained
+
+
+def _orthonormal(jacobian: FloatArray) -> FloatArray:
+    """Return the combinations of columns (n, 3, c) that are orthonormal over the rows, (c, p)."""
+    flat = jacobian.reshape(-1, jacobian.shape[2])
+    scale = np.linalg.norm(flat, axis=0)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    _, singular, vectors = np.linalg.svd(flat / scale, full_matrices=False)
+    seen = singular > ROUNDING * singular[0]
+    combinations: FloatArray = (vectors[seen] / scale).T / singular[seen]
+    return combinations

@@ -53,10 +53,12 @@ def discovery_content(
         content['rows_searched'] = discovery.thinning
     if confirmation is not None:
         content['confirmation'] = vars(confirmation) | {
+            'offsets_rms_sigmas': confirmation.offsets_rms_sigmas,
+            'parameters_rms_sigmas': confirmation.parameters_rms_sigmas,
             'effects': [
-                {'name': effect.name, 'joints': effect.joints, 'carried_over': share}
-                for effect, share in zip(discovery.effects, confirmation.effects, strict=False)
-            ]
+                {'name': effect.name, 'joints': effect.joints, **vars(cause)}
+                for effect, cause in zip(discovery.effects, confirmation.effects, strict=False)
+            ],
         }
     return schemas.checked(content, schemas.Discovered)
 

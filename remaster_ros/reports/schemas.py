@@ -254,16 +254,36 @@ class SearchedRows(Struct):
     others_rms_after_m: float | None
 
 
+class Compared(Struct):
+    """A parameter in both sessions, and by how many standard deviations of both they differ."""
+
+    name: str
+    unit: str
+    value: float
+    std: float
+    other_value: float
+    other_std: float
+    sigmas: float
+
+
 class ConfirmedEffect(Struct):
-    """Which share of an effect's gain carries over to the other session."""
+    """How an effect does in the other session.
+
+    ``rows_common`` of its rows have its driver where it was seen; ``carried_over`` is the share of
+    what it could gain there; None where that is nothing.
+    """
 
     name: str
     joints: list[int]
     carried_over: float | None
+    rows_common: int | UnsetType = UNSET
+    rms_without_m: float | UnsetType | None = UNSET
+    rms_frozen_m: float | UnsetType | None = UNSET
+    parameters: list[Compared] | UnsetType = UNSET
 
 
 class Confirmed(Struct):
-    """How the effects do in another session of the arm."""
+    """How the effects do in another session of the arm; see `confirmation.Confirmation`."""
 
     rms_before_m: float | None
     rms_after_m: float | None
@@ -272,6 +292,13 @@ class Confirmed(Struct):
     carried_over: float | None
     confirmed: bool
     effects: list[ConfirmedEffect]
+    rows: int | UnsetType = UNSET
+    rows_common: int | UnsetType = UNSET
+    rms_frozen_offsets_m: float | UnsetType | None = UNSET
+    joint_offsets: list[Compared] | UnsetType = UNSET
+    offsets_rms_sigmas: float | UnsetType | None = UNSET
+    parameters_rms_sigmas: float | UnsetType | None = UNSET
+    why: str | UnsetType = UNSET
 
 
 class Unexplained(Struct):

@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.types import FloatArray
 
 Place = Literal[
@@ -84,6 +85,9 @@ class Cell:
         When it happened, s since the first row; NaN for what does not happen at one moment.
     moment_std
         How well the rows date it, s; NaN as long as that was not judged.
+    curve
+        For free forms of one driver: their splines, one parameter each, or one for each of three
+        axes, those of a spline next to each other; None else.
     """
 
     name: str
@@ -102,6 +106,7 @@ class Cell:
     sign: int = 0
     moment: float = np.nan
     moment_std: float = np.nan
+    curve: Curve | None = None
 
     @property
     def size(self) -> int:

@@ -17,6 +17,8 @@ GRAVITY = (0.0, 0.0, -9.81)
 STILL_RAD = 1e-4
 # A joint that turns less than this in all stands still.
 LEAST_TURN_RAD = 1e-2
+# A joint with a range of more than this turns over: limits of ±180 degrees are just one turn.
+MORE_THAN_A_TURN = 2.0 * np.pi + LEAST_TURN_RAD
 # A driver known in a smaller share of the rows cannot be tested.
 KNOWN_SHARE = 0.8
 # Temperatures that vary less than this drive nothing that could be seen.
@@ -240,6 +242,15 @@ class Context:
     def seen_by(self, sensor: int) -> BoolArray:
         """Return which rows a sensor measured, (n,)."""
         return self.sensor == sensor
+
+    @cached_property
+    def to_fit(self) -> BoolArray:
+        """Which rows are not held out, (n,)."""
+        return ~self.measurements.is_validation
+
+    def turns_over(self, joint: int) -> bool:
+        """Return whether a joint (1-based) can turn on past a whole turn: it is then the same."""
+        return bool(self.chain.upper[joint - 1] - self.chain.lower[joint - 1] > MORE_THAN_A_TURN)
 
     @cached_property
     def moving(self) -> tuple[int, ...]:

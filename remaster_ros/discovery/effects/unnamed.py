@@ -26,11 +26,12 @@ from remaster_ros.discovery.effects.drivers import (
     slow_drivers,
     torque_of,
 )
-from remaster_ros.discovery.effects.splines import basis, knot_vector, roughness
-from remaster_ros.types import FloatArray
+from remaster_ros.discovery.effects.splines import Curve
+from remaster_ros.types import BoolArray, FloatArray
 
 # All causes without a name together are this many times less likely than one that has a name.
 RARITY = 3
+# Knots of a free form over the range of its driver.
 FREE_KNOTS = 10
 
 Feature = Callable[[Context], FloatArray]
@@ -53,12 +54,17 @@ class _Form:
     suffixes: tuple[str, ...]
     unit: str = ''
     penalty: FloatArray | None = None
+    curve: Curve | None = None
     sign: int = 0
 
 
-def _forms(context: Context, driver: Driver, *names: str) -> Iterator[_Form]:
-    """Give forms of a driver; none where it hardly varies."""
-    values = driver.value(context)
+def _forms(
+    context: Context, driver: Driver, *names: str, rows: BoolArray | None = None
+) -> Iterator[_Form]:
+    """Give forms of a driver that enter in all or some ``rows``; none where it hardly varies."""
+    values = driver.value(context)[context.to_fit if rows is None else context.to_fit & rows]
+    if not len(values):
+        return
     low, high = float(values.min()), float(values.max())
     if high - low < 1e-9:
         return
@@ -67,11 +73,10 @@ def _forms(context: Context, driver: Driver, *names: str) -> Iterator[_Form]:
         if name == 'sin/cos':
             yield form(partial(_sine_cosine, value=driver.value), ('_sin', '_cos'))
         elif name == 'free':
-            knots = knot_vector(low, high, (high - low) / FREE_KNOTS)
-            count = len(knots) - 4
-            features = partial(_spline, value=driver.value, knots=knots)
-            suffixes = tuple(f'_{i}' for i in range(count))
-            yield form(features, suffixes, penalty=roughness(count))
+            curve = driver.curve(context, 1.0 / FREE_KNOTS, rows=rows)
+            features = partial(_spline, value=driver.value, curve=curve)
+            suffixes = tuple(f'_{i}' for i in range(len(curve.places)))
+            yield form(features, suffixes, penalty=curve.penalty, curve=curve)
         else:
             power = 2 if name == 'quadratic' else 1
             unit = '' if driver.unit == '1' else f'/{driver.unit}' + ('^2' if power == 2 else '')
@@ -86,8 +91,8 @@ def _sine_cosine(context: Context, value: Feature) -> FloatArray:
     return np.stack((np.sin(value(context)), np.cos(value(context))), axis=-1)
 
 
-def _spline(context: Context, value: Feature, knots: FloatArray) -> FloatArray:
-    return basis(value(context), knots)
+def _spline(context: Context, value: Feature, curve: Curve) -> FloatArray:
+    return curve.columns(value(context))
 
 
 def _cell(
@@ -108,6 +113,7 @@ def _cell(
         form=form.name,
         unit=f'{unit}{form.unit}',
         penalty=form.penalty,
+        curve=form.curve,
         sign=form.sign,
         subject=subject,
     )
@@ -259,7 +265,7 @@ def _frames(context: Context) -> Iterator[Cell]:
         )
     for index, sensor in enumerate(context.sensor_names):
         axes = [f'{sensor}_{axis}' for axis in 'xyz']
-        for form in _sensor_forms(context):
+        for form in _sensor_forms(context, index):
             columns = partial(_shifted, turn=partial(_sensor_turn, sensor=index), form=form)
             yield _cell('sensor_frame', form, axes, 'm', columns, subject=sensor)
         for name, power, unit in (('constant', 0, 'm'), ('quadratic', 2, '1/m')):
@@ -274,12 +280,12 @@ def _frames(context: Context) -> Iterator[Cell]:
             )
 
 
-def _sensor_forms(context: Context) -> Iterator[_Form]:
+def _sensor_forms(context: Context, sensor: int) -> Iterator[_Form]:
     """Give what may drive a sensor's shift; over time, a line and a wander have names."""
     for driver in slow_drivers(context):
         if driver == TIME:
             continue
-        for form in _forms(context, driver, 'linear', 'free'):
+        for form in _forms(context, driver, 'linear', 'free', rows=context.seen_by(sensor)):
             if form.penalty is not None:
                 # The three axes of a knot stand next to each other.
                 penalty: FloatArray = np.kron(form.penalty, np.eye(3)).astype(float)

@@ -8,15 +8,14 @@ import pytest
 from calibration_scenes import CHAIN
 from discovery_scenes import at_joint, residuals_of, session_with
 
+from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
-from remaster_ros.discovery.confirmation import confirm, in_words
 from remaster_ros.discovery.cross_validation import held_out_error
 from remaster_ros.discovery.discover import Findings, discover_session, find_causes
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import _System, solve
 from remaster_ros.discovery.screening import Catalogue, screen
-from remaster_ros.errors import InputError
 from remaster_ros.types import Session
 
 ARC_MINUTE = np.radians(1.0 / 60.0)
@@ -79,8 +78,14 @@ def test_an_error_of_any_shape_is_a_curve_of_its_joint():
         q = session.measurements.q[:, 1]
         return at_joint(2, 4 * ARC_MINUTE * (np.exp(-((q - 0.3) ** 2) / 0.02) + np.cos(7.3 * q)))
 
-    found = findings(session_with(23, curve))
+    session = session_with(23, curve)
+    found = discover_session(session, rng=np.random.default_rng(0))
     assert ('joint_error_curve', (2,)) in {(e.name, e.joints) for e in found.effects}
+    # The curve is no constant: the zero-offset beside it stays measured.
+    plain = fit_session(session, rng=np.random.default_rng(0))
+    np.testing.assert_array_equal(found.fit.identifiable, plain.identifiable)
+    assert found.fit.identifiable[1]
+    assert found.fit.joint_offsets_std[1] < 2.0 * plain.joint_offsets_std[1]
 
 
 def test_an_unnamed_cause_is_located():
@@ -141,39 +146,6 @@ def test_the_extended_model_is_sampled_and_gains_on_held_out_poses():
     ):
         assert (parameter.value, parameter.std) == (mean, std)
     assert sum(e.share for e in found.effects if e.share is not None) == pytest.approx(1.0)
-
-
-def test_causes_are_confirmed_in_another_session_of_the_arm_and_missed_when_cured():
-    # The same offsets and markers: the seed makes the arm.
-    found = discover_session(sagging_session(), rng=np.random.default_rng(0))
-    same = confirm(found, session_with(21, sagging, pose_sigma_m=0.3e-3))
-    cured = confirm(found, session_with(21, pose_sigma_m=0.3e-3))
-    assert same.confirmed
-    assert same.carried_over == pytest.approx(1.0, abs=0.4)
-    assert not cured.confirmed
-    assert cured.carried_over < 0.0
-    assert cured.rms_after_m > cured.rms_before_m
-    assert same.same_offsets
-    assert cured.same_offsets
-
-
-def test_another_arm_of_the_same_model_is_not_taken_for_this_one():
-    found = discover_session(sagging_session(), rng=np.random.default_rng(0))
-    # The seed makes the arm: other zero-offsets, and the same joints give way.
-    other = confirm(found, session_with(27, sagging))
-    assert not other.same_offsets
-    assert not other.confirmed
-    assert other.rms_after_m > 3.0 * other.rms_own_m
-    (line,) = in_words(found, other)
-    assert 'another arm, or it was mastered anew' in line
-
-
-def test_another_robot_cannot_confirm():
-    found = discover_session(sagging_session(), rng=np.random.default_rng(0))
-    session = session_with(21)
-    other = replace(session, urdf=session.urdf.replace('joint_1"', 'shoulder"'))
-    with pytest.raises(InputError, match='another robot'):
-        confirm(found, other)
 
 
 @cache

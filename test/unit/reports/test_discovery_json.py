@@ -13,6 +13,9 @@ from discovery_scenes import at_joint, session_with
 from remaster_ros.calibration.noise import Noise, NoiseModel
 from remaster_ros.discovery.confirmation import confirm
 from remaster_ros.discovery.discover import discover_session
+from remaster_ros.discovery.effects.base import Design
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.errors import InputError
 from remaster_ros.reports import discovery_figures
 from remaster_ros.reports.discovery_json import read_discovery, save_discovery
@@ -75,7 +78,53 @@ def test_curves_of_a_large_session_are_drawn_at_the_rows_that_were_searched(save
     monkeypatch.setattr(discovery_figures, 'MOST_DRAWN', 0)
     few_x, few_y = curve()
     assert len(few_x) == len(found.residuals) < len(x)
-    np.testing.assert_allclose(few_y, np.interp(few_x, x, y), atol=1e-9)
+    # A gap in the line begins with what was measured, so the two differ at gaps alone.
+    known, few_known = np.isfinite(y), np.isfinite(few_y)
+    assert few_known.mean() > 0.8
+    expected = np.interp(few_x, x[known], y[known])
+    np.testing.assert_allclose(few_y[few_known], expected[few_known], atol=1e-9)
+
+
+def test_a_free_curve_is_drawn_where_it_was_measured_with_a_band_that_opens(saved):
+    found, _ = saved
+    data = found.residuals
+    q = data.context.measurements.q[:, 1]
+    # A curve of the same joint in place of the wave, with nothing measured in the middle of it.
+    away = np.abs(q - np.median(q)) > 0.3
+    cell = next(c for c in EFFECTS['joint_error_curve'].cells(data.context) if c.joints == (2,))
+    curve = Curve.of(q[away & data.context.to_fit], 0.05)
+    names = tuple(f'height_{i}' for i in range(len(curve.places)))
+    cell = replace(
+        cell,
+        curve=curve,
+        parameters=names,
+        columns=lambda context: Design(1, curve.columns(context.measurements.q[:, 1])),
+    )
+    seed = 3
+    print(f'seed {seed}')
+    covariance = 1e-8 * np.linalg.inv(
+        curve.columns(q[away]).T @ curve.columns(q[away]) + 1e-3 * curve.penalty
+    )
+    draws = np.random.default_rng(seed).multivariate_normal(0.0 * curve.places, covariance, 400)
+    solution = replace(
+        found.selection.solution, cells=(cell,), parameters=draws[0], covariance=covariance
+    )
+    drawn = replace(
+        found,
+        groups=((cell,),),
+        selection=replace(found.selection, solution=solution),
+        fit=replace(found.fit, theta_names=names, theta_draws=draws[None]),
+    )
+    (axes,) = discovery_figures.causes(drawn).axes
+    _, line = axes.lines
+    at, heights = np.radians(line.get_xdata()), line.get_ydata()
+    gap = np.abs(at - np.median(q)) < 0.2
+    assert np.all(np.isnan(heights[gap]))
+    assert np.isfinite(heights[~gap]).mean() > 0.5
+    (band,) = axes.collections
+    vertices = band.get_paths()[0].vertices
+    inside = np.abs(np.radians(vertices[:, 0]) - np.median(q)) < 0.2
+    assert np.ptp(vertices[inside, 1]) > 3.0 * np.ptp(heights[np.isfinite(heights)])
 
 
 def test_without_figures_there_is_no_report(saved, tmp_path):
