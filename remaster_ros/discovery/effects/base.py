@@ -20,6 +20,7 @@ Place = Literal[
     'joint_angle', 'link_translation', 'link_rotation', 'base_rotation', 'marker', 'sensor_frame'
 ]
 PLACES: tuple[Place, ...] = get_args(Place)
+NO_TIMES = 'the session has no times (times: none), only the order of its rows'
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,4 +230,6 @@ def needs_approach(context: Context) -> str:
 
 def needs_time(context: Context) -> str:
     """Return why drift cannot be tested; '' where it can."""
-    return '' if context.has_time else 'all rows have the same time'
+    if context.has_time:
+        return ''
+    return 'all rows have the same time' if context.timed else NO_TIMES
