@@ -23,6 +23,7 @@ Place = Literal[
 PLACES: tuple[Place, ...] = get_args(Place)
 # RMS displacement of the marker that a cause without a plausible range is taken to have at most.
 LARGEST_M = 10e-3
+NO_TIMES = 'the session has no times (times: none), only the order of its rows'
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,4 +267,6 @@ def needs_approach(context: Context) -> str:
 
 def needs_time(context: Context) -> str:
     """Return why drift cannot be tested; '' where it can."""
-    return '' if context.has_time else 'all rows have the same time'
+    if context.has_time:
+        return ''
+    return 'all rows have the same time' if context.timed else NO_TIMES

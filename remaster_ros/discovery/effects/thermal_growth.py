@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.base import NO_TIMES, Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import Driver, slow_drivers
 from remaster_ros.types import FloatArray
@@ -61,7 +61,7 @@ def needs_warming(context: Context) -> str:
     """Return why growth cannot be tested; '' where it can."""
     if context.has_temperature or context.has_time:
         return ''
-    return 'neither temperature nor time varies'
+    return 'neither temperature nor time varies' if context.timed else NO_TIMES
 
 
 EFFECT = Effect(
