@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from remaster_ros.calibration.predictions import Coverage
 from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.discovery.confirmation import (
     Confirmation,
@@ -17,8 +18,13 @@ from remaster_ros.discovery.confirmation import (
 from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.side_by_side import rms_sigmas
+from remaster_ros.discovery.words import percent
 from remaster_ros.errors import InsufficientDataError
-from remaster_ros.reports.discovery_json import save_discovery
+from remaster_ros.reports.discovery_json import (
+    held_out_coverage,
+    predictions_of,
+    save_discovery,
+)
 from remaster_ros.reports.fit_json import prepare_folder
 from remaster_ros.session.reader import read_session
 
@@ -62,16 +68,23 @@ def run(args: argparse.Namespace) -> int:
                 # What was found stays, whatever the other session is like.
                 refusal = InsufficientDataError(f'the other session: {error}')
         progress('writing', 0.0)
-        report = save_discovery(found, args.out, confirmation, figures=not args.no_figures)
-    show(args.quiet, summary(found, confirmation))
+        predictions = predictions_of(found)
+        report = save_discovery(
+            found, args.out, confirmation, figures=not args.no_figures, predictions=predictions
+        )
+    show(args.quiet, summary(found, confirmation, held_out_coverage(found, predictions)))
     show(args.quiet, f'written: {report}')
     if refusal is not None:
         raise refusal
     return 0
 
 
-def summary(found: Discovery, confirmation: Confirmation | None = None) -> str:
-    """Return verdict, causes and gain in a few lines."""
+def summary(
+    found: Discovery,
+    confirmation: Confirmation | None = None,
+    held_out: Coverage | None = None,
+) -> str:
+    """Return verdict, causes, gain and coverage of the held-out rows in a few lines."""
     lines = [f'verdict: {found.verdict}']
     for effect in found.effects:
         joints = f' {list(effect.joints)}' if effect.joints else ''
@@ -89,6 +102,11 @@ def summary(found: Discovery, confirmation: Confirmation | None = None) -> str:
             f'held out: {1e3 * gain.held_out_rms_before_m:.3f} mm RMS before, '
             f'{1e3 * gain.held_out_rms_after_m:.3f} mm after; '
             f'the noise alone is {1e3 * gain.noise_floor_m:.3f} mm'
+        )
+    if held_out is not None and held_out.share is not None:
+        lines.append(
+            f'{held_out.inside} of {held_out.rows} held-out rows ({percent(held_out.share)}) lie '
+            'in the regions predicted for them with 95 %'
         )
     if found.thinning is not None:
         part = found.thinning

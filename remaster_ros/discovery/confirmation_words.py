@@ -34,10 +34,10 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
         )
     elif found.joint_offsets:
         lines.append(
-            'The zero-offsets agree '
-            f'({found.offsets_rms_sigmas:.1f} standard deviations apart on the average; '
-            f'{1e3 * found.rms_frozen_offsets_m:.3f} mm RMS with those found here): '
-            'it is the same arm.'
+            'With the zero-offsets found here its error is '
+            f'{1e3 * found.rms_frozen_offsets_m:.3f} mm RMS, and they are '
+            f'{found.offsets_rms_sigmas:.1f} standard deviations apart on the average: it is the '
+            'same arm.'
         )
     lines += [
         _share_in_words(effect, cause)
@@ -56,8 +56,8 @@ def _summary(found: Confirmation) -> str:
     return (
         f'{1e3 * found.rms_before_m:.3f} mm RMS without the causes, {1e3 * found.rms_after_m:.3f} '
         f'mm with them as found here, {1e3 * found.rms_own_m:.3f} mm with them fitted there: '
-        f'{carried}. All of them were seen here in the range of {found.rows_common} of its '
-        f'{found.rows} rows; beyond it, each is fitted to the other session.'
+        f'{carried}. In {found.rows_common} of its {found.rows} rows all that drives them is in '
+        'the range seen here; beyond its own range each is fitted to the other session.'
     )
 
 

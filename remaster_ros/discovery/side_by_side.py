@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from remaster_ros.calibration.estimate import Estimate
+from remaster_ros.calibration.identifiability import WEAK_ANGLE
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.common_range import Split
 from remaster_ros.discovery.effects.base import Cell
@@ -110,7 +111,9 @@ def compare_offsets(
             (float(np.degrees(there[joint])), float(np.degrees(there_std[joint]))),
         )
         for joint, name in enumerate(fit.joint_names)
-        if fit.identifiable[joint] and not found.gauge.why[joint]
+        if fit.identifiable[joint]
+        and not found.gauge.why[joint]
+        and max(here_std[joint], there_std[joint]) < WEAK_ANGLE
     )
 
 

@@ -302,6 +302,37 @@ class Confirmed(Struct):
     why: str | UnsetType = UNSET
 
 
+class Coverage(Struct):
+    """How many rows lie in their 95 % regions; the interval takes the rows as independent."""
+
+    rows: int
+    inside: int
+    share: float | None
+    interval95: tuple[float, float] | None
+
+
+class PredictedRegions(Struct):
+    """The 95 % regions of predictions.csv: ``widening`` is the factor on their size.
+
+    It is what the fitted rows take when their pose is left out, so that 95 % of them lie inside.
+    """
+
+    widening: float
+    held_out: Coverage
+    fitted: Coverage
+
+
+class JointCovariance(Struct):
+    """Covariance of the zero-offsets that are identifiable and of all of the causes' parameters.
+
+    ``matrix`` is in the units of its parameters, to six figures.
+    """
+
+    names: list[str]
+    units: list[str]
+    matrix: list[list[float]]
+
+
 class Unexplained(Struct):
     """Structure that no cause explains: where it shows, its size, and what to do next."""
 
@@ -329,6 +360,10 @@ class Discovered(Struct):
     unexplained: list[Unexplained] | UnsetType = UNSET
     joint_offsets_before: list[OffsetBefore] | UnsetType = UNSET
     sampler: Sampler | UnsetType = UNSET
+    registration: dict[str, Registration] | UnsetType = UNSET
+    markers: dict[str, Marker] | UnsetType = UNSET
+    covariance: JointCovariance | UnsetType = UNSET
+    predicted_regions95: PredictedRegions | UnsetType = UNSET
     rows_searched: SearchedRows | UnsetType = UNSET
     confirmation: Confirmed | UnsetType = UNSET
 

@@ -54,6 +54,25 @@ class Design:
 
 
 @dataclass(frozen=True, eq=False)
+class ModelChange:
+    """What a unit of each of m parameters changes for good in the robot model: a joint's origin.
+
+    Attributes
+    ----------
+    joint
+        Index of the joint, from 0.
+    shifts
+        Of its origin, in the frame of the link before, m per unit, (m, 3).
+    turns
+        Of its frame, about axes of that frame, rad per unit, (m, 3).
+    """
+
+    joint: int
+    shifts: FloatArray
+    turns: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Cell:
     """One candidate cause: a place, a driver and a form, with its parameters.
 
@@ -89,6 +108,8 @@ class Cell:
     curve
         For free forms of one driver: their splines, one parameter each, or one for each of three
         axes, those of a spline next to each other; None else.
+    model_change
+        The same as a change of the robot model, where it is one; None else.
     """
 
     name: str
@@ -108,6 +129,7 @@ class Cell:
     moment: float = np.nan
     moment_std: float = np.nan
     curve: Curve | None = None
+    model_change: ModelChange | None = None
 
     @property
     def size(self) -> int:
