@@ -132,7 +132,7 @@ class _Checks:
         gross = np.flatnonzero(self.gross)
         # That a gross error ends by chance within the limit of one of two places: as often as it
         # lies within it of the places of other poses.
-        chance = min(1.0, 2.0 * np.mean([self._share_near(row) for row in gross]))
+        chance = min(1.0, 2.0 * np.mean([self._share_near(row) for row in gross.tolist()]))
         p_value = float(binom.sf(count - 1, len(gross), chance))
         if p_value > SIGNIFICANCE:
             return
