@@ -25,6 +25,7 @@ import time
 import warnings
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -47,93 +48,111 @@ from remaster_ros.simulation.hidden_effects import NAMED
 
 ROBOTS = ('iiwa7', 'six')
 SENSORS = (('mocap',), ('mocap', 'tracker'))
-GROUPS = {
-    'single': 24,
-    'pair': 60,
-    'unnamed': 12,
-    'null': 300,
-    'few': 150,
-    'triple': 40,
-    'structure': 40,
-    'noise': 150,
-    'plane': 80,
-    'region': 80,
-}
-"""Group -> sessions (of each kind, where it has kinds).
-
-Nothing is hidden in null, few (few poses), noise (of a kind that no noise model has), and in every
-second session of plane and region (poses on a plane, or in a small region, the tool hardly turned,
-the marker known to 5 mm), whose others have one effect. structure: what no simple cause explains,
-from twice the size that can be detected.
-"""
-MISPAIRED = 'mispaired'
-KINDS = {
-    'single': tuple(NAMED),
-    'unnamed': (
-        'foreign_torque',
-        'creeping_joint',
-        'slipped_joint',
-        'warm_joint',
-        'bent_coupling',
-        'sagging_tool',
-        'bumped_sensor',
-    ),
-    'structure': (
-        'range_distortion',
-        'spherical_distortion',
-        'one_sided_lens',
-        'slipped_marker',
-        'slipped_joint',
-        'bumped_sensor',
-        MISPAIRED,
-    ),
-    'noise': tuple(noise for noise in WRONG_NOISES if noise != MISPAIRED),
-}
-# Effects at once, and the powers of two between which their sizes are drawn.
-COUNTS = {'pair': 2, 'triple': 3}
-SIZES = {'pair': (2.0, 3.0), 'triple': (2.0, 3.0)} | dict.fromkeys(
-    ('structure', 'plane', 'region'), (1.0, 3.0)
-)
 FEW = (10, 13, 16)
 """Candidates of the sessions with few poses."""
+MISPAIRED = 'mispaired'
+STRUCTURE = (
+    'range_distortion',
+    'spherical_distortion',
+    'one_sided_lens',
+    'slipped_marker',
+    'slipped_joint',
+    'bumped_sensor',
+)
+# On a plane, the tool hardly turned, a wrong marker is seen only where it is wrong by decimetres.
+SEEN_ANYWHERE = tuple(kind for kind in NAMED if kind != 'marker_offset')
 
 
-def recipes(group: str, count: int) -> Iterator[tuple[str, Recipe]]:
+@dataclass(frozen=True)
+class Group:
+    """Sessions of one sort.
+
+    Attributes
+    ----------
+    count
+        How many, of each kind where there are kinds.
+    each
+        Kinds of effects, or of noise: a session has one of them, in turn.
+    of, at_once
+        Kinds of which so many are hidden at once, drawn anew for every session; the numbers in
+        turn.
+    powers
+        Powers of two between which sizes are drawn, as multiples of what can be detected.
+    where
+        See `hidden_tours.visits`; but for ``all`` the marker is known to 5 mm only.
+    """
+
+    count: int
+    each: tuple[str, ...] = ('',)
+    of: tuple[str, ...] = ()
+    at_once: tuple[int, ...] = (0,)
+    powers: tuple[float, float] = (-1.0, 3.0)
+    where: str = 'all'
+
+
+GROUPS = {
+    'single': Group(24, tuple(NAMED)),
+    'pair': Group(60, of=tuple(NAMED), at_once=(2,), powers=(2.0, 3.0)),
+    'triple': Group(40, of=tuple(NAMED), at_once=(3,), powers=(2.0, 3.0)),
+    'unnamed': Group(
+        12,
+        (
+            'foreign_torque',
+            'creeping_joint',
+            'slipped_joint',
+            'warm_joint',
+            'bent_coupling',
+            'sagging_tool',
+            'bumped_sensor',
+        ),
+    ),
+    # Nothing is hidden in these two; `few` has few poses.
+    'null': Group(300),
+    'few': Group(150),
+    # What no simple cause explains, and noise that no noise model has.
+    'structure': Group(40, (*STRUCTURE, MISPAIRED), powers=(1.0, 3.0)),
+    'noise': Group(150, tuple(noise for noise in WRONG_NOISES if noise != MISPAIRED)),
+    # Poses on a plane or in a small region: nothing hidden, or one effect; then two large ones
+    # that no simple cause explains.
+    'plane': Group(80, ('',), SEEN_ANYWHERE, (0, 1), (1.0, 3.0), 'plane'),
+    'region': Group(80, ('',), SEEN_ANYWHERE, (0, 1), (1.0, 3.0), 'region'),
+    'plane_wrong': Group(40, ('',), STRUCTURE, (2,), (3.0, 5.0), 'plane'),
+    'region_wrong': Group(40, ('',), STRUCTURE, (2,), (3.0, 5.0), 'region'),
+}
+
+
+def recipes(name: str, count: int) -> Iterator[tuple[str, Recipe]]:
     """Give every session of a group with its name; the first n stay the same for any count."""
+    group = GROUPS[name]
     for i in range(count):
-        for kind in KINDS.get(group, ('',)):
-            name = '-'.join(part for part in (group, kind, str(i)) if part)
-            seed = zlib.crc32(name.encode())
-            rng = np.random.default_rng(seed)
-            noise = tuple(NOISES)[(i // 4) % 4]
-            hidden: tuple[str, ...] = (kind,) if kind else ()
-            if kind in WRONG_NOISES:
-                hidden, noise = (), kind
-            elif group in COUNTS:
-                hidden = tuple(rng.choice(tuple(NAMED), COUNTS[group], replace=False).tolist())
-            elif group in ('plane', 'region') and i % 2:
-                # There a wrong marker is seen only where it is wrong by decimetres.
-                hidden = (str(rng.choice([kind for kind in NAMED if kind != 'marker_offset'])),)
-            # Half, a quarter … of the sessions have each: all combinations occur.
-            yield (
-                name,
-                Recipe(
-                    seed=seed,
-                    kinds=hidden,
-                    multiple=float(2.0 ** rng.uniform(*SIZES.get(group, (-1.0, 3.0)))),
-                    robot=ROBOTS[(i // 2 if group in ('plane', 'region') else i) % 2],
-                    # Of two markers only one can lie on a plane.
-                    sensors=SENSORS[0] if group == 'plane' else SENSORS[(i // 2) % 2],
-                    noise=noise,
-                    outliers=bool(rng.random() < 0.5)
-                    and group not in ('few', 'noise')
-                    and kind != MISPAIRED,
-                    held_out_outliers=group == 'null',
-                    candidates=FEW[i % 3] if group == 'few' else None,
-                    where=group if group in ('plane', 'region') else 'all',
-                    marker_std_m=5e-3 if group in ('plane', 'region') else 0.5e-3,
-                ),
-            )
+        for kind in group.each:
+            session = '-'.join(part for part in (name, kind, str(i)) if part)
+            yield session, _recipe(session, name, group, kind, i)
+
+
+def _recipe(session: str, name: str, group: Group, kind: str, i: int) -> Recipe:
+    seed = zlib.crc32(session.encode())
+    rng = np.random.default_rng(seed)
+    hidden: tuple[str, ...] = (kind,) if kind and kind not in WRONG_NOISES else ()
+    if drawn := group.at_once[i % len(group.at_once)]:
+        hidden = tuple(rng.choice(group.of, drawn, replace=False).tolist())
+    multiple = float(2.0 ** rng.uniform(*group.powers))
+    plain = name == 'few' or kind in WRONG_NOISES
+    # Half, a quarter … of the sessions have each: all combinations occur.
+    return Recipe(
+        seed=seed,
+        kinds=hidden,
+        multiple=multiple,
+        robot=ROBOTS[i // len(group.at_once) % 2],
+        # Of two markers only one can lie on a plane.
+        sensors=SENSORS[0 if group.where == 'plane' else (i // 2) % 2],
+        noise=kind if kind in WRONG_NOISES else tuple(NOISES)[(i // 4) % 4],
+        outliers=bool(rng.random() < 0.5) and not plain,
+        held_out_outliers=name == 'null',
+        candidates=FEW[i % 3] if name == 'few' else None,
+        where=group.where,
+        marker_std_m=0.5e-3 if group.where == 'all' else 5e-3,
+    )
 
 
 def run(name: str, recipe: Recipe, talk: bool = False) -> dict[str, Any]:
@@ -206,7 +225,7 @@ def _cause(cause: tuple[str, tuple[int, ...], str]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or '').partition('\n')[0])
     parser.add_argument('--results', type=Path, default=Path('bench_discovery.jsonl'))
-    parser.add_argument('--only', nargs='+', choices=GROUPS, default=list(GROUPS))
+    parser.add_argument('--only', nargs='+', choices=tuple(GROUPS), default=list(GROUPS))
     parser.add_argument('--kind', nargs='+', help='only sessions with these effects')
     parser.add_argument('--count', type=int, help='sessions (of each kind) instead of all')
     parser.add_argument('--above', type=float, default=0.0, help='only larger multiples than this')
@@ -217,7 +236,7 @@ def main() -> None:
     wanted = {
         name: recipe
         for group in args.only
-        for name, recipe in recipes(group, args.count or GROUPS[group])
+        for name, recipe in recipes(group, args.count or GROUPS[group].count)
         if not args.kind or set(args.kind) & set(recipe.kinds)
         if recipe.multiple > args.above or not recipe.kinds
     }

@@ -18,7 +18,7 @@ BINS = (0.5, 1.0, 2.0, 4.0, 8.0)
 # Held-out error may lie this far above the noise, in this share of single-effect sessions.
 EXCESS, WITHIN_EXCESS = 1.05, 0.95
 CLAIMS = 0.02
-OUTCOMES = ('right', 'unexplained', 'elsewhere', 'none', 'wrong')
+OUTCOMES = ('right', 'unexplained', 'elsewhere', 'partly', 'none', 'wrong')
 
 
 def report(lines: Iterable[dict[str, Any]]) -> None:
@@ -196,9 +196,9 @@ def report_outcomes(lines: list[dict[str, Any]]) -> None:
         kinds[' '.join((group, *kind))].append(line)
     print(
         '\nOutcomes. unexplained: said to be unexplained, at the right place, and no wrong name; '
-        'elsewhere: at another\nplace; wrong: something named that is not there; harm: error on a '
-        'third set of poses more than 5 % above\nthat of the offsets, both without noise; by how '
-        'much at most.\n'
+        'elsewhere: at another\nplace; partly: some of several are named, nothing else; wrong: '
+        'something named that is not there; harm:\nerror on a third set of poses more than 5 % '
+        'above that of the offsets, both without noise; by how much at most.\n'
     )
     header = ('sessions', 'n', *OUTCOMES, 'harm', 'largest', 'named')
     rows = []

@@ -38,7 +38,7 @@ FAULT_PLACES = {
     'tails': ('tail', 'outlier', 'gross'),
 }
 
-Outcome = Literal['right', 'unexplained', 'elsewhere', 'none', 'wrong']
+Outcome = Literal['right', 'unexplained', 'elsewhere', 'partly', 'none', 'wrong']
 
 
 @dataclass
@@ -60,7 +60,8 @@ class Judgement:
         None where they are not.
     outcome
         ``right``; ``unexplained`` at the right place, no wrong name beside; ``elsewhere``:
-        unexplained at another place; ``none``; ``wrong``: a name of what is not there.
+        unexplained at another place; ``partly``: some named, all of them right; ``none``;
+        ``wrong``: a name of what is not there.
     deviations
         (value - truth) / std of every parameter compared.
     """
@@ -108,24 +109,26 @@ def judge(world: HiddenWorld, truth: HiddenTruth, discovery: Any) -> Judgement:
         forgiven,
         bool(found) and first not in extra,
         size_right,
-        _outcome(truth, discovery.unexplained, missing, extra, named_right),
+        _outcome(truth, discovery, missing, extra, named_right),
         deviations,
     )
 
 
 def _outcome(
     truth: HiddenTruth,
-    unexplained: Sequence[Any],
+    discovery: Any,
     missing: dict[Cause, HiddenEffect],
     extra: dict[Cause, list[Any]],
     named_right: bool,
 ) -> Outcome:
     """Sum up in one word; a wrong name counts before all else."""
-    if extra and not named_right:
+    if named_right and truth.effects:
+        return 'right'
+    if extra:
         return 'wrong'
     words = [
         ' '.join(str(getattr(entry, name, '')) for name in ('kind', 'where', 'driver')).lower()
-        for entry in unexplained
+        for entry in discovery.unexplained
     ]
     wanted = [(KINDS[effect.kind].driver,) for effect in missing.values()]
     wanted += [places for fault, places in FAULT_PLACES.items() if fault in truth.faults]
@@ -133,9 +136,9 @@ def _outcome(
         any(place in text for place in places for text in words) for places in wanted
     ):
         return 'unexplained'
-    if named_right and truth.effects:
-        return 'right'
-    return 'elsewhere' if unexplained else 'none'
+    if discovery.effects:
+        return 'partly'
+    return 'elsewhere' if discovery.unexplained else 'none'
 
 
 def _claimed(effect: Any) -> list[Cause]:

@@ -101,6 +101,7 @@ class Residuals:
             model.offsets(x),
             model.markers(x),
             model.T_R_N(x),
+            timed=problem.session.timed,
         )
         count = len(context)
         every = Rows.of(problem.measurements, np.arange(count), model.reference)

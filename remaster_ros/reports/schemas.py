@@ -40,13 +40,14 @@ class Counts(Struct):
 
 
 class MeasuredSession(Struct):
-    """What was measured: counts, sensor -> marker, when, and how it ended."""
+    """What was measured: counts, sensor -> marker, when, how it ended; if it has no times."""
 
     optimization: Counts
     validation: Counts
     sensors: dict[str, str]
     created: str
     exit_status: str
+    times: Literal['none'] | UnsetType = UNSET
 
 
 class JointOffset(Struct):

@@ -100,6 +100,17 @@ def test_a_wrong_name_beside_the_right_place_is_wrong(six: HiddenWorld) -> None:
     assert judge(six, truth_of(six, STEP), found).outcome == 'wrong'
 
 
+def test_one_of_two_is_partly_right_unless_the_other_place_is_told(six: HiddenWorld) -> None:
+    truth = truth_of(six, STEP, SCALE)
+    named = claim('encoder_scale', 'joint_angle', 'joint_angle', (2,), scale_2=1e-3)
+    assert judge(six, truth, discovery(named)).outcome == 'partly'
+    assert judge(six, truth, discovery(named, unexplained=(('residuals', 'time'),))).outcome == (
+        'unexplained'
+    )
+    step = claim('unnamed', 'joint_angle', 'time', (3,), joint_3_by_time=1e-3)
+    assert judge(six, truth, discovery(named, step)).outcome == 'right'
+
+
 @pytest.mark.parametrize(
     ('noise', 'where'),
     [

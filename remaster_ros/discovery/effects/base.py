@@ -23,6 +23,7 @@ Place = Literal[
 PLACES: tuple[Place, ...] = get_args(Place)
 # RMS displacement of the marker that a cause without a plausible range is taken to have at most.
 LARGEST_M = 10e-3
+NO_TIMES = 'the session has no times (times: none), only the order of its rows'
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +96,6 @@ class Cell:
         Distinguishes cells of the same name and joints: the order of a harmonic, an axis.
     subject
         The sensor or marker it is about; '' where it is about joints or the whole arm.
-    curve
-        For free forms of one driver: their splines, one parameter each, or one for each of three
-        axes, those of a spline next to each other; None else.
-    model_change
-        The same as a change of the robot model, where it is one; None else.
     largest
         Standard deviation of the prior on each parameter about 0, in ``unit``: the largest that is
         plausible. None: what displaces the marker by `LARGEST_M`.
@@ -109,6 +105,11 @@ class Cell:
         When it happened, s since the first row; NaN for what does not happen at one moment.
     moment_std
         How well the rows date it, s; NaN as long as that was not judged.
+    curve
+        For free forms of one driver: their splines, one parameter each, or one for each of three
+        axes, those of a spline next to each other; None else.
+    model_change
+        The same as a change of the robot model, where it is one; None else.
     """
 
     name: str
@@ -123,12 +124,12 @@ class Cell:
     penalty: FloatArray | None = None
     variant: str = ''
     subject: str = ''
-    curve: Curve | None = None
-    model_change: ModelChange | None = None
     largest: float | None = None
     sign: int = 0
     moment: float = np.nan
     moment_std: float = np.nan
+    curve: Curve | None = None
+    model_change: ModelChange | None = None
 
     @property
     def size(self) -> int:
@@ -295,4 +296,6 @@ def needs_approach(context: Context) -> str:
 
 def needs_time(context: Context) -> str:
     """Return why drift cannot be tested; '' where it can."""
-    return '' if context.has_time else 'all rows have the same time'
+    if context.has_time:
+        return ''
+    return 'all rows have the same time' if context.timed else NO_TIMES

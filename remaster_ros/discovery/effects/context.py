@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -45,6 +45,8 @@ class Context:
         As fitted, in the tool frame, m, (markers, 3).
     T_R_N
         As fitted, (sensors, 4, 4).
+    timed
+        False where the rows' times only order them.
     """
 
     chain: SerialChain
@@ -54,6 +56,7 @@ class Context:
     joint_offsets: FloatArray
     markers: FloatArray
     T_R_N: FloatArray
+    timed: bool = field(default=True, kw_only=True)
 
     def __len__(self) -> int:
         """Return the number of rows n."""
@@ -164,8 +167,8 @@ class Context:
 
     @cached_property
     def has_time(self) -> bool:
-        """Whether the rows lie apart in time."""
-        return bool(np.ptp(self.elapsed_s) > 0.0)
+        """Whether the rows' times are known and lie apart."""
+        return self.timed and bool(np.ptp(self.elapsed_s) > 0.0)
 
     @cached_property
     def warming(self) -> FloatArray:
@@ -225,6 +228,7 @@ class Context:
             self.T_R_N,
             self,
             rows,
+            timed=self.timed,
         )
 
     def blocks(self, rows: int = BLOCK_ROWS) -> Iterator[tuple[slice, Context]]:

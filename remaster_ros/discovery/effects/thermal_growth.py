@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.base import NO_TIMES, Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import Driver, driver_named, slow_drivers
 from remaster_ros.discovery.effects.sizes import length
@@ -62,7 +62,7 @@ def needs_warming(context: Context) -> str:
     """Return why growth cannot be tested; '' where it can."""
     if context.has_temperature or context.has_time:
         return ''
-    return 'neither temperature nor time varies'
+    return 'neither temperature nor time varies' if context.timed else NO_TIMES
 
 
 def _grown_by(context: Context, cell: Cell, draws: FloatArray) -> str:
