@@ -269,7 +269,7 @@ class Compared(Struct):
     std: float
     other_value: float
     other_std: float
-    sigmas: float
+    sigmas: float | None
 
 
 class ConfirmedEffect(Struct):
