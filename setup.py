@@ -87,6 +87,7 @@ setup(
         'matplotlib>=3.6',
         'plotly>=5.20',
         'mcap>=1.2',
+        'python-dateutil>=2.8',
         'rosbags>=0.10',
     ],
     extras_require={

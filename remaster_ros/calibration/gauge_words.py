@@ -23,7 +23,7 @@ def in_words(model: Model, direction: FloatArray) -> str:
     markers = [
         index for index in range(len(model.marker_names)) if np.any(direction[model.marker(index)])
     ]
-    if len(joints) == 1:
+    if len(joints) == 1 and not np.any(model.theta(direction)):
         joint, amount = model.names[joints[0]], direction[joints[0]]
         if not sensors and not markers:
             return f'{joint} moves no marker; a marker off its axis would show it'

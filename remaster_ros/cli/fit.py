@@ -120,6 +120,8 @@ def summary(result: FitResult) -> str:
             )
     _, found = changes(result.session, result.chain, result.T_R_N)
     lines += [f'changed while it was measured: {change.describe()}' for change in found]
+    if not result.session.timed:
+        lines.append('the session has no times: nothing that changes with time can be seen')
     lines.append(result.sampler.message)
     if result.left_out:
         rows = ', '.join(str(observation) for observation, _ in result.left_out)

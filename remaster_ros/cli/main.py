@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import keyword
 import logging
 import os
 import sys
@@ -19,6 +20,7 @@ from remaster_ros.version import __version__
 # the rest take more than a second to load, and `remaster --help` needs none of it.
 VERBS = {
     'demo': 'The whole pipeline on fake hardware: real nodes, real DDS, real sockets.',
+    'import': "Make a session of anybody's table of joint angles and points, or of a ROS bag.",
     'simulate': 'Make a session from a known truth, which is written beside it.',
     'fit': 'Fit the zero-offsets of a session: fit.json, figures and report.html.',
     'discover': 'Find what the offsets leave, name the cause, extend the model, prove the gain.',
@@ -42,7 +44,9 @@ def build_parser(chosen: str | None) -> argparse.ArgumentParser:
         verb = verbs.add_parser(name, help=text, description=text)
         if name != chosen:
             continue
-        module = importlib.import_module(f'remaster_ros.cli.{name}')
+        # A module cannot be named `import`.
+        module_name = f'{name}_' if keyword.iskeyword(name) else name
+        module = importlib.import_module(f'remaster_ros.cli.{module_name}')
         module.add_arguments(verb)
         verb.add_argument(
             '--seed', type=integer(0), default=0, help='seed of all randomness (default 0)'

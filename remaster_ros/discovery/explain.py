@@ -147,6 +147,8 @@ def _described(
             strict=True,
         )
     )
+    if not np.isnan(first.moment):
+        parameters += (Parameter('moment', first.moment, first.moment_std, 's'),)
     rest = tuple(cell for cell in solution.cells if cell not in group)
     without = solve(data, rest, solution, prior=family_log_prior(rest, catalogue.cells))
     gain = sum(step.log_evidence_gain for step in selection.steps)
@@ -160,7 +162,7 @@ def _described(
     if without is not None and len(group) == 1:
         alike = _look_alikes(data, solution, without, catalogue, first)
     effect = FoundEffect(
-        name=first.name,
+        name=EFFECTS[first.name].reported_as or first.name,
         joints=_joints(group),
         place=first.place,
         driver=first.driver,
@@ -169,7 +171,7 @@ def _described(
         p_value=float(min(p_values)),
         log_evidence_gain=float(gain),
         confusable_with=alike,
-        cause=in_words(group, data.context) + _also_called(alike),
+        cause=in_words(group, data.part) + _also_called(alike),
         size_m=_size(data, solution, group),
         share=share,
         tied=any(not other.same and other.log_evidence_gain > gain - TIED for other in alike),
@@ -289,7 +291,11 @@ def in_words(group: Sequence[Cell], context: Context) -> str:
     if first.subject:
         place += f' of {first.subject}'
     sentence = effect.sentence.format(
-        subject=subject, other=other, driver=first.driver.replace('_', ' '), place=place
+        subject=subject,
+        other=other,
+        driver=first.driver.replace('_', ' '),
+        place=place,
+        when=_when(first, context),
     )
     sentence = sentence[:1].upper() + sentence[1:]
     if not context.has_gravity and first.place == 'joint_angle' and 'angle' in first.driver:
@@ -298,6 +304,19 @@ def in_words(group: Sequence[Cell], context: Context) -> str:
             'the two cannot be distinguished.'
         )
     return sentence
+
+
+def _when(cell: Cell, context: Context) -> str:
+    """Return when a cell's step was: minutes since the first row, and configurations."""
+    if np.isnan(cell.moment):
+        return ''
+    configuration, after = context.measurements.configuration, context.elapsed_s > cell.moment
+    before = configuration[~after][np.argmax(context.elapsed_s[~after])]
+    behind = configuration[after][np.argmin(context.elapsed_s[after])]
+    return (
+        f'{cell.moment / 60.0:.1f} min after the first reading, '
+        f'between configurations {before} and {behind},'
+    )
 
 
 def _listed(joints: Sequence[int]) -> str:

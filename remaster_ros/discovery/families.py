@@ -48,6 +48,6 @@ def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
         key: tuple[str, ...] = (cell.name, cell.driver, cell.form, cell.subject)
         cause_per = EFFECTS[cell.name].cause_per
         if cause_per != 'effect':
-            key += (str(cell.joints), cell.variant if cause_per == 'variant' else '')
+            key += (str(cell.joints), cell.label if cause_per == 'variant' else '')
         groups.setdefault(key, []).append(cell)
     return [tuple(group) for group in groups.values()]

@@ -105,6 +105,7 @@ class Search:
 
     def __post_init__(self) -> None:
         self._cheap = np.array([not EFFECTS[cell.name].costly for cell in self.cells])
+        self._structure = np.array([not EFFECTS[cell.name].is_cause for cell in self.cells])
         self._look_at(self.data)
 
     def _look_at(self, data: Residuals) -> None:
@@ -123,8 +124,6 @@ class Search:
         for count in range(ROUNDS):
             self.progress(count / (count + 2.0))
             screening = screen(self.data, self.catalogue, solution, rng=self.rng, draws=DRAWS)
-            if screening.score.max() <= 0.0:
-                break
             proposal = self.propose(solution, screening)
             if proposal is None or proposal[0].log_evidence <= solution.log_evidence:
                 break
@@ -138,7 +137,7 @@ class Search:
                 rejected = step
                 break
             steps.append(step)
-            solution = self.swap(self.prune(candidate))
+            solution = self.refine_moments(self.swap(self.prune(candidate)))
             solution = self._judged(self.backward_elimination(self.drop_unpredictive(solution)))
         empty = self.fit(())
         assert empty is not None
@@ -154,20 +153,31 @@ class Search:
         return solution if again is None else self.prune(again)
 
     def fit(self, cells: Sequence[Cell], start: Solution | None = None) -> Solution | None:
-        """Fit a set with its prior probability."""
+        """Fit a set with its prior probability; None for two cells of the same parameters."""
+        names = [name for cell in cells for name in cell.parameters]
+        if len(set(names)) < len(names):
+            return None
         return solve(self.data, cells, start, prior=family_log_prior(cells, self.catalogue.cells))
 
     def propose(self, solution: Solution, screening: Screening) -> tuple[Solution, float] | None:
         """Return the set of the highest evidence one step on, with the p-value of the step."""
         best: tuple[Solution, float] | None = None
-        for index in np.argsort(-screening.score)[:SHORTLIST]:
+        shortlist = np.argsort(-screening.score)[:SHORTLIST]
+        # Structure that hides in the noise common to a pose shows only when that is fitted again.
+        hidden = np.setdiff1d(np.flatnonzero(self._structure), shortlist)
+        for index in np.concatenate((shortlist, hidden)):
             if not np.isfinite(screening.score[index]):
                 continue
             candidate = self.fit((*solution.cells, self.catalogue.cells[index]), solution)
-            if candidate is not None and (
-                best is None or candidate.log_evidence > best[0].log_evidence
+            if (
+                candidate is not None
+                and not candidate.unphysical()
+                and (best is None or candidate.log_evidence > best[0].log_evidence)
             ):
-                best = candidate, screening.p_value(float(screening.score[index]))
+                score = float(screening.score[index])
+                if self._structure[index]:
+                    score = max(score, candidate.log_evidence - solution.log_evidence)
+                best = candidate, screening.p_value(score)
         for family in FAMILIES:
             if not self._promising(family, screening):
                 continue
@@ -221,15 +231,23 @@ class Search:
         return kept
 
     def prune(self, solution: Solution, among: set[Cell] | None = None) -> Solution:
-        """Drop, one by one, the cells without which the evidence is higher."""
+        """Drop, one by one, the cells without which the evidence is higher.
+
+        Those of a sign that physics excludes go first, whatever they explain.
+        """
         price = np.log(3.0 * len(self.data))
         while solution.cells:
+            unphysical = solution.unphysical()
             worth = []
-            for cell, where in zip(solution.cells, solution.slices(), strict=True):
-                if among is not None and cell not in among:
+            for index, (cell, where) in enumerate(
+                zip(solution.cells, solution.slices(), strict=True)
+            ):
+                if index in unphysical:
+                    worth.append(-np.inf)
+                elif among is not None and cell not in among:
                     worth.append(np.inf)
-                    continue
-                worth.append(worth_of(solution, cell, where, price))
+                else:
+                    worth.append(worth_of(solution, cell, where, price))
             order = np.argsort(worth)
             for index in order[:2]:
                 # Wald's estimate of the loss chooses; the evidence itself decides.
@@ -237,7 +255,9 @@ class Search:
                     return solution
                 rest = (*solution.cells[:index], *solution.cells[index + 1 :])
                 smaller = self.fit(rest, solution)
-                if smaller is not None and smaller.log_evidence > solution.log_evidence:
+                if smaller is not None and (
+                    index in unphysical or smaller.log_evidence > solution.log_evidence
+                ):
                     solution = smaller
                     break
             else:
@@ -271,6 +291,24 @@ class Search:
         if best is not None and self.held_out_share(solution, best) < 0.0:
             return None
         return best
+
+    def refine_moments(self, solution: Solution) -> Solution:
+        """Move what happened at one moment to the best moment nearby, as finely as rows allow."""
+        for cell in solution.cells:
+            between = EFFECTS[cell.name].between
+            if between is None:
+                continue
+            tried = np.unique([other.moment for other in self.cells if other.name == cell.name])
+            low = np.max(tried[tried < cell.moment], initial=-np.inf)
+            high = np.min(tried[tried > cell.moment], initial=np.inf)
+            rest = tuple(other for other in solution.cells if other is not cell)
+            fits = []
+            for other in between(self.data.part, float(low), float(high)):
+                if other.parameters == cell.parameters:
+                    moved = self.fit((*rest, other), solution)
+                    fits += [moved] if moved is not None else []
+            solution = _dated(fits) if fits else solution
+        return solution
 
     def drop_unpredictive(self, solution: Solution) -> Solution:
         """Drop the causes without which poses left out are predicted better."""
@@ -336,7 +374,7 @@ class Search:
         for index in np.argsort(-score)[:count]:
             if np.isfinite(score[index]):
                 other = self.fit((*rest, self.catalogue.cells[index]), solution)
-                if other is not None:
+                if other is not None and not other.unphysical():
                     found.append(other)
         return sorted(found, key=lambda fit: -fit.log_evidence)
 
@@ -347,6 +385,17 @@ class Search:
             self._last_held_out = larger, float(after.sum())
         before = held_out_error(self.data, smaller, larger.noise, self._fold_of_pose)
         return float(1.0 - self._last_held_out[1] / before.sum())
+
+
+def _dated(fits: Sequence[Solution]) -> Solution:
+    """Return the best of fits whose last cell differs in its moment, with the moment's std."""
+    evidence = np.array([fit.log_evidence for fit in fits])
+    best = fits[int(np.argmax(evidence))]
+    weight = np.exp(evidence - evidence.max())
+    moment = np.array([fit.cells[-1].moment for fit in fits])
+    spread = np.sqrt(np.average((moment - best.cells[-1].moment) ** 2, weights=weight))
+    dated = replace(best.cells[-1], moment_std=float(spread))
+    return replace(best, cells=(*best.cells[:-1], dated))
 
 
 def _least_share(solution: Solution, candidate: Solution) -> float:

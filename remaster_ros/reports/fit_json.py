@@ -126,6 +126,7 @@ def _describe(session: Session) -> dict[str, Any]:
         'sensors': session.sensors,
         'created': session.created,
         'exit_status': session.exit_status,
+        **({} if session.timed else {'times': 'none'}),
     }
 
 

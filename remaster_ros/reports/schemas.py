@@ -40,13 +40,14 @@ class Counts(Struct):
 
 
 class MeasuredSession(Struct):
-    """What was measured: counts, sensor -> marker, when, and how it ended."""
+    """What was measured: counts, sensor -> marker, when, how it ended; if it has no times."""
 
     optimization: Counts
     validation: Counts
     sensors: dict[str, str]
     created: str
     exit_status: str
+    times: Literal['none'] | UnsetType = UNSET
 
 
 class JointOffset(Struct):
@@ -254,16 +255,36 @@ class SearchedRows(Struct):
     others_rms_after_m: float | None
 
 
+class Compared(Struct):
+    """A parameter in both sessions, and by how many standard deviations of both they differ."""
+
+    name: str
+    unit: str
+    value: float
+    std: float
+    other_value: float
+    other_std: float
+    sigmas: float
+
+
 class ConfirmedEffect(Struct):
-    """Which share of an effect's gain carries over to the other session."""
+    """How an effect does in the other session.
+
+    ``rows_common`` of its rows have its driver where it was seen; ``carried_over`` is the share of
+    what it could gain there; None where that is nothing.
+    """
 
     name: str
     joints: list[int]
     carried_over: float | None
+    rows_common: int | UnsetType = UNSET
+    rms_without_m: float | UnsetType | None = UNSET
+    rms_frozen_m: float | UnsetType | None = UNSET
+    parameters: list[Compared] | UnsetType = UNSET
 
 
 class Confirmed(Struct):
-    """How the effects do in another session of the arm."""
+    """How the effects do in another session of the arm; see `confirmation.Confirmation`."""
 
     rms_before_m: float | None
     rms_after_m: float | None
@@ -272,6 +293,44 @@ class Confirmed(Struct):
     carried_over: float | None
     confirmed: bool
     effects: list[ConfirmedEffect]
+    rows: int | UnsetType = UNSET
+    rows_common: int | UnsetType = UNSET
+    rms_frozen_offsets_m: float | UnsetType | None = UNSET
+    joint_offsets: list[Compared] | UnsetType = UNSET
+    offsets_rms_sigmas: float | UnsetType | None = UNSET
+    parameters_rms_sigmas: float | UnsetType | None = UNSET
+    why: str | UnsetType = UNSET
+
+
+class Coverage(Struct):
+    """How many rows lie in their 95 % regions; the interval takes the rows as independent."""
+
+    rows: int
+    inside: int
+    share: float | None
+    interval95: tuple[float, float] | None
+
+
+class PredictedRegions(Struct):
+    """The 95 % regions of predictions.csv: ``widening`` is the factor on their size.
+
+    It is what the fitted rows take when their pose is left out, so that 95 % of them lie inside.
+    """
+
+    widening: float
+    held_out: Coverage
+    fitted: Coverage
+
+
+class JointCovariance(Struct):
+    """Covariance of the zero-offsets that are identifiable and of all of the causes' parameters.
+
+    ``matrix`` is in the units of its parameters, to six figures.
+    """
+
+    names: list[str]
+    units: list[str]
+    matrix: list[list[float]]
 
 
 class Unexplained(Struct):
@@ -301,6 +360,10 @@ class Discovered(Struct):
     unexplained: list[Unexplained] | UnsetType = UNSET
     joint_offsets_before: list[OffsetBefore] | UnsetType = UNSET
     sampler: Sampler | UnsetType = UNSET
+    registration: dict[str, Registration] | UnsetType = UNSET
+    markers: dict[str, Marker] | UnsetType = UNSET
+    covariance: JointCovariance | UnsetType = UNSET
+    predicted_regions95: PredictedRegions | UnsetType = UNSET
     rows_searched: SearchedRows | UnsetType = UNSET
     confirmation: Confirmed | UnsetType = UNSET
 

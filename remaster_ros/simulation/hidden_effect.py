@@ -208,10 +208,12 @@ Draw = Callable[[str, DrawContext], HiddenEffect]
 """(kind, what to draw from) -> an effect."""
 
 
-def one_value(largest: float, first_joint: int = 1) -> Draw:
-    """Draw a joint and a sign."""
+def one_value(largest: float, first_joint: int = 1, positive: bool = False) -> Draw:
+    """Draw a joint and, unless physics has only the positive one, a sign."""
     return lambda kind, context: HiddenEffect(
-        kind, context.joint(first_joint), np.array([largest * context.sign()])
+        kind,
+        context.joint(first_joint),
+        np.array([largest * (1.0 if positive else context.sign())]),
     )
 
 

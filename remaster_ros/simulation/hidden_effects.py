@@ -210,11 +210,16 @@ NAMED = {
         'approach',
         'step',
         _backlash,
-        one_value(15 * ARC_MINUTE),
+        one_value(15 * ARC_MINUTE, positive=True),
         (Part('half_backlash_{j}', (2.0,)),),
     ),
     'settling': HiddenKind(
-        'joint_angle', 'last_move', 'linear', _settling, one_value(3e-3), (Part('settling_{j}'),)
+        'joint_angle',
+        'last_move',
+        'linear',
+        _settling,
+        one_value(3e-3, positive=True),
+        (Part('settling_{j}'),),
     ),
     'joint_coupling': HiddenKind(
         'joint_angle',

@@ -133,7 +133,7 @@ UNNAMED = {
         'step',
         _slip,
         at_some_time(one_value(15 * ARC_MINUTE, 2)),
-        (Part('joint_{j}_by_time'),),
+        (Part('joint_{j}_step'),),
     ),
     'warm_joint': HiddenKind(
         'joint_angle',

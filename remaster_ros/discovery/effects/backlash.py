@@ -27,6 +27,7 @@ EFFECT = Effect(
     source='Nordin & Gutman 2002, Automatica 38',
     unit='rad',
     plausible=(1e-5, 2e-3),
+    sign=1,
     sentence='Where {subject} stops depends on the side it comes from (gear play).',
     separate_by='each pose approached from both sides, by small and by large moves',
     cells=cells,

@@ -35,6 +35,7 @@ EFFECT = Effect(
     source='Nubiola & Bonev 2013, Robot. Comput.-Integr. Manuf. 29 (base and stiffness)',
     unit='rad/(N m)',
     plausible=(1e-7, 1e-4),
+    sign=1,
     sentence='The base gives way under the weight of the arm (loose bolts or a soft stand).',
     separate_by='the same poses at several angles of joint 1, with and without a payload',
     cells=cells,

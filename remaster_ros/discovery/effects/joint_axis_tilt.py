@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, turned
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, ModelChange, turned
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.types import FloatArray
 
@@ -23,12 +23,14 @@ def cells(context: Context) -> Iterator[Cell]:
         # A tilt has any direction; on a whole arm some of them are other names for a link's.
         for axes in (''.join(directions), *directions):
             rarity = 1 if len(axes) > 1 else RARITY * len(directions)
+            turns = np.array([directions[axis] for axis in axes])
             yield EFFECT.cell(
-                partial(_tilted, joint=joint, axes=[directions[axis] for axis in axes]),
+                partial(_tilted, joint=joint, axes=list(turns)),
                 [f'tilt_{axis}_{joint}' for axis in axes],
                 joints=(joint,),
                 drawn_from=(context.joints - 1) * rarity,
                 variant=axes,
+                model_change=ModelChange(joint - 1, np.zeros((len(axes), 3)), turns),
             )
 
 

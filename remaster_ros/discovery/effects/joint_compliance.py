@@ -27,6 +27,7 @@ EFFECT = Effect(
     source='Spong 1987, J. Dyn. Sys. Meas. Control 109; Klodmann et al. 2011 (DLR LWR)',
     unit='rad/(N m)',
     plausible=(1e-6, 1e-3),
+    sign=1,
     sentence='The weight it carries winds up {subject} (soft gearbox or bearing).',
     separate_by='the same poses with and without a payload on the tool',
     cells=cells,

@@ -9,8 +9,8 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.splines import basis, centers, knot_vector, roughness
-from remaster_ros.types import FloatArray
+from remaster_ros.discovery.effects.drivers import angle_of
+from remaster_ros.discovery.effects.splines import Curve
 
 # The finest: gearbox errors have structure down to a few degrees; finer overfits any session.
 FINEST_KNOTS = np.radians(4.0)
@@ -20,31 +20,23 @@ RARITY = 10
 ROWS_PER_KNOT = 6.0
 
 
-def knots_of(context: Context, joint: int) -> FloatArray:
-    """Return the knots of a joint's curve: over its angles, as fine as the rows allow, rad."""
-    angle = context.measurements.q[:, joint - 1]
-    low, high = float(angle.min()), float(angle.max())
-    configurations = len(np.unique(context.measurements.configuration))
-    spacing = max(FINEST_KNOTS, (high - low) * ROWS_PER_KNOT / configurations)
-    return knot_vector(low, max(high, low + 3.0 * spacing), spacing)
-
-
 def cells(context: Context) -> Iterator[Cell]:
     """One curve per joint."""
+    configurations = len(np.unique(context.measurements.configuration[context.to_fit]))
     for joint in context.moving:
-        knots = knots_of(context, joint)
-        angles = np.degrees(centers(knots))
+        curve = angle_of(joint).curve(context, ROWS_PER_KNOT / configurations, FINEST_KNOTS)
         yield EFFECT.cell(
-            partial(_splines, joint=joint, knots=knots),
-            [f'curve_{joint}_at_{angle:+.1f}deg' for angle in angles],
+            partial(_splines, joint=joint, curve=curve),
+            [f'curve_{joint}_at_{angle:+.1f}deg' for angle in np.degrees(curve.places)],
             joints=(joint,),
             drawn_from=RARITY * context.joints,
-            penalty=roughness(len(angles)),
+            penalty=curve.penalty,
+            curve=curve,
         )
 
 
-def _splines(context: Context, joint: int, knots: FloatArray) -> Design:
-    return Design(joint - 1, basis(context.measurements.q[:, joint - 1], knots))
+def _splines(context: Context, joint: int, curve: Curve) -> Design:
+    return Design(joint - 1, curve.columns(context.measurements.q[:, joint - 1]))
 
 
 EFFECT = Effect(
@@ -52,7 +44,7 @@ EFFECT = Effect(
     place='joint_angle',
     driver='own_angle',
     form='free',
-    equation='δq_j = Σ_i w_i B_i(q_j), cubic B-splines, smoothness by the evidence',
+    equation='δq_j = Σ_i w_i B_i(q_j), cubic B-splines, mean 0, smoothness by the evidence',
     source='Eilers & Marx 1996, Statistical Science 11 (P-splines)',
     unit='rad',
     plausible=(1e-6, 5e-3),

@@ -7,7 +7,13 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.base import (
+    Cell,
+    Design,
+    Effect,
+    ModelChange,
+    displaced,
+)
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.types import FloatArray
 
@@ -23,6 +29,7 @@ def cells(context: Context) -> Iterator[Cell]:
                 joints=(link,),
                 drawn_from=len(context.links()) * len(directions),
                 variant=axis,
+                model_change=ModelChange(link, direction[None], np.zeros((1, 3))),
             )
 
 

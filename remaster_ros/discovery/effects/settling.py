@@ -27,6 +27,7 @@ EFFECT = Effect(
     source='creep and position error of a first-order servo after a move',
     unit='rad/rad',
     plausible=(1e-5, 1e-2),
+    sign=1,
     sentence='When measured, {subject} still lags by a share of the last move (wait longer).',
     separate_by='longer waiting before each measurement, and large moves from both sides',
     cells=cells,

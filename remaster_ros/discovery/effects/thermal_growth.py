@@ -7,11 +7,13 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.base import NO_TIMES, Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import Driver, slow_drivers
 from remaster_ros.types import FloatArray
 
+# What grows by 1e-4 per K grows by this per s in a warm-up of 10 K in a quarter of an hour.
+LARGEST_PER_S = 1e-6
 # Growth with time is rarer by so much where the temperature is recorded.
 BESIDE_TEMPERATURE = 50
 
@@ -30,6 +32,8 @@ def cells(context: Context) -> Iterator[Cell]:
                 [f'growth_{joints[0]}' if joints else 'growth'],
                 joints=joints,
                 driver=driver.name,
+                # An arm cools after work: with time it may shrink.
+                **({'largest': LARGEST_PER_S} if driver.name == 'time' else {'sign': 1}),
                 unit=f'1/{driver.unit}',
                 drawn_from=(4 * len(parts) if joints else 2)
                 * (BESIDE_TEMPERATURE if beside else 1),
@@ -57,7 +61,7 @@ def needs_warming(context: Context) -> str:
     """Return why growth cannot be tested; '' where it can."""
     if context.has_temperature or context.has_time:
         return ''
-    return 'neither temperature nor time varies'
+    return 'neither temperature nor time varies' if context.timed else NO_TIMES
 
 
 EFFECT = Effect(
