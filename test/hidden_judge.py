@@ -34,7 +34,7 @@ UNSEEN_SHARE = 0.02
 # What an entry of ``unexplained`` has to mention, one of these, where the readings themselves err.
 FAULT_PLACES = {
     'pairing': ('pairing', 'paired', 'tail', 'outlier', 'gross'),
-    'memory': ('serial', 'memory'),
+    'memory': ('serial',),
     'tails': ('tail', 'outlier', 'gross'),
 }
 
@@ -127,7 +127,7 @@ def _outcome(
     if extra:
         return 'wrong'
     words = [
-        ' '.join(str(getattr(entry, name, '')) for name in ('kind', 'where', 'driver')).lower()
+        f'{entry.where} {entry.driver}' + ' serial' * ('serial correlation' in entry.next)
         for entry in discovery.unexplained
     ]
     wanted = [(KINDS[effect.kind].driver,) for effect in missing.values()]
@@ -219,6 +219,7 @@ def _deviations(
             parameter.name: (parameter.value, parameter.std)
             for claim in claims
             for parameter in claim.parameters
+            if parameter.name != 'moment'
         }
         if effect.kind == 'joint_error_curve':
             deviations['curve'] = _curve_deviation(world, effect, estimates)

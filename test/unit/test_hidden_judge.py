@@ -48,7 +48,10 @@ def claim(name: str, place: str, driver: str, joints: tuple[int, ...] = (), **mo
 
 
 def discovery(*effects: Any, unexplained: tuple[tuple[str, str], ...] = ()) -> Any:
-    entries = [SimpleNamespace(where=where, driver=driver) for where, driver in unexplained]
+    entries = [
+        SimpleNamespace(where=where, driver=driver, next=f'Errors follow each other ({where}).')
+        for where, driver in unexplained
+    ]
     return SimpleNamespace(effects=effects, unexplained=entries)
 
 
@@ -114,7 +117,7 @@ def test_one_of_two_is_partly_right_unless_the_other_place_is_told(six: HiddenWo
 @pytest.mark.parametrize(
     ('noise', 'where'),
     [
-        (Noise(memory=0.9), 'serial_correlation'),
+        (Noise(memory=0.9), 'serial correlation'),
         (Noise(degrees_of_freedom=3.0), 'tails'),
         (Noise(mispaired_share=0.1), 'pairing'),
     ],
