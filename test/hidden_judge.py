@@ -219,8 +219,12 @@ def _deviations(
             parameter.name: (parameter.value, parameter.std)
             for claim in claims
             for parameter in claim.parameters
-            if parameter.name != 'moment'
         }
+        if 'moment' in estimates and 'moment_s' in effect.detail:
+            value, std = estimates.pop('moment')
+            # A moment is known to the time between two configurations at best.
+            std = max(std, float(np.median(np.diff(world.visited.time_s))))
+            deviations['moment'] = (value - effect.detail['moment_s']) / std
         if effect.kind == 'joint_error_curve':
             deviations['curve'] = _curve_deviation(world, effect, estimates)
             continue

@@ -144,6 +144,16 @@ def test_sizes_are_compared_by_the_names_of_the_kind(six: HiddenWorld) -> None:
     assert judge(six, truth, discovery(far)).size_right is False
 
 
+def test_the_moment_of_a_step_is_compared(six: HiddenWorld) -> None:
+    truth = truth_of(six, STEP)
+    for moment, right in ((505.0, True), (900.0, False)):
+        step = claim('unnamed', 'joint_angle', 'time', (3,), joint_3_step=1e-3, moment=moment)
+        step.parameters[1].std = 2.0
+        judgement = judge(six, truth, discovery(step))
+        assert judgement.outcome == 'right'
+        assert judgement.size_right is right
+
+
 def test_parts_undo_the_names_of_parameters() -> None:
     """Each parameter of an effect of several is that effect with its value alone."""
     waves = HiddenEffect('encoder_eccentricity', (4,), np.arange(1.0, 5.0), {'orders': (1, 2)})
