@@ -98,15 +98,21 @@ class _Checks:
         return gross | (np.linalg.norm(self.errors, axis=1) > self.limit)
 
     @cached_property
+    def predicted(self) -> FloatArray:
+        """Modelled positions in the sensor frames, m, (n, 3)."""
+        return self.data.context.measurements.position - self.errors
+
+    @cached_property
     def mispaired(self) -> BoolArray:
         """Gross rows that lie where the marker was at the configuration before or after, (n,)."""
-        position = self.data.context.measurements.position
-        predicted = position - self.errors
-        near = np.zeros(len(position), bool)
+        measurements = self.data.context.measurements
+        near = np.zeros(len(measurements), bool)
         for rows in self._series():
             for one, other in ((rows[1:], rows[:-1]), (rows[:-1], rows[1:])):
-                away = np.linalg.norm(position[one] - predicted[other], axis=1)
-                near[one] |= away < self.limit[one]
+                away = np.linalg.norm(measurements.position[one] - self.predicted[other], axis=1)
+                # All configurations of a pose have the marker near one place.
+                apart = measurements.pose[one] != measurements.pose[other]
+                near[one] |= apart & (away < self.limit[one])
         return near & self.gross
 
     def _series(self) -> Iterator[IntArray]:
@@ -123,10 +129,11 @@ class _Checks:
         if count < FEWEST_MISPAIRED:
             return
         measurements = self.data.context.measurements
-        spread = np.sqrt(np.sum(np.var(measurements.position, axis=0)))
-        # That a gross error ends by chance within the limit of one of two places.
-        chance = min(1.0, 2.0 * float((self.limit.max() / spread) ** 3))
-        p_value = float(binom.sf(count - 1, int(self.gross.sum()), chance))
+        gross = np.flatnonzero(self.gross)
+        # That a gross error ends by chance within the limit of one of two places: as often as it
+        # lies within it of the places of other poses.
+        chance = min(1.0, 2.0 * np.mean([self._share_near(row) for row in gross.tolist()]))
+        p_value = float(binom.sf(count - 1, len(gross), chance))
         if p_value > SIGNIFICANCE:
             return
         listed = ', '.join(map(str, measurements.observation[self.mispaired][:LISTED]))
@@ -142,6 +149,15 @@ class _Checks:
                 'after each motion, and record these configurations again.'
             ),
         )
+
+    def _share_near(self, row: int) -> float:
+        """Return the share of places of other poses that a reading lies near, at least one's."""
+        measurements = self.data.context.measurements
+        others = (measurements.sensor == measurements.sensor[row]) & (
+            measurements.pose != measurements.pose[row]
+        )
+        away = np.linalg.norm(self.predicted[others] - measurements.position[row], axis=1)
+        return float((1 + np.sum(away < self.limit[row])) / (1 + len(away)))
 
     def gross_held_out(self) -> Iterator[tuple[int, str]]:
         """Give the gross errors among the held-out rows, which no fit leaves out."""
