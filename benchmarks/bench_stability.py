@@ -70,9 +70,16 @@ def one(folder: Path, run: int) -> dict[str, Any]:
 
 def _sizes(found: Discovery) -> list[tuple[str, str, float, float]]:
     """Return cause, name, value and std of every parameter, curves at some angles instead."""
-    fit, sizes = found.fit, []
-    solution = found.selection.solution
-    for cell, where in zip(solution.cells, solution.slices(), strict=True):
+    fit, sizes, solution = found.fit, [], found.selection.solution
+    wheres = dict(zip(solution.cells, solution.slices(), strict=True))
+    # An effect without cells is that of a marker, which has no parameters of its own.
+    causes = [
+        (effect.name, cell)
+        for effect, group in zip(found.effects, found.groups, strict=False)
+        for cell in group
+    ]
+    for cause, cell in causes:
+        where = wheres[cell]
         if cell.penalty is None:
             values, stds = fit.theta[where], fit.theta_std[where]
             names: list[str] = list(cell.parameters)
@@ -86,7 +93,7 @@ def _sizes(found: Discovery) -> list[tuple[str, str, float, float]]:
             values, stds = columns @ fit.theta[where], draws.std(axis=0)
             names = [f'{cell.name}_{cell.joints}_{cell.label}_{i}' for i in range(ANGLES)]
         sizes += [
-            (cell.name, name, float(value), float(std))
+            (cause, name, float(value), float(std))
             for name, value, std in zip(names, values, stds, strict=True)
         ]
     return sizes
