@@ -99,11 +99,30 @@ class Designed:
         What was to be reached.
     reached
         Whether it is, with the floors.
+    joint_rms, tool_rms
+        What is expected, rad and m.
     """
 
     plans: Mapping[str, Plan]
     goal: Goal
     reached: bool
+    joint_rms: float
+    tool_rms: float
+
+    def describe(self) -> str:
+        """Return what is expected, in a line."""
+        goal = (
+            ''
+            if self.reached
+            else (
+                f'; not reached: {np.degrees(self.goal.joint_std_rad):.4f} deg for the offsets or '
+                f'{self.goal.tool_std_m * 1e3:.3f} mm for the tool'
+            )
+        )
+        return (
+            f'expected std of the offsets {np.degrees(self.joint_rms):.4f} deg (RMS), '
+            f'error of the predicted markers {self.tool_rms * 1e3:.3f} mm (RMS){goal}'
+        )
 
 
 def designed_plans(
@@ -165,7 +184,13 @@ def designed_plans(
     designed = {**plans, 'optimization': Plan(tuple(kept), dropped, solutions)}
     if 'validation' in plans:
         designed['validation'] = _held_out(plans['validation'], rng)
-    return Designed(designed, goal, design.reached)
+    return Designed(
+        designed,
+        goal,
+        design.reached,
+        information.joint_rms(chosen.tolist()),
+        information.tool_rms(chosen.tolist()),
+    )
 
 
 def _floors(information: DesignInformation, left: IntArray) -> Floors:
