@@ -21,6 +21,7 @@ from remaster_ros.version import __version__
 VERBS = {
     'demo': 'The whole pipeline on fake hardware: real nodes, real DDS, real sockets.',
     'import': "Make a session of anybody's table of joint angles and points, or of a ROS bag.",
+    'plan': 'Plan the poses of a cell: counts, times, expected precision; nothing moves.',
     'simulate': 'Make a session from a known truth, which is written beside it.',
     'fit': 'Fit the zero-offsets of a session: fit.json, figures and report.html.',
     'discover': 'Find what the offsets leave, name the cause, extend the model, prove the gain.',

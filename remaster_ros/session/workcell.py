@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-from math import degrees, pi, radians
+from math import radians
 from pathlib import Path
 from typing import Annotated
 
@@ -22,20 +22,21 @@ from remaster_ros.planning.candidates import (
     LIMIT_MARGIN_RAD,
     LineOfSight,
     PlanningScene,
-    PoseRanges,
 )
+from remaster_ros.planning.expected_sensors import POSE_SIGMA_M, SIGMA_M, ExpectedSensor
+from remaster_ros.planning.planned_design import DesignSettings
+from remaster_ros.session.cell_poses import RANGES, CellPoses
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.meshes import mesh_reader
 from remaster_ros.session.reader import URDF_LIMIT
 from remaster_ros.session.yaml_records import YAML_LIMIT, Bounds, Triple, read_yaml
 from remaster_ros.types import FARTHEST_M, FloatArray
 
-Range = tuple[float, float]
-# No arm or tool of those that this is for reaches so far.
-REACH = Bounds(-10.0, 10.0, 'm')
 ON_TOOL = Bounds(-3.0, 3.0, 'm')
 # A marker is placed better than this; a session file may give more, where nothing is known.
 MARKER_STD = Bounds(0.0, 0.02, 'm', above=True)
+# From the resolution of an interferometer to a depth camera's noise.
+NOISE = Bounds(1e-7, 0.05, 'm')
 # A retroreflector or sphere is seen from further round than this.
 VIEW = Bounds(3.5, 180.0, 'degrees')
 CLEARANCE = Bounds(HALF_STEP_M, 1.0, 'm', remedy='; half the step of a path check is the least')
@@ -68,6 +69,9 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     max_angle_deg
         Largest angle between the tool's z axis and the line to the sensor at which the marker
         is seen.
+    noise_m, pose_noise_m
+        Standard deviations per axis that are expected: of a reading, and of the error that all
+        readings at one pose share. Only plans depend on them; a fit estimates its own.
     """
 
     marker: str
@@ -76,6 +80,8 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     single_shot: bool = False
     measure_service: str = ''
     max_angle_deg: Annotated[float, VIEW] = 60.0
+    noise_m: Annotated[float, NOISE] = SIGMA_M
+    pose_noise_m: Annotated[float, Bounds(0.0, 0.05, 'm')] = POSE_SIGMA_M
 
 
 class CellBox(msgspec.Struct, forbid_unknown_fields=True):
@@ -123,24 +129,6 @@ class CellToolBody(msgspec.Struct, forbid_unknown_fields=True):
         return Body(name, len(chain), self.shape(), T, 'tool')
 
 
-class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
-    """Ranges of the Latin hypercube of poses."""
-
-    azimuth_deg: Range = (0.0, 360.0)
-    radius_m: Annotated[Range, Bounds(0.0, 10.0, 'm')] = (0.2, 0.5)
-    height_m: Annotated[Range, REACH] = (0.4, 0.8)
-    roll_deg: Range = (0.0, 360.0)
-
-    def ranges(self) -> PoseRanges:
-        """Return the ranges in SI units."""
-        return PoseRanges(
-            azimuth_rad=(radians(self.azimuth_deg[0]), radians(self.azimuth_deg[1])),
-            radius_m=self.radius_m,
-            height_m=self.height_m,
-            roll_rad=(radians(self.roll_deg[0]), radians(self.roll_deg[1])),
-        )
-
-
 class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     """A cell file; see config/cells/demo.yaml for what each key means."""
 
@@ -173,8 +161,16 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
 
     def fingerprint(self) -> str:
         """Return a checksum of all that a plan depends on."""
-        content = msgspec.json.encode(msgspec.structs.replace(self, file=''))
-        return hashlib.sha256(content).hexdigest()
+        plain = msgspec.to_builtins(msgspec.structs.replace(self, file=''))
+        # Keys that files of older versions have not count where they are not as by default: plans
+        # of those versions go on.
+        given = self.poses.given()
+        plain['poses'] = {k: v for k, v in plain['poses'].items() if k in RANGES or k in given}
+        for sensor in plain['sensors'].values():
+            for key, usual in (('noise_m', SIGMA_M), ('pose_noise_m', POSE_SIGMA_M)):
+                if sensor[key] == usual:
+                    del sensor[key]
+        return hashlib.sha256(msgspec.json.encode(plain)).hexdigest()
 
     def held(self, chain: SerialChain) -> dict[int, tuple[float, ...]] | None:
         """Return the held joint's index and values (rad), or None."""
@@ -261,6 +257,20 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
             limit_margin_rad,
         )
 
+    def design_settings(self) -> DesignSettings:
+        """Return which of the poses are to be visited, and in which order."""
+        expected = [
+            ExpectedSensor(
+                name,
+                np.array(sensor.rough_position_m),
+                {sensor.marker: np.array(self.markers[sensor.marker])},
+                sensor.noise_m,
+                sensor.pose_noise_m,
+            )
+            for name, sensor in self.sensors.items()
+        ]
+        return self.poses.settings(tuple(expected), self.marker_std_m)
+
 
 def _no_mesh(name: str) -> None:
     """Leave a mesh out."""
@@ -332,15 +342,8 @@ def _problem(cell: Workcell, chain: SerialChain) -> str:
             return f'sensor {name} follows marker {sensor.marker!r}; markers has {known}'
     if cell.aim_at not in cell.sensors:
         return f'aim_at {cell.aim_at!r} is none of the sensors {", ".join(cell.sensors)}'
-    for key in cell.poses.__struct_fields__:
-        low, high = getattr(cell.poses, key)
-        if low > high:
-            return f'poses.{key} goes from {low:g} down to {high:g}; give the smaller one first'
-        if key.endswith('_deg') and low < high and max(abs(low), abs(high)) < 2.0 * pi + 0.01:
-            return (
-                f'poses.{key} is {low:g} to {high:g}, a range of {high - low:.3g} degrees; if '
-                f'radians were meant, write {degrees(low):.4g}, {degrees(high):.4g}'
-            )
+    if problem := cell.poses.problem():
+        return problem
     limits = cell.acceleration_limit_rad_s2
     if isinstance(limits, list) and len(limits) != len(chain):
         return (
