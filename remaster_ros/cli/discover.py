@@ -88,8 +88,10 @@ def summary(
     lines = [f'verdict: {found.verdict}']
     for effect in found.effects:
         joints = f' {list(effect.joints)}' if effect.joints else ''
-        share = '' if effect.share is None else f', {100 * effect.share:.0f} % of the gain'
+        share = '' if effect.share is None else f', {percent(effect.share)} of the gain'
         lines.append(f'{effect.name}{joints}: {1e3 * effect.size_m:.3f} mm{share}; {effect.cause}')
+        if effect.remedy:
+            lines.append(f'    to do: {effect.remedy}')
         for alike in effect.confusable_with:
             where = f' {list(alike.joints)}' if alike.joints else ''
             lines.append(f'    could be {alike.name}{where}; to distinguish: {alike.separate_by}')

@@ -210,7 +210,10 @@ class LookAlike(Struct):
 
 
 class Effect(Struct):
-    """A cause; ``size_m`` is the RMS at the marker after absorption, ``share`` of the gain."""
+    """A cause; ``size_m`` is the RMS at the marker after absorption, ``share`` of the gain.
+
+    ``sizes`` are its parts in arc minutes and millimetres, ``remedy`` is what to do about it.
+    """
 
     name: str
     joints: list[int]
@@ -224,6 +227,8 @@ class Effect(Struct):
     cause: str
     size_m: float | UnsetType = UNSET
     share: float | UnsetType | None = UNSET
+    sizes: list[str] | UnsetType = UNSET
+    remedy: str | UnsetType = UNSET
 
 
 class Gain(Struct):
@@ -368,6 +373,7 @@ class Discovered(Struct):
     registration: dict[str, Registration] | UnsetType = UNSET
     markers: dict[str, Marker] | UnsetType = UNSET
     covariance: JointCovariance | UnsetType = UNSET
+    least_p_value: float | UnsetType = UNSET
     predicted_regions95: PredictedRegions | UnsetType = UNSET
     rows_searched: SearchedRows | UnsetType = UNSET
     confirmation: Confirmed | UnsetType = UNSET
