@@ -89,6 +89,7 @@ setup(
         'mcap>=1.2',
         'python-dateutil>=2.8',
         'rosbags>=0.10',
+        'xacro>=2.0.8',
     ],
     extras_require={
         'jazzy': JAZZY,

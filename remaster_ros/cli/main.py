@@ -20,6 +20,7 @@ from remaster_ros.version import __version__
 # the rest take more than a second to load, and `remaster --help` needs none of it.
 VERBS = {
     'demo': 'The whole pipeline on fake hardware: real nodes, real DDS, real sockets.',
+    'init': 'Write a cell file for a robot (URDF or xacro), with what is proposed and why.',
     'import': "Make a session of anybody's table of joint angles and points, or of a ROS bag.",
     'simulate': 'Make a session from a known truth, which is written beside it.',
     'fit': 'Fit the zero-offsets of a session: fit.json, figures and report.html.',

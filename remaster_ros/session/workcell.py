@@ -297,7 +297,11 @@ def read_cell(path: str | Path) -> Workcell:
     path = Path(path)
     if not path.suffix and not path.exists():
         path = config_path(f'cells/{path}.yaml')
-    data = read_limited(path, YAML_LIMIT, 'name a cell file')
+    return parse_cell(read_limited(path, YAML_LIMIT, 'name a cell file'), path)
+
+
+def parse_cell(data: bytes, path: Path) -> Workcell:
+    """Check the content of a cell file, which need not be written yet; errors as `read_cell`."""
     cell = read_yaml(data, path, Workcell)
     urdf = path.parent / cell.robot.urdf
     cell.file = str(path)
