@@ -73,6 +73,7 @@ setup(
     install_requires=[
         'numpy>=1.26',
         'scipy>=1.11',
+        'argcomplete>=3',
         'arviz-stats>=0.4',
         'PyYAML>=6',
         'EAIK>=1.2',

@@ -16,6 +16,7 @@ from remaster_ros.reports import schemas
 from remaster_ros.reports.discovery_apply import applied
 from remaster_ros.reports.fit_json import (
     APPLY_FOLDER,
+    DISCOVERY_FILE,
     fit_content,
     read_result,
     remove_report,
@@ -24,8 +25,6 @@ from remaster_ros.reports.fit_json import (
 from remaster_ros.reports.predictions_csv import PREDICTIONS_FILE, predictions_text
 from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.version import __version__
-
-DISCOVERY_FILE = 'discovery.json'
 
 
 def predictions_of(discovery: Discovery) -> Predictions:
