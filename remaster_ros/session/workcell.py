@@ -11,7 +11,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from remaster_ros.errors import InputError
+from remaster_ros.errors import InputError, did_you_mean
 from remaster_ros.kinematics.bodies import Body, Shape, box, cylinder, obstacle, sphere
 from remaster_ros.kinematics.collision import HALF_STEP_M, CollisionModel, arm_bodies
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
@@ -29,6 +29,7 @@ from remaster_ros.session.cell_poses import RANGES, CellPoses
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.meshes import mesh_reader
 from remaster_ros.session.reader import URDF_LIMIT
+from remaster_ros.session.yaml_places import with_line
 from remaster_ros.session.yaml_records import YAML_LIMIT, Bounds, Triple, read_yaml
 from remaster_ros.types import FARTHEST_M, FloatArray
 
@@ -306,7 +307,12 @@ def read_cell(path: str | Path) -> Workcell:
     path = Path(path)
     if not path.suffix and not path.exists():
         path = config_path(f'cells/{path}.yaml')
-    cell = read_yaml(read_limited(path, YAML_LIMIT, 'name a cell file'), path, Workcell)
+    return parse_cell(read_limited(path, YAML_LIMIT, 'name a cell file'), path)
+
+
+def parse_cell(data: bytes, path: Path) -> Workcell:
+    """Check the content of a cell file, which need not be written yet; errors as `read_cell`."""
+    cell = read_yaml(data, path, Workcell)
     urdf = path.parent / cell.robot.urdf
     cell.file = str(path)
     missing = (
@@ -314,24 +320,26 @@ def read_cell(path: str | Path) -> Workcell:
         'URDF there, or give its absolute path'
     )
     cell.urdf_text = decode_text(read_limited(urdf.resolve(), URDF_LIMIT, missing), urdf)
-    _check(path, cell)
+    _check(path, cell, decode_text(data, path))
     return cell
 
 
-def _check(path: Path, cell: Workcell) -> None:
+def _check(path: Path, cell: Workcell, text: str) -> None:
     """Refuse names that point nowhere and values that contradict each other."""
     try:
         chain = cell.chain()
     except InputError as error:
         raise InputError(f'{path.parent / cell.robot.urdf}: {error}') from None
     if problem := _problem(cell, chain):
-        raise InputError(f'{path}: {problem}')
+        raise InputError(f'{path}: {with_line(text, problem)}')
 
 
 def _problem(cell: Workcell, chain: SerialChain) -> str:
     """Return what is wrong between the keys of a cell file; '' where nothing is."""
     if cell.held_joint and cell.held_joint not in chain.joint_names:
-        return f'held_joint {cell.held_joint!r} is none of {", ".join(chain.joint_names)}'
+        known = ', '.join(chain.joint_names)
+        meant = did_you_mean(cell.held_joint, chain.joint_names)
+        return f'held_joint {cell.held_joint!r} is none of {known}{meant}'
     if cell.held_joint and not cell.held_values_deg:
         return 'held_values_deg is empty; give at least one angle'
     if not cell.sensors:
@@ -339,11 +347,26 @@ def _problem(cell: Workcell, chain: SerialChain) -> str:
     for name, sensor in cell.sensors.items():
         if sensor.marker not in cell.markers:
             known = ', '.join(cell.markers)
-            return f'sensor {name} follows marker {sensor.marker!r}; markers has {known}'
+            meant = did_you_mean(sensor.marker, cell.markers)
+            return f'sensors.{name}.marker is {sensor.marker!r}; markers has {known}{meant}'
     if cell.aim_at not in cell.sensors:
+<<<<<<< HEAD
         return f'aim_at {cell.aim_at!r} is none of the sensors {", ".join(cell.sensors)}'
     if problem := cell.poses.problem():
         return problem
+=======
+        meant = did_you_mean(cell.aim_at, cell.sensors)
+        return f'aim_at {cell.aim_at!r} is none of the sensors {", ".join(cell.sensors)}{meant}'
+    for key in cell.poses.__struct_fields__:
+        low, high = getattr(cell.poses, key)
+        if low > high:
+            return f'poses.{key} goes from {low:g} down to {high:g}; give the smaller one first'
+        if key.endswith('_deg') and low < high and max(abs(low), abs(high)) < 2.0 * pi + 0.01:
+            return (
+                f'poses.{key} is {low:g} to {high:g}, a range of {high - low:.3g} degrees; if '
+                f'radians were meant, write {degrees(low):.4g}, {degrees(high):.4g}'
+            )
+>>>>>>> 62590e0b4cd692d1a637312f47d1673d4697ad79
     limits = cell.acceleration_limit_rad_s2
     if isinstance(limits, list) and len(limits) != len(chain):
         return (
