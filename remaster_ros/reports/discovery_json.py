@@ -27,12 +27,8 @@ from remaster_ros.reports.predictions_csv import PREDICTIONS_FILE, predictions_t
 from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.version import __version__
 
-<<<<<<< HEAD
-DISCOVERY_FILE = 'discovery.json'
 LEAST_P_VALUE = 1.0 / (1.0 + DRAWS)
 
-=======
->>>>>>> 62590e0b4cd692d1a637312f47d1673d4697ad79
 
 def predictions_of(discovery: Discovery) -> Predictions:
     """Return where the final model predicts every row of the session."""

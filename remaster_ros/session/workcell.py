@@ -350,23 +350,10 @@ def _problem(cell: Workcell, chain: SerialChain) -> str:
             meant = did_you_mean(sensor.marker, cell.markers)
             return f'sensors.{name}.marker is {sensor.marker!r}; markers has {known}{meant}'
     if cell.aim_at not in cell.sensors:
-<<<<<<< HEAD
-        return f'aim_at {cell.aim_at!r} is none of the sensors {", ".join(cell.sensors)}'
-    if problem := cell.poses.problem():
-        return problem
-=======
         meant = did_you_mean(cell.aim_at, cell.sensors)
         return f'aim_at {cell.aim_at!r} is none of the sensors {", ".join(cell.sensors)}{meant}'
-    for key in cell.poses.__struct_fields__:
-        low, high = getattr(cell.poses, key)
-        if low > high:
-            return f'poses.{key} goes from {low:g} down to {high:g}; give the smaller one first'
-        if key.endswith('_deg') and low < high and max(abs(low), abs(high)) < 2.0 * pi + 0.01:
-            return (
-                f'poses.{key} is {low:g} to {high:g}, a range of {high - low:.3g} degrees; if '
-                f'radians were meant, write {degrees(low):.4g}, {degrees(high):.4g}'
-            )
->>>>>>> 62590e0b4cd692d1a637312f47d1673d4697ad79
+    if problem := cell.poses.problem():
+        return problem
     limits = cell.acceleration_limit_rad_s2
     if isinstance(limits, list) and len(limits) != len(chain):
         return (
