@@ -18,7 +18,6 @@ from typing import Any, Literal
 import numpy as np
 from hidden_oracle import Oracle
 from hidden_world import HiddenTruth, HiddenWorld
-from scipy.interpolate import BSpline
 
 from remaster_ros.simulation.expected_findings import Cause, answers, causes, named_cause
 from remaster_ros.simulation.hidden_effect import HiddenEffect
@@ -34,7 +33,7 @@ UNSEEN_SHARE = 0.02
 # What an entry of ``unexplained`` has to mention, one of these, where the readings themselves err.
 FAULT_PLACES = {
     'pairing': ('pairing', 'paired', 'tail', 'outlier', 'gross'),
-    'memory': ('serial', 'memory'),
+    'memory': ('serial',),
     'tails': ('tail', 'outlier', 'gross'),
 }
 
@@ -98,7 +97,7 @@ def judge(world: HiddenWorld, truth: HiddenTruth, discovery: Any) -> Judgement:
     deviations: dict[str, float] = {}
     size_right = None
     if named_right and not forgiven and hidden:
-        deviations = _deviations(world, truth.effects, discovery.effects)
+        deviations = _deviations(world, truth.effects, discovery)
         limits = {name: CURVE_SHARE if name == 'curve' else SIZE_STD for name in deviations}
         size_right = all(abs(z) <= limits[name] for name, z in deviations.items())
     first = next(iter(found), None)
@@ -127,7 +126,7 @@ def _outcome(
     if extra:
         return 'wrong'
     words = [
-        ' '.join(str(getattr(entry, name, '')) for name in ('kind', 'where', 'driver')).lower()
+        f'{entry.where} {entry.driver}' + ' serial' * ('serial correlation' in entry.next)
         for entry in discovery.unexplained
     ]
     wanted = [(KINDS[effect.kind].driver,) for effect in missing.values()]
@@ -201,7 +200,7 @@ def part_of(name: str) -> HiddenEffect | None:
 
 
 def _deviations(
-    world: HiddenWorld, effects: Sequence[HiddenEffect], found: Sequence[Any]
+    world: HiddenWorld, effects: Sequence[HiddenEffect], discovery: Any
 ) -> dict[str, float]:
     """Compare every true value with its estimate; one that was not estimated counts as zero.
 
@@ -212,7 +211,7 @@ def _deviations(
     for effect in effects:
         claims = [
             claim
-            for claim in found
+            for claim in discovery.effects
             if any(answers(c, cause, effect) for c in _claimed(claim) for cause in causes(effect))
         ]
         estimates = {
@@ -220,8 +219,13 @@ def _deviations(
             for claim in claims
             for parameter in claim.parameters
         }
+        if 'moment' in estimates and 'moment_s' in effect.detail:
+            value, std = estimates.pop('moment')
+            # A moment is known to the time between two configurations at best.
+            std = max(std, float(np.median(np.diff(world.visited.time_s))))
+            deviations['moment'] = (value - effect.detail['moment_s']) / std
         if effect.kind == 'joint_error_curve':
-            deviations['curve'] = _curve_deviation(world, effect, estimates)
+            deviations['curve'] = _curve_deviation(effect, discovery)
             continue
         if effect.kind == 'marker_offset':
             deviations |= _marker_deviations(world, effect, estimates)
@@ -269,20 +273,17 @@ def _marker_deviations(
     return deviations
 
 
-def _curve_deviation(
-    world: HiddenWorld, effect: HiddenEffect, estimates: dict[str, tuple[float, float]]
-) -> float:
-    """RMS of estimated minus true curve over the configurations, as a share of the true one's.
+def _curve_deviation(effect: HiddenEffect, discovery: Any) -> float:
+    """RMS of estimated minus true curve over all rows, as a share of the true one's.
 
     Offset and slope of both are left out: the one is a zero-offset, the other hardly seen.
     """
-    peaks = np.deg2rad([float(re.findall(r'_at_([-+.\d]+)deg', n)[0]) for n in estimates])
-    weights = np.array([value for value, _ in estimates.values()])
-    step = np.mean(np.diff(peaks))
-    knots = peaks[0] + step * np.arange(-2, len(peaks) + 2)
-    q = world.visits.q[:, effect.joints[0] - 1]
-    inside = np.clip(q, knots[3], knots[-4])
-    estimated = BSpline(knots, weights, 3)(inside)
+    context, solution = discovery.residuals.context, discovery.selection.solution
+    q = context.measurements.q[:, effect.joints[0] - 1]
+    estimated = np.zeros(len(q))
+    for cell, where in zip(solution.cells, solution.slices(), strict=True):
+        if (cell.name, cell.joints) == (effect.kind, effect.joints):
+            estimated += cell.columns(context).values @ discovery.fit.theta[where]
     waves = zip(effect.detail['orders'], effect.detail['amplitudes'], effect.detail['phases'])
     true = effect.values[0] * sum(a * np.cos(order * q + phase) for order, a, phase in waves)
     return float(np.std(_detrended(q, estimated - true)) / np.std(_detrended(q, true)))

@@ -15,6 +15,7 @@ from hidden_world import HiddenWorld, Visits
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.context import Context, PartOfContext
+from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.kinematics.transforms import apply, inverse
 from remaster_ros.simulation.hidden_effect import HiddenEffect
 from remaster_ros.types import FloatArray, Session
@@ -72,6 +73,9 @@ def predicted_by(found: Discovery, third: Session) -> FloatArray:
     # By their place: two cells without a name may call their parameters alike.
     solution = found.selection.solution
     for cell, where in zip(solution.cells, solution.slices(), strict=True):
+        if cell.driver == 'time' and not EFFECTS[cell.name].is_cause:
+            # Errors that follow each other belong to the readings, not to the poses.
+            continue
         columns = cell.columns(context)
         if columns.at is None:
             shift += columns.values @ fit.theta[where]

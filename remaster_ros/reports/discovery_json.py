@@ -17,6 +17,7 @@ from remaster_ros.reports import schemas
 from remaster_ros.reports.discovery_apply import applied
 from remaster_ros.reports.fit_json import (
     APPLY_FOLDER,
+    DISCOVERY_FILE,
     fit_content,
     read_result,
     remove_report,
@@ -26,7 +27,6 @@ from remaster_ros.reports.predictions_csv import PREDICTIONS_FILE, predictions_t
 from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.version import __version__
 
-DISCOVERY_FILE = 'discovery.json'
 LEAST_P_VALUE = 1.0 / (1.0 + DRAWS)
 
 

@@ -110,6 +110,9 @@ class Sampler(Struct):
 
     ``precision`` is the Monte Carlo error of the worst mean in standard deviations;
     ``log_density_error_max`` that of the second-order density on the draws that were checked.
+    ``method`` is 'metropolis' for chains, 'importance' for weighted draws, 'laplace' for a
+    Gaussian about the mode; for the latter two ``pareto_k`` is the check of their weights, passed
+    below 0.7.
     """
 
     name: str
@@ -125,6 +128,8 @@ class Sampler(Struct):
     precision_wanted: float | UnsetType | None = UNSET
     log_density_error_max: float | UnsetType | None = UNSET
     log_density_checked_draws: int | UnsetType = UNSET
+    method: Literal['metropolis', 'importance', 'laplace'] | UnsetType = UNSET
+    pareto_k: float | UnsetType | None = UNSET
 
 
 class SampledParameter(Struct):

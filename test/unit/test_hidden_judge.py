@@ -48,7 +48,10 @@ def claim(name: str, place: str, driver: str, joints: tuple[int, ...] = (), **mo
 
 
 def discovery(*effects: Any, unexplained: tuple[tuple[str, str], ...] = ()) -> Any:
-    entries = [SimpleNamespace(where=where, driver=driver) for where, driver in unexplained]
+    entries = [
+        SimpleNamespace(where=where, driver=driver, next=f'Errors follow each other ({where}).')
+        for where, driver in unexplained
+    ]
     return SimpleNamespace(effects=effects, unexplained=entries)
 
 
@@ -114,7 +117,7 @@ def test_one_of_two_is_partly_right_unless_the_other_place_is_told(six: HiddenWo
 @pytest.mark.parametrize(
     ('noise', 'where'),
     [
-        (Noise(memory=0.9), 'serial_correlation'),
+        (Noise(memory=0.9), 'serial correlation'),
         (Noise(degrees_of_freedom=3.0), 'tails'),
         (Noise(mispaired_share=0.1), 'pairing'),
     ],
@@ -139,6 +142,16 @@ def test_sizes_are_compared_by_the_names_of_the_kind(six: HiddenWorld) -> None:
     )
     assert judge(six, truth, discovery(near)).size_right is True
     assert judge(six, truth, discovery(far)).size_right is False
+
+
+def test_the_moment_of_a_step_is_compared(six: HiddenWorld) -> None:
+    truth = truth_of(six, STEP)
+    for moment, right in ((505.0, True), (900.0, False)):
+        step = claim('unnamed', 'joint_angle', 'time', (3,), joint_3_step=1e-3, moment=moment)
+        step.parameters[1].std = 2.0
+        judgement = judge(six, truth, discovery(step))
+        assert judgement.outcome == 'right'
+        assert judgement.size_right is right
 
 
 def test_parts_undo_the_names_of_parameters() -> None:
