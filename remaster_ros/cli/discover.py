@@ -149,8 +149,7 @@ def side_by_side(found: Discovery, confirmation: Confirmation) -> list[str]:
         for row in rows:
             here = ' ± '.join(shown(row.value, row.std, row.unit)[:2])
             value, std, unit = shown(row.other_value, row.other_std, row.unit)
-            lines.append(
-                f'    {row.name:{width}}  {here:>18}  {f"{value} ± {std}":>18} {unit:7}  '
-                f'{row.sigmas:+.1f} σ'
-            )
+            sigmas = f'{row.sigmas:+.1f}'.replace('-', '−')
+            there = f'{value} ± {std}'
+            lines.append(f'    {row.name:{width}}  {here:>18}  {there:>18} {unit:7}  {sigmas} σ')
     return ['here and there, and the difference in standard deviations:', *lines] if lines else []
