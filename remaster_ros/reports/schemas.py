@@ -50,7 +50,10 @@ class MeasuredSession(Struct):
 
 
 class JointOffset(Struct):
-    """One joint's zero-offset; where ``identifiable`` is false, ``why`` is the reason."""
+    """One joint's zero-offset; where ``identifiable`` is false, ``why`` is the reason.
+
+    ``model_std_deg`` stands where ``std_deg`` is wider than the model has it (``intervals``).
+    """
 
     joint: str
     mean_deg: float
@@ -58,6 +61,7 @@ class JointOffset(Struct):
     interval95_deg: tuple[float, float]
     identifiable: bool
     why: str
+    model_std_deg: float | UnsetType = UNSET
 
 
 class GaugeCombination(Struct):
@@ -171,8 +175,21 @@ class NoiseCheck(Struct):
     within_pose_std_m: float | None
 
 
+class StructureTest(Struct):
+    """Do the residuals follow a driver: in the means of the poses, or in deviations from them?"""
+
+    driver: str
+    between_poses: bool
+    p_value: float
+    found: bool
+
+
 class Fit(Struct):
-    """fit.json."""
+    """fit.json.
+
+    ``intervals`` is 'model' where those of the offsets are the posterior's, 'robust' where they
+    are wider because errors are left that the model has not.
+    """
 
     format: str
     joint_offsets: list[JointOffset]
@@ -188,6 +205,8 @@ class Fit(Struct):
     session: MeasuredSession | UnsetType = UNSET
     parameters: list[SampledParameter] | UnsetType = UNSET
     explained_by_noise: dict[str, NoiseCheck] | UnsetType = UNSET
+    residual_structure: list[StructureTest] | UnsetType = UNSET
+    intervals: Literal['model', 'robust'] | UnsetType = UNSET
 
 
 class EffectParameter(Struct):
