@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from common import table
 from hidden_judge import CURVE_SHARE
 from scipy.optimize import minimize
 
@@ -17,6 +18,7 @@ BINS = (0.5, 1.0, 2.0, 4.0, 8.0)
 # Held-out error may lie this far above the noise, in this share of single-effect sessions.
 EXCESS, WITHIN_EXCESS = 1.05, 0.95
 CLAIMS = 0.02
+OUTCOMES = ('right', 'unexplained', 'elsewhere', 'partly', 'none', 'wrong')
 
 
 def report(lines: Iterable[dict[str, Any]]) -> None:
@@ -42,9 +44,10 @@ def report(lines: Iterable[dict[str, Any]]) -> None:
         report_single(groups['single'])
         report_confusion(groups['single'])
         report_held_out(groups['single'])
-    for group in ('pair', 'unnamed'):
+    for group in ('pair', 'unnamed', 'triple'):
         if groups[group]:
             report_named(group, groups[group])
+    report_outcomes([line for members in groups.values() for line in members])
 
 
 def report_null(lines: list[dict[str, Any]]) -> None:
@@ -179,6 +182,46 @@ def report_named(group: str, lines: list[dict[str, Any]]) -> None:
         if not line['named_right'] and line['multiple'] >= 2.0:
             named = '; '.join(line['named']) or 'nothing'
             print(f'  {line["name"]}: hidden {"; ".join(line["hidden"])}; named {named}')
+
+
+def report_outcomes(lines: list[dict[str, Any]]) -> None:
+    """Print what came of every kind of session, and where what was returned did harm."""
+    kinds: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for line in lines:
+        group, *kind, _ = line['name'].split('-')
+        if group in ('plane', 'region'):
+            kind = ['one effect' if line['kinds'] else 'nothing hidden']
+        elif group in ('single', 'pair', 'triple', 'unnamed'):
+            kind = ['from 2 x' if line['multiple'] >= 2.0 else 'below 2 x']
+        kinds[' '.join((group, *kind))].append(line)
+    print(
+        '\nOutcomes. unexplained: said to be unexplained, at the right place, and no wrong name; '
+        'elsewhere: at another\nplace; partly: some of several are named, nothing else; wrong: '
+        'something named that is not there; harm:\nerror on a third set of poses more than 5 % '
+        'above that of the offsets, both without noise; by how much at most.\n'
+    )
+    header = ('sessions', 'n', *OUTCOMES, 'harm', 'largest', 'named')
+    rows = []
+    for kind, members in kinds.items():
+        counts = Counter(line['outcome'] for line in members)
+        ratios = [line['third_mm'] / line['third_offsets_mm'] for line in members]
+        names = Counter(
+            cause.split()[0]
+            for line in members
+            if line['outcome'] != 'right'
+            for cause in line['named']
+        )
+        rows.append(
+            (
+                kind,
+                len(members),
+                *(counts[outcome] for outcome in OUTCOMES),
+                sum(line['harm'] for line in members),
+                f'{max(ratios):.2f}',
+                ', '.join(f'{name} {n}' for name, n in names.most_common(4)),
+            )
+        )
+    print(table(header, rows))
 
 
 def _percent(part: int, whole: int) -> str:

@@ -206,8 +206,14 @@ class Session:
         fitted nor in any metric. None where there are none.
     base_prior
         Sensor name -> registration known beforehand.
+    settle_s
+        How long the arm stood still before a measurement, s; None where unknown.
+    timed
+        False where nothing is known of the times: ``stamp_s`` then only orders the rows.
     exit_status
         ``complete``, ``stopped``, ``aborted`` or '' where the file has none.
+    operator, serial_number
+        Who measured, and which arm; '' where the file has none.
     extra
         Keys of session.yaml this version does not know, kept as they are.
     """
@@ -219,9 +225,12 @@ class Session:
     sensors: Mapping[str, str]
     measurements: Measurements
     marker_std_m: float = 0.5e-3
-    settle_s: float = 3.0
+    settle_s: float | None = 3.0
+    timed: bool = True
     base_prior: Mapping[str, BasePrior] = field(default_factory=dict)
     exit_status: str = ''
+    operator: str = ''
+    serial_number: str = ''
     notes: str = ''
     created: str = ''
     extra: Mapping[str, Any] = field(default_factory=dict)

@@ -13,16 +13,15 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from hidden_oracle import Oracle
 from hidden_world import HiddenTruth, HiddenWorld
-from scipy.interpolate import BSpline
 
-from remaster_ros.simulation.expected_findings import Cause, causes, named_cause
+from remaster_ros.simulation.expected_findings import Cause, answers, causes, named_cause
 from remaster_ros.simulation.hidden_effect import HiddenEffect
-from remaster_ros.simulation.hidden_effects import true_parameters
+from remaster_ros.simulation.hidden_effects import KINDS, NAMED, true_parameters
 from remaster_ros.types import FloatArray
 
 INDISTINGUISHABLE = 4.0
@@ -31,6 +30,14 @@ SIZE_STD = 3.0
 CURVE_SHARE = 0.4
 # A component of which less than this share is left cannot be asked for.
 UNSEEN_SHARE = 0.02
+# What an entry of ``unexplained`` has to mention, one of these, where the readings themselves err.
+FAULT_PLACES = {
+    'pairing': ('pairing', 'paired', 'tail', 'outlier', 'gross'),
+    'memory': ('serial',),
+    'tails': ('tail', 'outlier', 'gross'),
+}
+
+Outcome = Literal['right', 'unexplained', 'elsewhere', 'partly', 'none', 'wrong']
 
 
 @dataclass
@@ -50,6 +57,10 @@ class Judgement:
     size_right
         Every parameter lies within 3 std of the truth, where the names are right and not forgiven;
         None where they are not.
+    outcome
+        ``right``; ``unexplained`` at the right place, no wrong name beside; ``elsewhere``:
+        unexplained at another place; ``partly``: some named, all of them right; ``none``;
+        ``wrong``: a name of what is not there.
     deviations
         (value - truth) / std of every parameter compared.
     """
@@ -60,6 +71,7 @@ class Judgement:
     forgiven: bool
     first_right: bool
     size_right: bool | None
+    outcome: Outcome
     deviations: dict[str, float] = field(default_factory=dict)
 
 
@@ -70,20 +82,62 @@ def judge(world: HiddenWorld, truth: HiddenTruth, discovery: Any) -> Judgement:
     for effect in discovery.effects:
         for cause in _claimed(effect):
             found.setdefault(cause, []).append(effect)
-    missing = {cause: effect for cause, effect in hidden.items() if cause not in found}
-    extra = {cause: claims for cause, claims in found.items() if cause not in hidden}
+    missing = {
+        cause: effect
+        for cause, effect in hidden.items()
+        if not any(answers(claim, cause, effect) for claim in found)
+    }
+    extra = {
+        claim: claims
+        for claim, claims in found.items()
+        if not any(answers(claim, cause, effect) for cause, effect in hidden.items())
+    }
     forgiven = bool(missing) and _forgiven(Oracle(world, truth), missing, extra)
     named_right = (not missing and not extra) or forgiven
     deviations: dict[str, float] = {}
     size_right = None
     if named_right and not forgiven and hidden:
-        deviations = _deviations(world, truth.effects, discovery.effects)
+        deviations = _deviations(world, truth.effects, discovery)
         limits = {name: CURVE_SHARE if name == 'curve' else SIZE_STD for name in deviations}
         size_right = all(abs(z) <= limits[name] for name, z in deviations.items())
     first = next(iter(found), None)
     return Judgement(
-        list(hidden), list(found), named_right, forgiven, first in hidden, size_right, deviations
+        list(hidden),
+        list(found),
+        named_right,
+        forgiven,
+        bool(found) and first not in extra,
+        size_right,
+        _outcome(truth, discovery, missing, extra, named_right),
+        deviations,
     )
+
+
+def _outcome(
+    truth: HiddenTruth,
+    discovery: Any,
+    missing: dict[Cause, HiddenEffect],
+    extra: dict[Cause, list[Any]],
+    named_right: bool,
+) -> Outcome:
+    """Sum up in one word; a wrong name counts before all else."""
+    if named_right and truth.effects:
+        return 'right'
+    if extra:
+        return 'wrong'
+    words = [
+        f'{entry.where} {entry.driver}' + ' serial' * ('serial correlation' in entry.next)
+        for entry in discovery.unexplained
+    ]
+    wanted = [(KINDS[effect.kind].driver,) for effect in missing.values()]
+    wanted += [places for fault, places in FAULT_PLACES.items() if fault in truth.faults]
+    if wanted and all(
+        any(place in text for place in places for text in words) for places in wanted
+    ):
+        return 'unexplained'
+    if discovery.effects:
+        return 'partly'
+    return 'elsewhere' if discovery.unexplained else 'none'
 
 
 def _claimed(effect: Any) -> list[Cause]:
@@ -121,53 +175,32 @@ def _parts(claim: Any) -> list[HiddenEffect]:
     ]
 
 
-# What the estimate calls a parameter -> the same thing in the terms of the hidden world.
-_PATTERNS = {
-    r'compliance_(?P<j>\d+)': 'joint_compliance',
-    r'sin(?P<order>\d+)_(?P<j>\d+)': 'encoder_eccentricity',
-    r'cos(?P<order>\d+)_(?P<j>\d+)': 'encoder_eccentricity',
-    r'scale_(?P<j>\d+)': 'encoder_scale',
-    r'half_backlash_(?P<j>\d+)': 'backlash',
-    r'settling_(?P<j>\d+)': 'settling',
-    r'coupling_(?P<j>\d+)_by_(?P<by>\d+)': 'joint_coupling',
-    r'length_(?P<j>\d+)': 'link_length',
-    r'offset_(?P<axis>[xyz])_(?P<j>\d+)': 'link_length',
-    r'tilt_(?P<axis>[xyz])_(?P<j>\d+)': 'joint_axis_tilt',
-    r'growth': 'thermal_growth',
-    r'base_compliance': 'base_compliance',
-    r'drift_(?P<axis>[xyz])_(?P<sensor>\w+)': 'registration_drift',
-    r'scale_z_(?P<sensor>[a-z]\w*)': 'sensor_scale',
-    r'scale_(?P<sensor>[a-z]\w+)': 'sensor_scale',
-    r'radial_(?P<sensor>[a-z]+)': 'sensor_distortion',
-}
+# What stands for a word in the name of a parameter; no sensor of these worlds has an underscore.
+_WORDS = {'j': r'\d+', 'by': r'\d+', 'order': r'\d+', 'sensor': '[a-z][a-z0-9]*'}
 
 
 def part_of(name: str) -> HiddenEffect | None:
     """Return the effect of size 1 whose parameter discovery calls so; None where none is."""
-    for pattern, kind in _PATTERNS.items():
-        match = re.fullmatch(pattern, name)
-        if match is None:
-            continue
-        detail: dict[str, Any] = match.groupdict()
-        values = np.ones(1)
-        joints = (int(detail['j']),) if 'j' in detail else ()
-        if kind == 'encoder_eccentricity':
-            detail = {'orders': (int(detail['order']),)}
-            values = np.array([1.0, 0.0] if name.startswith('sin') else [0.0, 1.0])
-        elif kind == 'joint_coupling':
-            detail = {'by': int(detail['by']), 'form': 'linear'}
-        elif kind in ('joint_axis_tilt', 'registration_drift'):
-            values = np.eye(3)['xyz'.index(detail['axis'])]
-        elif kind == 'sensor_scale':
-            detail['form'] = 'depth' if name.startswith('scale_z_') else 'all'
-        elif kind == 'link_length' and 'axis' not in detail:
-            detail = {'axis': 'along'}
-        return HiddenEffect(kind, joints, values, detail)
+    for kind, hidden in NAMED.items():
+        for part in hidden.parts:
+            pattern = part.name.format(**{w: f'(?P<{w}>{form})' for w, form in _WORDS.items()})
+            if (match := re.fullmatch(pattern, name)) is None:
+                continue
+            words = match.groupdict()
+            detail: dict[str, Any] = dict(part.detail)
+            if 'by' in words:
+                detail['by'] = int(words['by'])
+            if 'order' in words:
+                detail['orders'] = (int(words['order']),)
+            if 'sensor' in words:
+                detail['sensor'] = words['sensor']
+            joints = (int(words['j']),) if 'j' in words else ()
+            return HiddenEffect(kind, joints, np.array(part.values), detail)
     return None
 
 
 def _deviations(
-    world: HiddenWorld, effects: Sequence[HiddenEffect], found: Sequence[Any]
+    world: HiddenWorld, effects: Sequence[HiddenEffect], discovery: Any
 ) -> dict[str, float]:
     """Compare every true value with its estimate; one that was not estimated counts as zero.
 
@@ -176,20 +209,33 @@ def _deviations(
     """
     deviations = {}
     for effect in effects:
-        claims = [claim for claim in found if set(_claimed(claim)) & set(causes(effect))]
+        claims = [
+            claim
+            for claim in discovery.effects
+            if any(answers(c, cause, effect) for c in _claimed(claim) for cause in causes(effect))
+        ]
         estimates = {
             parameter.name: (parameter.value, parameter.std)
             for claim in claims
             for parameter in claim.parameters
         }
+        if 'moment' in estimates and 'moment_s' in effect.detail:
+            value, std = estimates.pop('moment')
+            # A moment is known to the time between two configurations at best.
+            std = max(std, float(np.median(np.diff(world.visited.time_s))))
+            deviations['moment'] = (value - effect.detail['moment_s']) / std
         if effect.kind == 'joint_error_curve':
-            deviations['curve'] = _curve_deviation(world, effect, estimates)
+            deviations['curve'] = _curve_deviation(effect, discovery)
             continue
         if effect.kind == 'marker_offset':
             deviations |= _marker_deviations(world, effect, estimates)
             continue
+        parameters = true_parameters(effect)
+        if not parameters.keys() & estimates.keys():
+            # An answer of another name, whose parameters are others.
+            continue
         spread = max(std for _, std in estimates.values())
-        for name, true in true_parameters(effect).items():
+        for name, true in parameters.items():
             if name not in estimates and _unseen(world, effect, name):
                 continue
             value, std = estimates.get(name, (0.0, spread))
@@ -227,20 +273,17 @@ def _marker_deviations(
     return deviations
 
 
-def _curve_deviation(
-    world: HiddenWorld, effect: HiddenEffect, estimates: dict[str, tuple[float, float]]
-) -> float:
-    """RMS of estimated minus true curve over the configurations, as a share of the true one's.
+def _curve_deviation(effect: HiddenEffect, discovery: Any) -> float:
+    """RMS of estimated minus true curve over all rows, as a share of the true one's.
 
     Offset and slope of both are left out: the one is a zero-offset, the other hardly seen.
     """
-    peaks = np.deg2rad([float(re.findall(r'_at_([-+.\d]+)deg', n)[0]) for n in estimates])
-    weights = np.array([value for value, _ in estimates.values()])
-    step = np.mean(np.diff(peaks))
-    knots = peaks[0] + step * np.arange(-2, len(peaks) + 2)
-    q = world.visits.q[:, effect.joints[0] - 1]
-    inside = np.clip(q, knots[3], knots[-4])
-    estimated = BSpline(knots, weights, 3)(inside)
+    context, solution = discovery.residuals.context, discovery.selection.solution
+    q = context.measurements.q[:, effect.joints[0] - 1]
+    estimated = np.zeros(len(q))
+    for cell, where in zip(solution.cells, solution.slices(), strict=True):
+        if (cell.name, cell.joints) == (effect.kind, effect.joints):
+            estimated += cell.columns(context).values @ discovery.fit.theta[where]
     waves = zip(effect.detail['orders'], effect.detail['amplitudes'], effect.detail['phases'])
     true = effect.values[0] * sum(a * np.cos(order * q + phase) for order, a, phase in waves)
     return float(np.std(_detrended(q, estimated - true)) / np.std(_detrended(q, true)))

@@ -8,7 +8,7 @@ method can detect it.
 from __future__ import annotations
 
 import numpy as np
-from hidden_world import MARKER_STD_M, HiddenTruth, HiddenWorld
+from hidden_world import HiddenTruth, HiddenWorld
 from scipy.linalg import solve_triangular
 from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
@@ -45,7 +45,7 @@ class Oracle:
         nuisance = self._whitened(world.nuisance)
         # The nominal markers are known to some extent: rows of their own.
         first = nuisance.shape[1] - 3 * len(world.markers)
-        prior = np.eye(nuisance.shape[1])[first:] / MARKER_STD_M
+        prior = np.eye(nuisance.shape[1])[first:] / world.marker_std_m
         basis, singular, _ = np.linalg.svd(np.concatenate((nuisance, prior)), full_matrices=False)
         self._basis = basis[:, singular > 1e-9 * singular[0]]
 

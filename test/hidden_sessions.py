@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from hidden_oracle import Oracle
 from hidden_tours import CANDIDATES, visits, world
-from hidden_world import HiddenTruth, HiddenWorld, Noise
+from hidden_world import MARKER_STD_M, HiddenTruth, HiddenWorld, Noise, Visits
 
 from remaster_ros.simulation.effect_sampling import draw_effect
 from remaster_ros.simulation.hidden_effect import HiddenEffect
@@ -19,6 +19,12 @@ NOISES = {
     'pose_common': Noise(0.08e-3, 0.15e-3),
     'range': Noise(0.12e-3, 0.05e-3, range_power=3.0),
     'depth': Noise(0.12e-3, 0.08e-3, depth_ratio=3.0),
+}
+# What the noise model of the fit has not.
+WRONG_NOISES = {
+    **{f'memory_{m}': Noise(0.15e-3, memory=m) for m in (0.7, 0.9, 0.97)},
+    **{f'student_{dof}': Noise(0.15e-3, degrees_of_freedom=dof) for dof in (3, 5)},
+    'mispaired': Noise(0.1e-3, 0.1e-3, mispaired_share=0.05),
 }
 OUTLIER_SHARE = 0.03
 # An effect is drawn as one that plausibly leaves this much, then scaled.
@@ -46,6 +52,12 @@ class Recipe:
         Whether 3 % of the rows to fit, and of those held out, are gross errors.
     candidates
         Poses drawn, of which about half can be reached; None for some 350 observations to fit.
+    where
+        See `hidden_tours.visits`.
+    marker_std_m
+        See `hidden_tours.world`.
+    further, further_multiple
+        Kinds hidden beside these, and their size as `multiple`.
     """
 
     seed: int
@@ -58,6 +70,10 @@ class Recipe:
     outliers: bool = False
     held_out_outliers: bool = False
     candidates: int | None = None
+    where: str = 'all'
+    marker_std_m: float = MARKER_STD_M
+    further: tuple[str, ...] = ()
+    further_multiple: float = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +94,7 @@ def hidden_session(recipe: Recipe) -> HiddenSession:
     rng = np.random.default_rng([recipe.seed, 7])
     hidden = _world(recipe, rng)
     noise = replace(
-        NOISES[recipe.noise],
+        {**NOISES, **WRONG_NOISES}[recipe.noise],
         outlier_share=OUTLIER_SHARE if recipe.outliers else 0.0,
         held_out_outliers=recipe.held_out_outliers,
     )
@@ -87,13 +103,13 @@ def hidden_session(recipe: Recipe) -> HiddenSession:
     _, plain = hidden.measure((), noise, np.random.default_rng(noise_seed))
     oracle = Oracle(hidden, plain)
     effects, best = [], []
-    for kind in recipe.kinds:
+    multiples = [(kind, recipe.multiple) for kind in recipe.kinds]
+    multiples += [(kind, recipe.further_multiple) for kind in recipe.further]
+    for kind, multiple in multiples:
         effect = draw_effect(hidden, kind, rng, recipe.size_m or VISIBLE_M)
         now = hidden.size_m(effect)
         best.append(now * oracle.size_for_power(effect))
-        effects.append(
-            effect if recipe.size_m else hidden.of_size(effect, recipe.multiple * best[-1])
-        )
+        effects.append(effect if recipe.size_m else hidden.of_size(effect, multiple * best[-1]))
     session, truth = hidden.measure(effects, noise, np.random.default_rng(noise_seed))
     return HiddenSession(session, hidden, truth, tuple(best))
 
@@ -102,8 +118,20 @@ def _world(recipe: Recipe, rng: np.random.Generator) -> HiddenWorld:
     """Draw a world; as a rule its sessions have some 350 observations to fit, whatever sees."""
     rounds = 2 // len(recipe.sensors)
     candidates = recipe.candidates or rounds * CANDIDATES[recipe.robot]
-    tour = visits(recipe.robot, int(rng.integers(8)), candidates)
-    return world(recipe.robot, rng, sensors=recipe.sensors, tour=tour)
+    tour = visits(recipe.robot, int(rng.integers(8)), candidates, where=recipe.where)
+    return world(
+        recipe.robot,
+        rng,
+        sensors=recipe.sensors,
+        tour=tour,
+        marker_std_m=recipe.marker_std_m,
+    )
+
+
+def third_visits(recipe: Recipe) -> Visits:
+    """Plan a tour like that of the session, which the session has no pose of."""
+    candidates = CANDIDATES[recipe.robot] // 2
+    return visits(recipe.robot, 100 + recipe.seed % 4, candidates, where=recipe.where)
 
 
 def another_session(

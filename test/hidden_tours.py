@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from hidden_arm import six_joint_arm
-from hidden_world import HiddenWorld, Visits
+from hidden_world import MARKER_STD_M, HiddenWorld, Visits
 
 from remaster_ros.kinematics.collision import CollisionModel, arm_bodies
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
@@ -30,6 +30,12 @@ PLACES = {
     'tracker': ('smr', np.array([1.9, 0.3, 1.0]), 45.0),
 }
 CANDIDATES = {'lwr4plus': 60, 'iiwa14': 60, 'iiwa7': 75, 'six': 95}
+# A small region; the tool hardly turns in it, nor on the plane.
+LITTLE_ROLL = (-0.3, 0.3)
+REGION = PoseRanges((-0.25, 0.25), (0.42, 0.55), (0.5, 0.62), LITTLE_ROLL)
+PLANE = PoseRanges(roll_rad=LITTLE_ROLL)
+# Markers on a plane before the sensor, to within so much.
+PLANE_X_M, PLANE_STD_M = 0.35, 2e-3
 # Repeatability of the arm, rad: no two visits report the very same angles.
 REPEATABILITY_RAD = 2e-5
 
@@ -44,7 +50,11 @@ def robot(name: str) -> str:
 
 @cache
 def visits(
-    name: str, seed: int, candidates: int | None = None, held: tuple[float, ...] = (0.0,)
+    name: str,
+    seed: int,
+    candidates: int | None = None,
+    held: tuple[float, ...] = (0.0,),
+    where: str = 'all',
 ) -> Visits:
     """Plan and order a tour; the same arguments give the same one.
 
@@ -59,6 +69,9 @@ def visits(
         None for as many as leave about 175 configurations of each split.
     held
         Values of joint 3 of an arm with seven, rad.
+    where
+        ``all``: the paper's poses; ``region``: in a small part of their space, the tool hardly
+        turned about its axis; ``plane``: likewise, the marker of the camera on a plane.
     """
     candidates = CANDIDATES[name] if candidates is None else candidates
     rng = np.random.default_rng([seed, candidates])
@@ -74,7 +87,7 @@ def visits(
         split: plan_poses(
             inverse,
             arm,
-            candidate_poses(candidates, PoseRanges(), PLACES['tracker'][1], rng),
+            _candidates(candidates, where, rng),
             sights,
             np.deg2rad(1.0),
         )
@@ -94,12 +107,22 @@ def visits(
     return Visits(reported, np.array(pose), np.array(is_validation), home)
 
 
+def _candidates(count: int, where: str, rng: np.random.Generator) -> FloatArray:
+    ranges = {'all': PoseRanges(), 'region': REGION, 'plane': PLANE}[where]
+    poses = candidate_poses(count, ranges, PLACES['tracker'][1], rng)
+    if where == 'plane':
+        marker_x = (poses[:, :3, :3] @ MARKERS['sir'])[:, 0] + poses[:, 0, 3]
+        poses[:, 0, 3] += PLANE_X_M + PLANE_STD_M * rng.standard_normal(count) - marker_x
+    return poses
+
+
 def world(
     name: str,
     rng: np.random.Generator,
     *,
     sensors: tuple[str, ...] = ('mocap',),
     tour: Visits | None = None,
+    marker_std_m: float = MARKER_STD_M,
 ) -> HiddenWorld:
     """Draw a world: the named robot on a tour in front of the sensors.
 
@@ -113,6 +136,8 @@ def world(
         Of `PLACES`.
     tour
         Where it goes; one of eight where None.
+    marker_std_m
+        How far the markers are from where they are drawn, per axis, m.
     """
     if tour is None:
         tour = visits(name, int(rng.integers(8)))
@@ -123,7 +148,7 @@ def world(
         T_R_N = transform(_facing(origin, rng.uniform(-0.2, 0.2)), origin)
         placed[sensor] = SimulatedSensor(marker, T_R_N)
     markers = {PLACES[sensor][0]: MARKERS[PLACES[sensor][0]] for sensor in sensors}
-    return HiddenWorld(robot(name), tour, placed, markers, rng)
+    return HiddenWorld(robot(name), tour, placed, markers, rng, marker_std_m)
 
 
 def _facing(origin: FloatArray, roll: float) -> FloatArray:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from hidden_arm import PinocchioArm
@@ -65,6 +66,13 @@ class Noise:
         Share of the observations that are gross errors of 3 to 30 mm.
     held_out_outliers
         Whether rows held out have them too.
+    memory
+        Correlation of the new part from one measurement of a sensor to its next, in time order.
+    degrees_of_freedom
+        The new part has Student's t-distribution, one factor for the three axes, of the same RMS;
+        None for a normal one.
+    mispaired_share
+        Share of the readings that are of the configuration before.
     """
 
     sigma_m: float = 0.1e-3
@@ -73,6 +81,36 @@ class Noise:
     range_power: float = 0.0
     outlier_share: float = 0.0
     held_out_outliers: bool = True
+    memory: float = 0.0
+    degrees_of_freedom: float | None = None
+    mispaired_share: float = 0.0
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What about it no noise model of a calibration has."""
+        return tuple(
+            fault
+            for fault, there in (
+                ('memory', self.memory > 0.0),
+                ('tails', self.degrees_of_freedom is not None),
+                ('pairing', self.mispaired_share > 0.0),
+            )
+            if there
+        )
+
+    def draw(self, sensor: IntArray, rng: np.random.Generator) -> FloatArray:
+        """Draw the new part of the rows of these sensors, of RMS 1, (n, 3)."""
+        white = rng.standard_normal((len(sensor), 3))
+        if self.degrees_of_freedom is not None:
+            dof = self.degrees_of_freedom
+            white *= np.sqrt((dof - 2.0) / rng.chisquare(dof, (len(sensor), 1)))
+        if self.memory > 0.0:
+            fresh = np.sqrt(1.0 - self.memory**2)
+            for index in np.unique(sensor):
+                mine = np.flatnonzero(sensor == index)
+                for before, row in pairwise(mine):
+                    white[row] = self.memory * white[before] + fresh * white[row]
+        return white
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +131,9 @@ class HiddenTruth:
     std, pose_std
         True standard deviations per row and axis of the two parts of the noise, m, (n, 3) each.
     outliers
-        Rows with a gross error.
+        Rows with a gross error, those that are paired wrongly among them.
+    faults
+        See `Noise.faults`.
     """
 
     effects: tuple[HiddenEffect, ...]
@@ -103,6 +143,7 @@ class HiddenTruth:
     std: FloatArray
     pose_std: FloatArray
     outliers: IntArray
+    faults: tuple[str, ...]
 
 
 class HiddenWorld(WorldModel):
@@ -117,8 +158,10 @@ class HiddenWorld(WorldModel):
     sensors, markers
         By name; true places, and nominal positions in the tool frame, m.
     rng
-        Draws the offsets (0.3° each), the true markers (0.5 mm per axis), the times (10 s and
-        more per configuration) and the temperature (a warming by 3 to 10 K and a slow swing).
+        Draws the offsets (0.3° each), the true markers, the times (10 s and more per
+        configuration) and the temperature (a warming by 3 to 10 K and a slow swing).
+    marker_std_m
+        How far the true markers are from the nominal ones, per axis, m, as the session states it.
     """
 
     def __init__(
@@ -128,14 +171,16 @@ class HiddenWorld(WorldModel):
         sensors: Mapping[str, SimulatedSensor],
         markers: Mapping[str, FloatArray],
         rng: np.random.Generator,
+        marker_std_m: float = MARKER_STD_M,
     ) -> None:
         m, k = visits.q.shape
         joint_offsets = np.deg2rad(0.3) * rng.standard_normal(k)
         true_markers = {
-            name: position + MARKER_STD_M * rng.standard_normal(3)
+            name: position + marker_std_m * rng.standard_normal(3)
             for name, position in markers.items()
         }
         self.urdf, self.visits, self.nominal_markers = urdf, visits, markers
+        self.marker_std_m = marker_std_m
         self._came_from = np.concatenate((visits.home[None], visits.q[:-1]))
         travel = np.max(np.abs(visits.q - self._came_from), axis=1) / 0.5
         self.stamp_s = np.cumsum(10.0 + travel + rng.uniform(0.0, 3.0, m))
@@ -172,7 +217,7 @@ class HiddenWorld(WorldModel):
         groups = np.unique(np.stack((pose, self.sensor)), axis=1, return_inverse=True)[1].ravel()
         common = rng.standard_normal((groups.max() + 1, 3))[groups]
         std, pose_std = noise.sigma_m * spread, noise.pose_sigma_m * spread
-        position = clean + std * rng.standard_normal((n, 3)) + pose_std * common
+        position = clean + std * noise.draw(self.sensor, rng) + pose_std * common
         gross = rng.random(n) < noise.outlier_share
         if not noise.held_out_outliers:
             gross &= ~self.visits.is_validation[self.configuration]
@@ -180,6 +225,12 @@ class HiddenWorld(WorldModel):
         direction = rng.standard_normal((len(outliers), 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         position[outliers] += rng.uniform(3e-3, 30e-3, (len(outliers), 1)) * direction
+        if noise.mispaired_share > 0.0:
+            step = len(self.sensors)
+            wrong = np.flatnonzero(rng.random(n) < noise.mispaired_share)
+            wrong = wrong[wrong >= step]
+            position[wrong] += clean[wrong - step] - clean[wrong]
+            outliers = np.union1d(outliers, wrong)
         truth = HiddenTruth(
             effects=tuple(effects),
             size_m=tuple(self.size_m(effect) for effect in effects),
@@ -188,8 +239,27 @@ class HiddenWorld(WorldModel):
             std=std,
             pose_std=pose_std,
             outliers=outliers,
+            faults=noise.faults,
         )
         return self._session(position), truth
+
+    def on(self, visits: Visits) -> HiddenWorld:
+        """Return the same arm, sensors and markers on other visits, spread over the same time."""
+        rng = np.random.default_rng(0)
+        other = HiddenWorld(self.urdf, visits, self.sensors, self.nominal_markers, rng)
+        m, since = len(visits.q), self.visited.time_s
+        time_s = np.linspace(0.0, since[-1], m)
+        warming_k = np.interp(time_s, since, self.visited.warming_k)
+        other.visited = Round(visits.q, visits.home, time_s, warming_k)
+        other.stamp_s = self.stamp_s[0] + time_s
+        other.temperature_c = np.interp(time_s, since, self.temperature_c)
+        other.joint_offsets, other.markers = self.joint_offsets, self.markers
+        other.marker_std_m = self.marker_std_m
+        return other
+
+    def without_noise(self, effects: Sequence[HiddenEffect]) -> Session:
+        """Return a session of what the sensors would see without noise."""
+        return self._session(self.seen(effects))
 
     def _session(self, position: FloatArray) -> Session:
         n, k = len(position), self.arm.joints
@@ -218,6 +288,6 @@ class HiddenWorld(WorldModel):
             markers=dict(self.nominal_markers),
             sensors={name: sensor.marker for name, sensor in self.sensors.items()},
             measurements=measurements,
-            marker_std_m=MARKER_STD_M,
+            marker_std_m=self.marker_std_m,
             exit_status='complete',
         )

@@ -28,7 +28,7 @@ def in_words(model: Model, direction: FloatArray) -> str:
     markers = [
         index for index in range(len(model.marker_names)) if np.any(direction[model.marker(index)])
     ]
-    if len(joints) == 1:
+    if len(joints) == 1 and not np.any(model.theta(direction)):
         joint, amount = model.names[joints[0]], direction[joints[0]]
         effects = np.flatnonzero(direction[model.core :]) + model.core
         if len(effects) and not sensors and not markers:

@@ -65,8 +65,24 @@ def robust_start(
     InsufficientDataError
         When the points of a sensor do not fix a registration, or are not those of this robot.
     """
-    chain = model.chain
     everything, rows = rows, _some_rows(measurements, rows)
+    start, z = closest_start(model, measurements, rows, nominal_markers, marker_std_m, priors)
+    sorted_rows = Rows.of(measurements, rows, start.reference)
+    _require_likeness(start, sorted_rows, sorted_rows.target - start.predict(z, sorted_rows))
+    moved = referenced(model, measurements, everything, start.T_R_N(z))
+    return moved, moved.vector(start.offsets(z), start.markers(z))
+
+
+def closest_start(
+    model: Model,
+    measurements: Measurements,
+    rows: IntArray,
+    nominal_markers: FloatArray,
+    marker_std_m: float,
+    priors: Sequence[Prior],
+) -> tuple[Model, FloatArray]:
+    """Find the closest solution, however far the data are from the robot; as `robust_start`."""
+    chain = model.chain
     tool = chain.forward(measurements.q[rows])
     sensor, marker = measurements.sensor[rows], measurements.marker[rows]
     measured = measurements.position[rows]
@@ -88,10 +104,7 @@ def robust_start(
         z, cost = _refined(start, sorted_rows, priors, z)
         candidates.append((cost, start, z))
     _, start, z = min(candidates, key=lambda candidate: candidate[0])
-    sorted_rows = Rows.of(measurements, rows, start.reference)
-    _require_likeness(start, sorted_rows, sorted_rows.target - start.predict(z, sorted_rows))
-    moved = referenced(model, measurements, everything, start.T_R_N(z))
-    return moved, moved.vector(start.offsets(z), start.markers(z))
+    return start, z
 
 
 def _some_rows(measurements: Measurements, rows: IntArray) -> IntArray:

@@ -99,6 +99,8 @@ class FitResult:
         Their posterior mean and std, in their units, (m,).
     theta_draws
         (chains, draws, m).
+    predictive
+        The posterior as predictions take it.
     """
 
     session: Session
@@ -133,6 +135,7 @@ class FitResult:
     theta: FloatArray
     theta_std: FloatArray
     theta_draws: FloatArray
+    predictive: Predictive
 
     @property
     def other_errors(self) -> bool:
@@ -325,6 +328,7 @@ def build_result(
         theta=model.theta(sampled.z_mean),
         theta_std=model.theta(flat).std(axis=0, ddof=1),
         theta_draws=model.theta(sampled.z),
+        predictive=predictive,
     )
 
 

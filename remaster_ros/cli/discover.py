@@ -8,17 +8,28 @@ from pathlib import Path
 
 import numpy as np
 
-from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.calibration.predictions import Coverage
+from remaster_ros.cli.console import progress_bar, show, show_file
 from remaster_ros.discovery.confirmation import (
     Confirmation,
     confirm,
-    in_words,
-    require_same_cell,
+    require_other_session,
 )
+from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.discover import Discovery, discover_session
-from remaster_ros.reports.discovery_json import save_discovery
-from remaster_ros.reports.fit_json import prepare_folder
+from remaster_ros.discovery.side_by_side import rms_sigmas
+from remaster_ros.discovery.words import percent
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.reports.discovery_json import (
+    held_out_coverage,
+    predictions_of,
+    save_discovery,
+)
+from remaster_ros.reports.fit_json import DISCOVERY_FILE, prepare_folder
 from remaster_ros.session.reader import read_session
+
+# Of a curve's hundred values the table has one line; discovery.json has them all.
+MOST_PARAMETERS = 8
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,10 +37,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('session', metavar='SESSION', type=Path, help='session folder')
     parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='output folder')
     parser.add_argument(
+        '--json', action='store_true', help='print discovery.json in place of a summary'
+    )
+    parser.add_argument(
         '--confirm',
         metavar='OTHER',
         type=Path,
-        help='another session of the same arm: do the causes, frozen, predict it?',
+        help='another session of the same arm: do the causes hold there?',
     )
 
 
@@ -39,33 +53,51 @@ def run(args: argparse.Namespace) -> int:
     other = None if args.confirm is None else read_session(args.confirm)
     if other is not None:
         # Not after the long search.
-        require_same_cell(session, other)
-    prepare_folder(args.out)
-    with progress_bar(args.quiet) as progress:
+        require_other_session(session, other)
+    prepare_folder(args.out, DISCOVERY_FILE)
+    with progress_bar(args.quiet or args.json) as progress:
         found = discover_session(
             session,
             rng=np.random.default_rng(args.seed),
             progress=progress,
             clock=time.perf_counter,
         )
-        confirmation = None
+        confirmation, refusal = None, None
         if other is not None:
             progress('confirming', 0.0)
-            confirmation = confirm(found, other)
+            try:
+                confirmation = confirm(found, other)
+            except InsufficientDataError as error:
+                # What was found stays, whatever the other session is like.
+                refusal = InsufficientDataError(f'the other session: {error}')
         progress('writing', 0.0)
-        report = save_discovery(found, args.out, confirmation, figures=not args.no_figures)
-    show(args.quiet, summary(found, confirmation))
-    show(args.quiet, f'written: {report}')
+        predictions = predictions_of(found)
+        report = save_discovery(
+            found, args.out, confirmation, figures=not args.no_figures, predictions=predictions
+        )
+    if args.json:
+        show_file(args.out / DISCOVERY_FILE)
+    else:
+        show(args.quiet, summary(found, confirmation, held_out_coverage(found, predictions)))
+        show(args.quiet, f'written: {report}')
+    if refusal is not None:
+        raise refusal
     return 0
 
 
-def summary(found: Discovery, confirmation: Confirmation | None = None) -> str:
-    """Return verdict, causes and gain in a few lines."""
+def summary(
+    found: Discovery,
+    confirmation: Confirmation | None = None,
+    held_out: Coverage | None = None,
+) -> str:
+    """Return verdict, causes, gain and coverage of the held-out rows in a few lines."""
     lines = [f'verdict: {found.verdict}']
     for effect in found.effects:
         joints = f' {list(effect.joints)}' if effect.joints else ''
-        share = '' if effect.share is None else f', {100 * effect.share:.0f} % of the gain'
+        share = '' if effect.share is None else f', {percent(effect.share)} of the gain'
         lines.append(f'{effect.name}{joints}: {1e3 * effect.size_m:.3f} mm{share}; {effect.cause}')
+        if effect.remedy:
+            lines.append(f'    to do: {effect.remedy}')
         for alike in effect.confusable_with:
             where = f' {list(alike.joints)}' if alike.joints else ''
             lines.append(f'    could be {alike.name}{where}; to distinguish: {alike.separate_by}')
@@ -79,6 +111,11 @@ def summary(found: Discovery, confirmation: Confirmation | None = None) -> str:
             f'{1e3 * gain.held_out_rms_after_m:.3f} mm after; '
             f'the noise alone is {1e3 * gain.noise_floor_m:.3f} mm'
         )
+    if held_out is not None and held_out.share is not None:
+        lines.append(
+            f'{held_out.inside} of {held_out.rows} held-out rows ({percent(held_out.share)}) lie '
+            'in the regions predicted for them with 95 %'
+        )
     if found.thinning is not None:
         part = found.thinning
         lines.append(
@@ -88,10 +125,30 @@ def summary(found: Discovery, confirmation: Confirmation | None = None) -> str:
         )
     lines += [f'not testable: {name}: {why}' for name, why in found.untestable.items()]
     if confirmation is not None:
-        lines.append(
-            f'other session: {1e3 * confirmation.rms_before_m:.3f} mm RMS with frozen offsets, '
-            f'{1e3 * confirmation.rms_after_m:.3f} mm with the frozen causes; '
-            f'{100 * confirmation.carried_over:.0f} % of the gain carries over'
-        )
-        lines += in_words(found, confirmation)
+        lines += [f'other session: {line}' for line in in_words(found, confirmation)]
+        lines += side_by_side(found, confirmation)
     return '\n'.join(lines)
+
+
+def side_by_side(found: Discovery, confirmation: Confirmation) -> list[str]:
+    """Return a table of the zero-offsets and the causes' parameters in both sessions."""
+    tables = [('zero-offsets', confirmation.joint_offsets)]
+    tables += [
+        (effect.name, cause.parameters)
+        for effect, cause in zip(found.effects, confirmation.effects, strict=False)
+    ]
+    width = max((len(row.name) for _, rows in tables for row in rows), default=0)
+    lines = []
+    for name, rows in tables:
+        if len(rows) > MOST_PARAMETERS:
+            lines.append(
+                f'    {name}: {len(rows)} values, which differ by {rms_sigmas(rows):.1f} standard '
+                'deviations on the average'
+            )
+            continue
+        lines += [
+            f'    {row.name:{width}}  {row.value:+.4g} ± {row.std:.2g}  '
+            f'{row.other_value:+.4g} ± {row.other_std:.2g} {row.unit}  {row.sigmas:+.1f} σ'
+            for row in rows
+        ]
+    return ['here and there, and the difference in standard deviations:', *lines] if lines else []

@@ -1,4 +1,4 @@
-"""Three ready ways to use the offsets: re-master, an offset layer, or a corrected URDF.
+"""Ready ways to use the offsets: re-master, an offset layer, or a corrected URDF.
 
 The true joint angle is the reported one plus the offset. Each way corrects all of it, so only one
 may be in use at a time.
@@ -11,7 +11,9 @@ Each file lists the joints that are left out, and why.
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 REMASTER_FILE = 'remaster.txt'
 LAYER_FILE = 'offset_layer.yaml'
 URDF_FILE = 'robot_calibrated.urdf'
+GEOMETRY_FILE = 'robot_geometry.urdf'
 
 _PROLOG = re.compile(r'(?:\s*(?:<\?.*?\?>|<!--.*?-->))*\s*', re.DOTALL)
 _LIMITS = {
@@ -36,23 +39,54 @@ _LIMITS = {
 }
 
 
-def exports(result: FitResult) -> dict[str, str]:
-    """Return the three files of the folder ``apply`` next to fit.json: name -> text."""
-    return {
-        REMASTER_FILE: remaster_text(result),
-        LAYER_FILE: layer_text(result),
-        URDF_FILE: calibrated_urdf(
-            result.session.urdf,
-            result.chain,
-            np.where(result.identifiable, result.joint_offsets, 0.0),
-            _notes(result),
-        ),
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """What a discovery corrects in a robot model of k joints beyond the zero-offsets.
+
+    Attributes
+    ----------
+    shifts
+        Of each joint's origin, in the frame of the link that the joint before it moves, m, (k, 3).
+    turns
+        Of each joint's frame, as a rotation vector in that frame, rad, (k, 3).
+    remarks
+        For the user: what is corrected, and what is not, a line each.
+    """
+
+    shifts: FloatArray
+    turns: FloatArray
+    remarks: tuple[str, ...]
+
+    @property
+    def is_any(self) -> bool:
+        """Whether it changes anything."""
+        return bool(np.any(self.shifts) or np.any(self.turns))
+
+
+def exports(result: FitResult, geometry: Geometry | None = None) -> dict[str, str]:
+    """Return the files of the folder ``apply`` next to fit.json or discovery.json: name -> text.
+
+    With changes of the geometry there is a robot model more, which holds them and no offsets.
+    """
+    offsets = np.where(result.identifiable, result.joint_offsets, 0.0)
+    urdf, chain = result.session.urdf, result.chain
+    remarks = geometry.remarks if geometry is not None else ()
+    notes = _notes(result, remarks)
+    files = {
+        REMASTER_FILE: remaster_text(result, remarks),
+        LAYER_FILE: layer_text(result, remarks),
+        URDF_FILE: calibrated_urdf(urdf, chain, offsets, notes, geometry),
     }
+    if geometry is not None and geometry.is_any:
+        none = np.zeros(len(chain))
+        files[GEOMETRY_FILE] = calibrated_urdf(urdf, chain, none, notes, geometry)
+    return files
 
 
-def _notes(result: FitResult) -> list[str]:
+def _notes(result: FitResult, remarks: Sequence[str] = ()) -> list[str]:
     """Return the warnings for the user of a file, a line each."""
     return [
+        *remarks,
         *(f'CHECK FIRST: {line}' for line in result.implausible),
         *(
             f'left out, not identifiable: {joint}: {" ".join(why.split())}'
@@ -67,7 +101,7 @@ def left_out(result: FitResult) -> dict[str, str]:
     return {result.joint_names[i]: result.why[i] for i in unknown}
 
 
-def remaster_text(result: FitResult) -> str:
+def remaster_text(result: FitResult, remarks: Sequence[str] = ()) -> str:
     """Return the instructions for re-mastering on the robot's own pad."""
     rows = []
     for i in np.flatnonzero(result.identifiable):
@@ -91,6 +125,8 @@ def remaster_text(result: FitResult) -> str:
             f'2. An offset layer between planner and controller: {LAYER_FILE}.',
             f'3. A corrected robot model for planner and controller: {URDF_FILE}.',
             '',
+            *(line for remark in remarks for line in textwrap.wrap(remark, 88)),
+            *(('',) if remarks else ()),
             *((head, *rows) if rows else ('  No joint: these data determine no offset.',)),
             *(('', 'Left out of all three, as the data do not determine their offsets. Leave',
                'these joints as they are:', *notes) if notes else ()),
@@ -102,7 +138,7 @@ def remaster_text(result: FitResult) -> str:
     )  # fmt: skip
 
 
-def layer_text(result: FitResult) -> str:
+def layer_text(result: FitResult, remarks: Sequence[str] = ()) -> str:
     """Return the offsets as a ROS 2 parameter file for an offset layer."""
     head = (
         '# Joint zero-offsets, rad. A layer between planner and controller:\n'
@@ -110,7 +146,7 @@ def layer_text(result: FitResult) -> str:
         '#   angle to the planner      = reported angle + offset\n'
         "# Shift the joint limits as well: the controller's limits apply to its own angles.\n"
     )  # fmt: skip
-    head += ''.join(f'# {note}\n' for note in _notes(result))
+    head += ''.join(f'# {note}\n' for note in _notes(result, remarks))
     known = np.flatnonzero(result.identifiable)
     lists: dict[str, list[str] | list[float]] = {
         'joint_names': [result.joint_names[i] for i in known],
@@ -132,6 +168,7 @@ def calibrated_urdf(
     chain: SerialChain,
     joint_offsets: FloatArray,
     notes: Sequence[str] = (),
+    geometry: Geometry | None = None,
 ) -> str:
     """Return the URDF whose kinematics at reported angles is that of the true ones.
 
@@ -150,13 +187,20 @@ def calibrated_urdf(
         rad, (k,).
     notes
         Further comments in the file, such as the joints left out.
+    geometry
+        Changes of the joints' origins beside the offsets.
     """
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
     root = ElementTree.fromstring(urdf, parser)
     # The robot's own children: a <transmission> or <ros2_control> has joints of the same names.
     joints = {joint.get('name'): joint for joint in root.findall('joint')}
-    for name, axis, offset in zip(chain.joint_names, chain.axes, joint_offsets, strict=True):
-        if offset == 0.0:
+    for i, (name, axis, offset) in enumerate(
+        zip(chain.joint_names, chain.axes, joint_offsets, strict=True)
+    ):
+        shift, turn = np.zeros(3), np.zeros(3)
+        if geometry is not None:
+            shift, turn = geometry.shifts[i], geometry.turns[i]
+        if offset == 0.0 and not np.any(shift) and not np.any(turn):
             continue
         joint = joints[name]
         origin = joint.find('origin')
@@ -164,8 +208,15 @@ def calibrated_urdf(
             origin = ElementTree.Element('origin', xyz='0 0 0', rpy='0 0 0')
             joint.insert(0, origin)
         rpy = [float(angle) for angle in origin.get('rpy', '0 0 0').split()]
-        turned = matrix_from_rpy(rpy) @ rotation_vector_to_matrix(offset * axis)
+        drawn = matrix_from_rpy(rpy)
+        turned = drawn @ rotation_vector_to_matrix(turn)
+        turned = turned @ rotation_vector_to_matrix(offset * axis)
         origin.set('rpy', ' '.join(repr(angle) for angle in _rpy(turned)))
+        if np.any(shift):
+            # From the link that the joint before moves, through fixed joints, to the parent link.
+            to_parent = drawn @ chain.T_fixed[i][:3, :3].T
+            xyz = [float(value) for value in origin.get('xyz', '0 0 0').split()]
+            origin.set('xyz', ' '.join(repr(float(v)) for v in xyz + to_parent @ shift))
         for tag, keys in _LIMITS.items():
             for element in joint.findall(tag):
                 for key in keys.intersection(element.keys()):
@@ -175,7 +226,12 @@ def calibrated_urdf(
                 if mimic.get('joint') == name:
                     share = float(mimic.get('multiplier', '1')) * float(offset)
                     mimic.set('offset', repr(float(mimic.get('offset', '0')) + share))
-    for text in (*reversed(notes), 'joint origins and limits hold the calibrated zero-offsets'):
+    first = []
+    if np.any(joint_offsets):
+        first.append('joint origins and limits hold the calibrated zero-offsets')
+    if geometry is not None and geometry.is_any:
+        first.append('joint origins hold the lengths and tilts that were found')
+    for text in (*reversed(notes), *(first or ['nothing is changed'])):
         # Two hyphens would end the comment.
         note = ElementTree.Comment(f' {re.sub("-(?=-)", "- ", text).rstrip("-")} ')
         note.tail = '\n  '

@@ -7,6 +7,7 @@ validation rows only measure the gain.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -30,6 +31,7 @@ from remaster_ros.discovery.gain import (
 )
 from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
+from remaster_ros.discovery.omnibus import structure_left
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.stepwise_selection import Search, Selection
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
@@ -62,11 +64,12 @@ class Discovery:
     noise_by_range
         By sensor: ratio of the errors far to near, and the p-value that they are equal.
     outliers
-        ``observation`` of every row set aside, with the reason.
+        ``observation`` of every gross error, with the reason: set aside, or held out.
     untestable
         Name of an effect -> why this session cannot show it.
     groups
-        The cells of each effect that was searched for, in the order of ``effects``.
+        The cells of each effect that was searched for, in the order of ``effects``; those of
+        structure without a cause are in ``selection`` alone.
     selection
         How the cells were found.
     residuals
@@ -129,12 +132,18 @@ def discover_session(
     findings = find_causes(session, rng=rng, progress=report)
     fit, gain = _sampled(session, findings, rng, report, clock)
     unexplained: tuple[Unexplained, ...] = ()
-    if findings.effects and is_harmful(gain):
-        unexplained = (harm_of(findings.before, fit, gain, findings.effects),)
+    if (findings.effects or findings.structure) and is_harmful(gain):
+        unexplained = (harm_of(findings.before, fit, gain, findings.effects + findings.structure),)
         findings = findings.without_causes()
         fit, gain = _sampled(session, findings, rng, report, clock)
     residuals, solution = findings.residuals, findings.selection.solution
-    effects = tuple(effect.sampled(fit) for effect in findings.effects)
+    structure, gross = structure_left(residuals, solution, fit, findings.structure)
+    unexplained += structure
+    effects = tuple(
+        effect.sampled(fit, group, residuals.part)
+        for effect, group in itertools.zip_longest(findings.effects, findings.groups, fillvalue=())
+        if isinstance(effect, FoundEffect)
+    )
     verdict: Verdict = 'effects' if effects else 'unexplained' if unexplained else 'none'
     # A tie over a small remainder does not put the rest in doubt.
     if any(effect.tied and (effect.share or 0.0) > LEADING_SHARE for effect in effects):
@@ -145,7 +154,7 @@ def discover_session(
         gain=gain,
         pose_common_fraction=pose_common_fraction(residuals, solution),
         noise_by_range=noise_by_range(residuals, solution),
-        outliers=fit.left_out,
+        outliers=fit.left_out + gross,
         untestable=findings.untestable,
         offsets_before=_offsets(findings.before),
         groups=findings.groups,
@@ -161,7 +170,8 @@ def discover_session(
 class Findings:
     """What is found before anything is sampled; fields as in `Discovery`.
 
-    ``before`` is the fit of the session as it is, without any effect.
+    ``before`` is the fit of the session as it is, without any effect, ``structure`` what the
+    search located without a cause.
     """
 
     before: Estimate
@@ -169,6 +179,7 @@ class Findings:
     selection: Selection
     groups: tuple[tuple[Cell, ...], ...]
     effects: tuple[FoundEffect, ...]
+    structure: tuple[FoundEffect, ...]
     untestable: Mapping[str, str]
     thinning: Thinning | None
 
@@ -183,6 +194,7 @@ class Findings:
             selection=Selection(empty, empty, (), None),
             groups=(),
             effects=(),
+            structure=(),
             thinning=None,
         )
 
@@ -222,7 +234,7 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
     pool = draw_rows(found.problem.measurements, found.problem.fitted, rng)
     thinned = len(pool) < len(found.problem.fitted)
     if thinned:
-        residuals = residuals.only(np.intersect1d(pool, found.kept), found.model.reference)
+        residuals = residuals.only(np.intersect1d(pool, found.kept))
     untestable = {
         name: why for name, effect in EFFECTS.items() if (why := effect.needs(residuals.context))
     }
@@ -241,16 +253,20 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
     )
     selection = search.run()
     residuals = search.data
-    groups, effects = describe(
+    groups, described = describe(
         residuals, selection, cells, lambda share: progress('comparing look-alikes', share)
     )
+    causes = [EFFECTS[group[0].name].is_cause for group in groups]
+    effects = tuple(itertools.compress(described, causes))
+    structure = tuple(effect for effect, cause in zip(described, causes, strict=True) if not cause)
     effects += moved_markers(found, residuals, selection.solution)
     thinning = None
     if thinned:
         thinning = judge_by_others(
             residuals, found.kept, residuals.rows.source, selection.empty, selection.solution
         )
-    return Findings(before, residuals, selection, groups, effects, untestable, thinning)
+    groups = tuple(itertools.compress(groups, causes))
+    return Findings(before, residuals, selection, groups, effects, structure, untestable, thinning)
 
 
 def _offsets(found: Estimate) -> tuple[FloatArray, FloatArray]:
@@ -268,7 +284,7 @@ def _judged(
 ) -> Residuals:
     """Return the residuals of the rows of the pool that the extended model does not call gross."""
     problem = found.problem
-    every = residuals.only(pool, found.model.reference)
+    every = residuals.only(pool)
     left = every.left(solution)
 
     def refit(keep: BoolArray) -> FloatArray:
@@ -282,4 +298,4 @@ def _judged(
     kept = np.sort(every.rows.source[~gross])
     if np.array_equal(kept, np.sort(residuals.rows.source)):
         return residuals
-    return residuals.only(kept, found.model.reference)
+    return residuals.only(kept)

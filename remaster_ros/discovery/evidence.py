@@ -8,7 +8,8 @@ from the Gram matrices G_s of the columns in each group, whatever the number of 
 
 (Patterson & Thompson 1971; Harville 1977). Noise and smoothness maximise L. Two sets of cells are
 compared by L in which every unpenalised parameter pays ½ log N (Schwarz 1978) and every penalised
-one has its proper Gaussian prior.
+one has its proper Gaussian prior. What is implausibly large costs more: Λ holds the prior of the
+unpenalised parameters, too, a Gaussian about 0 as wide as the largest plausible value.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from scipy.linalg.lapack import dpotri
 from scipy.optimize import minimize
 
 from remaster_ros.calibration.noise import RESOLUTION_M, Noise, NoiseModel
-from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.base import LARGEST_M, Cell
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.types import FloatArray
 
@@ -52,6 +53,8 @@ class Solution:
         Re-estimated.
     smoothness
         Precision factor of each penalised cell, in order of the cells (NaN for the others).
+    ridge
+        Prior precision of each unpenalised parameter (0 for the others), (m,).
     log_evidence
         With the prior probability of the cells.
     """
@@ -63,6 +66,7 @@ class Solution:
     full_covariance: FloatArray
     noise: Noise
     smoothness: FloatArray
+    ridge: FloatArray
     log_evidence: float
 
     def slices(self) -> list[slice]:
@@ -70,12 +74,20 @@ class Solution:
         edges = np.cumsum([0, *(cell.size for cell in self.cells)])
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
+    def unphysical(self) -> set[int]:
+        """Return the indices of the cells with a parameter of the sign that physics excludes."""
+        return {
+            index
+            for index, (cell, where) in enumerate(zip(self.cells, self.slices(), strict=True))
+            if np.any(cell.sign * self.parameters[where] < 0.0)
+        }
+
     def prior_precision(self) -> FloatArray:
         """Return the precision of the Gaussian prior on the parameters, (m, m)."""
-        precision = np.zeros_like(self.covariance)
+        precision = np.diag(self.ridge)
         for cell, factor, where in zip(self.cells, self.smoothness, self.slices(), strict=True):
             if cell.penalty is not None:
-                precision[where, where] = factor * cell.penalty
+                precision[where, where] += factor * cell.penalty
         return precision
 
 
@@ -116,11 +128,24 @@ def solve(
     for cell, (first, last) in zip(cells, itertools.pairwise(edges), strict=True):
         if cell.penalty is not None:
             scale[first:last] = np.max(scale[first:last]) or 1.0
+    largest = np.array([cell.largest or np.nan for cell in cells for _ in cell.parameters])
+    typical = LARGEST_M * np.sqrt(len(data)) / scale
+    std = np.where(np.isnan(largest), typical, largest)
     p = data.base.shape[2]
+    # Of free forms the heights of a curve have a plausible size, weights of kernels have none.
+    sized = np.array(
+        [
+            cell.penalty is None or cell.curve is not None
+            for cell in cells
+            for _ in cell.parameters
+        ],
+        dtype=bool,
+    )
+    ridge = np.concatenate((np.zeros(p), np.where(sized, (std * scale) ** -2.0, 0.0)))
     unit = np.concatenate((np.ones(p), scale))
     joined = np.concatenate((data.base, columns / scale, data.errors[:, :, None]), axis=2)
     grams = data.noise_model.gram(lambda _, where: joined[where], joined.shape[2])
-    system = _System(data.noise_model, grams, data.noise, cells, p, unit)
+    system = _System(data.noise_model, grams, data.noise, cells, p, unit, ridge)
     if not system.visible():
         return None
     try:
@@ -140,6 +165,7 @@ class _System:
     cells: tuple[Cell, ...]
     p: int
     unit: FloatArray
+    ridge: FloatArray
 
     def __post_init__(self) -> None:
         self.size = len(self.unit)
@@ -154,6 +180,9 @@ class _System:
             scaled = penalty / np.outer(u, u)
             # Of order one in the scaled columns, so that the factors start near right.
             self.penalties.append(scaled)
+        # Of each, for the determinant beside the ridge, which is the same for all of a cell.
+        self.spectra = [np.linalg.eigvalsh(penalty) for penalty in self.penalties]
+        self.ridges = [float(self.ridge[self.where[i].start]) for i in self.penalised]
         free = np.ones(self.size, dtype=bool)
         for i in self.penalised:
             free[self.where[i]] = False
@@ -194,6 +223,7 @@ class _System:
         trace = self.flat @ padded.ravel()
         n = self.model.freedom
         value = 0.5 * n @ np.log(weights) - np.sum(np.log(np.diag(root))) - 0.5 * weights @ rss
+        value -= 0.5 * self.ridge @ beta**2
         by_log_weight = 0.5 * (n - weights * trace - weights * rss)
         # d log w / d log sigma = -2 sigma² w, and the same with g pose_sigma².
         slope = np.zeros(len(eta))
@@ -209,11 +239,12 @@ class _System:
             zip(self.penalised, self.penalties, factors, strict=True)
         ):
             where = self.where[index]
-            m = len(penalty)
+            prior = factor * self.spectra[i] + self.ridges[i]
+            smooth = np.sum(factor * self.spectra[i] / prior)
             quadratic = factor * beta[where] @ penalty @ beta[where]
             spread = factor * np.sum(inverse[where, where] * penalty)
-            value += 0.5 * (m * np.log(factor) - quadratic)
-            slope[len(eta) - len(self.penalised) + i] = 0.5 * (m - spread - quadratic)
+            value += 0.5 * (np.sum(np.log(prior)) - quadratic)
+            slope[len(eta) - len(self.penalised) + i] = 0.5 * (smooth - spread - quadratic)
         return -value, -slope
 
     def _solve(
@@ -221,7 +252,7 @@ class _System:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return H, its lower Cholesky factor (natural order) and the estimate."""
         total = (weights @ self.flat).reshape(self.size + 1, self.size + 1)
-        H = total[:-1, :-1].copy()
+        H = total[:-1, :-1] + np.diag(self.ridge)
         for index, penalty, factor in zip(self.penalised, self.penalties, factors, strict=True):
             where = self.where[index]
             H[where, where] += factor * penalty
@@ -273,6 +304,7 @@ class _System:
             covariance,
             noise,
             smoothness,
+            (self.ridge * self.unit**2)[self.p :],
             evidence + prior,
         )
 
@@ -286,10 +318,12 @@ class _System:
         n = self.model.freedom
         value = 0.5 * n @ np.log(weights) - 0.5 * weights @ rss - logs[: self.p].sum()
         value -= 0.5 * (self.unpenalised - self.p) * np.log(n.sum() - self.p)
-        value -= logs[self.unpenalised :].sum()
-        for index, penalty, factor in zip(self.penalised, self.penalties, factors, strict=True):
+        value -= logs[self.unpenalised :].sum() + 0.5 * self.ridge @ beta**2
+        for index, penalty, spectrum, ridge, factor in zip(
+            self.penalised, self.penalties, self.spectra, self.ridges, factors, strict=True
+        ):
             where = self.where[index]
-            value += 0.5 * (len(penalty) * np.log(factor) + np.linalg.slogdet(penalty)[1])
+            value += 0.5 * np.sum(np.log(factor * spectrum + ridge))
             value -= 0.5 * factor * beta[where] @ penalty @ beta[where]
         return float(value)
 

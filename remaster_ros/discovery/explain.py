@@ -75,6 +75,10 @@ class FoundEffect:
         found by how far the fit moved a marker, not in the residuals.
     tied
         A look-alike that measurements could distinguish explains the data as well.
+    sizes
+        What each of its cells amounts to, in arc minutes and millimetres with uncertainty.
+    remedy
+        What to do about it.
     """
 
     name: str
@@ -90,9 +94,16 @@ class FoundEffect:
     size_m: float
     share: float | None = None
     tied: bool = False
+    sizes: tuple[str, ...] = ()
+    remedy: str = ''
 
-    def sampled(self, result: FitResult) -> FoundEffect:
-        """Return the effect with its parameters as the extended model's posterior has them."""
+    def sampled(
+        self, result: FitResult, group: Sequence[Cell] = (), context: Context | None = None
+    ) -> FoundEffect:
+        """Return the effect with its parameters as the extended model's posterior has them.
+
+        With its cells and the rows that they were fitted to, its sizes as well.
+        """
         index = {name: i for i, name in enumerate(result.theta_names)}
         parameters = tuple(
             replace(
@@ -104,7 +115,26 @@ class FoundEffect:
             else parameter
             for parameter in self.parameters
         )
-        return replace(self, parameters=parameters)
+        sizes = self.sizes
+        if context is not None and group:
+            draws = result.theta_draws.reshape(-1, len(index))
+            sizes = tuple(
+                EFFECTS[cell.name].size(
+                    context, cell, draws[:, [index[name] for name in cell.parameters]]
+                )
+                for cell in group
+            )
+        return replace(
+            self, parameters=parameters, sizes=sizes, cause=with_sizes(self.cause, sizes)
+        )
+
+
+def with_sizes(cause: str, sizes: Sequence[str]) -> str:
+    """Return the sentence of a cause with what it amounts to behind its first full stop."""
+    if not sizes:
+        return cause
+    first, stop, rest = cause.partition('. ')
+    return f'{first.removesuffix(".")}: {"; ".join(sizes)}.{" " if stop else ""}{rest}'
 
 
 def describe(
@@ -147,6 +177,8 @@ def _described(
             strict=True,
         )
     )
+    if not np.isnan(first.moment):
+        parameters += (Parameter('moment', first.moment, first.moment_std, 's'),)
     rest = tuple(cell for cell in solution.cells if cell not in group)
     without = solve(data, rest, solution, prior=family_log_prior(rest, catalogue.cells))
     gain = sum(step.log_evidence_gain for step in selection.steps)
@@ -160,7 +192,7 @@ def _described(
     if without is not None and len(group) == 1:
         alike = _look_alikes(data, solution, without, catalogue, first)
     effect = FoundEffect(
-        name=first.name,
+        name=EFFECTS[first.name].reported_as or first.name,
         joints=_joints(group),
         place=first.place,
         driver=first.driver,
@@ -169,9 +201,10 @@ def _described(
         p_value=float(min(p_values)),
         log_evidence_gain=float(gain),
         confusable_with=alike,
-        cause=in_words(group, data.context) + _also_called(alike),
+        cause=in_words(group, data.part) + _also_called(alike),
         size_m=_size(data, solution, group),
         share=share,
+        remedy=EFFECTS[first.name].remedy,
         tied=any(not other.same and other.log_evidence_gain > gain - TIED for other in alike),
     )
     return effect
@@ -289,7 +322,11 @@ def in_words(group: Sequence[Cell], context: Context) -> str:
     if first.subject:
         place += f' of {first.subject}'
     sentence = effect.sentence.format(
-        subject=subject, other=other, driver=first.driver.replace('_', ' '), place=place
+        subject=subject,
+        other=other,
+        driver=first.driver.replace('_', ' '),
+        place=place,
+        when=_when(first, context),
     )
     sentence = sentence[:1].upper() + sentence[1:]
     if not context.has_gravity and first.place == 'joint_angle' and 'angle' in first.driver:
@@ -298,6 +335,19 @@ def in_words(group: Sequence[Cell], context: Context) -> str:
             'the two cannot be distinguished.'
         )
     return sentence
+
+
+def _when(cell: Cell, context: Context) -> str:
+    """Return when a cell's step was: minutes since the first row, and configurations."""
+    if np.isnan(cell.moment):
+        return ''
+    configuration, after = context.measurements.configuration, context.elapsed_s > cell.moment
+    before = configuration[~after][np.argmax(context.elapsed_s[~after])]
+    behind = configuration[after][np.argmin(context.elapsed_s[after])]
+    return (
+        f'{cell.moment / 60.0:.1f} min after the first reading, '
+        f'between configurations {before} and {behind},'
+    )
 
 
 def _listed(joints: Sequence[int]) -> str:

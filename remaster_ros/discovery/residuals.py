@@ -64,6 +64,8 @@ class Residuals:
         Errors of every row of the session, m, (all rows, 3).
     full_jacobian
         Derivative of the prediction by the model's natural parameters, (all rows, 3, size).
+    reference
+        T_R_N of every sensor that `errors` are relative to, (sensors, 4, 4).
     noise_model
         Which errors of the rows have which variance.
     noise
@@ -77,6 +79,7 @@ class Residuals:
     full_base: FloatArray
     full_errors: FloatArray
     full_jacobian: FloatArray
+    reference: FloatArray
     noise_model: NoiseModel
     noise: Noise
 
@@ -98,6 +101,7 @@ class Residuals:
             model.offsets(x),
             model.markers(x),
             model.T_R_N(x),
+            timed=problem.session.timed,
         )
         count = len(context)
         every = Rows.of(problem.measurements, np.arange(count), model.reference)
@@ -109,12 +113,7 @@ class Residuals:
             full_jacobian[block.source] = model.natural_jacobian(x, block)
 
         rows = Rows.of(problem.measurements, found.kept, model.reference)
-        flat = full_jacobian[rows.source].reshape(-1, model.size)
-        scale = np.linalg.norm(flat, axis=0)
-        scale = np.where(scale > 0.0, scale, 1.0)
-        _, singular, vectors = np.linalg.svd(flat / scale, full_matrices=False)
-        seen = singular > ROUNDING * singular[0]
-        full_base = full_jacobian @ ((vectors[seen] / scale).T / singular[seen])
+        full_base = full_jacobian @ _orthonormal(full_jacobian[rows.source])
         noise_model = NoiseModel.of(rows, model.reference, found.posterior.noise_model.split)
         noise = robust_noise(rows, full_errors[rows.source], np.ones(len(rows), bool))
         return cls(
@@ -125,19 +124,31 @@ class Residuals:
             full_base,
             full_errors,
             full_jacobian,
+            model.reference,
             noise_model,
             noise_model.of_sensors(*noise),
         )
 
-    def only(self, source: IntArray, reference: FloatArray) -> Residuals:
+    def holding(self, parameters: IntArray) -> Residuals:
+        """Return the same where some parameters (of ``full_jacobian``) absorb nothing."""
+        jacobian = np.delete(self.full_jacobian, parameters, axis=2)
+        full_base = jacobian @ _orthonormal(jacobian[self.rows.source])
+        return replace(self, full_base=full_base, base=full_base[self.rows.source])
+
+    def less(self, shift: FloatArray) -> Residuals:
+        """Return the same with displacements (all rows, 3), m, taken off the errors."""
+        left = self.full_errors - shift
+        return replace(self, full_errors=left, errors=left[self.rows.source])
+
+    def only(self, source: IntArray) -> Residuals:
         """Return the same on other rows of the session."""
-        rows = Rows.of(self.context.measurements, np.sort(source), reference)
+        rows = Rows.of(self.context.measurements, np.sort(source), self.reference)
         return replace(
             self,
             rows=rows,
             errors=self.full_errors[rows.source],
             base=self.full_base[rows.source],
-            noise_model=NoiseModel.of(rows, reference, self.noise_model.split),
+            noise_model=NoiseModel.of(rows, self.reference, self.noise_model.split),
         )
 
     def __len__(self) -> int:
@@ -200,3 +211,14 @@ class Residuals:
         """Return the same in the rows worked on, m, (n, 3)."""
         explained: FloatArray = self.base @ fit.base + self.columns(fit.cells) @ fit.parameters
         return self.errors - explained
+
+
+def _orthonormal(jacobian: FloatArray) -> FloatArray:
+    """Return the combinations of columns (n, 3, c) that are orthonormal over the rows, (c, p)."""
+    flat = jacobian.reshape(-1, jacobian.shape[2])
+    scale = np.linalg.norm(flat, axis=0)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    _, singular, vectors = np.linalg.svd(flat / scale, full_matrices=False)
+    seen = singular > ROUNDING * singular[0]
+    combinations: FloatArray = (vectors[seen] / scale).T / singular[seen]
+    return combinations

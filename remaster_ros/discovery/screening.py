@@ -249,10 +249,17 @@ def _scores(
     blocks = left.reshape(len(left), count, m).transpose(1, 2, 0)
     gram = np.asarray(blocks @ blocks.transpose(0, 2, 1), dtype=float)
     prior = np.array([np.log(cell.drawn_from) for cell in cells])
+    sign = np.array([cell.sign for cell in cells])
     if cells[0].penalty is None:
         values, vectors = np.linalg.eigh(gram)
         seen = values > ABSORBED
-        root = vectors * np.where(seen, 1.0 / np.sqrt(np.maximum(values, ABSORBED)), 0.0)[:, None]
+        # The prior on their size, the same for all of a cell's directions.
+        largest = np.array([cell.largest or np.inf for cell in cells])
+        ridge = (largest**2 * np.mean(norm**2, axis=1) + np.finfo(float).tiny) ** -1.0
+        strength = np.maximum(values, ABSORBED) + ridge[:, None]
+        root = vectors * np.where(seen, strength**-0.5, 0.0)[:, None]
+        if m == 1:
+            pull[sign[:, None, None] * pull < 0.0] = 0.0
         gain = np.sum((root.transpose(0, 2, 1).astype(np.float32) @ pull) ** 2, axis=1)
         rank = seen.sum(axis=1)
         price = 0.5 * rank * np.log(n_eff) + prior

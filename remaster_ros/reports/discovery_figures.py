@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.drivers import driver_named
 from remaster_ros.reports.figures import AFTER, BEFORE, INK, WIDTH_IN, as_svg, error_histograms
 from remaster_ros.types import FloatArray
 
@@ -24,6 +25,10 @@ SCATTER_POINTS = 800
 MOST_CAUSES = 8
 # Of a larger session the curves are drawn at the rows that were searched.
 MOST_DRAWN = 20_000
+# A curve's line ends so many knots from the last value that was measured.
+NEAR = 0.5
+# A wave is not drawn across a larger share of its range without a measurement.
+WIDE_GAP = 1.0 / 30.0
 
 
 def draw_discovery(discovery: Discovery) -> dict[str, str]:
@@ -168,23 +173,17 @@ def causes(discovery: Discovery) -> Figure:
     return figure
 
 
-def _driver(context: Context, cell: Cell, features: FloatArray) -> tuple[str, FloatArray]:
-    """Return label and value of what drives a cause at a joint's angle, (n,)."""
-    joint = cell.joints[-1] - 1
-    if cell.driver == 'own_angle' or cell.driver.startswith('angle_of'):
-        return f'angle of joint {joint + 1} (°)', np.degrees(context.measurements.q[:, joint])
-    if cell.driver.startswith('gravity_torque'):
-        return f'gravity torque on joint {joint + 1} (N m)', context.gravity_torque[:, joint]
-    if cell.driver.startswith('approach'):
-        return f'approach of joint {joint + 1}', context.approach[:, joint]
-    if cell.driver.startswith('last_move'):
-        return f'last move of joint {joint + 1} (°)', np.degrees(context.last_move[:, joint])
-    if cell.driver == 'temperature':
-        return 'temperature above the first (K)', context.warming
-    if cell.driver == 'time':
-        return 'time (h)', context.elapsed_s / 3600.0
-    # A driver that has no unit here is drawn by what it adds per unit of its first parameter.
-    return f'{cell.driver.replace("_", " ")} (per unit of {cell.parameters[0]})', features[:, 0]
+def _driver(context: Context, cell: Cell, features: FloatArray) -> tuple[str, FloatArray, float]:
+    """Return label and value (n,) of what drives a cause, and how much of it the label's unit is.
+
+    What is no single number is drawn by what it adds per unit of its first parameter.
+    """
+    driver = driver_named(cell.driver, cell.joints[-1])
+    if driver is None:
+        name = cell.driver.replace('_', ' ')
+        return f'{name} (per unit of {cell.parameters[0]})', features[:, 0], 1.0
+    unit = f' ({driver.shown_unit})' if driver.shown_unit else ''
+    return f'{driver.label}{unit}', driver.value(context), driver.per_shown
 
 
 def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
@@ -197,19 +196,19 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     if whole:
         fitted = np.isin(np.arange(len(context)), data.rows.source)
     where = dict(zip(solution.cells, solution.slices(), strict=True))[cell]
-    columns = cell.columns(context)
-    assert columns.at is not None
-    label, x = _driver(context, cell, columns.values)
+    parameters = solution.parameters[where] / ARC_MINUTE
     index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
     chosen = [index[name] for name in cell.parameters]
-    draws = discovery.fit.theta_draws[..., chosen].reshape(-1, len(chosen))
+    draws = discovery.fit.theta_draws[..., chosen].reshape(-1, len(chosen)) / ARC_MINUTE
     draws = draws[:: max(1, len(draws) // 400)]
+    columns = cell.columns(context)
+    assert columns.at is not None
     values = columns.values
-    if cell.form in ('free', 'sin/cos'):
-        # A curve's mean is a zero-offset.
+    label, x, per_shown = _driver(context, cell, values)
+    if cell.form == 'sin/cos':
+        # Its mean is a zero-offset.
         values = values - values[fitted].mean(axis=0)
-    effect = values @ solution.parameters[where] / ARC_MINUTE
-    spread = (values @ draws.T / ARC_MINUTE).std(axis=1)
+    effect = values @ parameters
     motion = context.jacobian[:, :, columns.at]
     # What is left, as an angle of this joint: only where the marker is far from its axis.
     square = np.sum(motion**2, axis=1)
@@ -218,13 +217,28 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     shown = slice(None, None, max(1, int(far.sum()) // SCATTER_POINTS))
     points = (effect[far] + angle)[shown]
     if cell.driver.startswith('approach'):
-        _sides(ax, x, effect, 2.0 * spread, (x[far][shown], points))
+        band = 2.0 * (values @ draws.T).std(axis=1)
+        _sides(ax, x, effect, band, (x[far][shown], points))
     else:
-        ax.plot(x[far][shown], points, '.', color=BEFORE, markersize=2.5, alpha=0.6)
-        order = np.argsort(x)
-        line, band = effect[order], 2.0 * spread[order]
-        ax.fill_between(x[order], line - band, line + band, color=AFTER, alpha=0.25, linewidth=0)
-        ax.plot(x[order], line, color=AFTER, linewidth=1.3)
+        at, line = np.sort(x), effect[np.argsort(x)]
+        if cell.curve is not None:
+            # Everywhere, so that the band opens where nothing was measured; the line is not there.
+            x, at = cell.curve.in_turn(x), cell.curve.grid()
+            values = cell.curve.columns(at)
+            line = np.where(cell.curve.seen(at, NEAR), values @ parameters, np.nan)
+        else:
+            values = values[np.argsort(x)]
+            if cell.form == 'sin/cos':
+                # No straight line where nothing was measured.
+                gap = np.diff(at, prepend=at[0]) > WIDE_GAP * np.ptp(at)
+                line = np.where(gap, np.nan, line)
+        spread = 2.0 * (values @ draws.T).std(axis=1)
+        middle = values @ parameters
+        ax.plot(x[far][shown] / per_shown, points, '.', color=BEFORE, markersize=2.5, alpha=0.6)
+        ax.fill_between(
+            at / per_shown, middle - spread, middle + spread, color=AFTER, alpha=0.25, linewidth=0
+        )
+        ax.plot(at / per_shown, line, color=AFTER, linewidth=1.3)
     limit = np.quantile(np.abs(points), 0.99)
     ax.set_ylim(-1.2 * limit, 1.2 * limit)
     ax.set_xlabel(label)

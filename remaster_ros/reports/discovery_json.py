@@ -8,20 +8,40 @@ from typing import Any
 
 import numpy as np
 
+from remaster_ros.calibration.predictions import Coverage, Predictions, predict
+from remaster_ros.compensation.export import GEOMETRY_FILE
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.discover import Discovery
+from remaster_ros.discovery.stepwise_selection import DRAWS
 from remaster_ros.reports import schemas
-from remaster_ros.reports.fit_json import fit_content, read_result, remove_report, table_rows
+from remaster_ros.reports.discovery_apply import applied
+from remaster_ros.reports.fit_json import (
+    APPLY_FOLDER,
+    DISCOVERY_FILE,
+    fit_content,
+    read_result,
+    remove_report,
+    table_rows,
+)
+from remaster_ros.reports.predictions_csv import PREDICTIONS_FILE, predictions_text
 from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.version import __version__
 
-DISCOVERY_FILE = 'discovery.json'
+LEAST_P_VALUE = 1.0 / (1.0 + DRAWS)
+
+
+def predictions_of(discovery: Discovery) -> Predictions:
+    """Return where the final model predicts every row of the session."""
+    return predict(discovery.fit, discovery.residuals.context.measurements)
 
 
 def discovery_content(
-    discovery: Discovery, confirmation: Confirmation | None = None
+    discovery: Discovery,
+    confirmation: Confirmation | None = None,
+    predictions: Predictions | None = None,
 ) -> schemas.Discovered:
-    """Return a discovery as discovery.json has it."""
+    """Return a discovery as discovery.json has it; predictions are made where none are given."""
+    predictions = predictions_of(discovery) if predictions is None else predictions
     fit = fit_content(discovery.fit)
     before, before_std = discovery.offsets_before
     content: dict[str, Any] = {
@@ -48,17 +68,56 @@ def discovery_content(
         ),
         'joint_offsets_after': fit.joint_offsets,
         'sampler': fit.sampler,
+        'registration': fit.registration,
+        'markers': fit.markers,
+        'covariance': _covariance(discovery),
+        # That of a cause which no surrogate residuals reach: its p-value is below.
+        'least_p_value': LEAST_P_VALUE,
+        'predicted_regions95': _regions(discovery, predictions),
     }
     if discovery.thinning is not None:
         content['rows_searched'] = discovery.thinning
     if confirmation is not None:
         content['confirmation'] = vars(confirmation) | {
+            'offsets_rms_sigmas': confirmation.offsets_rms_sigmas,
+            'parameters_rms_sigmas': confirmation.parameters_rms_sigmas,
             'effects': [
-                {'name': effect.name, 'joints': effect.joints, 'carried_over': share}
-                for effect, share in zip(discovery.effects, confirmation.effects, strict=False)
-            ]
+                {'name': effect.name, 'joints': effect.joints, **vars(cause)}
+                for effect, cause in zip(discovery.effects, confirmation.effects, strict=False)
+            ],
         }
     return schemas.checked(content, schemas.Discovered)
+
+
+def _covariance(discovery: Discovery) -> dict[str, Any]:
+    fit, solution = discovery.fit, discovery.selection.solution
+    units = {name: cell.unit for cell in solution.cells for name in cell.parameters}
+    known = np.flatnonzero(fit.identifiable)
+    draws = np.concatenate((fit.joint_offset_draws[..., known], fit.theta_draws), axis=-1)
+    matrix = np.atleast_2d(np.cov(draws.reshape(-1, draws.shape[-1]), rowvar=False))
+    return {
+        'names': [*(fit.joint_names[i] for i in known), *fit.theta_names],
+        'units': [*('rad' for _ in known), *(units[name] for name in fit.theta_names)],
+        'matrix': [[float(f'{value:.5e}') for value in row] for row in matrix]
+        if draws.shape[-1]
+        else [],
+    }
+
+
+def held_out_coverage(discovery: Discovery, predictions: Predictions) -> Coverage:
+    """Return how many of the held-out rows lie in their 95 % regions."""
+    return Coverage.of(predictions.inside[discovery.residuals.context.measurements.is_validation])
+
+
+def _regions(discovery: Discovery, predictions: Predictions) -> dict[str, Any]:
+    measurements = discovery.residuals.context.measurements
+    gross = [observation for observation, _ in discovery.fit.left_out]
+    fitted = ~measurements.is_validation & ~np.isin(measurements.observation, gross)
+    return {
+        'widening': predictions.widening,
+        'held_out': held_out_coverage(discovery, predictions),
+        'fitted': Coverage.of(predictions.inside[fitted]),
+    }
 
 
 def save_discovery(
@@ -66,8 +125,14 @@ def save_discovery(
     folder: str | os.PathLike[str],
     confirmation: Confirmation | None = None,
     figures: bool = True,
+    predictions: Predictions | None = None,
 ) -> Path:
-    """Write discovery.json and, with figures, the report; return what to open.
+    """Write discovery.json, predictions.csv, what to apply and, with figures, the report.
+
+    Returns
+    -------
+    Path
+        The report; discovery.json without figures.
 
     Raises
     ------
@@ -76,8 +141,17 @@ def save_discovery(
     """
     folder = Path(folder)
     make_folder(folder)
-    content = discovery_content(discovery, confirmation)
+    predictions = predictions_of(discovery) if predictions is None else predictions
+    content = discovery_content(discovery, confirmation, predictions)
     write_atomically(folder / DISCOVERY_FILE, schemas.encode(content))
+    gross = {observation for observation, _ in discovery.fit.left_out}
+    text = predictions_text(discovery.fit.session, predictions, gross)
+    write_atomically(folder / PREDICTIONS_FILE, text)
+    make_folder(folder / APPLY_FOLDER)
+    # That of an earlier run with other causes would contradict the rest.
+    (folder / APPLY_FOLDER / GEOMETRY_FILE).unlink(missing_ok=True)
+    for name, text in applied(discovery).items():
+        write_atomically(folder / APPLY_FOLDER / name, text)
     if not figures:
         remove_report(folder)
         return folder / DISCOVERY_FILE

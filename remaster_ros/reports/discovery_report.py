@@ -6,10 +6,10 @@ from pathlib import Path
 
 import msgspec
 
-from remaster_ros.discovery.confirmation import Confirmation, in_words
+from remaster_ros.discovery.confirmation import Confirmation
+from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.stepwise_selection import DRAWS
 from remaster_ros.reports import schemas
 from remaster_ros.reports.discovery_figures import draw_discovery
 from remaster_ros.reports.pages import inlined, page, write_report
@@ -49,7 +49,6 @@ def write_discovery_report(
         equations={name: effect.equation for name, effect in EFFECTS.items()},
         sources={name: effect.source for name, effect in EFFECTS.items()},
         most_parameters=MOST_PARAMETERS,
-        least_p=1.0 / (1.0 + DRAWS),
         confirmed=in_words(discovery, confirmation) if confirmation else (),
         drawings={name: inlined(name, text) for name, text in drawings.items()},
     )
@@ -58,7 +57,7 @@ def write_discovery_report(
 
 def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
     """Whether poses that were never fitted, and the other session if there is one, agree."""
-    if discovery.verdict in ('undetermined', 'unexplained'):
+    if discovery.verdict in ('undetermined', 'unexplained') or discovery.unexplained:
         return False
     if confirmation is not None and not confirmation.same_offsets:
         return False
@@ -82,9 +81,7 @@ def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> 
     if discovery.verdict == 'none':
         return 'Nothing is there beyond the zero-offsets and the noise.'
     if discovery.verdict == 'unexplained':
-        return (
-            'Something is there that no cause explains: nothing but the zero-offsets is returned.'
-        )
+        return f'Something is there that no cause explains.{change}'
     count = len(discovery.effects)
     causes = 'one cause' if count == 1 else f'{count} causes'
     if discovery.verdict == 'undetermined':
@@ -93,9 +90,10 @@ def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> 
             f'would decide.{change}'
         )
     if confirmation is not None and not confirmation.confirmed:
-        change += (
-            f' The other session does not confirm {"it" if count == 1 else "them"}: its error is '
-            f'{1e3 * confirmation.rms_after_m:.3f} mm RMS with and '
+        change += f' The other session does not confirm {"it" if count == 1 else "them"}' + (
+            '.'
+            if confirmation.why
+            else f': its error is {1e3 * confirmation.rms_after_m:.3f} mm RMS with and '
             f'{1e3 * confirmation.rms_before_m:.3f} mm without.'
         )
     return f'Beyond the zero-offsets there {"is" if count == 1 else "are"} {causes}.{change}'

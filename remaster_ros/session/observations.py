@@ -49,6 +49,11 @@ class ColumnNames:
             for prefix, unit in (('q', 'rad'), ('from_q', 'rad'), ('effort', 'nm'))
         )
 
+    @property
+    def optional(self) -> tuple[str, ...]:
+        """Columns that a file may leave out where every field of them would be empty."""
+        return (*self.from_q, *self.std, 'samples', 'temperature_c')
+
     def names(self, with_effort: bool = False) -> list[str]:
         """Return every column's name."""
         return [
@@ -106,7 +111,10 @@ class RowFormat:
         _check_names(names, self._columns, path)
         if len(lines) < 2:
             raise InputError(f'{path}: no observations below the header; measure before fitting')
-        measurements = self._convert(Table(path, names, lines[1:], first_line=2))
+        table = Table(path, names, lines[1:], first_line=2)
+        for name in self._columns.optional:
+            table.cells.setdefault(name, [''] * table.rows)
+        measurements = self._convert(table)
         self._accept(measurements, 2, SequenceRules())
         return measurements
 
@@ -259,17 +267,17 @@ def _check_names(names: list[str], columns: ColumnNames, path: Path) -> None:
         prefix, suffix = wanted[0].split('1')
         pattern = re.compile(f'{prefix}[0-9]+{suffix}')
         found = [name for name in names if pattern.fullmatch(name)]
-        if set(found) != set(wanted) and (found or wanted is not columns.effort):
+        if set(found) != set(wanted) and (found or wanted is columns.q):
             raise InputError(
                 f'{where}: {len(found)} columns {prefix}…{suffix} for the {columns.joints} joints '
                 f'of the robot between its base_link and tip_link; give {wanted[0]} to '
                 f'{wanted[-1]}, or the right URDF and links in session.yaml'
             )
-    missing = [name for name in columns.names() if name not in names]
+    missing = [name for name in columns.names() if name not in (*names, *columns.optional)]
     if missing:
         raise InputError(
-            f'{where}: column {", ".join(missing)} is missing; add it, with empty fields where '
-            'the format lets a value be unknown'
+            f'{where}: column {", ".join(missing)} is missing; add it (docs/session-format.md), '
+            'or let "remaster import" make a session of this table'
         )
     unknown = [name for name in names if name not in columns.names(with_effort=True)]
     if unknown:

@@ -45,11 +45,14 @@ class SessionHeader(msgspec.Struct):
     robot: _Robot
     markers: dict[str, Triple]
     sensors: dict[str, _Sensor]
-    settle_s: Annotated[float, Bounds(0.0, unit='s')]
+    settle_s: Annotated[float | None, Bounds(0.0, unit='s')] = None
+    times: Literal['', 'none'] = ''
     marker_std_m: Annotated[float, MARKER_STD] = 0.5e-3
     base_prior: dict[str, BaseFrame] = {}
     exit_status: Literal['', ExitStatus] = ''
     created: str = ''
+    operator: str = ''
+    serial_number: str = ''
     notes: str = ''
     extra: dict[str, Any] = {}
 
@@ -66,10 +69,13 @@ class SessionHeader(msgspec.Struct):
             measurements=measurements,
             marker_std_m=self.marker_std_m,
             settle_s=self.settle_s,
+            timed=self.times != 'none',
             base_prior={sensor: base.prior() for sensor, base in self.base_prior.items()},
             exit_status=self.exit_status,
             notes=self.notes,
             created=self.created,
+            operator=self.operator,
+            serial_number=self.serial_number,
             extra=self.extra,
             references=references,
         )
@@ -119,14 +125,17 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
         'markers': session.markers,
         'sensors': {name: {'marker': marker} for name, marker in session.sensors.items()},
         'settle_s': session.settle_s,
+        'times': '' if session.timed else 'none',
         'marker_std_m': session.marker_std_m,
         'base_prior': session.base_prior,
         'exit_status': exit_status,
         'created': session.created,
+        'operator': session.operator,
+        'serial_number': session.serial_number,
         'notes': session.notes,
     }
     header = _checked(to_plain(content), 'session to be written: ')
-    given = {key: value for key, value in to_plain(header).items() if value not in ('', {})}
+    given = {key: value for key, value in to_plain(header).items() if value not in ('', {}, None)}
     return dump_yaml(_merge(given, session.extra))
 
 
@@ -141,7 +150,7 @@ def _checked(content: Mapping[str, Any], where: str) -> SessionHeader:
     try:
         header = msgspec.convert(known, SessionHeader)
     except msgspec.ValidationError as error:
-        raise InputError(f'{where}{error}; see the session format') from None
+        raise InputError(f'{where}{error}; see docs/session-format.md') from None
     if problem := out_of_bounds(header) or _problem(header):
         raise InputError(f'{where}{problem}')
     return header

@@ -109,7 +109,9 @@ def draw_effect(
     InputError
         Where all draws leave nothing, or none is about that joint.
     """
-    context = DrawContext(rng, stage.arm.joints, stage.circumstances, tuple(stage.sensors))
+    context = DrawContext(
+        rng, stage.arm.joints, stage.circumstances, stage.distance_m, tuple(stage.markers)
+    )
     best, best_size = None, 0.0
     for _ in range(TRIES if joint is None else TRIES * stage.arm.joints):
         effect = KINDS[kind].draw(kind, context)

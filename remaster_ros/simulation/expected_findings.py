@@ -10,10 +10,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from remaster_ros.simulation.hidden_effect import HiddenEffect
-from remaster_ros.simulation.hidden_effects import UNNAMED
+from remaster_ros.simulation.hidden_effects import KINDS, NAMED, UNNAMED
 
 Cause = tuple[str, tuple[int, ...], str]
-"""Name, joints, and for a cell without a name its place and driver; for a sensor its name."""
+"""Name, joints, and the place and driver of what is hidden without a name; for a sensor its name.
+"""
 
 
 def causes(effect: HiddenEffect) -> list[Cause]:
@@ -45,7 +46,7 @@ def named_cause(effect: Mapping[str, Any]) -> list[Cause]:
         Of its list ``effects``.
     """
     name, joints = effect['name'], tuple(effect['joints'])
-    if name == 'unnamed':
+    if name not in NAMED:
         return [(name, joints, f'{effect["place"]} {effect["driver"]}')]
     if name != 'joint_coupling' and len(joints) > 1:
         # One entry for several joints that err in the same way.
@@ -54,6 +55,20 @@ def named_cause(effect: Mapping[str, Any]) -> list[Cause]:
     if effect['place'] == 'sensor_frame':
         sensor = effect['parameters'][0]['name'].rpartition('_')[2]
     return [(name, joints, sensor)]
+
+
+def answers(found: Cause, hidden: Cause, effect: HiddenEffect) -> bool:
+    """Return whether a cause found is the one hidden, which is a cause of the effect.
+
+    What is hidden without a name is found by any effect that is at its place and has its driver,
+    or that its kind names as an answer.
+    """
+    name, joints, rest = found
+    if joints != hidden[1]:
+        return False
+    if name in KINDS[effect.kind].answers:
+        return name not in NAMED or rest in ('', effect.detail.get('sensor', ''))
+    return found == hidden or (name not in NAMED and hidden[0] == 'unnamed' and rest == hidden[2])
 
 
 def describe(cause: Cause) -> str:

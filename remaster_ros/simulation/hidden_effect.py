@@ -13,6 +13,7 @@ import numpy as np
 
 from remaster_ros.types import FloatArray
 
+ARC_MINUTE = np.deg2rad(1.0 / 60.0)
 # A joint that moved less than this, rad, keeps the flank of its gears that it had.
 SLACK_RAD = 2e-4
 
@@ -57,8 +58,8 @@ class Deviation:
 
     Attributes
     ----------
-    sensors
-        Names of the sensors.
+    sensors, markers
+        Their names.
     angle
         Added to the true joint angles, rad, (n, k).
     shift
@@ -68,32 +69,42 @@ class Deviation:
     base
         Turns the base about its origin, axes of R, rad, (n, 3).
     marker
-        Added to the marker in the tool frame, m, (n, 3).
-    beside, scale, radial
-        What each sensor (s of them) adds to a point p that it measures, in its frame N: beside,
-        m, (n, s, 3), scale p, (n, s, 3), and radial r² (x, y, 0), 1/m², (n, s, 1).
+        Added to each marker (c of them) in the tool frame, m, (n, c, 3).
+    beside, turn, scale, radial, along, half
+        What each sensor (s of them) adds to a point p = (x, y, z) that it measures, in its frame
+        N: beside, m, (n, s, 3); turn × p, rad, (n, s, 3); scale p, (n, s, 3); radial (x² + y²)
+        (x, y, 0), 1/m², (n, s, 1); along the line of sight a + b |p|² + c |p|³, in m, 1/m, 1/m²,
+        (n, s, 3); and z u² half where u = (x, y)/z along half is positive, (n, s, 2): the rays of
+        one half of its view bend.
     """
 
     sensors: tuple[str, ...]
+    markers: tuple[str, ...]
     angle: FloatArray
     shift: FloatArray
     tilt: FloatArray
     base: FloatArray
     marker: FloatArray
     beside: FloatArray
+    turn: FloatArray
     scale: FloatArray
     radial: FloatArray
+    along: FloatArray
+    half: FloatArray
 
     @classmethod
-    def none(cls, n: int, k: int, sensors: tuple[str, ...] = ()) -> Deviation:
+    def none(
+        cls, n: int, k: int, sensors: tuple[str, ...] = (), markers: tuple[str, ...] = ()
+    ) -> Deviation:
         """Return an arm and sensors as drawn."""
-        shapes = ((k,), (k + 1, 3), (k, 3), (3,), (3,))
-        per_sensor = ((len(sensors), 3), (len(sensors), 3), (len(sensors), 1))
-        return cls(sensors, *(np.zeros((n, *shape)) for shape in (*shapes, *per_sensor)))
+        s = len(sensors)
+        shapes = ((k,), (k + 1, 3), (k, 3), (3,), (len(markers), 3))
+        per_sensor = ((s, 3), (s, 3), (s, 3), (s, 1), (s, 3), (s, 2))
+        return cls(sensors, markers, *(np.zeros((n, *shape)) for shape in (*shapes, *per_sensor)))
 
     def map(self, change: Callable[..., FloatArray], *others: Deviation) -> Deviation:
         """Apply a function to every array of this and other deviations."""
-        names = [spec.name for spec in fields(self) if spec.name != 'sensors']
+        names = [s.name for s in fields(self) if s.name not in ('sensors', 'markers')]
         changed: dict[str, Any] = {
             name: change(getattr(self, name), *(getattr(other, name) for other in others))
             for name in names
@@ -105,7 +116,16 @@ class Deviation:
         s = self.sensors.index(sensor)
         across = points * (1.0, 1.0, 0.0)
         square = np.sum(across**2, axis=1, keepdims=True)
+        distance = np.linalg.norm(points, axis=1, keepdims=True)
+        powers = distance ** np.array([0.0, 2.0, 3.0])
+        along = np.sum(self.along[:, s] * powers, axis=1, keepdims=True)
         added = self.scale[:, s] * points + self.radial[:, s] * square * across
+        added += np.cross(self.turn[:, s], points) + along * points / distance
+        half = self.half[:, s]
+        length = np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-30)
+        towards = np.sum(half * points[:, :2], axis=1, keepdims=True) / length
+        bent = np.maximum(towards, 0.0) ** 2 / points[:, 2:]
+        added[:, :2] += bent * half
         return points + self.beside[:, s] + added
 
 
@@ -153,14 +173,22 @@ class DrawContext:
         Number of joints.
     circumstances
         Of the visits.
-    sensors
+    distance_m
+        Sensor -> mean distance of what it measures, m.
+    markers
         Their names.
     """
 
     rng: np.random.Generator
     joints: int
     circumstances: Circumstances
-    sensors: tuple[str, ...]
+    distance_m: Mapping[str, float]
+    markers: tuple[str, ...]
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors."""
+        return tuple(self.distance_m)
 
     def joint(self, first: int = 1) -> tuple[int]:
         """Draw a joint, 1-based."""
@@ -180,10 +208,12 @@ Draw = Callable[[str, DrawContext], HiddenEffect]
 """(kind, what to draw from) -> an effect."""
 
 
-def one_value(largest: float, first_joint: int = 1) -> Draw:
-    """Draw a joint and a sign."""
+def one_value(largest: float, first_joint: int = 1, positive: bool = False) -> Draw:
+    """Draw a joint and, unless physics has only the positive one, a sign."""
     return lambda kind, context: HiddenEffect(
-        kind, context.joint(first_joint), np.array([largest * context.sign()])
+        kind,
+        context.joint(first_joint),
+        np.array([largest * (1.0 if positive else context.sign())]),
     )
 
 
@@ -222,7 +252,7 @@ def at_some_time(draw: Draw) -> Draw:
 
     def timed(kind: str, context: DrawContext) -> HiddenEffect:
         effect = draw(kind, context)
-        moment = float(context.rng.uniform(0.15, 0.4) * context.circumstances.time_s[-1])
+        moment = float(context.rng.uniform(0.15, 0.85) * context.circumstances.time_s[-1])
         return replace(effect, detail={**effect.detail, 'moment_s': moment})
 
     return timed
@@ -230,34 +260,39 @@ def at_some_time(draw: Draw) -> Draw:
 
 Rule = Callable[[HiddenEffect, Deviation, Circumstances], None]
 """Adds what an effect makes of the circumstances to a deviation."""
-Parameters = Callable[[HiddenEffect], dict[str, float]]
-"""Returns the true parameters in SI units, under the names that discovery gives them."""
 
 
-def named(*names: str, factor: float = 1.0) -> Parameters:
-    """Name the values of an effect in order.
+@dataclass(frozen=True)
+class Part:
+    """A parameter under the name that discovery gives it.
 
-    Parameters
+    Attributes
     ----------
-    names
-        With ``{j}`` for the joint, ``{by}`` for the driving joint, ``{sensor}`` for the sensor.
-    factor
-        What the parameters are in units of the values.
+    name
+        With ``{j}`` for the joint, ``{by}`` for the one that drives it, ``{order}`` for the order
+        of a wave, ``{sensor}`` for the sensor.
+    values
+        The effect's values where this parameter is 1 and all others are 0.
+    detail
+        What the effect has to have in its detail.
     """
 
-    def parameters(effect: HiddenEffect) -> dict[str, float]:
+    name: str
+    values: tuple[float, ...] = (1.0,)
+    detail: Mapping[str, str] = field(default_factory=dict)
+
+    def of(self, effect: HiddenEffect) -> dict[str, float]:
+        """Return name and true value, SI units, of an effect of one joint and one order."""
+        if any(effect.detail.get(key) != value for key, value in self.detail.items()):
+            return {}
+        values = np.array(self.values)
+        value = float(values @ effect.values / (values @ values))
+        if abs(value) < 1e-9 * np.linalg.norm(effect.values):
+            return {}
         words = {'j': effect.joints[0] if effect.joints else 0, **effect.detail}
-        return {
-            name.format(**words): factor * float(value)
-            for name, value in zip(names, effect.values, strict=True)
-        }
-
-    return parameters
-
-
-def not_compared(effect: HiddenEffect) -> dict[str, float]:
-    """Return no parameters: discovery has none that could be compared one by one."""
-    return {}
+        if 'orders' in words:
+            (words['order'],) = words['orders']
+        return {self.name.format(**words): value}
 
 
 @dataclass(frozen=True)
@@ -273,8 +308,11 @@ class HiddenKind:
     draw
         Draws one of about the largest size that is plausible; `WorldModel.of_size` makes it
         smaller.
-    parameters
-        What discovery should find.
+    parts
+        What discovery should find; none where it has no parameters that could be compared one by
+        one.
+    answers
+        Names of discovery.json that name it too, beside its own.
     """
 
     place: str
@@ -282,4 +320,5 @@ class HiddenKind:
     form: str
     rule: Rule
     draw: Draw
-    parameters: Parameters = not_compared
+    parts: tuple[Part, ...] = ()
+    answers: tuple[str, ...] = ()

@@ -2,30 +2,31 @@
 
 Nothing here is shared with the code that estimates (`discovery.effects`). An effect is linear in
 its values: `HiddenEffect.values` times what its rule adds to a `Deviation`. A rule reads the
-`Circumstances` of every configuration. `NAMED` are the effects with a name, `UNNAMED` are cells
-without one. Compliance and thermal growth are drawn with the sign of physics.
+`Circumstances` of every configuration. `NAMED` are the effects with a name, `UNNAMED` (in
+`hidden_unnamed`) those without one. Compliance and thermal growth are drawn with the sign of
+physics.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from remaster_ros.simulation.hidden_effect import (
+    ARC_MINUTE,
     Circumstances,
     Deviation,
     DrawContext,
     HiddenEffect,
     HiddenKind,
-    at_some_time,
-    named,
+    Part,
     no_joint,
     of_sensor,
     one_value,
     two_joints,
 )
-from remaster_ros.types import FloatArray
-
-ARC_MINUTE = np.deg2rad(1.0 / 60.0)
+from remaster_ros.simulation.hidden_unnamed import UNNAMED
 
 # Rules: true = drawn + what stands here
 
@@ -123,46 +124,6 @@ def _distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     d.radial[:, d.sensors.index(e.detail['sensor'])] += e.values[0]
 
 
-def _foreign_torque(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s τ_i: joint j gives way to another joint's torque."""
-    d.angle[:, e.joints[0] - 1] += e.values[0] * c.torque[:, e.detail['by'] - 1]
-
-
-def _creep(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s t."""
-    d.angle[:, e.joints[0] - 1] += e.values[0] * c.time_s
-
-
-def _slip(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s from some moment on."""
-    d.angle[:, e.joints[0] - 1] += e.values[0] * _after(e, c)
-
-
-def _warm_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s ΔT."""
-    d.angle[:, e.joints[0] - 1] += e.values[0] * c.warming_k
-
-
-def _bent_coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s q_i²: neither a line nor a wave of the other joint."""
-    d.angle[:, e.joints[0] - 1] += e.values[0] * c.q[:, e.detail['by'] - 1] ** 2
-
-
-def _sagging_tool(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """The marker's stem bends: δ = s (gravity's direction across the tool's z axis)."""
-    down = np.swapaxes(c.tool, -1, -2) @ np.array([0.0, 0.0, -1.0])
-    d.marker += e.values[0] * down * (1.0, 1.0, 0.0)
-
-
-def _bumped_sensor(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """From some moment on the sensor measures everything beside where it did, m."""
-    d.beside[:, d.sensors.index(e.detail['sensor'])] += _after(e, c)[:, None] * e.values
-
-
-def _after(e: HiddenEffect, c: Circumstances) -> FloatArray:
-    return (c.time_s > e.detail['moment_s']).astype(float)
-
-
 # Draws of effects that need more than a size and a sign
 
 
@@ -221,52 +182,27 @@ def _draw_marker(kind: str, context: DrawContext) -> HiddenEffect:
     return HiddenEffect(kind, (), 10e-3 * context.direction(3))
 
 
-# Parameters whose names or values depend on more than a template.
-
-
-def _compliances(effect: HiddenEffect) -> dict[str, float]:
-    return {f'compliance_{j}': float(v) for j, v in zip(effect.joints, effect.values, strict=True)}
-
-
-def _waves(effect: HiddenEffect) -> dict[str, float]:
-    orders = effect.detail['orders']
-    names = [f'{wave}{order}_{{j}}' for order in orders for wave in ('sin', 'cos')]
-    return named(*names)(effect)
-
-
-def _couplings(effect: HiddenEffect) -> dict[str, float]:
-    if effect.detail['form'] == 'linear':
-        return named('coupling_{j}_by_{by}')(effect)
-    return named('sin_{j}_by_{by}', 'cos_{j}_by_{by}')(effect)
-
-
-def _length(effect: HiddenEffect) -> dict[str, float]:
-    along = effect.detail['axis'] == 'along'
-    return named('length_{j}' if along else 'offset_{axis}_{j}')(effect)
-
-
-def _tilts(effect: HiddenEffect) -> dict[str, float]:
-    found = named('tilt_x_{j}', 'tilt_y_{j}', 'tilt_z_{j}')(effect)
-    return {name: value for name, value in found.items() if abs(value) > 1e-12}
-
-
-def _scales(effect: HiddenEffect) -> dict[str, float]:
-    depth = effect.detail['form'] == 'depth'
-    return named('scale_z_{sensor}' if depth else 'scale_{sensor}')(effect)
-
+# Parameters of more than one kind.
+WAVES = (Part('sin{order}_{j}', (1.0, 0.0)), Part('cos{order}_{j}', (0.0, 1.0)))
+UNIT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 NAMED = {
     'joint_compliance': HiddenKind(
-        'joint_angle', 'gravity_torque', 'linear', _compliance, _draw_compliance, _compliances
+        'joint_angle',
+        'gravity_torque',
+        'linear',
+        _compliance,
+        _draw_compliance,
+        (Part('compliance_{j}'),),
     ),
     'encoder_eccentricity': HiddenKind(
-        'joint_angle', 'joint_angle', 'sin/cos', _eccentricity, _draw_eccentricity, _waves
+        'joint_angle', 'joint_angle', 'sin/cos', _eccentricity, _draw_eccentricity, WAVES
     ),
     'encoder_scale': HiddenKind(
-        'joint_angle', 'joint_angle', 'linear', _scale, one_value(5e-3), named('scale_{j}')
+        'joint_angle', 'joint_angle', 'linear', _scale, one_value(5e-3), (Part('scale_{j}'),)
     ),
     'gear_periodic': HiddenKind(
-        'joint_angle', 'joint_angle', 'sin/cos', _eccentricity, _draw_gear, _waves
+        'joint_angle', 'joint_angle', 'sin/cos', _eccentricity, _draw_gear, WAVES
     ),
     'joint_error_curve': HiddenKind('joint_angle', 'joint_angle', 'free', _curve, _draw_curve),
     'backlash': HiddenKind(
@@ -274,11 +210,16 @@ NAMED = {
         'approach',
         'step',
         _backlash,
-        one_value(15 * ARC_MINUTE),
-        named('half_backlash_{j}', factor=0.5),
+        one_value(15 * ARC_MINUTE, positive=True),
+        (Part('half_backlash_{j}', (2.0,)),),
     ),
     'settling': HiddenKind(
-        'joint_angle', 'last_move', 'linear', _settling, one_value(3e-3), named('settling_{j}')
+        'joint_angle',
+        'last_move',
+        'linear',
+        _settling,
+        one_value(3e-3, positive=True),
+        (Part('settling_{j}'),),
     ),
     'joint_coupling': HiddenKind(
         'joint_angle',
@@ -286,17 +227,34 @@ NAMED = {
         'linear or sin/cos',
         _coupling,
         two_joints(5e-3, ('linear', 'sin/cos')),
-        _couplings,
+        (
+            Part('coupling_{j}_by_{by}', detail={'form': 'linear'}),
+            Part('sin_{j}_by_{by}', (1.0, 0.0), {'form': 'sin/cos'}),
+            Part('cos_{j}_by_{by}', (0.0, 1.0), {'form': 'sin/cos'}),
+        ),
     ),
     'link_length': HiddenKind(
-        'link_translation', 'constant', 'constant', _link_length, _draw_link, _length
+        'link_translation',
+        'constant',
+        'constant',
+        _link_length,
+        _draw_link,
+        (
+            Part('length_{j}', detail={'axis': 'along'}),
+            *(Part(f'offset_{axis}_{{j}}', detail={'axis': axis}) for axis in 'xyz'),
+        ),
     ),
     'joint_axis_tilt': HiddenKind(
-        'link_rotation', 'constant', 'constant', _tilt, _draw_tilt, _tilts
+        'link_rotation',
+        'constant',
+        'constant',
+        _tilt,
+        _draw_tilt,
+        tuple(Part(f'tilt_{axis}_{{j}}', unit) for axis, unit in zip('xyz', UNIT)),
     ),
     'marker_offset': HiddenKind('marker', 'constant', 'constant', _marker, _draw_marker),
     'thermal_growth': HiddenKind(
-        'link_translation', 'temperature', 'linear', _thermal, no_joint(2e-4), named('growth')
+        'link_translation', 'temperature', 'linear', _thermal, no_joint(2e-4), (Part('growth'),)
     ),
     'base_compliance': HiddenKind(
         'base_rotation',
@@ -304,7 +262,7 @@ NAMED = {
         'linear',
         _base,
         no_joint(1e-4),
-        named('base_compliance'),
+        (Part('base_compliance'),),
     ),
     'registration_drift': HiddenKind(
         'sensor_frame',
@@ -312,7 +270,7 @@ NAMED = {
         'linear',
         _drift,
         of_sensor(1e-6, 3),
-        named('drift_x_{sensor}', 'drift_y_{sensor}', 'drift_z_{sensor}'),
+        tuple(Part(f'drift_{axis}_{{sensor}}', unit) for axis, unit in zip('xyz', UNIT)),
     ),
     'sensor_scale': HiddenKind(
         'sensor_frame',
@@ -320,7 +278,10 @@ NAMED = {
         'linear',
         _sensor_scale,
         of_sensor(1e-2, 1, ('all', 'depth')),
-        _scales,
+        (
+            Part('scale_z_{sensor}', detail={'form': 'depth'}),
+            Part('scale_{sensor}', detail={'form': 'all'}),
+        ),
     ),
     'sensor_distortion': HiddenKind(
         'sensor_frame',
@@ -328,43 +289,7 @@ NAMED = {
         'quadratic, radial',
         _distortion,
         of_sensor(0.2),
-        named('radial_{sensor}'),
-    ),
-}
-UNNAMED = {
-    'foreign_torque': HiddenKind(
-        'joint_angle',
-        'gravity_torque',
-        'linear',
-        _foreign_torque,
-        two_joints(4e-4),
-        named('joint_{j}_by_gravity_torque_of_joint_{by}'),
-    ),
-    'creeping_joint': HiddenKind(
-        'joint_angle', 'time', 'linear', _creep, one_value(1e-6, 2), named('joint_{j}_by_time')
-    ),
-    'slipped_joint': HiddenKind(
-        'joint_angle',
-        'time',
-        'step',
-        _slip,
-        at_some_time(one_value(15 * ARC_MINUTE, 2)),
-        named('joint_{j}_by_time'),
-    ),
-    'warm_joint': HiddenKind(
-        'joint_angle',
-        'temperature',
-        'linear',
-        _warm_joint,
-        one_value(5e-4, 2),
-        named('joint_{j}_by_temperature'),
-    ),
-    'bent_coupling': HiddenKind(
-        'joint_angle', 'angle', 'quadratic', _bent_coupling, two_joints(3e-3)
-    ),
-    'sagging_tool': HiddenKind('marker', 'gravity', 'linear', _sagging_tool, no_joint(3e-3)),
-    'bumped_sensor': HiddenKind(
-        'sensor_frame', 'time', 'step', _bumped_sensor, at_some_time(of_sensor(3e-3, 3))
+        (Part('radial_{sensor}'),),
     ),
 }
 KINDS = NAMED | UNNAMED
@@ -381,4 +306,26 @@ def true_parameters(effect: HiddenEffect) -> dict[str, float]:
     Empty where there is none to compare: a curve, a marker (of which only parts can be seen), and
     cells without a name that are more than a line.
     """
-    return KINDS[effect.kind].parameters(effect)
+    return {
+        name: value
+        for one in _each(effect)
+        for part in KINDS[effect.kind].parts
+        for name, value in part.of(one).items()
+    }
+
+
+def _each(effect: HiddenEffect) -> list[HiddenEffect]:
+    """Return the effect joint by joint, a wave order by order."""
+    if len(effect.joints) > 1:
+        return [
+            replace(effect, joints=(joint,), values=np.array([value]))
+            for joint, value in zip(effect.joints, effect.values, strict=True)
+        ]
+    if effect.kind in ('encoder_eccentricity', 'gear_periodic'):
+        return [
+            replace(effect, values=values, detail={'orders': (order,)})
+            for order, values in zip(
+                effect.detail['orders'], effect.values.reshape(-1, 2), strict=True
+            )
+        ]
+    return [effect]

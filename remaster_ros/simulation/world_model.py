@@ -118,11 +118,14 @@ def circumstances(arm: Arm, visited: Round, joint_offsets: FloatArray) -> Circum
 
 
 def deviation(
-    effects: Sequence[HiddenEffect], c: Circumstances, sensors: tuple[str, ...]
+    effects: Sequence[HiddenEffect],
+    c: Circumstances,
+    sensors: tuple[str, ...],
+    markers: tuple[str, ...],
 ) -> Deviation:
-    """Return what all the effects together do."""
+    """Return what all the effects together do to sensors and markers of these names."""
     n, k = c.q.shape
-    together = Deviation.none(n, k, sensors)
+    together = Deviation.none(n, k, sensors, markers)
     for effect in effects:
         add_effect(effect, together, c)
     return together
@@ -156,7 +159,8 @@ def measured(
     """What the named sensor measures of a marker of the tool frame (3,), in N, m, (n, 3)."""
     if wrong is None:
         return sensor.in_sensor(placed(state, marker, None))
-    return wrong.measured(name, sensor.in_sensor(placed(state, marker + wrong.marker, wrong)))
+    moved = marker + wrong.marker[:, wrong.markers.index(sensor.marker)]
+    return wrong.measured(name, sensor.in_sensor(placed(state, moved, wrong)))
 
 
 @dataclass(eq=False)
@@ -195,7 +199,8 @@ class WorldModel:
         """
         q, wrong = self.visited.q + self.joint_offsets, None
         if effects:
-            wrong = deviation(effects, self.circumstances, tuple(self.sensors))
+            names = tuple(self.sensors), tuple(self.markers)
+            wrong = deviation(effects, self.circumstances, *names)
             q = q + wrong.angle
         state = self.arm.state(q)
         points = [
@@ -203,6 +208,12 @@ class WorldModel:
             for name, sensor in self.sensors.items()
         ]
         return np.stack(points, axis=1).reshape(-1, 3)
+
+    @cached_property
+    def distance_m(self) -> dict[str, float]:
+        """Mean distance of what each sensor measures, m."""
+        points = self._as_drawn.reshape(-1, len(self.sensors), 3)
+        return dict(zip(self.sensors, np.linalg.norm(points, axis=2).mean(axis=0).tolist()))
 
     def response(self, effect: HiddenEffect) -> FloatArray:
         """How far an effect moves what the sensors see, m, (n, 3)."""

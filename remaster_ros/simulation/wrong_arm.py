@@ -80,5 +80,7 @@ class WrongArm:
             warming_k=self._truth.warming.at(times),
         )
         c = circumstances(self._arm, visited, self._truth.joint_offsets)
-        together = deviation(self._truth.effects, c, tuple(self._truth.sensors))
+        together = deviation(
+            self._truth.effects, c, tuple(self._truth.sensors), tuple(self._truth.markers)
+        )
         return together.map(lambda array: array[-1:])

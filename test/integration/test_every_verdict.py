@@ -55,6 +55,12 @@ def with_positions(session: Session, position: np.ndarray) -> Session:
     return replace(session, measurements=replace(session.measurements, position=position))
 
 
+def measured_again(session: Session) -> Session:
+    """Return the same with noise of its own on top: another measurement of the same poses."""
+    noise = np.random.default_rng(5).normal(0.0, 0.03e-3, session.measurements.position.shape)
+    return with_positions(session, session.measurements.position + noise)
+
+
 def only_fitted(session: Session) -> Session:
     return session.select(~session.measurements.is_validation)
 
@@ -205,13 +211,21 @@ def test_discover_with_a_session_that_confirms(case: str, tmp_path: Path) -> Non
     options = DISCOVER[case][0]
     session = simulated(tmp_path / 'session', '--seed', 3, *options)
     out = tmp_path / 'causes'
-    process = remaster('discover', session, '--out', out, '--confirm', session)
+    again = changed(session, tmp_path, measured_again)
+    process = remaster('discover', session, '--out', out, '--confirm', again)
     assert process.returncode == 0, process.stderr
     assert 'other session: ' in process.stdout
     page, _, _ = page_of(out)
     assert 'In the other session' in page
     found = json.loads((out / 'discovery.json').read_text(encoding='utf-8'))
     assert found['confirmation']['rms_before_m'] > 0.0
+
+
+def test_a_copy_of_the_session_cannot_confirm_it(healthy: Path, tmp_path: Path) -> None:
+    copy = changed(healthy, tmp_path, lambda session: session)
+    line = refusal('discover', healthy, '--out', tmp_path / 'causes', '--confirm', copy)
+    assert 'a session cannot confirm itself' in line
+    assert not (tmp_path / 'causes').exists()
 
 
 def test_causes_that_another_session_does_not_have_are_not_green(tmp_path: Path) -> None:
@@ -223,7 +237,7 @@ def test_causes_that_another_session_does_not_have_are_not_green(tmp_path: Path)
     assert 'class="verdict caution"' in page
     assert 'The other session does not confirm it: its error is ' in page
     confirming = tmp_path / 'again'
-    again = simulated(tmp_path / 'second', '--seed', 3, *DISCOVER['effects'][0])
+    again = changed(session, tmp_path, measured_again)
     assert remaster('discover', session, '--out', confirming, '--confirm', again).returncode == 0
     page, _, _ = page_of(confirming)
     assert 'class="verdict good"' in page

@@ -22,14 +22,14 @@ from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.simulation.effect_sampling import draw_effect
-from remaster_ros.simulation.hidden_effect import Deviation, HiddenEffect
+from remaster_ros.simulation.hidden_effect import ARC_MINUTE, Deviation, HiddenEffect
 from remaster_ros.simulation.hidden_effects import (
-    ARC_MINUTE,
     NAMED,
     UNNAMED,
     add_effect,
     true_parameters,
 )
+from remaster_ros.types import FloatArray
 
 
 @pytest.mark.parametrize('name', ['lwr4plus', 'iiwa7', 'iiwa14', 'six'])
@@ -195,10 +195,110 @@ def test_true_values_have_the_names_that_discovery_gives_them(
     assert set(true) <= {name for cell in cells for name in cell.parameters}
     for name in true:
         part = part_of(name)
-        assert part is not None, f'hidden_judge has no pattern for {name}'
+        assert part is not None, f'no part of the kind is called {name}'
         # Waves of any order are hidden by one rule.
         assert part.kind == ('encoder_eccentricity' if kind == 'gear_periodic' else kind)
         assert part.joints in ((), *((joint,) for joint in effect.joints))
+
+
+def _of_sensor(iiwa: HiddenWorld, values: FloatArray, sensor: str) -> FloatArray:
+    """Return the rows of one sensor."""
+    return values[iiwa.sensor == list(iiwa.sensors).index(sensor)]
+
+
+def test_lenses_and_ranges_err_by_their_equations(iiwa: HiddenWorld) -> None:
+    p = _of_sensor(iiwa, iiwa.seen(), 'mocap')
+    distance = np.linalg.norm(p, axis=1, keepdims=True)
+    mean = float(distance.mean())
+    u = np.maximum(p[:, :1] * 0.6 + p[:, 1:2] * 0.8, 0.0) / p[:, 2:]
+    expected = {
+        'range_distortion': (distance / mean - 1.0) ** 2 * p / distance,
+        'spherical_distortion': ((distance / mean) ** 2 - 1.0) * p,
+        'one_sided_lens': p[:, 2:] * u**2 * (0.6, 0.8, 0.0),
+    }
+    # The view has two halves, and one is as it should be.
+    assert 0.1 < np.mean(u > 0.0) < 0.9
+    for kind, shift in expected.items():
+        values = np.array([0.6, 0.8]) if kind == 'one_sided_lens' else np.ones(1)
+        effect = HiddenEffect(kind, (), 1e-3 * values, {'sensor': 'mocap', 'distance_m': mean})
+        response = iiwa.response(effect)
+        np.testing.assert_allclose(_of_sensor(iiwa, response, 'mocap'), 1e-3 * shift, atol=1e-12)
+        np.testing.assert_allclose(_of_sensor(iiwa, response, 'tracker'), 0.0, atol=1e-12)
+
+
+def test_steps_begin_at_their_moment_and_strike_one_thing(iiwa: HiddenWorld) -> None:
+    moment = float(np.median(iiwa.visited.time_s))
+    after = iiwa.visited.time_s > moment
+    tool = iiwa.circumstances.tool
+    turn_R = np.swapaxes(iiwa.sensors['tracker'].T_R_N[:3, :3], 0, 1)
+    slip = np.array([1e-3, -2e-3, 3e-3])
+    detail = {'marker': 'smr', 'moment_s': moment}
+    response = iiwa.response(HiddenEffect('slipped_marker', (), slip, detail))
+    expected = after[:, None] * (tool @ slip) @ turn_R.T
+    np.testing.assert_allclose(_of_sensor(iiwa, response, 'tracker'), expected, atol=1e-12)
+    np.testing.assert_allclose(_of_sensor(iiwa, response, 'mocap'), 0.0, atol=1e-12)
+
+    bump = np.array([1e-3, 0.0, 0.0, 0.0, 2e-3, 0.0])
+    detail = {'sensor': 'mocap', 'moment_s': moment}
+    response = iiwa.response(HiddenEffect('bumped_sensor', (), bump, detail))
+    x, y, z = _of_sensor(iiwa, iiwa.seen(), 'mocap').T
+    expected = after[:, None] * np.column_stack((1e-3 + 2e-3 * z, 0 * y, -2e-3 * x))
+    np.testing.assert_allclose(_of_sensor(iiwa, response, 'mocap'), expected, atol=1e-12)
+    np.testing.assert_allclose(_of_sensor(iiwa, response, 'tracker'), 0.0, atol=1e-12)
+
+
+def test_noise_remembers_and_has_tails() -> None:
+    seed = 41
+    print(f'seed {seed}')
+    sensor = np.tile(np.arange(2), 20_000)
+    for memory in (0.7, 0.97):
+        z = Noise(memory=memory).draw(sensor, np.random.default_rng(seed))[sensor == 1]
+        # 20,000 rows, of which some 300 are independent at 0.97.
+        assert np.mean(z**2) == pytest.approx(1.0, abs=0.3)
+        assert np.mean(z[1:] * z[:-1]) / np.mean(z**2) == pytest.approx(memory, abs=0.03)
+    z = Noise(degrees_of_freedom=5.0).draw(sensor, np.random.default_rng(seed))
+    assert np.mean(z**2) == pytest.approx(1.0, abs=0.1)
+    # A normal distribution has 6e-5 beyond four standard deviations.
+    assert np.mean(np.abs(z) > 4.0) > 1e-3
+
+
+def test_readings_paired_wrongly_are_those_of_the_configuration_before() -> None:
+    hidden = world('six', np.random.default_rng(43), sensors=('mocap', 'tracker'))
+    noise = Noise(1e-6, mispaired_share=0.05)
+    session, truth = hidden.measure((), noise, np.random.default_rng(47))
+    position = session.measurements.position
+    assert 0.02 < len(truth.outliers) / len(position) < 0.09
+    assert truth.faults == ('pairing',)
+    before = truth.clean[truth.outliers - 2]
+    np.testing.assert_allclose(position[truth.outliers], before, atol=1e-5)
+    good = np.setdiff1d(np.arange(len(position)), truth.outliers)
+    np.testing.assert_allclose(position[good], truth.clean[good], atol=1e-5)
+
+
+@pytest.mark.parametrize('where', ['plane', 'region'])
+def test_poses_lie_where_they_are_to(where: str) -> None:
+    hidden = world('six', np.random.default_rng(53), tour=visits('six', 0, 40, where=where))
+    points = hidden.seen()
+    spread = np.linalg.svd(points - points.mean(axis=0))[1] / np.sqrt(len(points))
+    assert len(hidden.visits.q) > 50
+    if where == 'plane':
+        # The offsets and the marker move points off the plane on which they were planned.
+        assert spread[2] < 4e-3 < 0.1 < spread[1]
+    else:
+        assert spread[0] < 0.15
+
+
+def test_a_third_set_is_of_the_same_arm_and_time(iiwa: HiddenWorld) -> None:
+    """On the session's own visits it is the session, but for the times between."""
+    effect = draw_effect(iiwa, 'encoder_scale', np.random.default_rng(11), 0.3e-3)
+    again = iiwa.on(iiwa.visits)
+    np.testing.assert_allclose(again.seen([effect]), iiwa.seen([effect]), rtol=0, atol=1e-12)
+    assert again.stamp_s[0] == iiwa.stamp_s[0]
+    assert again.stamp_s[-1] == pytest.approx(iiwa.stamp_s[-1])
+    other = iiwa.on(visits('iiwa7', 100, 20))
+    seen = other.without_noise(()).measurements
+    assert len(np.unique(seen.pose)) > 8
+    assert not set(map(tuple, seen.q)) & set(map(tuple, iiwa.visits.q))
 
 
 def test_noise_has_the_given_size_and_shape() -> None:

@@ -13,7 +13,15 @@ import pytest
 pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 
 from hidden_judge import judge
-from hidden_sessions import NOISES, Recipe, another_session, held_out_noise_m, hidden_session
+from hidden_sessions import (
+    NOISES,
+    Recipe,
+    another_session,
+    held_out_noise_m,
+    hidden_session,
+    third_visits,
+)
+from hidden_third import predicted_by, predicted_by_offsets, third_errors
 
 from remaster_ros.discovery.confirmation import confirm
 from remaster_ros.discovery.discover import Discovery, discover_session
@@ -112,3 +120,21 @@ def test_causes_carry_over_to_a_session_of_the_same_arm_until_they_are_removed()
     assert not repaired.confirmed
     # Frozen causes of an arm that no longer has them make its errors worse.
     assert repaired.rms_after_m > repaired.rms_before_m
+
+
+def test_what_was_found_predicts_a_third_set_better_than_the_offsets() -> None:
+    """Causes at a joint, in the sensor, over time: all that a prediction is made of."""
+    recipe = Recipe(SEED, ('registration_drift', 'backlash', 'sensor_scale'), CLEAR)
+    found, hidden = discovered(recipe)
+    rows = hidden.session.measurements
+    np.testing.assert_allclose(
+        predicted_by(found, hidden.session), rows.position - found.fit.residuals_after, atol=1e-9
+    )
+    offsets = rows.position - predicted_by_offsets(hidden.session, hidden.session)
+    fitted = ~rows.is_validation
+    # A mode without causes is no sampled mean, but near it.
+    assert np.std(offsets[fitted]) > np.std(found.fit.residuals_after[fitted])
+    third = third_errors(hidden.world, hidden.truth.effects, third_visits(recipe), found)
+    print(third)
+    assert third.returned_m < 0.5 * third.offsets_m
+    assert not third.harm

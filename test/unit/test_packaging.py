@@ -40,6 +40,7 @@ DISTRIBUTION = {
     'collada': 'pycollada',
     'coal': 'pin',
     'hppfcl': 'pin',
+    'dateutil': 'python-dateutil',
 }
 # Brought by rclpy itself, as wheel and as Debian package.
 WITH_RCLPY = {'rcl_interfaces'}
@@ -146,7 +147,12 @@ def test_package_xml_names_every_requirement_or_how_to_get_it(
         for e in ElementTree.fromstring(text).iter('exec_depend')
         if e.text
     }
-    known = {'pyyaml': 'yaml', 'pycollada': 'collada', 'pin': 'coal'}
+    known = {
+        'pyyaml': 'yaml',
+        'pycollada': 'collada',
+        'pin': 'coal',
+        'python-dateutil': 'dateutil',
+    }
     required = {normal(line) for line in setup_arguments['install_requires']}
     by_rosdep = {name for name in required if known.get(name, name) in depends}
     assert by_pip | by_rosdep == required

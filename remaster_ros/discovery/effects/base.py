@@ -14,12 +14,16 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.types import FloatArray
 
 Place = Literal[
     'joint_angle', 'link_translation', 'link_rotation', 'base_rotation', 'marker', 'sensor_frame'
 ]
 PLACES: tuple[Place, ...] = get_args(Place)
+# RMS displacement of the marker that a cause without a plausible range is taken to have at most.
+LARGEST_M = 10e-3
+NO_TIMES = 'the session has no times (times: none), only the order of its rows'
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +54,25 @@ class Design:
 
 
 @dataclass(frozen=True, eq=False)
+class ModelChange:
+    """What a unit of each of m parameters changes for good in the robot model: a joint's origin.
+
+    Attributes
+    ----------
+    joint
+        Index of the joint, from 0.
+    shifts
+        Of its origin, in the frame of the link before, m per unit, (m, 3).
+    turns
+        Of its frame, about axes of that frame, rad per unit, (m, 3).
+    """
+
+    joint: int
+    shifts: FloatArray
+    turns: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Cell:
     """One candidate cause: a place, a driver and a form, with its parameters.
 
@@ -73,6 +96,20 @@ class Cell:
         Distinguishes cells of the same name and joints: the order of a harmonic, an axis.
     subject
         The sensor or marker it is about; '' where it is about joints or the whole arm.
+    largest
+        Standard deviation of the prior on each parameter about 0, in ``unit``: the largest that is
+        plausible. None: what displaces the marker by `LARGEST_M`.
+    sign
+        Of the parameters, where physics has only one: 1 or -1; 0 for both.
+    moment
+        When it happened, s since the first row; NaN for what does not happen at one moment.
+    moment_std
+        How well the rows date it, s; NaN as long as that was not judged.
+    curve
+        For free forms of one driver: their splines, one parameter each, or one for each of three
+        axes, those of a spline next to each other; None else.
+    model_change
+        The same as a change of the robot model, where it is one; None else.
     """
 
     name: str
@@ -87,6 +124,12 @@ class Cell:
     penalty: FloatArray | None = None
     variant: str = ''
     subject: str = ''
+    largest: float | None = None
+    sign: int = 0
+    moment: float = np.nan
+    moment_std: float = np.nan
+    curve: Curve | None = None
+    model_change: ModelChange | None = None
 
     @property
     def size(self) -> int:
@@ -100,8 +143,9 @@ class Cell:
 
     @property
     def label(self) -> str:
-        """Subject and variant in one."""
-        return f'{self.subject} {self.variant}'.strip()
+        """Subject, variant and moment in one."""
+        moment = '' if np.isnan(self.moment) else f'{self.moment:.3f} s'
+        return ' '.join(part for part in (self.subject, self.variant, moment) if part)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,12 +163,20 @@ class Effect:
     unit
         Of its parameters.
     plausible
-        Range of size that real machines have, in ``unit``.
+        Range of size that real machines have, in ``unit``; its upper end is the standard deviation
+        of the prior on each parameter. None where nothing is known.
+    sign
+        Of its parameters, as of `Cell`.
     sentence
         For a technician; ``{subject}`` (its joints or sensor), ``{other}`` (the joint that
         drives) and ``{driver}`` are filled in.
     separate_by
         Which measurements distinguish it from others.
+    remedy
+        What to do about it: a sentence for whoever answers for the arm.
+    size
+        What a cell amounts to, for a sentence: of context, cell and draws of its parameters
+        (draws, m); see `sizes`.
     cells
         All of its cells for a context.
     needs
@@ -142,6 +194,13 @@ class Effect:
     moves_the_fit
         The offsets model absorbs it: it is judged by how far that fit moved the markers
         (`marker_offsets`), not by the residuals.
+    reported_as
+        Name in discovery.json, where it is another: 'unnamed' for what has no name of its own.
+    is_cause
+        False for structure that is located without a cause: it is reported as unexplained.
+    between
+        For what happened at one moment: its cells at all moments between two, s since the first
+        row.
     driven_by_joint
         Its cells' second joint is the one that drives; the sentence is about the first.
     """
@@ -153,9 +212,11 @@ class Effect:
     equation: str
     source: str
     unit: str
-    plausible: tuple[float, float]
+    plausible: tuple[float, float] | None
     sentence: str
     separate_by: str
+    remedy: str
+    size: Callable[[Context, Cell, FloatArray], str]
     cells: Callable[[Context], Iterable[Cell]]
     needs: Callable[[Context], str] = field(default=lambda context: '')
     family: str = ''
@@ -164,12 +225,18 @@ class Effect:
     costly: bool = False
     moves_the_fit: bool = False
     driven_by_joint: bool = False
+    sign: int = 0
+    reported_as: str = ''
+    is_cause: bool = True
+    between: Callable[[Context, float, float], Iterable[Cell]] | None = None
 
     def cell(
         self, columns: Callable[[Context], Design], parameters: Iterable[str], **more: Any
     ) -> Cell:
         """Return a cell of this effect; ``more`` are further arguments of `Cell`."""
-        own = {name: getattr(self, name) for name in ('name', 'place', 'driver', 'form', 'unit')}
+        names = ('name', 'place', 'driver', 'form', 'unit', 'sign')
+        own = {name: getattr(self, name) for name in names}
+        own['largest'] = self.plausible[1] if self.plausible else None
         return Cell(columns=columns, parameters=tuple(parameters), **{**own, **more})
 
     def at_joints(
@@ -229,4 +296,6 @@ def needs_approach(context: Context) -> str:
 
 def needs_time(context: Context) -> str:
     """Return why drift cannot be tested; '' where it can."""
-    return '' if context.has_time else 'all rows have the same time'
+    if context.has_time:
+        return ''
+    return 'all rows have the same time' if context.timed else NO_TIMES

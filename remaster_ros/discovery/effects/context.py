@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +17,8 @@ GRAVITY = (0.0, 0.0, -9.81)
 STILL_RAD = 1e-4
 # A joint that turns less than this in all stands still.
 LEAST_TURN_RAD = 1e-2
+# A joint with a range of more than this turns over: limits of ±180 degrees are just one turn.
+MORE_THAN_A_TURN = 2.0 * np.pi + LEAST_TURN_RAD
 # A driver known in a smaller share of the rows cannot be tested.
 KNOWN_SHARE = 0.8
 # Temperatures that vary less than this drive nothing that could be seen.
@@ -43,6 +45,8 @@ class Context:
         As fitted, in the tool frame, m, (markers, 3).
     T_R_N
         As fitted, (sensors, 4, 4).
+    timed
+        False where the rows' times only order them.
     """
 
     chain: SerialChain
@@ -52,6 +56,7 @@ class Context:
     joint_offsets: FloatArray
     markers: FloatArray
     T_R_N: FloatArray
+    timed: bool = field(default=True, kw_only=True)
 
     def __len__(self) -> int:
         """Return the number of rows n."""
@@ -154,9 +159,16 @@ class Context:
         return self.measurements.stamp_s - self.measurements.stamp_s.min()
 
     @cached_property
+    def progress(self) -> FloatArray:
+        """Place of each row in the order of time, from 0 (the first) to 1 (the last), (n,)."""
+        _, rank = np.unique(self.elapsed_s, return_inverse=True)
+        progress: FloatArray = rank / max(1, int(rank.max()))
+        return progress
+
+    @cached_property
     def has_time(self) -> bool:
-        """Whether the rows lie apart in time."""
-        return bool(np.ptp(self.elapsed_s) > 0.0)
+        """Whether the rows' times are known and lie apart."""
+        return self.timed and bool(np.ptp(self.elapsed_s) > 0.0)
 
     @cached_property
     def warming(self) -> FloatArray:
@@ -216,6 +228,7 @@ class Context:
             self.T_R_N,
             self,
             rows,
+            timed=self.timed,
         )
 
     def blocks(self, rows: int = BLOCK_ROWS) -> Iterator[tuple[slice, Context]]:
@@ -233,6 +246,15 @@ class Context:
     def seen_by(self, sensor: int) -> BoolArray:
         """Return which rows a sensor measured, (n,)."""
         return self.sensor == sensor
+
+    @cached_property
+    def to_fit(self) -> BoolArray:
+        """Which rows are not held out, (n,)."""
+        return ~self.measurements.is_validation
+
+    def turns_over(self, joint: int) -> bool:
+        """Return whether a joint (1-based) can turn on past a whole turn: it is then the same."""
+        return bool(self.chain.upper[joint - 1] - self.chain.lower[joint - 1] > MORE_THAN_A_TURN)
 
     @cached_property
     def moving(self) -> tuple[int, ...]:
@@ -283,6 +305,11 @@ class PartOfContext(Context):
     def elapsed_s(self) -> FloatArray:
         """Time since the first row of the whole, s, (n,)."""
         return self.whole.elapsed_s[self.rows]
+
+    @cached_property
+    def progress(self) -> FloatArray:
+        """As of the whole, (n,)."""
+        return self.whole.progress[self.rows]
 
     @cached_property
     def has_time(self) -> bool:

@@ -7,8 +7,9 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, turned
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, ModelChange, turned
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import angle
 from remaster_ros.types import FloatArray
 
 # A tilt along the axis before is, with that joint's zero-offset, another name for a shift of the
@@ -23,12 +24,14 @@ def cells(context: Context) -> Iterator[Cell]:
         # A tilt has any direction; on a whole arm some of them are other names for a link's.
         for axes in (''.join(directions), *directions):
             rarity = 1 if len(axes) > 1 else RARITY * len(directions)
+            turns = np.array([directions[axis] for axis in axes])
             yield EFFECT.cell(
-                partial(_tilted, joint=joint, axes=[directions[axis] for axis in axes]),
+                partial(_tilted, joint=joint, axes=list(turns)),
                 [f'tilt_{axis}_{joint}' for axis in axes],
                 joints=(joint,),
                 drawn_from=(context.joints - 1) * rarity,
                 variant=axes,
+                model_change=ModelChange(joint - 1, np.zeros((len(axes), 3)), turns),
             )
 
 
@@ -45,6 +48,12 @@ def tilt_directions(context: Context, joint: int) -> dict[str, FloatArray]:
     }
 
 
+def _tilt(context: Context, cell: Cell, draws: FloatArray) -> str:
+    size = np.linalg.norm(draws, axis=1) if cell.size > 1 else draws[:, 0]
+    axes = ' and '.join(cell.variant)
+    return f'the axis of joint {cell.joints[0]} is tilted by {angle(size)} about {axes}'
+
+
 EFFECT = Effect(
     name='joint_axis_tilt',
     place='link_rotation',
@@ -56,6 +65,8 @@ EFFECT = Effect(
     plausible=(1e-5, 2e-2),
     sentence='The axis of {subject} is tilted against its drawing.',
     separate_by='all joint solutions of each pose: the tilt changes sign with the branch',
+    remedy='Put the tilts into the robot model: apply/robot_geometry.urdf has them.',
+    size=_tilt,
     cells=cells,
     family='geometry',
     in_family=lambda cell: cell.size == 1,

@@ -9,42 +9,49 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.splines import basis, centers, knot_vector, roughness
+from remaster_ros.discovery.effects.drivers import angle_of
+from remaster_ros.discovery.effects.sizes import ARC_MINUTE, number
+from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.types import FloatArray
 
 # The finest: gearbox errors have structure down to a few degrees; finer overfits any session.
 FINEST_KNOTS = np.radians(4.0)
+# Draws of the curve from which the uncertainty of its size is taken.
+DRAWS = 200
 # A shape with a name that explains as much is the better answer.
 RARITY = 10
 # Below this many configurations per knot the curve is coarser.
 ROWS_PER_KNOT = 6.0
 
 
-def knots_of(context: Context, joint: int) -> FloatArray:
-    """Return the knots of a joint's curve: over its angles, as fine as the rows allow, rad."""
-    angle = context.measurements.q[:, joint - 1]
-    low, high = float(angle.min()), float(angle.max())
-    configurations = len(np.unique(context.measurements.configuration))
-    spacing = max(FINEST_KNOTS, (high - low) * ROWS_PER_KNOT / configurations)
-    return knot_vector(low, max(high, low + 3.0 * spacing), spacing)
-
-
 def cells(context: Context) -> Iterator[Cell]:
     """One curve per joint."""
+    configurations = len(np.unique(context.measurements.configuration[context.to_fit]))
     for joint in context.moving:
-        knots = knots_of(context, joint)
-        angles = np.degrees(centers(knots))
+        curve = angle_of(joint).curve(context, ROWS_PER_KNOT / configurations, FINEST_KNOTS)
         yield EFFECT.cell(
-            partial(_splines, joint=joint, knots=knots),
-            [f'curve_{joint}_at_{angle:+.1f}deg' for angle in angles],
+            partial(_splines, joint=joint, curve=curve),
+            [f'curve_{joint}_at_{angle:+.1f}deg' for angle in np.degrees(curve.places)],
             joints=(joint,),
             drawn_from=RARITY * context.joints,
-            penalty=roughness(len(angles)),
+            penalty=curve.penalty,
+            curve=curve,
         )
 
 
-def _splines(context: Context, joint: int, knots: FloatArray) -> Design:
-    return Design(joint - 1, basis(context.measurements.q[:, joint - 1], knots))
+def _splines(context: Context, joint: int, curve: Curve) -> Design:
+    return Design(joint - 1, curve.columns(context.measurements.q[:, joint - 1]))
+
+
+def _range(context: Context, cell: Cell, draws: FloatArray) -> str:
+    joint = cell.joints[0]
+    values = cell.columns(context).values
+    middle = values @ draws.mean(axis=0) / ARC_MINUTE
+    rms = np.sqrt(np.mean((draws[:DRAWS] @ values.T / ARC_MINUTE) ** 2, axis=1))
+    return (
+        f'joint {joint} errs by {middle.min():+.1f}′ to {middle.max():+.1f}′, '
+        f'{number(float(np.sqrt(np.mean(middle**2))), float(rms.std()), "′")} RMS'
+    ).replace('-', '−')
 
 
 EFFECT = Effect(
@@ -52,14 +59,17 @@ EFFECT = Effect(
     place='joint_angle',
     driver='own_angle',
     form='free',
-    equation='δq_j = Σ_i w_i B_i(q_j), cubic B-splines, smoothness by the evidence',
+    equation='δq_j = Σ_i w_i B_i(q_j), cubic B-splines, mean 0, smoothness by the evidence',
     source='Eilers & Marx 1996, Statistical Science 11 (P-splines)',
     unit='rad',
     plausible=(1e-6, 5e-3),
-    sentence='The error of {subject} follows its own angle (gearbox or encoder): '
-    'the curve shows where.',
+    sentence='The error of {subject} follows its own angle (gearbox or encoder).',
     separate_by='poses that step the joint through its range, all else held; '
     'with and without a payload',
+    remedy='Correct the angle by the curve that was found, within the angles that were '
+    'measured; where it grows from session to session, have gearbox and encoder '
+    'checked.',
+    size=_range,
     cells=cells,
     family='joint error curves',
 )

@@ -23,6 +23,9 @@ MODULES = (
     'registration_drift',
     'sensor_scale',
     'sensor_distortion',
+    'step',
+    'sensor_field',
+    'sensor_wander',
     'unnamed',
 )
 """Modules of this package, each of which has an ``EFFECT``; in the order they are tried."""

@@ -18,6 +18,7 @@ from remaster_ros.discovery.effects.base import (
 )
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import (
+    TIME,
     Driver,
     angle_of,
     approach_of,
@@ -25,14 +26,14 @@ from remaster_ros.discovery.effects.drivers import (
     slow_drivers,
     torque_of,
 )
-from remaster_ros.discovery.effects.splines import basis, knot_vector, roughness
-from remaster_ros.types import FloatArray
+from remaster_ros.discovery.effects.sizes import at_most
+from remaster_ros.discovery.effects.splines import Curve
+from remaster_ros.types import BoolArray, FloatArray
 
 # All causes without a name together are this many times less likely than one that has a name.
 RARITY = 3
+# Knots of a free form over the range of its driver.
 FREE_KNOTS = 10
-# Something may have slipped or been bumped at any time: so many moments are tried.
-MOMENTS = 24
 
 Feature = Callable[[Context], FloatArray]
 
@@ -54,12 +55,17 @@ class _Form:
     suffixes: tuple[str, ...]
     unit: str = ''
     penalty: FloatArray | None = None
-    variant: str = ''
+    curve: Curve | None = None
+    sign: int = 0
 
 
-def _forms(context: Context, driver: Driver, *names: str) -> Iterator[_Form]:
-    """Give forms of a driver; none where it hardly varies."""
-    values = driver.value(context)
+def _forms(
+    context: Context, driver: Driver, *names: str, rows: BoolArray | None = None
+) -> Iterator[_Form]:
+    """Give forms of a driver that enter in all or some ``rows``; none where it hardly varies."""
+    values = driver.value(context)[context.to_fit if rows is None else context.to_fit & rows]
+    if not len(values):
+        return
     low, high = float(values.min()), float(values.max())
     if high - low < 1e-9:
         return
@@ -68,25 +74,14 @@ def _forms(context: Context, driver: Driver, *names: str) -> Iterator[_Form]:
         if name == 'sin/cos':
             yield form(partial(_sine_cosine, value=driver.value), ('_sin', '_cos'))
         elif name == 'free':
-            knots = knot_vector(low, high, (high - low) / FREE_KNOTS)
-            count = len(knots) - 4
-            features = partial(_spline, value=driver.value, knots=knots)
-            suffixes = tuple(f'_{i}' for i in range(count))
-            yield form(features, suffixes, penalty=roughness(count))
+            curve = driver.curve(context, 1.0 / FREE_KNOTS, rows=rows)
+            features = partial(_spline, value=driver.value, curve=curve)
+            suffixes = tuple(f'_{i}' for i in range(len(curve.places)))
+            yield form(features, suffixes, penalty=curve.penalty, curve=curve)
         else:
             power = 2 if name == 'quadratic' else 1
             unit = '' if driver.unit == '1' else f'/{driver.unit}' + ('^2' if power == 2 else '')
             yield form(partial(_power, value=driver.value, power=power), ('',), unit)
-
-
-def _steps(context: Context) -> Iterator[_Form]:
-    """Give steps at moments spread over the session, between rows."""
-    times = np.unique(context.elapsed_s)
-    if not context.has_time:
-        return
-    for i in np.unique(np.linspace(0, len(times) - 1, MOMENTS + 2).astype(int)[1:-1]):
-        after = partial(_after, moment=float(times[i]))
-        yield _Form('time', 'step', after, ('',), variant=f'{times[i]:.0f} s')
 
 
 def _power(context: Context, value: Feature, power: int) -> FloatArray:
@@ -97,12 +92,8 @@ def _sine_cosine(context: Context, value: Feature) -> FloatArray:
     return np.stack((np.sin(value(context)), np.cos(value(context))), axis=-1)
 
 
-def _after(context: Context, moment: float) -> FloatArray:
-    return (context.elapsed_s > moment).astype(float)[:, None]
-
-
-def _spline(context: Context, value: Feature, knots: FloatArray) -> FloatArray:
-    return basis(value(context), knots)
+def _spline(context: Context, value: Feature, curve: Curve) -> FloatArray:
+    return curve.columns(value(context))
 
 
 def _cell(
@@ -123,7 +114,8 @@ def _cell(
         form=form.name,
         unit=f'{unit}{form.unit}',
         penalty=form.penalty,
-        variant=form.variant,
+        curve=form.curve,
+        sign=form.sign,
         subject=subject,
     )
 
@@ -137,6 +129,14 @@ def _joint_forms(context: Context, joint: int) -> Iterator[tuple[tuple[int, ...]
 
     if joint in context.moving:
         yield from by(angle_of(joint), 'quadratic')
+        if context.has_approach:
+            # The other sign has a name: backlash and settling.
+            for driver, sign in (
+                (approach_of(joint, 'approach'), -1),
+                (last_move_of(joint, 'last_move'), 1),
+            ):
+                for joints, form in by(driver, 'linear'):
+                    yield joints, replace(form, sign=sign)
     for driver in slow_drivers(context):
         yield from by(driver, 'linear', 'quadratic', 'free')
     if context.has_gravity:
@@ -151,7 +151,6 @@ def _joint_forms(context: Context, joint: int) -> Iterator[tuple[tuple[int, ...]
         if context.has_approach and other in context.moving:
             yield from by(approach_of(other, f'approach_of_joint_{other}'), 'linear')
             yield from by(last_move_of(other, f'last_move_of_joint_{other}'), 'linear')
-    yield from (((joint,), step) for step in _steps(context))
 
 
 def _joint_angles(context: Context) -> Iterator[Cell]:
@@ -267,7 +266,7 @@ def _frames(context: Context) -> Iterator[Cell]:
         )
     for index, sensor in enumerate(context.sensor_names):
         axes = [f'{sensor}_{axis}' for axis in 'xyz']
-        for form in _sensor_forms(context):
+        for form in _sensor_forms(context, index):
             columns = partial(_shifted, turn=partial(_sensor_turn, sensor=index), form=form)
             yield _cell('sensor_frame', form, axes, 'm', columns, subject=sensor)
         for name, power, unit in (('constant', 0, 'm'), ('quadratic', 2, '1/m')):
@@ -282,17 +281,23 @@ def _frames(context: Context) -> Iterator[Cell]:
             )
 
 
-def _sensor_forms(context: Context) -> Iterator[_Form]:
-    """Give what may drive a sensor's shift; one that is linear in time has a name."""
-    yield from _steps(context)
+def _sensor_forms(context: Context, sensor: int) -> Iterator[_Form]:
+    """Give what may drive a sensor's shift; over time, a line and a wander have names."""
     for driver in slow_drivers(context):
-        for form in _forms(context, driver, 'linear', 'free'):
+        if driver == TIME:
+            continue
+        for form in _forms(context, driver, 'linear', 'free', rows=context.seen_by(sensor)):
             if form.penalty is not None:
                 # The three axes of a knot stand next to each other.
                 penalty: FloatArray = np.kron(form.penalty, np.eye(3)).astype(float)
                 yield replace(form, penalty=penalty)
-            elif form.driver != 'time':
+            else:
                 yield form
+
+
+def _size(context: Context, cell: Cell, draws: FloatArray) -> str:
+    what = f'joint {cell.joints[0]} errs' if cell.place == 'joint_angle' else 'the marker is moved'
+    return f'{what} by up to {at_most(context, cell, draws)}'
 
 
 EFFECT = Effect(
@@ -303,9 +308,12 @@ EFFECT = Effect(
     equation='δ = Σ θ_i f_i(driver) at the place',
     source='the systematic table of places, drivers and forms',
     unit='',
-    plausible=(0.0, np.inf),
+    plausible=None,
     sentence='No named cause: {place} follows {driver}.',
     separate_by='poses in which {driver} changes and all else is held',
+    remedy='Find the cause with the measurements named; until then the model that is '
+    'returned corrects it where it was measured.',
+    size=_size,
     cells=cells,
     cause_per='variant',
 )

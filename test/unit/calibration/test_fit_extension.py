@@ -106,6 +106,7 @@ def test_an_effect_that_is_a_zero_offset_in_disguise_is_held_and_named(sagging) 
     assert direction.combination['joint_3'] == pytest.approx(-1.0, abs=1e-6)
     assert direction.fixed_by == 'effect.compliance_2 = 0'
     assert 'effect.compliance_2' in gauge.why[2]
+    assert 'moves no marker' not in gauge.why[2]
     # With a prior on its size it need not be held.
     known = replace(twin, prior_precision=np.diag([1e3**2, 0.0, 0.0]))
     found = estimate(Problem.of(session), known)

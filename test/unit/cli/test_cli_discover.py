@@ -1,11 +1,13 @@
 """What `remaster discover` prints."""
 
 import types
+from dataclasses import replace
 
 from remaster_ros.cli.discover import summary
-from remaster_ros.discovery.confirmation import Confirmation
+from remaster_ros.discovery.confirmation import Confirmation, ConfirmedCause
 from remaster_ros.discovery.explain import FoundEffect, LookAlike
 from remaster_ros.discovery.gain import Gain
+from remaster_ros.discovery.side_by_side import Compared
 from remaster_ros.discovery.thinning import Thinning
 
 EFFECT = FoundEffect(
@@ -21,6 +23,7 @@ EFFECT = FoundEffect(
     cause='The weight it carries winds up joints 2 and 4.',
     size_m=0.5e-3,
     share=1.0,
+    remedy='Stiffen it.',
 )
 
 
@@ -40,6 +43,9 @@ def test_causes_look_alikes_and_gain_are_said():
     text = summary(found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {}))
     assert 'verdict: effects' in text
     assert 'joint_compliance [2, 4]: 0.500 mm, 100 % of the gain' in text
+    assert 'to do: Stiffen it.' in text
+    nothing = summary(found((replace(EFFECT, share=-0.004),), Gain(None, None, 1e-4, {}), {}))
+    assert ', 0 % of the gain' in nothing
     assert 'could be encoder_scale [2]; to distinguish: a payload' in text
     assert '1.000 mm RMS before, 0.300 mm after; the noise alone is 0.280 mm' in text
 
@@ -57,8 +63,55 @@ def test_what_was_searched_of_a_large_session_is_said():
     assert 'searched: 10000 of 80000 rows; the others fall from 0.420 to 0.390 mm RMS' in text
 
 
+def compared(name, value, other, sigmas, unit='rad/(N m)'):
+    return Compared(name, unit, value, 1e-6, other, 1e-6, sigmas)
+
+
+def confirmation(share, frozen, parameters, **more):
+    cause = ConfirmedCause(180, share, 0.9e-3, frozen, tuple(parameters))
+    given = {
+        'rows': 200,
+        'rows_common': 150,
+        'rms_before_m': 0.9e-3,
+        'rms_after_m': frozen,
+        'rms_own_m': 0.3e-3,
+        'rms_frozen_offsets_m': 0.31e-3,
+        'carried_over': share,
+        'effects': (cause,),
+        'joint_offsets': (compared('joint_2', 0.1, 0.11, 1.0, 'deg'),),
+        'confirmed': True,
+        'same_offsets': True,
+    }
+    return Confirmation(**{**given, **more})
+
+
+def test_the_other_session_is_shown_side_by_side():
+    session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {})
+    rows = [compared('compliance_2', 2e-5, 2.1e-5, 0.7)]
+    text = summary(session, confirmation(0.93, 0.35e-3, rows))
+    assert 'other session: 0.900 mm RMS without the causes, 0.350 mm with them as found' in text
+    assert '93 % of what they could gain there' in text
+    assert '150 of its 200 rows' in text
+    assert 'Confirmed: 93 % of what the other session could gain from it' in text
+    assert '+2e-05 ± 1e-06  +2.1e-05 ± 1e-06 rad/(N m)  +0.7 σ' in text
+    assert 'joint_2' in text
+    many = [compared(f'curve_2_at_{i}', 1e-4, 2e-4, 2.0) for i in range(30)]
+    text = summary(session, confirmation(0.93, 0.35e-3, many))
+    assert 'joint_compliance: 30 values, which differ by 2.0 standard deviations' in text
+
+
 def test_a_cause_that_was_cured_is_not_confirmed():
     session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {})
-    text = summary(session, Confirmation(0.3e-3, 0.9e-3, -0.9, (-0.9,), False, 0.2e-3, True))
-    assert '-90 % of the gain carries over' in text
-    assert 'Not there any more' in text
+    text = summary(session, confirmation(float('nan'), 3.3e-3, [], confirmed=False))
+    assert 'the causes could gain next to nothing there' in text
+    assert 'Not there any more: as found here it goes from 0.900 to 3.300 mm RMS' in text
+    assert 'nan' not in text
+
+
+def test_why_nothing_can_be_compared_is_said():
+    session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {})
+    nan = float('nan')
+    nothing = Confirmation(9, 0, nan, nan, nan, nan, nan, (), (), False, False, 'Too few rows.')
+    text = summary(session, nothing)
+    assert text.endswith('other session: Too few rows.')
+    assert 'nan' not in text

@@ -1,5 +1,6 @@
 """discovery.json as the contract has it, and a report that stands alone."""
 
+import csv
 import json
 import re
 from dataclasses import replace
@@ -11,10 +12,16 @@ import pytest
 from discovery_scenes import at_joint, session_with
 
 from remaster_ros.calibration.noise import Noise, NoiseModel
+from remaster_ros.compensation.export import exports
 from remaster_ros.discovery.confirmation import confirm
 from remaster_ros.discovery.discover import discover_session
+from remaster_ros.discovery.effects.base import Design
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports import discovery_figures
+from remaster_ros.reports.discovery_apply import geometry_of
 from remaster_ros.reports.discovery_json import read_discovery, save_discovery
 
 
@@ -45,6 +52,10 @@ def test_discovery_json_keeps_its_contract(saved):
     for other in effect['confusable_with']:
         assert other.keys() == {'name', 'joints', 'log_evidence_gain', 'separate_by'}
         assert other['separate_by']
+    assert re.search(r'joint 2 errs by up to [45]\.\d+′ ± 0\.\d+′', effect['cause'])
+    assert effect['sizes'][0] in effect['cause']
+    assert effect['remedy'].endswith('.')
+    assert content['least_p_value'] == pytest.approx(1.0 / 301.0)
     assert content['gain']['held_out_rms_after_m'] < content['gain']['held_out_rms_before_m']
     assert content['joint_offsets_after'][1].keys() >= {'joint', 'mean_deg', 'std_deg'}
     assert content['confirmation']['confirmed'] is True
@@ -56,6 +67,8 @@ def test_the_report_needs_nothing_else_and_names_the_cause(saved):
     page = (folder / 'report.html').read_text()
     assert not re.findall(r'(?:src|href)="(?!#)[^"]', page)
     assert found.effects[0].cause in page
+    assert f'What to do: {found.effects[0].remedy}' in page
+    assert 'p &lt; 0.0033 over all causes' in page
     assert 'sin2_2' in page
     for name in ('gain', 'drivers', 'causes'):
         ElementTree.parse(folder / 'figures' / f'{name}.svg')
@@ -75,14 +88,61 @@ def test_curves_of_a_large_session_are_drawn_at_the_rows_that_were_searched(save
     monkeypatch.setattr(discovery_figures, 'MOST_DRAWN', 0)
     few_x, few_y = curve()
     assert len(few_x) == len(found.residuals) < len(x)
-    np.testing.assert_allclose(few_y, np.interp(few_x, x, y), atol=1e-9)
+    # A gap in the line begins with what was measured, so the two differ at gaps alone.
+    known, few_known = np.isfinite(y), np.isfinite(few_y)
+    assert few_known.mean() > 0.8
+    expected = np.interp(few_x, x[known], y[known])
+    np.testing.assert_allclose(few_y[few_known], expected[few_known], atol=1e-9)
+
+
+def test_a_free_curve_is_drawn_where_it_was_measured_with_a_band_that_opens(saved):
+    found, _ = saved
+    data = found.residuals
+    q = data.context.measurements.q[:, 1]
+    # A curve of the same joint in place of the wave, with nothing measured in the middle of it.
+    away = np.abs(q - np.median(q)) > 0.3
+    cell = next(c for c in EFFECTS['joint_error_curve'].cells(data.context) if c.joints == (2,))
+    curve = Curve.of(q[away & data.context.to_fit], 0.05)
+    names = tuple(f'height_{i}' for i in range(len(curve.places)))
+    cell = replace(
+        cell,
+        curve=curve,
+        parameters=names,
+        columns=lambda context: Design(1, curve.columns(context.measurements.q[:, 1])),
+    )
+    seed = 3
+    print(f'seed {seed}')
+    covariance = 1e-8 * np.linalg.inv(
+        curve.columns(q[away]).T @ curve.columns(q[away]) + 1e-3 * curve.penalty
+    )
+    draws = np.random.default_rng(seed).multivariate_normal(0.0 * curve.places, covariance, 400)
+    solution = replace(
+        found.selection.solution, cells=(cell,), parameters=draws[0], covariance=covariance
+    )
+    drawn = replace(
+        found,
+        groups=((cell,),),
+        selection=replace(found.selection, solution=solution),
+        fit=replace(found.fit, theta_names=names, theta_draws=draws[None]),
+    )
+    (axes,) = discovery_figures.causes(drawn).axes
+    _, line = axes.lines
+    at, heights = np.radians(line.get_xdata()), line.get_ydata()
+    gap = np.abs(at - np.median(q)) < 0.2
+    assert np.all(np.isnan(heights[gap]))
+    assert np.isfinite(heights[~gap]).mean() > 0.5
+    (band,) = axes.collections
+    vertices = band.get_paths()[0].vertices
+    inside = np.abs(np.radians(vertices[:, 0]) - np.median(q)) < 0.2
+    assert np.ptp(vertices[inside, 1]) > 3.0 * np.ptp(heights[np.isfinite(heights)])
 
 
 def test_without_figures_there_is_no_report(saved, tmp_path):
     found, _ = saved
     (tmp_path / 'report.html').write_text('of an earlier run')
     assert save_discovery(found, tmp_path, figures=False) == tmp_path / 'discovery.json'
-    assert [path.name for path in tmp_path.iterdir()] == ['discovery.json']
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {'discovery.json', 'predictions.csv', 'apply'}
 
 
 def test_what_is_no_discovery_is_refused_in_one_line(saved, tmp_path):
@@ -115,3 +175,82 @@ def test_noise_along_the_line_of_sight_is_drawn_by_sensor(saved):
     figure = discovery_figures.gain(replace(found, residuals=residuals, selection=selection))
     heights = [bar.get_height() for bar in figure.axes[1].patches]
     np.testing.assert_allclose(heights, 2 * [0.6 * np.sqrt(2.0 / 3.0), 0.3 / np.sqrt(3.0)])
+
+
+def test_predictions_csv_has_every_row_with_its_covariance(saved):
+    found, folder = saved
+    content = json.loads((folder / 'discovery.json').read_text())
+    with (folder / 'predictions.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    m = found.fit.session.measurements
+    assert [int(row['observation']) for row in rows] == m.observation.tolist()
+    for axis, name in enumerate('xyz'):
+        error = [float(row[f'{name}_m']) - float(row[f'predicted_{name}_m']) for row in rows]
+        np.testing.assert_allclose(error, found.fit.residuals_after[:, axis], atol=2e-7)
+    held_out = [row for row in rows if row['held_out'] == '1']
+    assert {row['split'] for row in held_out} == {'validation'}
+    regions = content['predicted_regions95']
+    assert regions['held_out']['rows'] == len(held_out) == m.is_validation.sum()
+    assert regions['held_out']['inside'] == sum(int(row['inside95']) for row in held_out)
+    assert regions['held_out']['share'] > 0.8
+    first = rows[0]
+    matrix = [[float(first[f'cov_{min(a, b)}{max(a, b)}_m2']) for a in 'xyz'] for b in 'xyz']
+    assert np.linalg.eigvalsh(matrix).min() > 0.0
+
+
+def test_discovery_json_has_registration_markers_and_joint_covariance(saved):
+    found, folder = saved
+    content = json.loads((folder / 'discovery.json').read_text())
+    assert set(content['registration']) == set(found.fit.T_R_N)
+    assert set(content['markers']) == set(found.fit.marker_positions)
+    covariance = content['covariance']
+    known = [row['joint'] for row in content['joint_offsets_after'] if row['identifiable']]
+    assert covariance['names'] == [*known, *found.fit.theta_names]
+    assert len(covariance['units']) == len(covariance['names'])
+    matrix = np.array(covariance['matrix'])
+    np.testing.assert_allclose(matrix, matrix.T, rtol=1e-5)
+    stds = [p['std'] for effect in content['effects'] for p in effect['parameters']]
+    np.testing.assert_allclose(np.sqrt(np.diag(matrix))[len(known) :], stds, rtol=1e-3)
+
+
+def test_discover_writes_what_to_apply_and_says_what_it_leaves(saved, tmp_path):
+    found, folder = saved
+    (tmp_path / 'apply').mkdir()
+    (tmp_path / 'apply' / 'robot_geometry.urdf').write_text('of an earlier run')
+    save_discovery(found, tmp_path, figures=False)
+    for place in (folder, tmp_path):
+        names = {path.name for path in (place / 'apply').iterdir()}
+        assert names == {'remaster.txt', 'offset_layer.yaml', 'robot_calibrated.urdf'}
+    text = (folder / 'apply' / 'remaster.txt').read_text()
+    assert 'Corrected in none of these files: encoder eccentricity of joint 2.' in text
+
+
+def test_lengths_and_tilts_are_in_the_robot_model(saved):
+    """The corrected URDF moves the tool as the cells of the search do, to first order."""
+    found, _ = saved
+    context, chain = found.residuals.context, found.fit.chain
+    cells = [
+        cell
+        for name in ('link_length', 'joint_axis_tilt')
+        for cell in EFFECTS[name].cells(context)
+        if cell.size == 1
+    ]
+    seed = 4
+    print(f'seed {seed}')
+    theta = 1e-5 * np.random.default_rng(seed).standard_normal(len(cells))
+    names = tuple(cell.parameters[0] for cell in cells)
+    fit = replace(found.fit, theta_names=names, theta=theta)
+    drawn = replace(found, fit=fit, groups=(tuple(cells),))
+    files = exports(fit, geometry_of(drawn))
+    geometry = SerialChain.from_urdf(files['robot_geometry.urdf'], chain.base_link, chain.tip_link)
+    markers = context.markers[context.marker]
+    moved = geometry.positions(context.q, markers) - chain.positions(context.q, markers)
+    np.testing.assert_allclose(moved, found.residuals.displaced(cells, theta), atol=2e-9)
+    both = SerialChain.from_urdf(files['robot_calibrated.urdf'], chain.base_link, chain.tip_link)
+    offsets = np.where(fit.identifiable, fit.joint_offsets, 0.0)
+    np.testing.assert_allclose(
+        both.positions(context.q, markers),
+        geometry.positions(context.q, markers, offsets),
+        atol=1e-12,
+    )
+    assert 'The robot model holds of them' in files['remaster.txt']

@@ -26,6 +26,7 @@ from remaster_ros.reports.fit_json import (
     joint_offsets_rad,
     prepare_folder,
     read_fit,
+    save_fit,
     write_fit,
 )
 
@@ -110,12 +111,12 @@ def test_what_is_no_fit_json_is_refused(data, tmp_path):
 
 
 def test_an_output_folder_is_tried_before_the_work(tmp_path):
-    prepare_folder(tmp_path / 'out')
-    prepare_folder(tmp_path / 'out')
+    prepare_folder(tmp_path / 'out', 'fit.json')
+    prepare_folder(tmp_path / 'out', 'fit.json')
     assert list((tmp_path / 'out').iterdir()) == []
     (tmp_path / 'file').write_text('')
     with pytest.raises(InputError, match='cannot be written'):
-        prepare_folder(tmp_path / 'file')
+        prepare_folder(tmp_path / 'file', 'fit.json')
 
 
 def test_the_calibrated_urdf_is_the_robot_with_offsets(fit_result):
@@ -240,3 +241,26 @@ def test_the_approximation_and_its_check_are_in_the_file(fit_result):
     assert content['sampler']['r_hat_max'] is None
     usual = msgspec.to_builtins(fit_content(fit_result))['sampler']
     assert (usual['method'], usual['pareto_k']) == ('metropolis', None)
+
+
+def test_results_of_others_are_not_replaced(fit_result, tmp_path):
+    save_fit(fit_result, tmp_path / 'fit', figures=False)
+    prepare_folder(tmp_path / 'fit', 'fit.json')
+    with pytest.raises(InputError, match=r'holds apply, fit\.json, not written by this command'):
+        prepare_folder(tmp_path / 'fit', 'discovery.json')
+    for name, words in (
+        ('report.html', r'holds report\.html, not written by this command'),
+        ('figures', 'holds figures, '),
+        ('fit.json', r'fit\.json: is there and is no remaster-fit/1'),
+        ('discovery.json', r'holds discovery\.json, '),
+    ):
+        folder = tmp_path / f'with_{name}'
+        folder.mkdir()
+        (folder / name).write_text('{"format": "mine"}')
+        with pytest.raises(InputError, match=words):
+            prepare_folder(folder, 'fit.json')
+        assert (folder / name).read_text() == '{"format": "mine"}'
+    # What the command does not write is in nobody's way.
+    (tmp_path / 'notes').mkdir()
+    (tmp_path / 'notes' / 'mine.txt').write_text('')
+    prepare_folder(tmp_path / 'notes', 'fit.json')

@@ -143,7 +143,7 @@ def edit(path, old, new):
     ('old', 'new', 'problem'),
     [
         ('x_m,', '', ('line 1', 'column x_m is missing')),
-        ('samples,', '', ('column samples is missing',)),
+        ('samples,', '', ('line 2: ', 'columns instead of')),
         ('y_m,', 'x_m,', ("column 'x_m' is given twice",)),
         ('q2_rad,', 'q3_rad,', ('for the 2 joints',)),
         ('effort2_nm', 'effort3_nm', ('columns effort',)),
@@ -240,7 +240,7 @@ def test_only_a_line_without_its_end_counts_as_torn(session, folder, caplog):
     [
         ('remaster-session/1', 'remaster-session/2', "key 'format'"),
         ('format: remaster-session/1', '- a\n#', 'line'),
-        ('settle_s: 2.5\n', '', 'settle_s'),
+        ('settle_s: 2.5', 'settle_s: 2.5\ntimes: unknown', 'times'),
         ('settle_s: 2.5', 'settle_s: -1', 'settle_s'),
         ('settle_s: 2.5', 'settle_s: .nan', 'settle_s'),
         ('settle_s: 2.5', 'settle_s: "2.5"', 'settle_s'),

@@ -1,0 +1,214 @@
+"""Where a fit predicts each measurement, how sure it is of that, and how often it is right.
+
+To first order the prediction is Gaussian, with the covariance Σ of the parameters' posterior
+carried through the model's derivative J, and the covariance R of the sensor's noise::
+
+    C = J Σ J' + R,    R = σ_across² I + (σ_along² − σ_across²) s s'
+
+with s the direction of the line of sight. A measurement lies in the 95 % region where its squared
+Mahalanobis distance is below the quantile of chi-squared with three degrees of freedom.
+
+A model is never quite right, and its errors on poses that it was fitted to are smaller than on
+others. So C is multiplied by one factor, at least 1, such that 95 % of the fitted rows lie in
+their regions when their whole pose is left out (cross-validation; Vovk et al. 2005). Gross errors
+do not count. For a pose with the errors e, the rows' noise R and M = J Σ J' these are, without
+another fit::
+
+    e_out = R (R − M)⁻¹ e,    C_out = R (R − M)⁻¹ R
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import binomtest, chi2
+
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.result import FitResult
+from remaster_ros.kinematics.transforms import apply, inverse
+from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements
+
+REGION = 0.95
+# Rows whose derivatives are at hand at a time.
+BLOCK_ROWS = 5_000
+# So many poses determine the factor, with so many rows of each.
+MOST_POSES = 1_000
+MOST_ROWS = 60
+# Fewer say nothing of one in twenty.
+FEWEST_ROWS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """Of n rows, in the frame N of the row's sensor.
+
+    Attributes
+    ----------
+    position
+        m, (n, 3).
+    covariance
+        With the factor, m², (n, 3, 3).
+    inside
+        Whether the measured position lies in the 95 % region, (n,).
+    widening
+        The factor on standard deviations.
+    """
+
+    position: FloatArray
+    covariance: FloatArray
+    inside: BoolArray
+    widening: float
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How many measurements lie in their 95 % regions.
+
+    Attributes
+    ----------
+    rows, inside
+        Counts.
+    share
+        The latter of the former; None without rows.
+    interval95
+        Of the share, were all rows independent (Clopper & Pearson 1934); None without rows.
+    """
+
+    rows: int
+    inside: int
+    share: float | None
+    interval95: tuple[float, float] | None
+
+    @classmethod
+    def of(cls, inside: BoolArray) -> Coverage:
+        """Count (n,)."""
+        rows, count = len(inside), int(inside.sum())
+        if rows == 0:
+            return cls(0, 0, None, None)
+        interval = binomtest(count, rows).proportion_ci(0.95)
+        return cls(rows, count, count / rows, (float(interval.low), float(interval.high)))
+
+
+def predict(fit: FitResult, measurements: Measurements) -> Predictions:
+    """Predict all rows of a session.
+
+    Parameters
+    ----------
+    fit
+        The posterior.
+    measurements
+        Those that were fitted, in the model's order of sensors and markers.
+    """
+    model, draws = fit.predictive.model, fit.predictive.draws
+    root = (draws - draws.mean(axis=0)) / np.sqrt(max(1, len(draws) - 1))
+    # Σ = L' L with the triangle L of the draws: rounding leaves it positive.
+    triangle = np.asarray(np.linalg.qr(root, 'r'))
+    every = Rows.of(measurements, np.arange(len(measurements)), model.reference)
+    position = np.empty((len(measurements), 3))
+    covariance = np.empty((len(measurements), 3, 3))
+    for first, last in every.blocks(BLOCK_ROWS):
+        part = _Part.of(fit, every.of_groups(first, last), triangle)
+        source = part.rows.source
+        found = part.spread @ np.swapaxes(part.spread, 1, 2) + part.own_noise + part.pose_noise
+        to_sensor = inverse(model.reference)[part.sensor]
+        turn = to_sensor[:, :3, :3]
+        position[source] = apply(to_sensor, part.place)
+        covariance[source] = turn @ found @ np.swapaxes(turn, 1, 2)
+    limit = float(chi2.ppf(REGION, 3))
+    left_out = _left_out_distances(fit, measurements, triangle)
+    factor = 1.0
+    if len(left_out) >= FEWEST_ROWS:
+        factor = max(1.0, float(np.quantile(left_out, REGION)) / limit)
+    covariance *= factor
+    distance = _distances(measurements.position - position, covariance)
+    return Predictions(position, covariance, distance <= limit, float(np.sqrt(factor)))
+
+
+def _distances(errors: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return squared Mahalanobis distances (n,) of errors (n, 3)."""
+    solved = np.linalg.solve(covariance, errors[..., None])[..., 0]
+    distances: FloatArray = np.einsum('ni,ni->n', errors, solved)
+    return distances
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Some rows with what their covariance is made of, in the references' base coordinates.
+
+    Attributes
+    ----------
+    rows, sensor
+        n rows, and the sensor of each, (n,).
+    place
+        Predicted, m, (n, 3).
+    spread
+        A root of the covariance by the parameters, m, (n, 3, size).
+    own_noise, pose_noise
+        Covariance of the noise of one row, and of what rows of a pose share, m², (n, 3, 3).
+    """
+
+    rows: Rows
+    sensor: IntArray
+    place: FloatArray
+    spread: FloatArray
+    own_noise: FloatArray
+    pose_noise: FloatArray
+
+    @classmethod
+    def of(cls, fit: FitResult, rows: Rows, triangle: FloatArray) -> _Part:
+        predictive = fit.predictive
+        model = predictive.model
+        sensor = rows.group_sensor[rows.group_of_row]
+        place = model.predict(predictive.after, rows)
+        spread = model.jacobian(predictive.after, rows) @ triangle.T
+        sight = place - model.reference[sensor, :3, 3]
+        sight /= np.linalg.norm(sight, axis=1)[:, None]
+        squares = sight[:, :, None] * sight[:, None, :]
+
+        def covariance(variances: FloatArray) -> FloatArray:
+            along, across = variances[sensor].T
+            total: FloatArray = across[:, None, None] * np.eye(3)
+            return total + (along - across)[:, None, None] * squares
+
+        own, shared = _variances(fit)
+        return cls(rows, sensor, place, spread, covariance(own), covariance(shared))
+
+
+def _variances(fit: FitResult) -> tuple[FloatArray, FloatArray]:
+    """Return the noise of one row and that shared by a pose, m², (sensors, 2): along, across."""
+    own, shared = [], []
+    for name in fit.predictive.model.sensor_names:
+        noise = fit.noise[name]
+        sides = [noise.directions.get(side, noise) for side in ('along', 'across')]
+        own.append([side.sigma_m**2 for side in sides])
+        shared.append([(side.pose_sigma_m or 0.0) ** 2 for side in sides])
+    return np.array(own), np.array(shared)
+
+
+def _left_out_distances(
+    fit: FitResult, measurements: Measurements, triangle: FloatArray
+) -> FloatArray:
+    """Return the squared distances of fitted rows, their whole pose left out of the fit."""
+    gross = [observation for observation, _ in fit.left_out]
+    fitted = ~measurements.is_validation & ~np.isin(measurements.observation, gross)
+    poses = np.unique(measurements.pose[fitted])
+    distances = []
+    for pose in poses[:: -(-len(poses) // MOST_POSES)]:
+        source = np.flatnonzero(fitted & (measurements.pose == pose))[:MOST_ROWS]
+        rows = Rows.of(measurements, source, fit.predictive.model.reference)
+        part = _Part.of(fit, rows, triangle)
+        n = len(rows)
+        same = rows.group_of_row[:, None] == rows.group_of_row
+        # Rows of a pose share an error: their noise is one matrix of n × n blocks.
+        noise = np.einsum('nm,nij->nimj', same.astype(float), part.pose_noise)
+        noise[np.arange(n), :, np.arange(n)] += part.own_noise
+        R = noise.reshape(3 * n, 3 * n)
+        root = part.spread.reshape(3 * n, -1)
+        error = (rows.target - part.place).ravel()
+        out = R @ np.linalg.solve(R - root @ root.T, np.column_stack((error, R)))
+        blocks = out[:, 1:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+        found = _distances(out[:, 0].reshape(n, 3), blocks)
+        # A pose that alone determines a parameter is far out, whatever rounding makes of it.
+        distances.append(np.where(found >= 0.0, found, np.inf))
+    return np.concatenate(distances) if distances else np.zeros(0)

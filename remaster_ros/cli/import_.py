@@ -1,0 +1,215 @@
+"""Make a session of anybody's table of joint angles and points, or of a ROS bag."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.cli.options import names, number
+from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.importing.assemble import (
+    SessionOptions,
+    assemble,
+    corrected,
+    refuse_outside_limits,
+)
+from remaster_ros.importing.bags import is_bag, read_bag
+from remaster_ros.importing.columns import Told
+from remaster_ros.importing.robots import read_robot
+from remaster_ros.importing.rows import RawRows, TableOptions, read_rows
+from remaster_ros.importing.sense import Sense, check_sense
+from remaster_ros.importing.units import ANGLES, LENGTHS
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.reader import write_session
+from remaster_ros.types import Session
+
+SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'bar': '|', 'blank': ' '}
+DECIMALS = {'comma': ',', 'point': '.'}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``remaster import``."""
+    parser.add_argument(
+        'files',
+        metavar='FILE',
+        type=Path,
+        nargs='+',
+        help='a table with joints and points, or two to be joined; or a ROS bag',
+    )
+    parser.add_argument('--out', metavar='SESSION', type=Path, required=True, help='new folder')
+    parser.add_argument('--urdf', metavar='FILE', type=Path, required=True, help='the nominal arm')
+    parser.add_argument('--base-link', metavar='LINK', help='frame R (default: the root link)')
+    parser.add_argument(
+        '--tip-link', metavar='LINK', help='frame T, in which the marker is (default: proposed)'
+    )
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    table = parser.add_argument_group('what the columns are, where it was not found')
+    table.add_argument('--joints', metavar='COLUMN,…', type=names, default=(), help='base to tip')
+    table.add_argument('--points', metavar='X,Y,Z', type=names, default=(), help='measured points')
+    table.add_argument('--time', metavar='COLUMN', default='', help="or 'none' to leave it out")
+    table.add_argument('--names', metavar='COLUMN', default='', help='by which to join two tables')
+    table.add_argument('--angles', choices=tuple(ANGLES), default='', help='unit of the joints')
+    table.add_argument('--length', choices=tuple(LENGTHS), default='', help='unit of the points')
+    table.add_argument('--separator', choices=tuple(SEPARATORS), help='between the columns')
+    table.add_argument('--decimal', choices=tuple(DECIMALS), help='decimal sign')
+    table.add_argument('--encoding', metavar='NAME', default='', help='such as utf-8 or cp1252')
+    table.add_argument(
+        '--join', choices=('name', 'time', 'order'), default='', help='how two tables are joined'
+    )
+    table.add_argument(
+        '--within',
+        metavar='S',
+        type=number(unit='s'),
+        default=1.0,
+        help='largest difference of times that are joined (default 1)',
+    )
+    arm = parser.add_argument_group('corrections of the joints, by column or joint')
+    arm.add_argument(
+        '--reverse', metavar='JOINT,…', type=names, default=(), help='counts the other way round'
+    )
+    arm.add_argument(
+        '--offset',
+        metavar='JOINT=DEG',
+        type=_offset,
+        action='append',
+        default=[],
+        help='add an angle to a joint; may be repeated',
+    )
+    session = parser.add_argument_group('the session')
+    session.add_argument('--sensor', metavar='NAME', default='sensor', help='default: sensor')
+    session.add_argument('--marker', metavar='NAME', default='marker', help='default: marker')
+    session.add_argument(
+        '--marker-mm',
+        metavar=('X', 'Y', 'Z'),
+        type=number(-3000.0, 3000.0, 'mm'),
+        nargs=3,
+        help='the marker in the tip link, mm (default: unknown, and fitted)',
+    )
+    session.add_argument(
+        '--marker-std-mm',
+        metavar='S',
+        type=number(0.0, 400.0, 'mm'),
+        help='how well that is known (default 0.5; 300 where unknown)',
+    )
+    session.add_argument(
+        '--hold-out',
+        metavar='SHARE',
+        type=number(0.0, 0.5),
+        default=0.25,
+        help='share of the poses held out where the table names none (default 0.25)',
+    )
+    session.add_argument(
+        '--visited-in-order',
+        action='store_true',
+        help='the arm went from row to row and nowhere between: fills from_q, for backlash',
+    )
+    session.add_argument(
+        '--unchecked', action='store_true', help='write it also where it does not fit the robot'
+    )
+
+
+def _offset(text: str) -> tuple[str, float]:
+    """Argument type: a joint and an angle in degrees."""
+    name, sign, angle = text.rpartition('=')
+    if not sign or not name:
+        raise argparse.ArgumentTypeError(f'{text!r} is not JOINT=DEGREES, such as A2=-90')
+    return name, number(-360.0, 360.0, 'degrees')(angle)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, show what was read, try it against the robot, write."""
+    urdf, chain = read_robot(args.urdf, args.base_link, args.tip_link)
+    with progress_bar(args.quiet or args.json) as progress:
+        progress('reading', 0.0)
+        rows = _read(args, chain).in_order()
+        options = _session_options(args)
+        q = corrected(rows, chain, options)
+        notes = f'imported from {", ".join(path.name for path in args.files)}'
+        rng = np.random.default_rng(args.seed)
+        session, how = assemble(rows, q, urdf, chain, options, rng, notes)
+        sense = check_sense(session, rows, progress)
+    if not args.json:
+        show(args.quiet, _as_text(rows, session, how))
+    if sense.fits or args.unchecked:
+        refuse_outside_limits(rows, chain, q)
+        write_session(args.out, session)
+    if args.json:
+        print(
+            json.dumps(_as_json(args.out if sense.fits or args.unchecked else None, rows, sense))
+        )
+    if not sense.fits and not args.unchecked:
+        remedy = f'to write it so, add {sense.options}' if sense.options else 'nothing was written'
+        raise InsufficientDataError(
+            f'{sense.sentence}; {remedy}; to write it as it is, add --unchecked'
+        )
+    if not args.json:
+        show(args.quiet, sense.sentence)
+        show(args.quiet, f'written: {args.out}; go on with: remaster fit {args.out} --out …')
+    return 0
+
+
+def _read(args: argparse.Namespace, chain: SerialChain) -> RawRows:
+    bags = [path for path in args.files if is_bag(path)]
+    if bags:
+        if len(args.files) > 1:
+            raise InputError(f'{bags[0]}: a bag is imported alone; give one file')
+        return read_bag(bags[0], chain, args.joints, args.points, args.length)
+    if len(args.files) > 2:
+        raise InputError(f'{len(args.files)} files; give one table, or two that are to be joined')
+    return read_rows(
+        args.files,
+        chain,
+        TableOptions(
+            separator=SEPARATORS.get(args.separator, ''),
+            decimal=DECIMALS.get(args.decimal, ''),
+            encoding=args.encoding,
+            angles=args.angles,
+            length=args.length,
+            told=Told(args.joints, args.points, args.time, args.names),
+            join=args.join,
+            within_s=args.within,
+        ),
+    )
+
+
+def _session_options(args: argparse.Namespace) -> SessionOptions:
+    return SessionOptions(
+        reverse=args.reverse,
+        add_rad={name: np.radians(angle) for name, angle in args.offset},
+        sensor=args.sensor,
+        marker=args.marker,
+        marker_m=None if args.marker_mm is None else tuple(1e-3 * v for v in args.marker_mm),
+        marker_std_m=None if args.marker_std_mm is None else 1e-3 * args.marker_std_mm,
+        hold_out=args.hold_out,
+        visited_in_order=args.visited_in_order,
+    )
+
+
+def _as_text(rows: RawRows, session: Session, how: list[str]) -> str:
+    """Return what was read and how it was understood."""
+    width = max(map(len, rows.columns))
+    lines = [*rows.description]
+    lines += [f'  {column:{width}s}  {meaning}' for column, meaning in rows.columns.items()]
+    lines += [f'warning: {warning}' for warning in rows.warnings]
+    lines.append(
+        f'{len(session.measurements)} rows; joints between {session.base_link} and '
+        f'{session.tip_link}; '
+        + ('times as given' if session.timed else 'no times: causes driven by time are untestable')
+    )
+    return '\n'.join([*lines, *how])
+
+
+def _as_json(out: Path | None, rows: RawRows, sense: Sense) -> dict[str, Any]:
+    return {
+        'session': None if out is None else str(out),
+        'columns': rows.columns,
+        'warnings': list(rows.warnings),
+        'hint': '' if sense.fits else f'{sense.sentence}; {sense.options}'.rstrip('; '),
+        'fits': sense.fits,
+        'error_mm': None if sense.error_m is None else 1e3 * sense.error_m,
+    }

@@ -1,0 +1,114 @@
+"""Sensor field: errors that follow the place in a sensor's volume in any smooth way.
+
+A Gaussian process over the position in the sensor frame, one for each axis, by a basis of kernels
+at some places of the volume (subset of regressors); and a free form of the distance, along the
+line of sight. It has no cause: it locates what no effect with a name explains, and the model that
+is sampled contains it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+from scipy.cluster.vq import kmeans2
+from scipy.spatial.distance import cdist
+
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import up_to
+from remaster_ros.discovery.effects.splines import basis, knot_vector, mean_penalty, roughness
+from remaster_ros.types import FloatArray
+
+# Lengths of the kernel, of the RMS distance from the middle of the volume: about a quadratic and
+# a quartic field.
+LENGTHS = {'smooth': 1.5, 'fine': 0.7}
+MOST_CENTERS = 30
+RANGE_KNOTS = 8
+POSES_PER_CENTER = 1.5
+# A cause with a name that explains as much is the better answer.
+RARITY = 20
+JITTER = 1e-6
+
+
+def cells(context: Context) -> Iterator[Cell]:
+    """Each sensor, with a long and with a short length, and along the line of sight."""
+    for index, name in enumerate(context.sensor_names):
+        mine = context.seen_by(index)
+        poses = len(np.unique(context.measurements.pose[mine]))
+        count = min(MOST_CENTERS, int(poses / POSES_PER_CENTER))
+        places = context.in_sensor[mine]
+        spread = float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1))))
+        if count < 4 or spread == 0.0:
+            continue
+        rarity = RARITY * (len(LENGTHS) + 1) * len(context.sensor_names)
+        # A fixed seed: the centers are a property of the places.
+        centers, _ = kmeans2(places, count, minit='++', rng=np.random.default_rng(0))
+        for variant, factor in LENGTHS.items():
+            length = factor * spread
+            kernel = _kernel(centers, centers, length) + JITTER * np.eye(count)
+            yield EFFECT.cell(
+                partial(_field, sensor=index, centers=centers, length=length),
+                [f'field_{axis}_{variant}_{name}_{i}' for i in range(count) for axis in 'xyz'],
+                # The three axes of a center stand next to each other.
+                penalty=np.kron(kernel, np.eye(3)),
+                drawn_from=rarity,
+                variant=variant,
+                subject=name,
+            )
+        distance = context.range_m[mine]
+        knots = knot_vector(distance.min(), distance.max(), np.ptp(distance) / RANGE_KNOTS)
+        yield EFFECT.cell(
+            partial(_along_sight, sensor=index, knots=knots),
+            [f'field_range_{name}_{i}' for i in range(len(knots) - 4)],
+            penalty=roughness(len(knots) - 4) + mean_penalty(len(knots) - 4),
+            drawn_from=rarity,
+            variant='range',
+            subject=name,
+        )
+
+
+def _kernel(places: FloatArray, centers: FloatArray, length: float) -> FloatArray:
+    values: FloatArray = np.exp(-0.5 * cdist(places, centers, 'sqeuclidean') / length**2)
+    return values
+
+
+def _along_sight(context: Context, sensor: int, knots: FloatArray) -> Design:
+    sight = context.in_sensor / np.maximum(context.range_m, 1e-3)[:, None]
+    along = np.einsum('nij,nj->ni', context.sensor_turn, sight)
+    along = along * context.seen_by(sensor)[:, None]
+    return displaced(*(value[:, None] * along for value in basis(context.range_m, knots).T))
+
+
+def _field(context: Context, sensor: int, centers: FloatArray, length: float) -> Design:
+    mine = context.seen_by(sensor)[:, None]
+    features = _kernel(context.in_sensor, centers, length) * mine
+    return displaced(
+        *(
+            features[:, [i]] * context.sensor_turn[:, :, axis]
+            for i in range(len(centers))
+            for axis in range(3)
+        )
+    )
+
+
+EFFECT = Effect(
+    name='sensor_field',
+    reported_as='unnamed',
+    place='sensor_frame',
+    driver='position',
+    form='free',
+    equation='δp = f(p) in the sensor frame, f smooth: a Gaussian process',
+    source='Kennedy & O’Hagan 2001, J. R. Stat. Soc. B 63; Quiñonero-Candela & Rasmussen 2005, '
+    'J. Mach. Learn. Res. 6',
+    unit='m',
+    plausible=(1e-6, 5e-3),
+    sentence='The errors follow the place in the view of the sensor {subject}.',
+    separate_by='the same poses measured with the sensor moved and turned',
+    remedy='Measure with the sensor somewhere else, and calibrate its lenses; the errors '
+    'follow its volume.',
+    size=up_to('{subject} errs'),
+    cells=cells,
+    is_cause=False,
+)

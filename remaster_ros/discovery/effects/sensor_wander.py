@@ -1,0 +1,83 @@
+"""Sensor wander: errors that remember, from one reading to the next or over the whole session.
+
+A shift of the sensor frame that is an Ornstein-Uhlenbeck process over the readings in their
+order, by linear interpolation between knots. It has no cause: a mount that creeps back and forth,
+air that warms up, a tracker that filters; where it is fast, noise with memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced, needs_time
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import up_to
+from remaster_ros.types import FloatArray
+
+# Correlation lengths, as a share of the session.
+LENGTHS = {'slow': 0.3, 'middling': 0.1, 'fast': 0.033}
+KNOTS_PER_LENGTH = 2.0
+FEWEST_READINGS = 20
+RARITY = 3
+
+
+def cells(context: Context) -> Iterator[Cell]:
+    """Each sensor, with a long, a middling and a short memory."""
+    for index, name in enumerate(context.sensor_names):
+        if np.sum(context.seen_by(index)) < FEWEST_READINGS:
+            continue
+        for variant, length in LENGTHS.items():
+            knots = np.linspace(0.0, 1.0, 1 + int(np.ceil(KNOTS_PER_LENGTH / length)))
+            correlation = np.exp(-np.abs(knots[:, None] - knots) / length)
+            yield EFFECT.cell(
+                partial(_wandered, sensor=index, knots=knots),
+                [
+                    f'wander_{axis}_{variant}_{name}_{i}'
+                    for i in range(len(knots))
+                    for axis in 'xyz'
+                ],
+                # The three axes of a knot stand next to each other.
+                penalty=np.kron(np.linalg.inv(correlation), np.eye(3)),
+                drawn_from=RARITY * len(LENGTHS) * len(context.sensor_names),
+                variant=variant,
+                subject=name,
+            )
+
+
+def _wandered(context: Context, sensor: int, knots: FloatArray) -> Design:
+    # Linear: the splines' own knots stand once more at both ends.
+    padded = np.concatenate((knots[:1], knots, knots[-1:]))
+    features = BSpline.design_matrix(context.progress, padded, 1).toarray()
+    features = features * context.seen_by(sensor)[:, None]
+    return displaced(
+        *(
+            features[:, [i]] * context.sensor_turn[:, :, axis]
+            for i in range(len(knots))
+            for axis in range(3)
+        )
+    )
+
+
+EFFECT = Effect(
+    name='sensor_wander',
+    reported_as='unnamed',
+    place='sensor_frame',
+    driver='time',
+    form='free',
+    equation='δp = w(t) in the sensor frame, w an Ornstein-Uhlenbeck process over the readings',
+    source='Uhlenbeck & Ornstein 1930, Phys. Rev. 36',
+    unit='m',
+    plausible=(1e-6, 5e-3),
+    sentence='The errors of the sensor {subject} follow each other: a reading errs as the ones '
+    'before it (serial correlation).',
+    separate_by='fixed reference markers measured again and again, and poses repeated in time',
+    remedy='Fix the mount of the sensor, let it warm up, and watch references while measuring.',
+    size=up_to('{subject} wanders'),
+    cells=cells,
+    needs=needs_time,
+    is_cause=False,
+)

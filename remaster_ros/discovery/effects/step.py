@@ -1,0 +1,154 @@
+"""Step: something slipped or was bumped at one moment and stayed there.
+
+A moment lies midway between two successive configurations. The search tries moments spread over
+the session, and then all of them near the best (`Effect.between`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced, needs_time
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import angle, length
+from remaster_ros.types import FloatArray
+
+MOMENTS = 40
+# Of the configurations, before and after a step: fewer do not tell it from gross errors.
+LEAST_SHARE = 0.04
+
+
+def moments_of(context: Context) -> FloatArray:
+    """Return the moments between successive configurations, s since the first row, ascending."""
+    _, row = np.unique(context.measurements.configuration, return_inverse=True)
+    first, last = np.full(row.max() + 1, np.inf), np.full(row.max() + 1, -np.inf)
+    np.minimum.at(first, row, context.elapsed_s)
+    np.maximum.at(last, row, context.elapsed_s)
+    order = np.argsort(first)
+    first, last = first[order], np.maximum.accumulate(last[order])
+    apart = first[1:] > last[:-1]
+    edge = max(2, int(LEAST_SHARE * len(first)))
+    inside = (np.arange(1, len(first)) >= edge) & (np.arange(1, len(first)) <= len(first) - edge)
+    moments: FloatArray = 0.5 * (first[1:] + last[:-1])[apart & inside]
+    return moments
+
+
+def cells(context: Context) -> Iterator[Cell]:
+    """Every place, at moments spread evenly over the configurations."""
+    moments = moments_of(context)
+    if len(moments):
+        chosen = np.linspace(0, len(moments) - 1, min(MOMENTS, len(moments)))
+        yield from _at(context, moments[chosen.round().astype(int)])
+
+
+def between(context: Context, low: float, high: float) -> Iterator[Cell]:
+    """Every place, at every moment between two."""
+    moments = moments_of(context)
+    yield from _at(context, moments[(moments > low) & (moments < high)])
+
+
+def _at(context: Context, moments: FloatArray) -> Iterator[Cell]:
+    """Zero-offsets; markers; sensors, which shift or also turn; the base where several see it."""
+    sensors: list[tuple[int, ...]] = [(index,) for index in range(len(context.sensor_names))]
+    if len(sensors) > 1:
+        sensors.append(tuple(range(len(sensors))))
+    places = context.joints + len(context.marker_names) + 2 * len(sensors)
+    for moment in map(float, moments):
+        at = partial(EFFECT.cell, moment=moment, drawn_from=MOMENTS * places)
+        for joint in range(1, context.joints + 1):
+            yield at(
+                partial(_slipped, joint=joint, moment=moment),
+                [f'joint_{joint}_step'],
+                joints=(joint,),
+                unit='rad',
+                largest=LARGEST_RAD,
+            )
+        for index, name in enumerate(context.marker_names):
+            yield at(
+                partial(_marker_moved, marker=index, moment=moment),
+                [f'marker_{name}_step_{axis}' for axis in 'xyz'],
+                place='marker',
+                subject=name,
+            )
+        for seen_by in sensors:
+            whole = len(seen_by) > 1
+            subject = '' if whole else context.sensor_names[seen_by[0]]
+            stem = f'{subject or "base"}_step'
+            shifts, turns = ([f'{stem}_{kind}{axis}' for axis in 'xyz'] for kind in ('', 'r'))
+            for variant, parameters in (('shift', shifts), ('shift and turn', shifts + turns)):
+                yield at(
+                    partial(
+                        _sensor_moved,
+                        sensors=seen_by,
+                        moment=moment,
+                        turning=parameters != shifts,
+                    ),
+                    parameters,
+                    place='base_rotation' if whole else 'sensor_frame',
+                    variant=variant,
+                    subject=subject,
+                )
+
+
+def _after(context: Context, moment: float) -> FloatArray:
+    return (context.elapsed_s > moment).astype(float)[:, None]
+
+
+def _slipped(context: Context, joint: int, moment: float) -> Design:
+    return Design(joint - 1, _after(context, moment))
+
+
+def _marker_moved(context: Context, marker: int, moment: float) -> Design:
+    mine = _after(context, moment) * (context.marker == marker)[:, None]
+    return displaced(*(context.tool[:, :3, axis] * mine for axis in range(3)))
+
+
+def _sensor_moved(
+    context: Context, sensors: tuple[int, ...], moment: float, turning: bool
+) -> Design:
+    mine = _after(context, moment) * np.isin(context.sensor, sensors)[:, None]
+    # Along the axes of the sensor, or of the base where all of them are concerned.
+    turn = context.sensor_turn if len(sensors) == 1 else np.eye(3)[None]
+    axes = [np.broadcast_to(turn[:, :, axis], (len(context), 3)) for axis in range(3)]
+    shifts = [mine * axis for axis in axes]
+    if turning:
+        # A turn seen at one metre, which has the unit of the shifts.
+        arms = context.points - np.mean(context.centers[list(sensors)], axis=0)
+        shifts += [mine * np.cross(axis, arms) for axis in axes]
+    return displaced(*shifts)
+
+
+# A belt or a coupling that slips by more is seen without a measurement.
+LARGEST_RAD = 2e-2
+
+
+def _jump(context: Context, cell: Cell, draws: FloatArray) -> str:
+    if cell.place == 'joint_angle':
+        return f'joint {cell.joints[0]} by {angle(np.abs(draws[:, 0]))}'
+    way = length(np.linalg.norm(draws[:, :3], axis=1))
+    turn = f' and {angle(np.linalg.norm(draws[:, 3:], axis=1))}' if cell.size > 3 else ''
+    return f'{cell.subject or "the base"} by {way}{turn}'
+
+
+EFFECT = Effect(
+    name='step',
+    reported_as='unnamed',
+    place='joint_angle',
+    driver='time',
+    form='step',
+    equation='δ = Δ for t > t₀, else 0',
+    source='change point of one level: Hinkley 1970, Biometrika 57',
+    unit='m',
+    plausible=(1e-5, 2e-2),
+    sentence='The {place} jumped {when} and stayed so: something slipped or was bumped.',
+    separate_by='reference poses measured again and again during the session',
+    remedy='Find what slipped or was bumped, fasten it, and measure again.',
+    size=_jump,
+    cells=cells,
+    needs=needs_time,
+    cause_per='variant',
+    between=between,
+)

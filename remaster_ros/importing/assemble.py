@@ -1,0 +1,260 @@
+"""From rows to a session: poses by equal goals, a fair choice of what is held out, one order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from remaster_ros.errors import InputError
+from remaster_ros.importing.rows import RawRows
+from remaster_ros.importing.units import split_unit
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.observations import LIMIT_TOLERANCE_RAD
+from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements, Session
+
+# Tool poses that are equal but for the rounding of the robot's report and for the difference
+# between its controller's kinematics and the nominal ones.
+SAME_POSE_M = 2e-3
+SAME_POSE_RAD = 5e-3
+# One of so many poses, in the order measured, is held out.
+HOLD_OUT_ONE_OF = 4
+# Fewer poses are all needed for the fit.
+FEWEST_POSES = 12
+# Where nothing is known of a marker's place (the session format's own advice).
+UNKNOWN_MARKER_STD_M = 0.3
+_SPLITS = {
+    **dict.fromkeys(('optimization', 'fit', 'train', 'training', 'calibration', 'opt'), 0),
+    **dict.fromkeys(('validation', 'test', 'held_out', 'holdout', 'val', 'check'), 1),
+}
+
+
+@dataclass(frozen=True)
+class SessionOptions:
+    """What the user said of the session.
+
+    Attributes
+    ----------
+    reverse, add_rad, order
+        Corrections of the joints by column: signs that are reversed, and angles added, rad.
+    marker_m, marker_std_m
+        Where the marker is in the tool frame, m; None where nothing is known.
+    hold_out
+        Share of the poses that is held out where the table names none.
+    visited_in_order
+        Whether each row's configuration was reached from that of the row before.
+    """
+
+    reverse: tuple[str, ...] = ()
+    add_rad: Mapping[str, float] = field(default_factory=dict)
+    sensor: str = 'sensor'
+    marker: str = 'marker'
+    marker_m: tuple[float, float, float] | None = None
+    marker_std_m: float | None = None
+    hold_out: float = 1.0 / HOLD_OUT_ONE_OF
+    visited_in_order: bool = False
+
+
+def corrected(rows: RawRows, chain: SerialChain, options: SessionOptions) -> FloatArray:
+    """Return the joint angles with the corrections that were told, rad, (n, k)."""
+    q = rows.q.copy()
+    for name in options.reverse:
+        q[:, _joint(name, rows, chain, '--reverse')] *= -1.0
+    for name, angle in options.add_rad.items():
+        q[:, _joint(name, rows, chain, '--offset')] += angle
+    return q
+
+
+def _joint(name: str, rows: RawRows, chain: SerialChain, option: str) -> int:
+    for names in (rows.joint_columns, chain.joint_names):
+        folded = [known.casefold() for known in names]
+        matching = [i for i, known in enumerate(folded) if known == name.casefold()]
+        matching += [
+            i for i, known in enumerate(folded) if split_unit(known)[0] == name.casefold()
+        ]
+        if matching:
+            return matching[0]
+    known = ', '.join(dict.fromkeys((*rows.joint_columns, *chain.joint_names)))
+    raise InputError(f'{option}: there is no joint {name!r}; the table and the robot have {known}')
+
+
+def assemble(
+    rows: RawRows,
+    q: FloatArray,
+    urdf: str,
+    chain: SerialChain,
+    options: SessionOptions,
+    rng: np.random.Generator,
+    notes: str,
+) -> tuple[Session, list[str]]:
+    """Return the session, and how poses were found and held out, a sentence each.
+
+    Parameters
+    ----------
+    q
+        Joint angles with the corrections, rad, (n, k).
+
+    Raises
+    ------
+    InputError
+        Labels that contradict each other, naming the row.
+    """
+    n = len(q)
+    pose, how_pose = _poses(rows, chain, q)
+    configuration = _configurations(rows, pose, q)
+    validation, how_split = _splits(rows, pose, options.hold_out, rng)
+    sensor, sensors = _numbered(rows.labels.get('sensor', [options.sensor] * n))
+    marker, markers = _numbered(rows.labels.get('marker', [options.marker] * n))
+    from_q = rows.from_q
+    if options.visited_in_order:
+        from_q = _visited(configuration, q)
+    measurements = Measurements(
+        observation=np.arange(n),
+        pose=pose,
+        configuration=configuration,
+        is_validation=validation,
+        stamp_s=np.arange(n, dtype=float) if rows.stamp_s is None else rows.stamp_s,
+        sensor=sensor,
+        marker=marker,
+        q=q,
+        from_q=from_q,
+        position=rows.position,
+        std=rows.std,
+        samples=rows.samples.astype(np.int64),
+        temperature_c=rows.temperature_c,
+    )
+    place = np.zeros(3) if options.marker_m is None else np.array(options.marker_m)
+    std = UNKNOWN_MARKER_STD_M if options.marker_m is None else 0.5e-3
+    session = Session(
+        urdf=urdf,
+        base_link=chain.base_link,
+        tip_link=chain.tip_link,
+        markers={name: place for name in markers},
+        sensors={
+            name: markers[int(marker[np.flatnonzero(sensor == i)[0]])]
+            for i, name in enumerate(sensors)
+        },
+        measurements=measurements,
+        marker_std_m=std if options.marker_std_m is None else options.marker_std_m,
+        settle_s=None,
+        timed=rows.stamp_s is not None,
+        notes=notes,
+    )
+    return session, [how_pose, how_split]
+
+
+def refuse_outside_limits(rows: RawRows, chain: SerialChain, q: FloatArray) -> None:
+    """Refuse joint angles outside the URDF's limits, naming the row of the table.
+
+    Raises
+    ------
+    InputError
+        One line for the first such row.
+    """
+    outside = (q < chain.lower - LIMIT_TOLERANCE_RAD) | (q > chain.upper + LIMIT_TOLERANCE_RAD)
+    for row, joint in np.argwhere(outside)[:1]:
+        count = int(outside[:, joint].sum())
+        raise InputError(
+            f'{rows.where[row]}, column {rows.joint_columns[joint]}: '
+            f'{np.degrees(q[row, joint]):.3f} degrees is outside the limits of '
+            f'{chain.joint_names[joint]} ({np.degrees(chain.lower[joint]):.1f} to '
+            f'{np.degrees(chain.upper[joint]):.1f} degrees), as {count} of {len(q)} rows are; are '
+            'unit (--angles), sign (--reverse), zero position (--offset) and URDF right?'
+        )
+
+
+def _poses(rows: RawRows, chain: SerialChain, q: FloatArray) -> tuple[IntArray, str]:
+    """Return the pose of each row, (n,), and how it was found."""
+    if 'pose' in rows.labels:
+        pose, names = _numbered(rows.labels['pose'])
+        return pose, f'{len(names)} poses, as the table numbers them'
+    T = chain.forward(q)
+    # A rotation by a small angle a moves the columns of its matrix by a * sqrt(2) in all.
+    scale = SAME_POSE_M / (SAME_POSE_RAD * np.sqrt(2.0))
+    places = np.concatenate((T[:, :3, 3], scale * T[:, :3, :3].reshape(len(q), 9)), axis=1)
+    near = cKDTree(places).query_ball_point(places, SAME_POSE_M)
+    pose = np.full(len(q), -1)
+    count = 0
+    for row in range(len(q)):
+        if pose[row] < 0:
+            # From the first row of a pose, so that a dense path does not become one pose.
+            alike = [other for other in near[row] if pose[other] < 0]
+            pose[alike] = count
+            count += 1
+    return pose, (
+        f'{count} poses: rows whose tool poses agree within {1e3 * SAME_POSE_M:g} mm and '
+        f'{np.degrees(SAME_POSE_RAD):.1f} degrees are one'
+    )
+
+
+def _configurations(rows: RawRows, pose: IntArray, q: FloatArray) -> IntArray:
+    """Return the configuration of each row: as labelled, else equal joints and no move between."""
+    if 'configuration' in rows.labels:
+        labels = list(zip(pose.tolist(), rows.labels['configuration'], strict=True))
+        index: dict[tuple[int, str], int] = {}
+        return np.array([index.setdefault(label, len(index)) for label in labels])
+    moved = np.any(np.diff(q, axis=0) != 0.0, axis=1)
+    moved |= np.diff(pose) != 0
+    seen = [rows.labels.get('sensor'), rows.labels.get('marker')]
+    again = np.ones(len(q) - 1, bool)
+    for names in seen:
+        if names is not None:
+            again &= np.array(names[1:]) == np.array(names[:-1])
+    # The same marker by the same sensor again is another visit, or another shot of it.
+    return np.concatenate(([0], np.cumsum(moved | again)))
+
+
+def _splits(
+    rows: RawRows, pose: IntArray, share: float, rng: np.random.Generator
+) -> tuple[BoolArray, str]:
+    """Return which rows are held out, (n,), and how they were chosen."""
+    if 'split' in rows.labels:
+        given = [_SPLITS.get(text.strip().lower(), -1) for text in rows.labels['split']]
+        for row, split in enumerate(given):
+            if split < 0:
+                raise InputError(
+                    f'{rows.where[row]}, column split: {rows.labels["split"][row]!r} is neither '
+                    'optimization nor validation; correct it'
+                )
+        splits = np.array(given)
+        for one in np.unique(pose):
+            mine = np.flatnonzero(pose == one)
+            if len(np.unique(splits[mine])) > 1:
+                other = mine[splits[mine] != splits[mine[0]]][0]
+                raise InputError(
+                    f'{rows.where[other]}: another split than {rows.where[mine[0]]}, which has '
+                    'the same pose; give a pose one split'
+                )
+        return splits == 1, f'{int(splits.sum())} rows held out, as the table has them'
+    poses, first = np.unique(pose, return_index=True)
+    order = poses[np.argsort(first)]
+    if share == 0.0:
+        return np.zeros(len(pose), bool), 'no pose held out, as told'
+    if len(order) < FEWEST_POSES:
+        return np.zeros(len(pose), bool), (
+            f'no pose held out: with less than {FEWEST_POSES} poses the fit needs all'
+        )
+    # One of each run of poses: the held-out ones meet all of the session, and so does any drift.
+    runs = np.array_split(order, max(1, round(share * len(order))))
+    held = [rng.choice(run) for run in runs]
+    return np.isin(pose, held), (
+        f'{len(held)} of {len(order)} poses held out: one, drawn at random, of every '
+        f'{len(order) / len(runs):.3g} in the order measured'
+    )
+
+
+def _visited(configuration: IntArray, q: FloatArray) -> FloatArray:
+    """Return where the arm came from: the configuration before, (n, k)."""
+    from_q = np.full_like(q, np.nan)
+    first = np.flatnonzero(np.diff(configuration, prepend=configuration[0]) != 0)
+    for start, end in zip(first, [*first[1:], len(q)]):
+        from_q[start:end] = q[start - 1]
+    return from_q
+
+
+def _numbered(names: Sequence[str]) -> tuple[IntArray, list[str]]:
+    """Return the index of each name in the order of their first, and the names."""
+    index: dict[str, int] = {}
+    return np.array([index.setdefault(name, len(index)) for name in names]), list(index)

@@ -1,0 +1,368 @@
+"""What the columns of a table are (joints, a point, time, …), by their headers or as told."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import chain as flat
+
+from remaster_ros.errors import InputError
+from remaster_ros.importing.text_table import TextTable
+from remaster_ros.importing.units import ANGLES, LENGTHS, split_unit
+
+AXES = ('x', 'y', 'z')
+# Words of headers, in the languages of the programs and pendants seen so far.
+_JOINT_WORDS = {
+    'a',
+    'j',
+    'q',
+    'ax',
+    'th',
+    'theta',
+    'θ',
+    'jt',
+    'jnt',
+    'axis',
+    'joint',
+    'joints',
+} | {
+    *('achse', 'gelenk', 'eje', 'axe', 'asse', 'angle', 'position', 'positions', 'pos'),
+    *('robot', 'lbr', 'rad', 'deg', 'state', 'states'),
+}
+_REPORTED = {'actual', 'act', 'measured', 'meas', 'ist', 'reported', 'encoder', 'real'}
+_OTHER_JOINTS = {
+    *('target', 'command', 'commanded', 'cmd', 'goal', 'desired', 'soll', 'setpoint', 'nominal'),
+    *('velocity', 'vel', 'qd', 'speed', 'current', 'torque', 'effort', 'moment', 'tau', 'temp'),
+    *('temperature', 'acceleration', 'error', 'err', 'offset', 'std', 'sigma', 'min', 'max'),
+}
+_SPREAD = {'std', 'stdev', 'stddev', 'sigma', 'sd', 'uncertainty', 'rms'}
+_TOOL = {
+    *('target', 'nominal', 'command', 'goal', 'desired', 'soll', 'tcp', 'tool', 'flange', 'robot'),
+    *('error', 'err', 'dev', 'deviation', 'delta', 'd', 'diff', 'rot', 'normal', 'offset', 'r'),
+    *('w', 'v', 'a', 'vel', 'velocity', 'force', 'f', 'orientation', 'quaternion', 'rotation'),
+}
+_WORDS = {
+    'name': {
+        *('name', 'point', 'pointname', 'pt', 'label', 'punkt', 'punktname', 'id', 'nr', 'no'),
+        *('number', 'nummer', '#', 'index', 'observation', 'messpunkt', 'prüfpunkt', 'row', 'nom'),
+    },
+    'time': {
+        'time',
+        'timestamp',
+        'stamp',
+        't',
+        'zeit',
+        'datetime',
+        'zeitstempel',
+        'secs',
+        'epoch',
+    },
+    'date': {'date', 'datum'},
+    'clock': {'uhrzeit', 'clock'},
+    'pose': {'pose', 'goal', 'poses', 'ziel', 'zielpose'},
+    'configuration': {'configuration', 'config', 'konfiguration'},
+    'split': {'split', 'subset', 'partition'},
+    'sensor': {'sensor', 'instrument', 'station'},
+    'marker': {'marker', 'reflector', 'reflektor'},
+    'temperature': {'temperature', 'temp', 'temperatur', 'ambient'},
+    'samples': {'samples', 'shots', 'messungen'},
+}
+_KINDS = {word: kind for kind, words in _WORDS.items() for word in words}
+_TOKEN = re.compile(r'[^\W\d_]+|\d+|#')
+_CAMEL = re.compile(r'(?<=[a-z])(?=[A-Z])')
+
+
+@dataclass
+class Columns:
+    """Which column of a table is what; indices from 0, None and empty where there is none.
+
+    Attributes
+    ----------
+    joints, from_joints
+        Base to tip.
+    point, std
+        X, Y and Z of the marker, and the standard deviations.
+    others
+        Kind (``name``, ``time``, ``pose``, …) -> columns.
+    units
+        Column -> unit of its header.
+    why
+        Column -> how it was taken for what it is: ``header``, ``told`` or ``place``.
+    """
+
+    joints: tuple[int, ...] = ()
+    from_joints: tuple[int, ...] = ()
+    point: tuple[int, ...] = ()
+    std: tuple[int, ...] = ()
+    others: dict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
+    units: dict[int, str] = field(default_factory=dict)
+    why: dict[int, str] = field(default_factory=dict)
+
+    def one(self, kind: str) -> int | None:
+        """Return the first column of a kind."""
+        return next(iter(self.others.get(kind, ())), None)
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the user said of the columns, by name or by number from 1; '' and () where nothing."""
+
+    joints: tuple[str, ...] = ()
+    points: tuple[str, ...] = ()
+    time: str = ''
+    names: str = ''
+
+
+def find_columns(table: TextTable, joint_names: Sequence[str], told: Told = Told()) -> Columns:
+    """Find out what the columns of a table are.
+
+    Parameters
+    ----------
+    joint_names
+        Of the robot; a header that holds one of them is that joint's.
+
+    Raises
+    ------
+    InputError
+        Several columns could be the same, or a told one is not there; with what to say.
+    """
+    found = Columns()
+    headers = [_Header.of(name) for name in table.names]
+    found.units = {i: header.unit for i, header in enumerate(headers) if header.unit}
+    found.joints = _told_columns(table, told.joints, '--joints', found)
+    found.point = _told_columns(table, told.points, '--points', found)
+    for kind, name in (('time', told.time), ('name', told.names)):
+        if name and name != 'none':
+            found.others[kind] += _told_columns(table, (name,), f'--{kind}', found, missing=True)
+    if not table.has_header:
+        return _by_place(table, found, len(joint_names))
+    taken = set(found.why)
+    if not found.joints:
+        found.joints = _joints(table, headers, joint_names, taken, found)
+    if not found.point:
+        found.point = _point(table, headers, taken, found)
+    for i, header in enumerate(headers):
+        if i in taken:
+            continue
+        kind = header.kind()
+        if kind and not (kind in ('time', 'date', 'clock') and told.time):
+            found.others[kind].append(i)
+            found.why[i] = 'header'
+    return found
+
+
+@dataclass(frozen=True)
+class _Header:
+    """A header as words, and its unit."""
+
+    words: tuple[str, ...]
+    unit: str
+
+    @classmethod
+    def of(cls, text: str) -> _Header:
+        name, unit = split_unit(text)
+        words = _TOKEN.findall(_CAMEL.sub(' ', name))
+        return cls(tuple(word.lower() for word in words), unit)
+
+    def kind(self) -> str:
+        """Return the kind of column beside joints and points; '' where it is none."""
+        words = [word for word in self.words if word not in ('s', 'c', 'ns', 'ms', 'air', 'nsec')]
+        joined = ''.join(words)
+        if joined in _KINDS:
+            return _KINDS[joined]
+        kinds = {_KINDS.get(word, '') for word in words}
+        return next(iter(kinds)) if len(kinds) == 1 else _first_kind(words)
+
+
+def _first_kind(words: Sequence[str]) -> str:
+    """Return the kind of `point name`, `time stamp`, `no of samples`; '' of anything else."""
+    kinds = [_KINDS.get(word, '') for word in words]
+    if len(words) == 2 and kinds[0] in ('name', 'time') and kinds[1] in ('name', 'time'):
+        return kinds[0]
+    if 'samples' in kinds:
+        return 'samples'
+    return 'temperature' if 'temperature' in kinds and len(words) <= 2 else ''
+
+
+def _told_columns(
+    table: TextTable, names: Sequence[str], option: str, found: Columns, missing: bool = False
+) -> tuple[int, ...]:
+    """Return told columns; with `missing`, none where this table has not the column."""
+    columns = []
+    # Of two tables the columns are in one: all of them, or none.
+    index = {name.casefold(): i for i, name in enumerate(table.names)}
+    for i, name in enumerate(table.names):
+        index.setdefault(split_unit(name)[0].casefold(), i)
+    for name in names:
+        at = index.get(name.casefold())
+        if at is None and name.isdigit() and 1 <= int(name) <= len(table.names):
+            at = int(name) - 1
+        if at is not None:
+            columns.append(at)
+    if not columns or (missing and len(columns) < len(names)):
+        return ()
+    if len(columns) < len(names):
+        absent = [name for name in names if name.casefold() not in index]
+        raise InputError(
+            f'{table.path}: {option}: there is no column {absent[0]!r}; it has '
+            f'{", ".join(table.names)}'
+        )
+    if len(set(columns)) < len(columns):
+        raise InputError(f'{table.path}: {option} names a column twice')
+    found.why.update(dict.fromkeys(columns, 'told'))
+    return tuple(columns)
+
+
+def _joints(
+    table: TextTable,
+    headers: Sequence[_Header],
+    joint_names: Sequence[str],
+    taken: set[int],
+    found: Columns,
+) -> tuple[int, ...]:
+    """Return the columns of the joints, base to tip; those they came from go into `found`."""
+    groups: dict[tuple[str, ...], dict[int, int]] = defaultdict(dict)
+    named = [tuple(_Header.of(name).words) for name in joint_names]
+    for i, header in enumerate(headers):
+        if i in taken or (header.unit and header.unit not in ANGLES):
+            continue
+        number, stem = _joint_of(header.words, named)
+        if number is not None:
+            groups[stem].setdefault(number, i)
+    complete = {}
+    for stem, columns in groups.items():
+        numbers = sorted(columns)
+        if len(numbers) > 1 and numbers in (
+            list(range(1, len(numbers) + 1)),
+            list(range(len(numbers))),
+        ):
+            complete[stem] = tuple(columns[number] for number in numbers)
+    came_from = [stem for stem in complete if 'from' in stem]
+    if came_from:
+        found.from_joints = complete[came_from[0]]
+        _take(found, found.from_joints, taken)
+    usable = [stem for stem in complete if not _OTHER_JOINTS & set(stem) and stem not in came_from]
+    known = [stem for stem in usable if set(stem) <= _JOINT_WORDS | _REPORTED | {'*', '='}]
+    best = [stem for stem in known if '=' in stem or _REPORTED & set(stem)] or known or usable
+    if len(best) > 1:
+        sets = '; '.join(', '.join(table.names[i] for i in complete[stem]) for stem in best[:4])
+        raise InputError(
+            f'{table.path}: these could all be the joint angles: {sets}; name them, base to tip, '
+            'with --joints'
+        )
+    if not best:
+        return ()
+    _take(found, complete[best[0]], taken)
+    return complete[best[0]]
+
+
+def _joint_of(
+    words: tuple[str, ...], named: Sequence[tuple[str, ...]]
+) -> tuple[int | None, tuple[str, ...]]:
+    """Return the number of the joint that a header names, and the words around it."""
+    for i, name in sorted(enumerate(named), key=lambda pair: -len(pair[1])):
+        for short in (name, name[:-1] if name[-1:] == ('joint',) else name):
+            for start in range(len(words) - len(short) + 1):
+                if words[start : start + len(short)] == short:
+                    rest = (*words[:start], '=', *words[start + len(short) :])
+                    return i + 1, rest
+    digits = [i for i, word in enumerate(words) if word.isdigit()]
+    if len(digits) != 1 or len(words) < 2:
+        return None, ()
+    at = digits[0]
+    return int(words[at]), (*words[:at], '*', *words[at + 1 :])
+
+
+def _point(
+    table: TextTable, headers: Sequence[_Header], taken: set[int], found: Columns
+) -> tuple[int, ...]:
+    """Return the columns X, Y, Z of the marker; their standard deviations go into `found`."""
+    groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
+    for i, header in enumerate(headers):
+        if i in taken or (header.unit and header.unit not in LENGTHS):
+            continue
+        words = _with_axis(header.words)
+        axes = [word for word in words if word in AXES]
+        if len(axes) == 1:
+            stem = tuple('*' if word in AXES else word for word in words)
+            groups[stem].setdefault(axes[0], i)
+    complete = {
+        stem: tuple(columns[axis] for axis in AXES)
+        for stem, columns in groups.items()
+        if len(columns) == 3
+    }
+    spreads = [stem for stem in complete if _SPREAD & set(stem) or 's' in stem]
+    if spreads:
+        found.std = complete[spreads[0]]
+        _take(found, found.std, taken)
+    usable = [stem for stem in complete if stem not in spreads]
+    best = [stem for stem in usable if not _TOOL & set(stem)] or usable
+    best = [stem for stem in best if _REPORTED & set(stem)] or best
+    if len(best) > 1:
+        sets = '; '.join(', '.join(table.names[i] for i in complete[stem]) for stem in best[:4])
+        raise InputError(
+            f'{table.path}: these could all be the measured points: {sets}; name the three '
+            'columns with --points'
+        )
+    if not best:
+        return ()
+    _take(found, complete[best[0]], taken)
+    return complete[best[0]]
+
+
+def _with_axis(words: Sequence[str]) -> tuple[str, ...]:
+    """Return words with `px`, `posx`, `sy` or `dz` taken apart."""
+    apart = (
+        (word[:-1], word[-1]) if re.fullmatch(r'(?:p|pos|s|d|r|t|v)[xyz]', word) else (word,)
+        for word in words
+    )
+    return tuple(flat.from_iterable(apart))
+
+
+def _take(found: Columns, columns: Sequence[int], taken: set[int]) -> None:
+    taken.update(columns)
+    found.why.update(dict.fromkeys(columns, 'header'))
+
+
+def _by_place(table: TextTable, found: Columns, joints: int) -> Columns:
+    """Take columns without a header by their place: a name, then joints, then X, Y, Z."""
+    free = [i for i in range(len(table.names)) if i not in found.why]
+    numeric = [i for i in free if all(_numeric(table, row, i) for row in range(len(table.rows)))]
+    texts = [i for i in free if i not in numeric]
+    wanted = (0 if found.joints else joints, 0 if found.point else 3)
+    first = numeric[:1] if _counts_up(table, numeric) else []
+    for need_joints, need_point in ((*wanted,), (0, wanted[1]), (wanted[0], 0)):
+        for lead in ([], first):
+            if need_joints + need_point and len(numeric) - len(lead) == need_joints + need_point:
+                places = numeric[len(lead) :]
+                if need_joints:
+                    found.joints = tuple(places[:need_joints])
+                if need_point:
+                    found.point = tuple(places[need_joints:])
+                if texts or lead:
+                    found.others['name'] += [*texts[:1], *lead]
+                found.why.update(dict.fromkeys([*texts[:1], *lead, *places], 'place'))
+                return found
+    if found.joints or found.point:
+        return found
+    raise InputError(
+        f'{table.path}: no header, and {len(numeric)} columns of numbers, which is neither a '
+        f'point (3), nor {joints} joints, nor both; give it a header line, or name the columns '
+        'by their numbers: --points 2,3,4 --joints 5,6,…'
+    )
+
+
+def _counts_up(table: TextTable, numeric: Sequence[int]) -> bool:
+    if not numeric:
+        return False
+    cells = [row[numeric[0]] for row in table.rows]
+    return all(cell.isdigit() for cell in cells) and len(set(cells)) == len(cells)
+
+
+def _numeric(table: TextTable, row: int, column: int) -> bool:
+    try:
+        return table.number(row, column) is not None
+    except InputError:
+        return False

@@ -1,0 +1,36 @@
+"""The robot of a table: its description, and the links between which its joints are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.arm_ends import likely_base, likely_tips
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.urdf import parse_urdf
+from remaster_ros.session.robot_description import read_description
+
+
+def read_robot(
+    path: Path, base_link: str | None = None, tip_link: str | None = None
+) -> tuple[str, SerialChain]:
+    """Read a URDF, or expand a xacro, and find the arm in it.
+
+    Parameters
+    ----------
+    base_link, tip_link
+        As told; None for the likely ones.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the remedy.
+    """
+    urdf = read_description(path)
+    try:
+        model = parse_urdf(urdf)
+        base = likely_base(model) if base_link is None else base_link
+        tip = likely_tips(model, base)[0] if tip_link is None else tip_link
+        return urdf, SerialChain.from_urdf(urdf, base, tip)
+    except InputError as error:
+        raise InputError(f'{path}: {error}') from None

@@ -1,0 +1,297 @@
+"""A text table of any program: its encoding, separator and decimal sign, and its cells by line."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from remaster_ros.errors import InputError
+from remaster_ros.importing.units import bare, is_unit
+from remaster_ros.session.files import read_limited
+
+TABLE_LIMIT = 256 * 1024**2
+# In this order where several explain a table equally well; blanks come last.
+SEPARATORS = {';': 'semicolons', '\t': 'tabs', ',': 'commas', '|': 'bars', ' ': 'blanks'}
+_COMMENT = re.compile(r'\s*(?:#|//|%|!|\*)\s*')
+_PLAIN = re.compile(r'[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?', re.ASCII)
+# Groups of three digits, as spreadsheets like to write thousands, and then a decimal sign.
+_THOUSANDS = re.compile(r'[+-]?\d{1,3}(?:([.,])\d{3})(?:\1\d{3})*[.,]\d+', re.ASCII)
+# Blanks, but not those before a unit in brackets: `X [mm]  Y [mm]`.
+_BLANKS = re.compile(r'\s+(?![\[(])')
+# A row of the table has the joints of the smallest arm at least.
+_FEWEST_NUMBERS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class TextTable:
+    """A table as text.
+
+    Attributes
+    ----------
+    path
+        The file, for messages.
+    encoding, separator, decimal
+        What it was found, or told, to be written with.
+    names
+        Of the columns; numbers from 1 on where it has no header.
+    rows, lines
+        Cells as text, and the line of each row in the file.
+    preamble
+        Title and comment lines.
+    has_header
+        Whether the names stand in the file.
+    """
+
+    path: Path
+    encoding: str
+    separator: str
+    decimal: str
+    names: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    lines: tuple[int, ...]
+    preamble: str
+    has_header: bool
+
+    def describe(self) -> str:
+        """Return how it is written, in a few words."""
+        sign = 'comma' if self.decimal == ',' else 'point'
+        header = '' if self.has_header else ', no header'
+        return (
+            f'{self.path}: {len(self.rows)} rows; {SEPARATORS.get(self.separator, "cells")} '
+            f'between the columns, decimal {sign}, {self.encoding}{header}'
+        )
+
+    def fault(self, row: int, column: int, problem: str) -> InputError:
+        """Return the error of one cell, both counted from 0."""
+        cell = self.rows[row][column]
+        shown = repr(cell if len(cell) <= 40 else cell[:40] + '…')
+        return InputError(
+            f'{self.path}, line {self.lines[row]}, column {self.names[column]}: {shown} {problem}'
+        )
+
+    def number(self, row: int, column: int) -> float | None:
+        """Return a cell as a number; None where it is empty.
+
+        Raises
+        ------
+        InputError
+            It is neither.
+        """
+        cell = self.rows[row][column]
+        if not cell:
+            return None
+        value = parse_number(cell, self.decimal)
+        if value is None:
+            raise self.fault(row, column, 'is not a number; correct it or remove the row')
+        return value
+
+    def select(self, rows: Iterable[int]) -> TextTable:
+        """Return some of the rows."""
+        kept = list(rows)
+        return replace(
+            self,
+            rows=tuple(self.rows[row] for row in kept),
+            lines=tuple(self.lines[row] for row in kept),
+        )
+
+
+def parse_number(cell: str, decimal: str) -> float | None:
+    """Return the finite number of a cell; None where there is none."""
+    other = '.' if decimal == ',' else ','
+    if _THOUSANDS.fullmatch(cell) and cell.count(decimal) == 1 and _last_sign(cell) == decimal:
+        cell = cell.replace(other, '')
+    if not _PLAIN.fullmatch(cell) or other in cell:
+        return None
+    value = float(cell.replace(',', '.'))
+    return value if abs(value) < float('inf') else None
+
+
+def read_table(
+    path: Path, separator: str = '', decimal: str = '', encoding: str = ''
+) -> TextTable:
+    """Read a text table; what is not told is found.
+
+    Raises
+    ------
+    InputError
+        One line naming file, line and remedy: no text, no numbers, or rows of unequal length.
+    """
+    data = read_limited(path, TABLE_LIMIT, 'name the table')
+    text, encoding = decode(data, path, encoding)
+    lines = [
+        (number, line)
+        for number, line in enumerate(text.replace('\r\n', '\n').split('\n'), start=1)
+        if line.strip().strip(''.join(SEPARATORS))
+    ]
+    plain = [line for _, line in lines if not _COMMENT.match(line)]
+    separator = separator or _find_separator(plain)
+    split = [(number, line, _split(line, separator, path, number)) for number, line in lines]
+    width, first = _first_row(split, path)
+    header, preamble = _header(split[:first], width, separator)
+    rows, at = [], []
+    for number, line, cells in split[first:]:
+        if _COMMENT.match(line):
+            preamble += f'\n{line}'
+            continue
+        # A separator at the end of a line is no further column.
+        while len(cells) > width and not cells[-1]:
+            cells = cells[:-1]
+        if len(cells) != width:
+            raise InputError(
+                f'{path}, line {number}: {len(cells)} columns, where most rows have {width}; '
+                'give every row all columns, empty where unknown'
+            )
+        rows.append(tuple(cells))
+        at.append(number)
+    while width > 1 and not any(row[width - 1] for row in rows):
+        width -= 1
+    rows = [row[:width] for row in rows]
+    names = tuple(header[:width]) if header else tuple(map(str, range(1, width + 1)))
+    for name in names:
+        if name and names.count(name) > 1:
+            raise InputError(f'{path}: two columns are named {name!r}; name them differently')
+    return TextTable(
+        path=path,
+        encoding=encoding,
+        separator=separator,
+        decimal=decimal or _find_decimal(rows),
+        names=tuple(name or str(i) for i, name in enumerate(names, start=1)),
+        rows=tuple(rows),
+        lines=tuple(at),
+        preamble=preamble,
+        has_header=bool(header),
+    )
+
+
+def decode(data: bytes, path: Path, encoding: str = '') -> tuple[str, str]:
+    """Return the text of a file, and the name of its encoding.
+
+    A byte order mark decides, then zeros between Latin letters (UTF-16), then whether it is valid
+    UTF-8; else it is Windows' Latin alphabet, which gives each byte a letter.
+    """
+    if data.startswith((b'PK\x03\x04', b'\xd0\xcf\x11\xe0')):
+        raise InputError(f'{path}: this is a workbook, not a text table; save the sheet as CSV')
+    even, odd = data[:64:2], data[1:64:2]
+    if encoding:
+        guesses: Sequence[str] = (encoding,)
+    elif data.startswith((b'\xff\xfe', b'\xfe\xff')):
+        guesses = ('utf-16',)
+    elif len(data) > 3 and not any(odd):
+        guesses = ('utf-16-le',)
+    elif len(data) > 3 and not any(even):
+        guesses = ('utf-16-be',)
+    else:
+        guesses = ('utf-8-sig', 'cp1252', 'latin-1')
+    for guess in guesses:
+        try:
+            text = data.decode(guess)
+        except UnicodeDecodeError:
+            continue
+        except LookupError:
+            raise InputError(f'--encoding {encoding}: Python has no such encoding') from None
+        if '\0' in text:
+            break
+        return text, 'UTF-8' if guess == 'utf-8-sig' else guess.upper()
+    raise InputError(
+        f'{path}: this is no text in {" or ".join(guesses)}; save the table as CSV in UTF-8'
+    )
+
+
+def _split(line: str, separator: str, path: Path, number: int) -> list[str]:
+    if separator == ' ':
+        return _BLANKS.split(line.strip())
+    try:
+        cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True))
+    except csv.Error as error:
+        raise InputError(f'{path}, line {number}: {error}; correct the quotes') from None
+    return [cell.strip() for cell in cells]
+
+
+def _find_separator(lines: Sequence[str]) -> str:
+    """Return the separator between which most cells of most rows are numbers."""
+    best, most = ' ', 0
+    for separator in SEPARATORS:
+        split = []
+        for line in lines:
+            try:
+                split.append(_split(line, separator, Path(), 0))
+            except InputError:
+                continue
+        widths = Counter(len(cells) for cells in split if _is_row(cells))
+        width = widths.most_common(1)[0][0] if widths else 0
+        count = sum(
+            sum(map(_is_number, cells)) for cells in split if len(cells) == width and width > 1
+        )
+        if count > most:
+            best, most = separator, count
+    return best
+
+
+def _is_number(cell: str) -> bool:
+    return bool(_PLAIN.fullmatch(cell) or _THOUSANDS.fullmatch(cell))
+
+
+def _is_row(cells: Sequence[str]) -> bool:
+    return sum(map(_is_number, cells)) >= _FEWEST_NUMBERS
+
+
+def _first_row(split: list[tuple[int, str, list[str]]], path: Path) -> tuple[int, int]:
+    """Return the number of columns, and the index of the first line that is a row."""
+    rows = [
+        (i, cells)
+        for i, (_, line, cells) in enumerate(split)
+        if _is_row(cells) and not _COMMENT.match(line)
+    ]
+    if not rows:
+        raise InputError(
+            f'{path}: no row with two numbers; is it a table? name its separator with '
+            '--separator if it has an unusual one'
+        )
+    widths = Counter(len(cells) for _, cells in rows)
+    return widths.most_common(1)[0][0], rows[0][0]
+
+
+def _header(
+    above: list[tuple[int, str, list[str]]], width: int, separator: str
+) -> tuple[list[str], str]:
+    """Return the names of the columns, empty where there are none, and the lines above them."""
+    names: list[str] = []
+    preamble = []
+    for number, line, cells in above:
+        mark = _COMMENT.match(line)
+        if mark:
+            # NumPy and many trackers write the names into a comment.
+            cells = _split(line[mark.end() :], separator, Path(), number)
+            if len(cells) == width and not cells[0]:
+                cells[0] = line.strip()[0]
+        while len(cells) > width and not cells[-1]:
+            cells = cells[:-1]
+        given = [cell for cell in cells if cell]
+        if len(cells) != width or len(given) < _FEWEST_NUMBERS:
+            preamble.append(line)
+        elif names and all(map(is_unit, given)):
+            names = [
+                f'{name} [{bare(unit)}]' if unit else name for name, unit in zip(names, cells)
+            ]
+        else:
+            names = cells
+    return names, '\n'.join(preamble)
+
+
+def _find_decimal(rows: Sequence[Sequence[str]]) -> str:
+    """Return the decimal sign: the last sign of the numbers that have one."""
+    signs: Counter[str] = Counter()
+    for cells in rows:
+        for cell in cells:
+            if _is_number(cell):
+                signs[_last_sign(cell)] += 1
+    return ',' if signs[','] > signs['.'] else '.'
+
+
+def _last_sign(cell: str) -> str:
+    """Return the last point or comma of a number; '' where it has none."""
+    return next((letter for letter in reversed(cell) if letter in '.,'), '')

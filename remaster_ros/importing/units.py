@@ -1,0 +1,98 @@
+"""Units as tables write them, and what they are in SI."""
+
+from __future__ import annotations
+
+import math
+import re
+
+ANGLES = {
+    'rad': 1.0,
+    'deg': math.radians(1.0),
+    'gon': math.radians(0.9),
+}
+LENGTHS = {
+    'm': 1.0,
+    'cm': 1e-2,
+    'mm': 1e-3,
+    'um': 1e-6,
+    'in': 0.0254,
+}
+TIMES = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}
+TEMPERATURES = {'degc': 1.0, 'k': 1.0}
+SI = {**ANGLES, **LENGTHS, **TIMES, **TEMPERATURES}
+
+_WORDS = {
+    '°': 'deg',
+    'º': 'deg',
+    'degs': 'deg',
+    'degree': 'deg',
+    'degrees': 'deg',
+    # German; who means the other one writes gon.
+    'grad': 'deg',
+    'radian': 'rad',
+    'radians': 'rad',
+    'rads': 'rad',
+    'gons': 'gon',
+    'meter': 'm',
+    'meters': 'm',
+    'metre': 'm',
+    'metres': 'm',
+    'millimeter': 'mm',
+    'millimeters': 'mm',
+    'millimetre': 'mm',
+    'millimetres': 'mm',
+    'centimeters': 'cm',
+    'centimetres': 'cm',
+    'µm': 'um',
+    'μm': 'um',
+    'micron': 'um',
+    'microns': 'um',
+    'inch': 'in',
+    'inches': 'in',
+    '"': 'in',
+    'sec': 's',
+    'secs': 's',
+    'seconds': 's',
+    'c': 'degc',
+    '°c': 'degc',
+    'celsius': 'degc',
+    'kelvin': 'k',
+}
+_IN_BRACKETS = re.compile(r'\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$')
+_AFTER_SLASH = re.compile(r'\s*(?:/|,| in )\s*([^\s/,]+)\s*$')
+_AT_END = re.compile(r'[ _.-]([^ _.-]+)$')
+# At the end of a name these mean something else: `A1_min`.
+_ONLY_IN_BRACKETS = ('min', 'h', 'k')
+# One letter at the end of a name is no unit: `point_s`, `J_m`; but x_m is one.
+_COORDINATE_IN_M = re.compile(r'(?:^|.*[ _.-])[xyz]_m$', re.IGNORECASE)
+
+
+def unit_of(text: str) -> str:
+    """Return the unit that a text stands for, as `SI` has it; '' where it stands for none."""
+    word = bare(text).lower()
+    word = _WORDS.get(word, word)
+    return word if word in SI else ''
+
+
+def is_unit(text: str) -> bool:
+    """Return whether a cell below a header can be a unit."""
+    return bool(unit_of(text)) or bare(text) in ('', '-', '–', '1')
+
+
+def bare(text: str) -> str:
+    """Return a unit without the brackets around it."""
+    return text.strip().strip('[]()').strip()
+
+
+def split_unit(header: str) -> tuple[str, str]:
+    """Return the name of a column without its unit, and the unit, '' where it has none."""
+    found = _IN_BRACKETS.search(header) or _AFTER_SLASH.search(header)
+    if found and unit_of(found[1]):
+        return header[: found.start()].strip(), unit_of(found[1])
+    found = _AT_END.search(header)
+    long = found and (len(found[1]) > 1 or found[1] in '°"' or _COORDINATE_IN_M.match(header))
+    if found and long and unit_of(found[1]) not in ('', *_ONLY_IN_BRACKETS):
+        return header[: found.start()].strip(), unit_of(found[1])
+    if header.endswith('°'):
+        return header[:-1].strip(), 'deg'
+    return header.strip(), ''

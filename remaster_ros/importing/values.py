@@ -1,0 +1,150 @@
+"""The numbers, names and times of a table's columns, in SI."""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.importing.columns import Columns
+from remaster_ros.importing.text_table import TextTable, parse_number
+from remaster_ros.importing.units import LENGTHS, TIMES, unit_of
+from remaster_ros.types import FARTHEST_M, FloatArray
+
+_UNIT_LINE = re.compile(r'units?\s*(?:are|is)?\s*[:=]?\s*([A-Za-zµ"°]+)', re.IGNORECASE)
+# A time since 1970 that is larger is in ms, us or ns.
+_EPOCHS = ((1e17, 'ns'), (1e14, 'us'), (1e11, 'ms'))
+# More than one turn each way: no arm reports that in radians.
+_LARGEST_RAD = 2.1 * np.pi
+
+
+def numbers(table: TextTable, columns: tuple[int, ...], optional: bool = False) -> FloatArray:
+    """Return columns of numbers, (n, len(columns)); NaN where optional and empty.
+
+    Raises
+    ------
+    InputError
+        Naming line and column of the first cell that is none.
+    """
+    values = np.full((len(table.rows), len(columns)), np.nan)
+    for row in range(len(table.rows)):
+        for i, column in enumerate(columns):
+            value = table.number(row, column)
+            if value is not None:
+                values[row, i] = value
+            elif not optional:
+                raise table.fault(row, column, 'is empty; complete it or remove the row')
+    return values
+
+
+def labels(table: TextTable, column: int | None) -> list[str] | None:
+    """Return a column of names; None where there is none."""
+    return None if column is None else [row[column] for row in table.rows]
+
+
+def angle_unit(table: TextTable, columns: Columns, told: str) -> tuple[str, str]:
+    """Return the unit of the joint angles, and how it is known: told, header or guessed."""
+    units = {columns.units.get(i, '') for i in columns.joints} - {''}
+    if told:
+        return told, 'told'
+    if len(units) > 1:
+        raise InputError(
+            f'{table.path}: the joints have several units in the header '
+            f'({", ".join(sorted(units))}); say which with --angles'
+        )
+    if units:
+        return units.pop(), 'header'
+    largest = np.abs(numbers(table, columns.joints)).max(initial=0.0)
+    return ('rad', 'guessed') if largest < _LARGEST_RAD else ('deg', 'guessed')
+
+
+def length_unit(
+    table: TextTable, columns: Columns, told: str, points: FloatArray, modelled: FloatArray
+) -> tuple[str, str]:
+    """Return the unit of the points, and how it is known.
+
+    Parameters
+    ----------
+    points
+        As written, (n, 3).
+    modelled
+        The points as the robot's model has them, m, (n, 3): where nothing states the unit, it is
+        the one in which the measured ones lie as far apart.
+    """
+    units = {columns.units.get(i, '') for i in columns.point} - {''}
+    if told:
+        return told, 'told'
+    if len(units) > 1:
+        raise InputError(
+            f'{table.path}: X, Y and Z have several units in the header '
+            f'({", ".join(sorted(units))}); say which with --length'
+        )
+    if units:
+        return units.pop(), 'header'
+    for found in _UNIT_LINE.findall(table.preamble):
+        if unit_of(found) in LENGTHS:
+            return unit_of(found), 'header'
+    spread, wanted = (np.sqrt(np.mean(np.var(p, axis=0))) for p in (points, modelled))
+    ratio = wanted / spread if spread > 0.0 else 1.0
+    # Centimetres are rare, and too near to inches.
+    likely = ('m', 'mm', 'in')
+    return min(likely, key=lambda unit: abs(np.log(LENGTHS[unit] / ratio))), 'guessed'
+
+
+def refuse_far(table: TextTable, columns: Columns, unit: str) -> None:
+    """Refuse points beyond any sensor."""
+    far = np.abs(numbers(table, columns.point)) * LENGTHS[unit] > FARTHEST_M
+    for row, i in np.argwhere(far)[:1]:
+        raise table.fault(
+            int(row),
+            columns.point[i],
+            f'{unit} is further than {FARTHEST_M:g} m away, beyond any sensor; is the unit right '
+            '(--length)?',
+        )
+
+
+def times(table: TextTable, columns: Columns) -> FloatArray | None:
+    """Return the times of the rows, s, (n,); None where the table has none.
+
+    Numbers, ISO 8601, or a date and a time as programs write them (dates with points have the day
+    first), in one column or in two.
+    """
+    column = columns.one('time')
+    clock, date = columns.one('clock'), columns.one('date')
+    if column is None:
+        column = clock if clock is not None else date
+    if column is None or not any(row[column] for row in table.rows):
+        return None
+    day = date if date not in (None, column) else None
+    unit = columns.units.get(column, '')
+    result = np.empty(len(table.rows))
+    for row, cells in enumerate(table.rows):
+        text = cells[column] if day is None else f'{cells[day]} {cells[column]}'
+        value = _time(text, table.decimal)
+        if value is None:
+            raise table.fault(row, column, 'is no time; correct it, or say --time none')
+        result[row] = value
+    if unit not in TIMES:
+        largest = np.abs(result).max(initial=0.0)
+        unit = next((name for size, name in _EPOCHS if largest > size), 's')
+    return result * TIMES[unit]
+
+
+def _time(text: str, decimal: str) -> float | None:
+    number = parse_number(text, decimal)
+    if number is not None:
+        return number
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except ValueError:
+        pass
+    # Imported where it is needed: few tables are so.
+    from dateutil import parser
+
+    try:
+        moment = parser.parse(text, dayfirst='.' in text, default=datetime(2000, 1, 1))
+        return float(moment.timestamp())
+    except (ValueError, OverflowError):
+        return None

@@ -1,0 +1,117 @@
+"""Tables whose joints are otherwise than the robot's are recognised, and right ones left alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from foreign_tables import measured
+
+from remaster_ros.calibration.arrangement import (
+    Arrangement,
+    arranged,
+    fit_arrangement,
+    search,
+    some_rows,
+)
+from remaster_ros.types import Measurements, Session
+
+LENGTHS = (1e-3, 0.0254, 1e3, 25.4)
+
+
+def scene(robot, rows, seed):
+    arm = measured(robot, rows, seed)
+    joints, i = arm.q.shape[1], np.arange(rows)
+    measurements = replace(
+        Measurements.empty(joints),
+        observation=i,
+        pose=i,
+        configuration=i,
+        is_validation=np.zeros(rows, bool),
+        stamp_s=i.astype(float),
+        sensor=0 * i,
+        marker=0 * i,
+        q=arm.q,
+        from_q=np.full((rows, joints), np.nan),
+        position=arm.points,
+        std=np.full((rows, 3), np.nan),
+        samples=-np.ones(rows, int),
+        temperature_c=np.full(rows, np.nan),
+    )
+    return Session(
+        urdf=arm.urdf,
+        base_link=arm.chain.base_link,
+        tip_link=arm.chain.tip_link,
+        markers={'m': np.zeros(3)},
+        sensors={'s': 'm'},
+        measurements=measurements,
+        marker_std_m=0.3,
+    )
+
+
+def spoilt(session, q=lambda q: q, points=lambda points: points):
+    m = session.measurements
+    return replace(session, measurements=replace(m, q=q(m.q), position=points(m.position)))
+
+
+def one(joints, joint, value, otherwise):
+    return tuple(value if i == joint else otherwise for i in range(joints))
+
+
+@pytest.mark.parametrize('robot', ['irb120', 'ur5e', 'panda'])
+@pytest.mark.parametrize(
+    ('change', 'found'),
+    [
+        (dict(q=lambda q: q * np.where(np.arange(q.shape[1]) == 2, -1, 1)), 'signs'),
+        (dict(q=np.rad2deg), 'angle_scale'),
+        (dict(q=np.deg2rad), 'angle_scale'),
+        (dict(q=lambda q: q[:, ::-1]), 'order'),
+        (dict(q=lambda q: q - np.where(np.arange(q.shape[1]) == 1, np.pi / 2, 0.0)), 'quarters'),
+        (dict(points=lambda p: p * [1.0, 1.0, -1.0]), 'mirrored'),
+        (dict(points=lambda p: 1e3 * p), 'length_scale'),
+        (dict(q=lambda q: np.roll(q, 1, axis=0)), 'shift'),
+    ],
+)
+def test_one_change_is_found_and_nothing_else_is(robot, change, found):
+    session = spoilt(scene(robot, 30, 3), **change)
+    given = fit_arrangement(session, Arrangement.given(session.measurements.q.shape[1]))
+    assert given.gross
+    fitting = search(session, given, LENGTHS)
+    best = fitting[0]
+    assert best.error_m < 0.5e-3
+    plain = vars(given.arrangement)
+    other = {key for key, value in vars(best.arrangement).items() if value != plain[key]}
+    assert other == {found}
+    again = arranged(session, best.arrangement)
+    assert not fit_arrangement(again, given.arrangement).gross
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_right_table_is_not_gross_and_nonsense_has_no_remedy(seed):
+    session = scene('irb120', 30, seed)
+    given = Arrangement.given(6)
+    assert not fit_arrangement(session, given).gross
+    rng = np.random.default_rng(seed)
+    nonsense = spoilt(session, q=rng.permutation)
+    fitted = fit_arrangement(nonsense, given)
+    assert fitted.gross
+    assert search(nonsense, fitted, LENGTHS) == []
+
+
+def test_a_mirrored_arm_is_also_one_with_joints_reversed():
+    """Both are returned: no data distinguish them."""
+    session = spoilt(scene('irb120', 30, 0), points=lambda p: p[:, [1, 0, 2]])
+    fitted = fit_arrangement(session, Arrangement.given(6))
+    fitting = search(session, fitted, LENGTHS)
+    assert fitting[0].arrangement == replace(Arrangement.given(6), mirrored=True)
+    assert fitting[1].arrangement == replace(Arrangement.given(6), signs=(-1, 1, 1, -1, 1, -1))
+
+
+def test_of_many_rows_some_are_tried_and_of_few_none():
+    session = scene('irb120', 400, 1)
+    part = some_rows(session).measurements
+    assert len(part) == 200
+    assert part.observation[[0, -1]].tolist() == [0, 399]
+    few = spoilt(scene('irb120', 10, 1), q=lambda q: -q)
+    assert search(few, fit_arrangement(few, Arrangement.given(6))) == []

@@ -1,0 +1,63 @@
+"""Predicted positions with their covariance: as wide as errors on other poses are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration_scenes import scene
+from scipy.stats import binom, chi2
+
+from remaster_ros.calibration.estimate import Problem
+from remaster_ros.calibration.fit import fit_session
+from remaster_ros.calibration.predictions import Coverage, predict
+
+
+def predicted(session):
+    fit = fit_session(session, rng=np.random.default_rng(0), draws=1000)
+    measurements = Problem.of(session).measurements
+    return fit, measurements, predict(fit, measurements)
+
+
+@pytest.mark.parametrize('sensors', [1, 2])
+def test_held_out_rows_lie_in_their_regions_as_often_as_stated(sensors):
+    session, _ = scene(51, poses=40, validation=60, sensor_count=sensors)
+    fit, measurements, found = predicted(session)
+    np.testing.assert_allclose(
+        measurements.position - found.position, fit.residuals_after, atol=1e-12
+    )
+    held_out = found.inside[measurements.is_validation]
+    coverage = Coverage.of(held_out)
+    assert coverage.rows == len(held_out)
+    # By pose, whose rows share an error: within what chance does once in 10,000.
+    poses = len(np.unique(measurements.pose[measurements.is_validation]))
+    low, high = binom.ppf([5e-5, 1.0 - 5e-5], poses, 0.95) / poses
+    assert low < coverage.share <= min(1.0, high + 1e-9)
+    assert coverage.interval95[0] < coverage.share < coverage.interval95[1] or coverage.share == 1
+    assert 1.0 <= found.widening < 1.2
+    # Symmetric, positive, and at least the noise.
+    np.testing.assert_allclose(found.covariance, np.swapaxes(found.covariance, 1, 2), atol=1e-15)
+    noise = min(noise.sigma_m for noise in fit.noise.values())
+    assert np.linalg.eigvalsh(found.covariance).min() > 0.9 * noise**2
+
+
+def test_errors_with_long_tails_widen_the_regions():
+    session, _ = scene(52, poses=60, validation=60, sigma_m=1e-6, pose_sigma_m=0.0)
+    seed = 3
+    print(f'seed {seed}')
+    m = session.measurements
+    errors = np.random.default_rng(seed).standard_t(3.0, m.position.shape) * 0.1e-3
+    session = replace(session, measurements=replace(m, position=m.position + errors))
+    fit, measurements, found = predicted(session)
+    assert found.widening > 1.03
+    held_out = measurements.is_validation
+    left = fit.residuals_after
+    narrow = found.covariance / found.widening**2
+    distance = np.einsum('ni,ni->n', left, np.linalg.solve(narrow, left[..., None])[..., 0])
+    without = np.mean(distance[held_out] <= chi2.ppf(0.95, 3))
+    print(found.widening, without, np.mean(found.inside[held_out]))
+    assert without < np.mean(found.inside[held_out])
+    assert abs(np.mean(found.inside[held_out]) - 0.95) < 0.035
+
+
+def test_without_rows_there_is_no_coverage():
+    assert Coverage.of(np.zeros(0, dtype=bool)) == Coverage(0, 0, None, None)

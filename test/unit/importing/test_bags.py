@@ -1,0 +1,121 @@
+"""A bag of joint states and points becomes rows: one for each standstill and sensor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagsWriter
+from rosbags.typesys import Stores, get_typestore
+
+from remaster_ros.cli.main import main
+from remaster_ros.errors import InputError
+from remaster_ros.importing.bags import is_bag, read_bag
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.bag_writer import BagWriter
+from remaster_ros.session.reader import read_session
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+JOINT_STATE, POINT = 'sensor_msgs/msg/JointState', 'geometry_msgs/msg/PointStamped'
+STOPS = np.array([[0.1, -0.4], [0.5, 0.2], [-0.7, 1.0]])
+START_S = 1_700_000_000.0
+
+
+def header(time_s):
+    stamp = STORE.types['builtin_interfaces/msg/Time'](int(time_s), round(time_s % 1 * 1e9))
+    return STORE.types['std_msgs/msg/Header'](stamp=stamp, frame_id='')
+
+
+def joints(time_s, q):
+    names = ['joint_2', 'gripper', 'joint_1']
+    values = np.array([q[1], 0.3, q[0]])
+    message = STORE.types[JOINT_STATE](header(time_s), names, values, np.zeros(0), np.zeros(0))
+    return '/joint_states', JOINT_STATE, message, time_s
+
+
+def point(time_s, topic, xyz):
+    place = STORE.types['geometry_msgs/msg/Point'](*xyz)
+    return topic, POINT, STORE.types[POINT](header(time_s), place), time_s
+
+
+def messages(seed=0):
+    """Give three stops of 3 s with a second of motion between; a stream and single shots."""
+    print(f'bag seed {seed}')
+    rng = np.random.default_rng(seed)
+    for i, q in enumerate(STOPS):
+        for step in range(200):
+            time_s = START_S + 4.0 * i + 0.02 * step
+            # Moving for the first second.
+            moved = q + 0.3 * max(0.0, 1.0 - 0.02 * step) + rng.normal(0.0, 1e-6, 2)
+            yield joints(time_s, moved)
+            yield point(time_s, '/optitrack/marker', [i, 1.0, 2.0] + rng.normal(0.0, 1e-5, 3))
+        yield point(START_S + 4.0 * i + 3.0, '/laser_tracker/marker', (10.0 + i, 1.0, 2.0))
+
+
+@pytest.fixture
+def chain(session):
+    return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+
+
+@pytest.fixture(params=['mcap', 'sqlite3', 'ours'])
+def bag(request, tmp_path):
+    folder = tmp_path / 'bag'
+    if request.param == 'ours':
+        with BagWriter(folder) as writer:
+            for topic, kind, message, time_s in messages():
+                data = bytes(STORE.serialize_cdr(message, kind))
+                writer.write(topic, kind, data, int(1e9 * time_s))
+        return folder
+    plugin = StoragePlugin.MCAP if request.param == 'mcap' else StoragePlugin.SQLITE3
+    with RosbagsWriter(folder, version=9, storage_plugin=plugin) as writer:
+        connections = {}
+        for topic, kind, message, time_s in messages():
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            data = STORE.serialize_cdr(message, kind)
+            writer.write(connections[topic], int(1e9 * time_s), data)
+    return folder
+
+
+def test_one_row_for_each_standstill_and_sensor(bag, chain):
+    assert is_bag(bag)
+    rows = read_bag(bag, chain)
+    assert rows.labels['sensor'] == ['laser_tracker', 'optitrack'] * 3
+    np.testing.assert_allclose(rows.q, np.repeat(STOPS, 2, axis=0), atol=1e-5)
+    np.testing.assert_allclose(rows.position[0::2, 0], [10.0, 11.0, 12.0])
+    np.testing.assert_allclose(rows.position[1::2, 0], [0.0, 1.0, 2.0], atol=1e-5)
+    assert rows.samples[0::2].tolist() == [1, 1, 1]
+    # 3 s less the half in which it may swing, at 50 Hz.
+    assert np.all(np.abs(rows.samples[1::2] - 125) < 5)
+    assert np.all(np.isnan(rows.std[0::2]))
+    assert np.all((rows.std[1::2] > 5e-6) & (rows.std[1::2] < 2e-5))
+
+
+def test_one_topic_can_be_told(bag, chain):
+    rows = read_bag(bag, chain, point_topics=('/laser_tracker/marker',))
+    assert rows.labels['sensor'] == ['laser_tracker'] * 3
+
+
+def test_what_is_missing_is_named(bag, session, chain, tmp_path):
+    with pytest.raises(InputError, match=r'no geometry_msgs/PointStamped; it has /joint_states'):
+        read_bag(bag, chain, point_topics=('/elsewhere',))
+    urdf = session.urdf.replace('"joint_2"', '"elbow"')
+    other = SerialChain.from_urdf(urdf, session.base_link, session.tip_link)
+    with pytest.raises(InputError, match='no sensor_msgs/JointState with the joints joint_1, elb'):
+        read_bag(bag, other)
+    file = next(path for path in bag.iterdir() if path.suffix in ('.mcap', '.db3'))
+    file.write_bytes(file.read_bytes()[:1000])
+    with pytest.raises(InputError, match='bag'):
+        read_bag(bag, chain)
+
+
+def test_the_command_makes_a_session_of_it(bag, session, tmp_path):
+    urdf = tmp_path / 'robot.urdf'
+    urdf.write_text(session.urdf)
+    args = ['--urdf', str(urdf), '--out', str(tmp_path / 'session')]
+    assert main(['import', str(bag), *args]) == 0
+    made = read_session(tmp_path / 'session')
+    assert made.sensor_names == ('laser_tracker', 'optitrack')
+    # Two sensors saw each configuration.
+    assert made.measurements.configuration.tolist() == [0, 0, 1, 1, 2, 2]
+    assert made.timed

@@ -1,0 +1,165 @@
+"""Tables of five other programs become sessions, and each session can be fitted."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from foreign_tables import MARKER, measured, text, write
+
+from remaster_ros.calibration.fit import fit_session
+from remaster_ros.cli.main import main
+from remaster_ros.session.reader import read_session
+
+
+@pytest.fixture
+def arm():
+    return measured()
+
+
+@pytest.fixture
+def do(arm, tmp_path, capsys):
+    """Return a function that imports files; it returns status, stdout, stderr and the session."""
+    urdf = tmp_path / 'robot.urdf'
+    urdf.write_text(arm.urdf)
+
+    def run(*args):
+        out = tmp_path / f'session{len(list(tmp_path.glob("session*")))}'
+        capsys.readouterr()
+        status = main(['import', *map(str, args), '--urdf', str(urdf), '--out', str(out)])
+        printed = capsys.readouterr()
+        print(printed.out, printed.err)
+        return status, printed.out, printed.err, read_session(out) if out.is_dir() else None
+
+    return run
+
+
+def assert_fits(session, arm):
+    """Assert that the offsets of the inner joints are found, and that some poses are held out."""
+    result = fit_session(session, rng=np.random.default_rng(0))
+    off = (result.joint_offsets - arm.offsets)[1:-1] / result.joint_offsets_std[1:-1]
+    assert np.all(np.abs(off) < 5.0), off
+    after = result.accuracy['validation']['post_registration']['after']['mean_mm']
+    assert after < 0.3
+
+
+def degrees(arm):
+    return list(np.rad2deg(arm.q).T)
+
+
+def joint_names(arm):
+    return [f'A{i + 1}' for i in range(arm.q.shape[1])]
+
+
+def test_degrees_millimetres_decimal_commas(arm, do, tmp_path):
+    header = ['Nr', *(f'{name} [°]' for name in joint_names(arm)), 'X [mm]', 'Y [mm]', 'Z [mm]']
+    columns = [range(1, 41), *degrees(arm), *(1e3 * arm.points.T)]
+    path = write(tmp_path, 'messung.csv', text(header, columns, ';', ','), 'cp1252')
+    status, out, _, session = do(path)
+    assert status == 0
+    assert 'semicolons between the columns, decimal comma, CP1252' in out
+    assert 'A3 [°]  joint 3 (joint_3), deg, header' in out
+    assert 'Y [mm]  y of the marker, mm, header' in out
+    assert '10 of 40 poses held out' in out
+    np.testing.assert_allclose(session.measurements.q, arm.q, atol=1e-8)
+    np.testing.assert_allclose(session.measurements.position, arm.points, atol=1e-8)
+    assert not session.timed
+    assert_fits(session, arm)
+
+
+def test_a_trackers_export_and_the_joints_beside_it(arm, do, tmp_path):
+    """SpatialAnalyzer writes comments, group and name; the controller has its own order."""
+    order = np.random.default_rng(1).permutation(40)
+    points = '// SpatialAnalyzer export\n// Units: Millimeters\n' + text(
+        ['Group', 'Point Name', 'X', 'Y', 'Z', 'Timestamp'],
+        [
+            ['Main'] * 40,
+            [f'p{i + 1:03d}' for i in order],
+            *(1e3 * arm.points[order].T),
+            [f'2026-05-04 10:{minute:02d}:30' for minute in range(40)],
+        ],
+        ', ',
+    )
+    joints = text(
+        ['name', *(f'joint_{i}' for i in range(1, 7))],
+        [[f'P{i + 1}' for i in range(40)], *degrees(arm)],
+        '\t',
+    )
+    status, out, _, session = do(
+        write(tmp_path, 'points.txt', points), write(tmp_path, 'joints.txt', joints)
+    )
+    assert status == 0
+    assert '40 rows joined by Point Name and name' in out
+    assert 'X           x of the marker, mm' in out.replace('points.txt: ', '')
+    assert session.timed
+    assert np.ptp(session.measurements.stamp_s) == 39 * 60
+    np.testing.assert_allclose(session.measurements.q, arm.q[order], atol=1e-8)
+    assert_fits(session, arm)
+
+
+def test_no_times_no_units_no_header(arm, do, tmp_path):
+    """Numbers alone, in rad and m, between blanks; the point's name stands before them."""
+    columns = [[f'P{i}' for i in range(40)], *arm.q.T, *arm.points.T]
+    status, out, _, session = do(write(tmp_path, 'table.txt', text([], columns, '  ')))
+    assert status == 0
+    assert 'no header' in out
+    assert 'rad, guessed, by its place' in out
+    assert 'm, guessed, by its place' in out
+    assert 'no times: causes driven by time are untestable' in out
+    assert not session.timed
+    assert_fits(session, arm)
+
+
+def test_a_reversed_joint_is_proposed_and_reversed_only_where_told(arm, do, tmp_path):
+    turned = arm.q.copy()
+    turned[:, 2] *= -1.0
+    header = [*joint_names(arm), 'X', 'Y', 'Z']
+    path = write(tmp_path, 't.csv', text(header, [*np.rad2deg(turned).T, *(1e3 * arm.points.T)]))
+    status, _, error, session = do(path)
+    assert (status, session) == (1, None)
+    assert error.count('\n') == 1
+    assert 'with A3 reversed the data fit to 0.' in error
+    assert 'without, to ' in error
+    assert 'add --reverse A3;' in error
+    status, _, _, session = do(path, '--reverse', 'A3')
+    assert status == 0
+    np.testing.assert_allclose(session.measurements.q, arm.q, atol=1e-8)
+    assert_fits(session, arm)
+
+
+def test_a_wrong_tip_is_named_by_the_marker(arm, do, tmp_path):
+    """The marker's place is of the tool frame, and the flange before it was given."""
+    header = [*joint_names(arm), 'X_mm', 'Y_mm', 'Z_mm']
+    path = write(tmp_path, 't.csv', text(header, [*degrees(arm), *(1e3 * arm.points.T)]))
+    marker = ('--marker-mm', *(1e3 * MARKER), '--marker-std-mm', 1)
+    tip, other = arm.chain.tip_link, 'link_5'
+    # link_5 lies before the last joint.
+    status, _, error, _ = do(path, *marker, '--tip-link', other)
+    assert status == 2
+    assert f"5 joints between 'base_link' and '{other}'" in error
+    status, _, error, session = do(path, *marker, '--tip-link', 'link_6')
+    assert (status, session) == (1, None)
+    assert f'with the tip link {tip} the marker is ' in error
+    assert f'add --tip-link {tip};' in error
+    status, _, _, session = do(path, *marker, '--tip-link', tip)
+    assert status == 0
+    assert_fits(session, arm)
+
+
+def test_json_has_the_columns_and_the_hint(arm, do, tmp_path):
+    header = [*joint_names(arm), 'X', 'Y', 'Z', 'remark']
+    reversed_ = arm.q * [1, -1, 1, -1, 1, 1]
+    columns = [*np.rad2deg(reversed_).T, *(1e3 * arm.points.T), ['x'] * 40]
+    path = write(tmp_path, 't.csv', text(header, columns))
+    status, out, _, _ = do(path, '--json')
+    found = json.loads(out)
+    assert status == 1
+    assert found['session'] is None
+    assert found['hint'].endswith('--reverse A2,A4')
+    assert found['columns']['A1'] == 'joint 1 (joint_1), deg, guessed'
+    assert found['columns']['remark'] == 'not used'
+    status, out, _, session = do(path, '--json', '--unchecked')
+    assert status == 0
+    assert json.loads(out)['session'] is not None
+    np.testing.assert_allclose(session.measurements.q, reversed_, atol=1e-8)
