@@ -121,7 +121,8 @@ def find_gauge(
     for along, worst, std in weak:
         directions.append(_badly_determined(model, along, worst, std, scale))
         if std > OPEN_ANGLE and not why[worst]:
-            why[worst] = f'{directions[-1].fixed_by}: {directions[-1].why}'
+            known = f'the data determine it only to {np.degrees(std):.2f} deg'
+            why[worst] = f'{known}: {directions[-1].why}'
     return Gauge(tuple(directions), np.array(sorted(held), dtype=np.int64), tuple(why))
 
 

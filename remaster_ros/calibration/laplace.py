@@ -150,9 +150,17 @@ class Mode:
 
     @property
     def weakest(self) -> str:
-        """Names of the parameters that are determined worst together."""
-        direction = open_direction(self.linearisation, self.eta)
-        return hardly_seen(self.linearisation.posterior.free_names, direction)
+        """Names of the parameters that are determined worst together; effects not counted.
+
+        A curve of a joint always has a coefficient that only its smoothness determines.
+        """
+        posterior = self.linearisation.posterior
+        core = posterior.free < posterior.model.core
+        scale = np.sqrt(np.diag(self.linearisation.gram(self.eta))[: len(core)])
+        scaled = self.covariance * np.outer(scale, scale)
+        direction = np.linalg.eigh(scaled[core][:, core])[1][:, -1]
+        names = np.array(posterior.free_names)[core]
+        return hardly_seen(names.tolist(), direction)
 
     @property
     def covariance(self) -> FloatArray:
@@ -208,7 +216,7 @@ def find_mode(posterior: Posterior, eta: FloatArray | None = None) -> Mode:
     except np.linalg.LinAlgError:
         # A parameter without any information: the same remedy as steps that never end.
         pass
-    weakest = hardly_seen(posterior.free_names, open_direction(linearisation, eta, step))
+    weakest = hardly_seen(posterior.free_names, _open_direction(linearisation, eta, step))
     raise InsufficientDataError(
         f'the fit does not settle: the observations hardly determine {weakest}; measure more '
         'poses, spread further, or give a prior on one of them'
@@ -230,21 +238,18 @@ def _uphill(
     return tries[1 + (higher[0] if len(higher) else HALVINGS - 1)]
 
 
-def open_direction(
-    linearisation: Linearisation, eta: FloatArray, step: FloatArray | None = None
-) -> FloatArray:
-    """Return loadings (f,) of the worst determined direction, or of that a step (f,) goes along.
+def _open_direction(linearisation: Linearisation, eta: FloatArray, step: FloatArray) -> FloatArray:
+    """Return loadings (f,) of the worst determined direction that a step (f,) goes along.
 
     Each in units of what the parameter alone does to the observations.
     """
-    f = len(linearisation.posterior.free)
+    f = len(step)
     gram = linearisation.gram(eta)[:f, :f]
     scale = np.sqrt(np.diag(gram))
     if np.any(scale == 0.0):
         return (scale == 0.0).astype(float)
     vectors = np.linalg.eigh(gram / np.outer(scale, scale))[1]
-    chosen = 0 if step is None else np.argmax(np.abs(vectors.T @ (scale * step)))
-    loadings: FloatArray = vectors[:, chosen]
+    loadings: FloatArray = vectors[:, np.argmax(np.abs(vectors.T @ (scale * step)))]
     return loadings
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,12 +13,19 @@ from remaster_ros.calibration.convergence import SamplerInfo
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.identifiability import Gauge, GaugeDirection
+from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.metropolis import Chains
 from remaster_ros.calibration.model import Model
-from remaster_ros.calibration.noise import Noise
 from remaster_ros.calibration.noise_check import NoiseCheck, check_noise
+from remaster_ros.calibration.noise_estimate import NoiseEstimate, noise_estimates
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.predictive_accuracy import Predictive
+from remaster_ros.calibration.residual_structure import (
+    ResidualStructure,
+    errors_are_left,
+    residual_structure,
+)
+from remaster_ros.calibration.robust_intervals import robust_std
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, inverse, matrix_to_rotation_vector
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Session
@@ -31,22 +38,6 @@ AS_GOOD_AS_SEEN = 2.0
 LARGEST_OFFSET = np.radians(5.0)
 # Of an unknown angle, uniform over the turn.
 UNKNOWN_STD = np.pi / np.sqrt(3.0)
-
-
-@dataclass(frozen=True)
-class NoiseEstimate:
-    """The noise of one sensor per axis, m: posterior means, and the std of ``sigma_m``.
-
-    ``pose_sigma_m`` is None where no pose has two rows: ``sigma_m`` then holds both parts. Where
-    the noise along the line of sight differs, these are root mean squares over the three axes, and
-    ``directions`` has the noise 'along' and 'across'; otherwise it is empty.
-    """
-
-    sigma_m: float
-    std_m: float
-    pose_sigma_m: float | None
-    pose_std_m: float | None
-    directions: Mapping[str, NoiseEstimate] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +88,11 @@ class FitResult:
         (observation, reason) of every gross error.
     noise_checks
         Of every sensor: is what the fit leaves what noise explains?
+    structure
+        What the residuals follow; None where the sampler is the paper's, or with an extension.
+    widening
+        How many times the standard deviation and the interval of each joint's offset are those of
+        the model, because of errors that it leaves out, (k,); 1 where there are none.
     theta_names
         Of the extension's m parameters; empty without one.
     theta, theta_std
@@ -133,11 +129,18 @@ class FitResult:
     accuracy: Mapping[str, Any]
     left_out: tuple[tuple[int, str], ...]
     noise_checks: tuple[NoiseCheck, ...]
+    structure: ResidualStructure | None
+    widening: FloatArray
     theta_names: tuple[str, ...]
     theta: FloatArray
     theta_std: FloatArray
     theta_draws: FloatArray
     predictive: Predictive
+
+    @property
+    def other_errors(self) -> bool:
+        """Whether errors that are neither offsets nor noise are known to be left."""
+        return errors_are_left(self.noise_checks, self.structure)
 
     @property
     def implausible(self) -> tuple[str, ...]:
@@ -181,8 +184,8 @@ class Sampled:
         Pinned parameters of the fit with offsets at zero, (size,).
     left_out
         (row of the measurements, reason) of the gross errors.
-    weakest
-        Names of the parameters that the observations determine worst together.
+    mode
+        Of the posterior; None where it was not sought.
     """
 
     posterior: Posterior
@@ -197,7 +200,7 @@ class Sampled:
     taken_as_known: FloatArray
     z_before: FloatArray
     left_out: tuple[tuple[int, str], ...]
-    weakest: str = ''
+    mode: Mode | None = None
 
 
 def sampled_columns(
@@ -241,7 +244,6 @@ def build_result(
     predicted_before = predicted_rows(problem, model, sampled.z_before)
     predicted_after = predicted_rows(problem, model, sampled.z_mean)
     mean, std, interval = _offset_summary(flat[:, : model.joints], unfixed, sampled.taken_as_known)
-
     T_R_N, markers = model.T_R_N(x_after), model.markers(x_after)
     x_draws = model.natural(flat)
     T_draws = model.T_R_N(x_draws)
@@ -249,6 +251,19 @@ def build_result(
     left_rows = np.array([row for row, _ in sampled.left_out], dtype=np.int64)
     left_out = measurements.observation[left_rows]
     residuals_after = measurements.position - predicted_after
+    noise_checks = check_noise(
+        measurements,
+        problem.sensor_names,
+        residuals_after,
+        left_out,
+        parameters=len(sampled.moved),
+    )
+    structure, widening = None, np.ones(model.joints)
+    if sampled.mode is not None and model.extension is None:
+        structure = residual_structure(sampled.mode, measurements)
+        if errors_are_left(noise_checks, structure):
+            robust = robust_std(sampled.mode, measurements)
+            widening = np.where(unfixed, 1.0, np.maximum(1.0, robust / std))
     noise = posterior.noise(sampled.eta)
     total_noise = posterior.noise_model.total_noise(noise)
     predictive = Predictive(
@@ -275,8 +290,8 @@ def build_result(
         trace=sampled.run.trace,
         joint_offset_draws=model.offsets(sampled.z),
         joint_offsets=mean,
-        joint_offsets_std=std,
-        joint_offsets_interval95=interval,
+        joint_offsets_std=widening * std,
+        joint_offsets_interval95=mean[:, None] + widening[:, None] * (interval - mean[:, None]),
         identifiable=_identifiable(gauge.why, std),
         why=gauge.why,
         gauge=gauge.directions,
@@ -285,14 +300,14 @@ def build_result(
         T_R_N_std_rad=by_sensor(turns.std(axis=0, ddof=1)),
         marker_positions=by_marker(markers),
         marker_std_m=by_marker(model.markers(x_draws).std(axis=0, ddof=1)),
-        noise=_noise(posterior, noise),
+        noise=noise_estimates(posterior, noise),
         sampler=SamplerInfo.of(
             sampled.run,
             names,
             name=sampled.name,
             wanted=sampled.precision,
             seconds=seconds,
-            weakest=sampled.weakest,
+            weakest='' if sampled.mode is None else sampled.mode.weakest,
         ),
         T_R_N_before=by_sensor(model.T_R_N(x_before)),
         residuals_before=measurements.position - predicted_before,
@@ -306,13 +321,9 @@ def build_result(
             rng,
         ),
         left_out=tuple(zip(left_out.tolist(), (why for _, why in sampled.left_out), strict=True)),
-        noise_checks=check_noise(
-            measurements,
-            problem.sensor_names,
-            residuals_after,
-            left_out,
-            parameters=len(sampled.moved),
-        ),
+        noise_checks=noise_checks,
+        structure=structure,
+        widening=widening,
         theta_names=model.extension.names if model.extension is not None else (),
         theta=model.theta(sampled.z_mean),
         theta_std=model.theta(flat).std(axis=0, ddof=1),
@@ -357,30 +368,3 @@ def predicted_rows(problem: Problem, model: Model, z: FloatArray) -> FloatArray:
     predicted = np.empty((len(measurements), 3))
     predicted[rows.source] = model.predict(z, rows)
     return apply(inverse(model.reference)[measurements.sensor], predicted)
-
-
-def _noise(posterior: Posterior, by_channel: Noise) -> dict[str, NoiseEstimate]:
-    """Return the noise of every sensor from draws of that of the channels (chains, draws, …)."""
-    noise_model = posterior.noise_model
-    by_sensor = noise_model.sensor_noise(by_channel)
-    separate = {noise_model.channels[index].sensor for index in noise_model.separable}
-
-    def estimate(noise: Noise, at: int, sensor: int) -> NoiseEstimate:
-        sigma, pose_sigma = noise.sigma[..., at], noise.pose_sigma[..., at]
-        known = sensor in separate
-        return NoiseEstimate(
-            sigma_m=float(sigma.mean()),
-            std_m=float(sigma.std(ddof=1)),
-            pose_sigma_m=float(pose_sigma.mean()) if known else None,
-            pose_std_m=float(pose_sigma.std(ddof=1)) if known else None,
-        )
-
-    result = {}
-    for sensor, name in enumerate(posterior.model.sensor_names):
-        directions = {
-            channel.direction: estimate(by_channel, index, sensor)
-            for index, channel in enumerate(noise_model.channels)
-            if channel.sensor == sensor and channel.direction
-        }
-        result[name] = replace(estimate(by_sensor, sensor, sensor), directions=directions)
-    return result

@@ -124,6 +124,8 @@ def summary(
             'with the causes as found, frozen'
         )
     lines += [f'not testable: {name}: {why}' for name, why in found.untestable.items()]
+    if not found.fit.sampler.converged:
+        lines.append(f'uncertainties are approximate: {found.fit.sampler.message}')
     if confirmation is not None:
         lines += [f'other session: {line}' for line in in_words(found, confirmation)]
         lines += side_by_side(found, confirmation)

@@ -122,6 +122,15 @@ def summary(result: FitResult) -> str:
                 f'{check.sensor}: noise ({1e3 * check.noise_error_m:.3f} mm) does not explain the '
                 f'{left}: other errors dominate; run "remaster discover"'
             )
+    if result.structure is not None:
+        lines += [f'{test.words} ({test.chance})' for test in result.structure.found]
+        if result.structure.found and all(check.explained for check in result.noise_checks):
+            lines.append('other errors dominate; run "remaster discover"')
+    if np.any(result.widening > 1.0):
+        lines.append(
+            'the standard deviations of the offsets include these other errors: up to '
+            f'{np.max(result.widening):.1f} times those of the model alone'
+        )
     _, found = changes(result.session, result.chain, result.T_R_N)
     lines += [f'changed while it was measured: {change.describe()}' for change in found]
     if not result.session.timed:

@@ -29,7 +29,7 @@ from remaster_ros.discovery.gain import (
     noise_by_range,
     pose_common_fraction,
 )
-from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful
+from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, unfitted
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
 from remaster_ros.discovery.omnibus import structure_left
 from remaster_ros.discovery.residuals import Residuals
@@ -130,8 +130,16 @@ def discover_session(
     """
     report = progress if progress is not None else silent
     findings = find_causes(session, rng=rng, progress=report)
-    fit, gain = _sampled(session, findings, rng, report, clock)
     unexplained: tuple[Unexplained, ...] = ()
+    try:
+        fit, gain = _sampled(session, findings, rng, report, clock)
+    except InsufficientDataError as error:
+        if not findings.selection.solution.cells:
+            raise
+        suggested = findings.effects + findings.structure
+        unexplained = (unfitted(findings.residuals.errors, suggested, error),)
+        findings = findings.without_causes()
+        fit, gain = _sampled(session, findings, rng, report, clock)
     if (findings.effects or findings.structure) and is_harmful(gain):
         unexplained = (harm_of(findings.before, fit, gain, findings.effects + findings.structure),)
         findings = findings.without_causes()

@@ -12,6 +12,7 @@ from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.result import FitResult, predicted_rows
 from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.gain import Gain
+from remaster_ros.errors import InsufficientDataError
 from remaster_ros.types import FloatArray
 
 # Causes with an error on the held-out poses of so many times that of the offsets are not returned.
@@ -89,5 +90,33 @@ def harm_of(
             f'{1e3 * gain.held_out_rms_after_m:.3f} mm RMS: it is not taken as a cause. Measure '
             'poses that are spread as the arm is used, over the whole region and with the tool '
             'turned, and search again.'
+        ),
+    )
+
+
+def unfitted(
+    errors: FloatArray, effects: Sequence[FoundEffect], reason: InsufficientDataError
+) -> Unexplained:
+    """Return what is left unexplained where the model does not end with the causes in it.
+
+    Parameters
+    ----------
+    errors
+        What the offsets alone leave, m, (n, 3).
+    effects
+        The causes.
+    reason
+        Why they cannot be fitted together with offsets, registrations and markers.
+    """
+    names = ', '.join(dict.fromkeys(effect.name.replace('_', ' ') for effect in effects))
+    return Unexplained(
+        where='residuals',
+        driver='unknown',
+        size_m=float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))),
+        p_value=np.nan,
+        next=(
+            f'The residuals suggest {names}, but these poses do not determine that together with '
+            f'everything else ({reason}): it is not taken as a cause. Measure poses that are '
+            'spread further and turn the tool, and search again.'
         ),
     )

@@ -59,6 +59,8 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
     """Whether poses that were never fitted, and the other session if there is one, agree."""
     if discovery.verdict in ('undetermined', 'unexplained') or discovery.unexplained:
         return False
+    if not discovery.fit.sampler.converged:
+        return False
     if confirmation is not None and not confirmation.same_offsets:
         return False
     if discovery.verdict == 'none':
@@ -78,8 +80,12 @@ def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> 
             f'{1e3 * gain.held_out_rms_before_m:.3f} to {1e3 * gain.held_out_rms_after_m:.3f} mm '
             f'RMS; the noise alone is {1e3 * gain.noise_floor_m:.3f} mm.'
         )
+    doubt = ''
+    if not discovery.fit.sampler.converged:
+        doubt = f' How uncertain the figures are is not known: {discovery.fit.sampler.message}.'
+    change += doubt
     if discovery.verdict == 'none':
-        return 'Nothing is there beyond the zero-offsets and the noise.'
+        return f'Nothing is there beyond the zero-offsets and the noise.{doubt}'
     if discovery.verdict == 'unexplained':
         return f'Something is there that no cause explains.{change}'
     count = len(discovery.effects)

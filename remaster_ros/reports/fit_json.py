@@ -27,7 +27,8 @@ from remaster_ros.types import FloatArray, Session
 from remaster_ros.version import __version__
 
 if TYPE_CHECKING:
-    from remaster_ros.calibration.result import FitResult, NoiseEstimate
+    from remaster_ros.calibration.noise_estimate import NoiseEstimate
+    from remaster_ros.calibration.result import FitResult
 
 FIT_FILE = 'fit.json'
 REPORT_FILE = 'report.html'
@@ -43,7 +44,7 @@ def fit_content(result: FitResult) -> schemas.Fit:
     """Return a fit as fit.json has it."""
     session, sampler = result.session, result.sampler
     draws = result.draws.reshape(-1, result.draws.shape[-1])
-    content = {
+    content: dict[str, Any] = {
         'format': schemas.FIT_FORMAT,
         'version': __version__,
         'robot': {
@@ -105,6 +106,16 @@ def fit_content(result: FitResult) -> schemas.Fit:
             for check in result.noise_checks
         },
     }
+    if result.structure is not None:
+        content['residual_structure'] = [
+            {**vars(test), 'found': test in result.structure.found}
+            for test in result.structure.tests
+        ]
+        content['intervals'] = 'robust' if result.other_errors else 'model'
+        model = np.degrees(result.joint_offsets_std / result.widening)
+        for row, std, times in zip(content['joint_offsets'], model, result.widening, strict=True):
+            if times > 1.0:
+                row['model_std_deg'] = std
     return schemas.checked(content, schemas.Fit)
 
 

@@ -97,7 +97,8 @@ def verdict(result: FitResult) -> Headline:
     change = f'{before:.3f} mm to {after:.3f} mm {where}'
     unexplained = [check for check in result.noise_checks if not check.explained]
     changes = _references(result)[1]
-    points = [_compared(check) for check in unexplained] + changes
+    points = [_compared(check) for check in unexplained] + _structure(result) + changes
+    doubtful = bool(unexplained) or result.other_errors
     mood = 'caution'
     if result.sampler.wandering and not result.sampler.converged:
         mood = 'bad'
@@ -110,17 +111,19 @@ def verdict(result: FitResult) -> Headline:
             'The data leave some parameters so open that their distribution is known only '
             f'approximately. The mean position error goes from {change}.'
         )
+        if doubtful:
+            headline += f' {_dominated(result, unexplained)}'
     elif gain >= NOTICEABLE_GAIN:
         times = f'{gain:.1f} times' if gain < 10 else f'{gain:.0f} times'
         headline = f'The mean position error falls from {change}: {times} smaller.'
-        if unexplained:
-            headline += f' {_dominated(unexplained)}'
+        if doubtful:
+            headline += f' {_dominated(result, unexplained)}'
         elif validated and not changes and result.sampler.converged:
             mood = 'good'
     elif gain > 1 / NOTICEABLE_GAIN:
         headline = (
             f'The zero-offsets hardly matter here: the mean position error goes from {change}. '
-            + (_dominated(unexplained) if unexplained else 'That is what noise explains.')
+            + (_dominated(result, unexplained) if doubtful else 'That is what noise explains.')
         )
     else:
         mood = 'bad'
@@ -172,10 +175,27 @@ def verdict(result: FitResult) -> Headline:
     return Headline(mood, headline, points)
 
 
-def _dominated(unexplained: Sequence[NoiseCheck]) -> str:
+def _structure(result: FitResult) -> list[str]:
+    """Return what the residuals follow, and what that does to the intervals."""
+    found = result.structure.found if result.structure is not None else ()
+    lines = [f'{test.words} ({test.chance}).'.capitalize() for test in found]
+    if np.any(result.widening > 1.0):
+        lines.append(
+            'The standard deviations and intervals of the offsets include what the model leaves '
+            f'out: they are up to {np.max(result.widening):.1f} times as wide as without it.'
+        )
+    return lines
+
+
+def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
     """Return why the error after is no success, and what to do."""
-    if all(check.noise_m is None for check in unexplained):
+    if not result.other_errors:
         return 'Whether noise explains what is left, this session cannot show.'
+    if not any(check.noise_m is not None for check in unexplained):
+        return (
+            'But what is left has structure, which noise has not: other errors dominate; '
+            'run "remaster discover".'
+        )
     return (
         'But noise does not explain what is left: other errors dominate; run "remaster discover".'
     )

@@ -37,6 +37,7 @@ def found(effects, gain, untestable, thinning=None):
         untestable=untestable,
         thinning=thinning,
         unexplained=(),
+        fit=types.SimpleNamespace(sampler=types.SimpleNamespace(converged=True)),
     )
 
 

@@ -11,12 +11,14 @@ from discovery_scenes import at_joint, residuals_of, session_with
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
+from remaster_ros.discovery import discover
 from remaster_ros.discovery.cross_validation import held_out_error
 from remaster_ros.discovery.discover import Findings, discover_session, find_causes
 from remaster_ros.discovery.effects.base import Design
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import _System, solve
 from remaster_ros.discovery.screening import Catalogue, screen
+from remaster_ros.errors import InsufficientDataError
 from remaster_ros.types import Session
 
 ARC_MINUTE = np.radians(1.0 / 60.0)
@@ -132,6 +134,31 @@ def test_what_a_marker_moved_further_than_allowed_is_said():
     z = effect.parameters[2]
     # The true marker is itself 0.5 mm from where the session has it.
     assert abs(z.value + 6e-3) < 3 * 0.5e-3
+
+
+def test_causes_that_the_poses_do_not_determine_are_left_out_with_the_reason(monkeypatch):
+    """The offsets alone can be fitted: the answer is theirs, and the units are not blamed."""
+
+    def refusing(session, *, extension, **options):
+        if extension is not None:
+            raise InsufficientDataError('the observations hardly determine effect.compliance_2')
+        return fit_session(session, extension=None, **options)
+
+    monkeypatch.setattr(discover, 'fit_session', refusing)
+    found = discover_session(sagging_session(), rng=np.random.default_rng(3))
+    assert found.verdict == 'unexplained'
+    assert found.effects == ()
+    left = found.unexplained[0]
+    assert 'joint compliance' in left.next
+    assert 'hardly determine effect.compliance_2' in left.next
+    assert left.size_m == pytest.approx(found.gain.held_out_rms_before_m, rel=0.3)
+
+    def broken(session, **options):
+        raise InsufficientDataError('too few poses')
+
+    monkeypatch.setattr(discover, 'fit_session', broken)
+    with pytest.raises(InsufficientDataError, match='too few poses'):
+        discover_session(sagging_session(), rng=np.random.default_rng(3))
 
 
 def test_the_extended_model_is_sampled_and_gains_on_held_out_poses():

@@ -107,3 +107,14 @@ def test_a_table_without_the_optional_columns_has_its_page(tmp_path):
     page, _, names = saved(discovery, tmp_path)
     assert names >= {'gain', 'drivers'}
     assert 'What this session cannot test' in page
+
+
+def test_a_posterior_that_is_only_approximate_is_never_green(found, tmp_path):
+    message = 'NOT converged: Pareto k of the importance weights 1.18, not below 0.7'
+    fit = found['healthy'].fit
+    sampler = replace(fit.sampler, converged=False, method='laplace', message=message)
+    doubtful = replace(found['healthy'], fit=replace(fit, sampler=sampler))
+    page, mood, _ = saved(doubtful, tmp_path)
+    assert mood == 'caution'
+    assert message in page
+    assert message in summary(doubtful)

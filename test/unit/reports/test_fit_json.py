@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+from remaster_ros.calibration.residual_structure import ResidualStructure, StructureTest
 from remaster_ros.compensation.export import (
     _rpy,
     calibrated_urdf,
@@ -209,6 +210,37 @@ def test_all_joints_or_none_may_be_applied(fit_result, known):
     chain = SerialChain.from_urdf(urdf, result.chain.base_link, result.chain.tip_link)
     assert np.array_equal(chain.lower, result.chain.lower) != known
     assert ('left out' in urdf) != known
+
+
+def test_wider_intervals_and_their_reason_are_in_the_file(fit_result):
+    """And nothing of them where the sampler is one that has no such tests."""
+    tests = (StructureTest('position', True, 1e-9), StructureTest('time', True, 0.4))
+    widening = np.ones(len(fit_result.joint_names))
+    widening[2] = 3.0
+    found = replace(fit_result, structure=ResidualStructure(tests), widening=widening)
+    content = msgspec.to_builtins(fit_content(found))
+    assert content['intervals'] == 'robust'
+    assert [test['found'] for test in content['residual_structure']] == [True, False]
+    assert content['residual_structure'][0]['driver'] == 'position'
+    rows = content['joint_offsets']
+    assert rows[2]['model_std_deg'] == pytest.approx(rows[2]['std_deg'] / 3.0)
+    assert 'model_std_deg' not in rows[3]
+    assert 'intervals' not in msgspec.to_builtins(fit_content(replace(fit_result, structure=None)))
+
+
+def test_the_approximation_and_its_check_are_in_the_file(fit_result):
+    sampler = replace(
+        fit_result.sampler,
+        method='importance',
+        pareto_k=0.45,
+        r_hat=np.full(len(fit_result.parameter_names), np.nan),
+    )
+    content = msgspec.to_builtins(fit_content(replace(fit_result, sampler=sampler)))
+    assert content['sampler']['method'] == 'importance'
+    assert content['sampler']['pareto_k'] == 0.45
+    assert content['sampler']['r_hat_max'] is None
+    usual = msgspec.to_builtins(fit_content(fit_result))['sampler']
+    assert (usual['method'], usual['pareto_k']) == ('metropolis', None)
 
 
 def test_results_of_others_are_not_replaced(fit_result, tmp_path):

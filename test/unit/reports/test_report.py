@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 
 from remaster_ros.calibration.noise_check import NoiseCheck
-from remaster_ros.calibration.result import NoiseEstimate
+from remaster_ros.calibration.noise_estimate import NoiseEstimate
+from remaster_ros.calibration.residual_structure import ResidualStructure, StructureTest
+from remaster_ros.cli.fit import summary
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.reports.fit_json import save_fit
@@ -222,6 +224,28 @@ def test_an_approximation_that_fails_its_check_is_never_green(fit_result):
     assert any(message in point for point in judged.points)
     text = report_html(replace(fit_result, sampler=sampler), {})
     assert 'No chain reached the precision' in text
+
+
+def test_structure_in_the_residuals_is_never_green(fit_result):
+    """Also where noise explains their size; the wider intervals are mentioned."""
+    structure = ResidualStructure(
+        (StructureTest('position', True, 1e-9), StructureTest('time', True, 0.4))
+    )
+    result = replace(
+        with_accuracy(fit_result, 'validation', 4.0, 0.5),
+        noise_checks=(),
+        structure=structure,
+        widening=np.array([1.0, 3.14, 1.2, 1.0, 1.0, 1.0, 1.0]),
+    )
+    judged = verdict(result)
+    assert judged.mood == 'caution'
+    assert 'other errors dominate; run "remaster discover"' in judged.headline
+    told = ' '.join(judged.points)
+    assert 'follows the position in front of the sensor from pose to pose (p < 0.0001)' in told
+    assert 'follows time' not in told
+    assert 'up to 3.1 times as wide' in told
+    printed = summary(replace(fit_result, noise_checks=(), structure=structure))
+    assert 'other errors dominate; run "remaster discover"' in printed
 
 
 MOVED = NoiseCheck('tracker', 2.337e-3, None, 0.11e-3, poses=12)

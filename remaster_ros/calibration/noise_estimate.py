@@ -1,0 +1,52 @@
+"""The noise of each sensor as a fit reports it: means and standard deviations over the draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from remaster_ros.calibration.noise import Noise
+from remaster_ros.calibration.posterior import Posterior
+
+
+@dataclass(frozen=True)
+class NoiseEstimate:
+    """The noise of one sensor per axis, m: posterior means, and the std of ``sigma_m``.
+
+    ``pose_sigma_m`` is None where no pose has two rows: ``sigma_m`` then holds both parts. Where
+    the noise along the line of sight differs, these are root mean squares over the three axes, and
+    ``directions`` has the noise 'along' and 'across'; otherwise it is empty.
+    """
+
+    sigma_m: float
+    std_m: float
+    pose_sigma_m: float | None
+    pose_std_m: float | None
+    directions: Mapping[str, NoiseEstimate] = field(default_factory=dict)
+
+
+def noise_estimates(posterior: Posterior, by_channel: Noise) -> dict[str, NoiseEstimate]:
+    """Return the noise of every sensor from draws of that of the channels (chains, draws, …)."""
+    noise_model = posterior.noise_model
+    by_sensor = noise_model.sensor_noise(by_channel)
+    separate = {noise_model.channels[index].sensor for index in noise_model.separable}
+
+    def estimate(noise: Noise, at: int, sensor: int) -> NoiseEstimate:
+        sigma, pose_sigma = noise.sigma[..., at], noise.pose_sigma[..., at]
+        known = sensor in separate
+        return NoiseEstimate(
+            sigma_m=float(sigma.mean()),
+            std_m=float(sigma.std(ddof=1)),
+            pose_sigma_m=float(pose_sigma.mean()) if known else None,
+            pose_std_m=float(pose_sigma.std(ddof=1)) if known else None,
+        )
+
+    result = {}
+    for sensor, name in enumerate(posterior.model.sensor_names):
+        directions = {
+            channel.direction: estimate(by_channel, index, sensor)
+            for index, channel in enumerate(noise_model.channels)
+            if channel.sensor == sensor and channel.direction
+        }
+        result[name] = replace(estimate(by_sensor, sensor, sensor), directions=directions)
+    return result

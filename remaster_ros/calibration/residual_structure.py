@@ -1,0 +1,242 @@
+"""Is any structure left in the residuals of a fit? A light omnibus test.
+
+The residuals at the mode, in units of the noise, fall into two independent parts: the means of
+each sensor's rows at a pose, and the deviations from these. In each part the model's own columns
+are projected out, and an F test asks whether a family of smooth functions (`smooth_functions`)
+explains more of the rest than noise would. Two more tests ask whether one reading resembles the
+next: pose after pose, and within the poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import beta
+from scipy.stats import f as f_distribution
+from scipy.stats import t as t_distribution
+
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.laplace import Mode
+from remaster_ros.calibration.noise_check import NoiseCheck
+from remaster_ros.calibration.smooth_functions import (
+    of_joint_angles,
+    of_position,
+    of_time,
+    spread_poses,
+    whitened,
+)
+from remaster_ros.types import FloatArray, Measurements
+
+# Of all tests together, where noise is as the model has it.
+FAMILY_WISE_ERROR = 0.01
+# A family of functions is tested where so many times its number remain to judge the noise by.
+LEAST_REST = 2.0
+# Of functions of unit length, directions shorter than this beside the model's are the model's own:
+# a turn of the sensor is a function of the measured as of the modelled position.
+ABSORBED = 0.03
+FEWEST_POSES = 12
+# Simulated readings without noise leave rounding errors, which have structure.
+LEAST_NOISE_M = 1e-6
+
+
+@dataclass(frozen=True)
+class StructureTest:
+    """One of the tests.
+
+    Attributes
+    ----------
+    driver
+        What the residuals were held against: 'position', 'time', 'joint_angle', 'reading_before'.
+    between_poses
+        Whether in the means of the poses or in the deviations from them.
+    p_value
+        Of so much or more by chance.
+    """
+
+    driver: str
+    between_poses: bool
+    p_value: float
+
+    @property
+    def chance(self) -> str:
+        """How probable so much is by chance, for people."""
+        return 'p < 0.0001' if self.p_value < 1e-4 else f'p = {self.p_value:.4f}'
+
+    @property
+    def words(self) -> str:
+        """What the residuals follow, for people."""
+        where = 'from pose to pose' if self.between_poses else 'within the poses'
+        what = {
+            'position': 'follows the position in front of the sensor',
+            'time': 'follows time',
+            'joint_angle': "follows the joints' angles",
+            'reading_before': 'resembles that of the reading before',
+        }[self.driver]
+        return f'the error {what} {where}'
+
+
+@dataclass(frozen=True)
+class ResidualStructure:
+    """All of the tests; none where there are too few poses."""
+
+    tests: tuple[StructureTest, ...]
+
+    @property
+    def found(self) -> tuple[StructureTest, ...]:
+        """Return the tests that fire, the clearest first."""
+        limit = FAMILY_WISE_ERROR / max(1, len(self.tests))
+        return tuple(
+            sorted((t for t in self.tests if t.p_value < limit), key=lambda test: test.p_value)
+        )
+
+
+def errors_are_left(checks: Sequence[NoiseCheck], structure: ResidualStructure | None) -> bool:
+    """Return whether the residuals have structure, or are more than the noise that is known."""
+    unexplained = any(c.noise_error_m is not None and not c.explained for c in checks)
+    return unexplained or (structure is not None and bool(structure.found))
+
+
+def residual_structure(mode: Mode, measurements: Measurements) -> ResidualStructure:
+    """Test the residuals of a fit at its mode.
+
+    Parameters
+    ----------
+    mode
+        Of the posterior of the rows fitted.
+    measurements
+        That the rows were taken from; their ``stamp_s`` tells which came first.
+    """
+    posterior = mode.linearisation.posterior
+    rows = spread_poses(posterior.rows)
+    noiseless = np.all(posterior.noise(mode.eta).sigma < LEAST_NOISE_M)
+    if len(rows.group_start) < FEWEST_POSES or noiseless:
+        return ResidualStructure(())
+    seconds = measurements.stamp_s[rows.source]
+    families = {
+        'position': of_position(rows),
+        'time': of_time(rows, seconds),
+        'joint_angle': of_joint_angles(mode, rows),
+    }
+    white = whitened(mode, rows, families)
+    size = rows.group_size[:, None, None]
+    middle = {name: rows.group_sum(part, axis=0) / size for name, part in white.items()}
+    apart = {name: part - middle[name][rows.group_of_row] for name, part in white.items()}
+    between = {name: _flat(part * np.sqrt(size)) for name, part in middle.items()}
+    within = {name: _flat(part) for name, part in apart.items()}
+    basis = _basis(between['model'])
+    rest = _without(basis, between['errors'])
+    tests = [_explained(driver, between, rest, basis) for driver in families]
+    tests.append(_from_pose_to_pose(rest, basis, rows, seconds))
+    if np.any(rows.group_size > 1):
+        basis = _basis(within['model'])
+        rest = _without(basis, within['errors'])
+        # The deviations from the mean of n rows are n - 1 independent numbers.
+        lost = 3 * len(rows.group_start)
+        tests.append(_explained('joint_angle', within, rest, basis, lost))
+        tests.append(_within_poses(rest.reshape(-1, 3), rows, seconds))
+    return ResidualStructure(tuple(test for test in tests if test is not None))
+
+
+def _flat(columns: FloatArray) -> FloatArray:
+    return columns.reshape(-1, columns.shape[2])
+
+
+def _basis(columns: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of columns (n, c), (n, b), of whatever lengths."""
+    length = np.linalg.norm(columns, axis=0)
+    kept = length > 1e-12 * np.max(length)
+    left, singular, _ = np.linalg.svd(columns[:, kept] / length[kept], full_matrices=False)
+    basis: FloatArray = left[:, singular > 1e-9 * singular[0]]
+    return basis
+
+
+def _without(basis: FloatArray, columns: FloatArray) -> FloatArray:
+    """Return columns (n, c) less what they have in common with a basis (n, b)."""
+    rest: FloatArray = columns - basis @ (basis.T @ columns)
+    return rest
+
+
+def _explained(
+    driver: str,
+    columns: dict[str, FloatArray],
+    rest: FloatArray,
+    basis: FloatArray,
+    lost: int = 0,
+) -> StructureTest | None:
+    """Test whether the columns of a driver explain the rest (n, 1) that the model's leave.
+
+    None where there are too many of them for the rows.
+    """
+    family = columns[driver]
+    length = np.linalg.norm(family, axis=0)
+    left, singular, _ = np.linalg.svd(
+        _without(basis, family / np.where(length > 0.0, length, 1.0)), full_matrices=False
+    )
+    own = left[:, singular > ABSORBED]
+    freedom = len(rest) - lost - basis.shape[1] - own.shape[1]
+    if own.shape[1] == 0 or freedom < LEAST_REST * own.shape[1]:
+        return None
+    explained, total = float(np.sum((own.T @ rest) ** 2)), float(np.sum(rest**2))
+    ratio = explained / own.shape[1] / ((total - explained) / freedom)
+    p_value = float(f_distribution.sf(ratio, own.shape[1], freedom))
+    return StructureTest(driver, lost == 0, p_value)
+
+
+def _from_pose_to_pose(
+    rest: FloatArray, basis: FloatArray, rows: Rows, seconds: FloatArray
+) -> StructureTest:
+    """Test whether the mean error of a pose resembles that of the pose before.
+
+    The rest is M e with a projection M. Of the ratio e' M A M e / e' M e, A being half the sum of
+    either neighbour, mean and variance follow from traces; its distribution is nearly a beta one
+    (Durbin and Watson 1951, doi:10.1093/biomet/38.1-2.159).
+    """
+    time = rows.group_sum(seconds, axis=0) / rows.group_size
+    order = np.lexsort((time, rows.group_sensor))
+    neighbours = np.diff(rows.group_sensor[order], prepend=-1) == 0
+
+    def shifted(columns: FloatArray) -> FloatArray:
+        """Return A times columns (3 g, c): half the sum of the neighbours' on either side."""
+        blocks = columns.reshape(len(order), 3, -1)[order]
+        result = np.zeros_like(blocks)
+        result[1:] += blocks[:-1] * neighbours[1:, None, None]
+        result[:-1] += blocks[1:] * neighbours[1:, None, None]
+        back = np.empty_like(result)
+        back[order] = 0.5 * result
+        return back.reshape(columns.shape)
+
+    along = shifted(basis)
+    small = basis.T @ along
+    freedom = len(rest) - basis.shape[1]
+    first = -float(np.trace(small))
+    second = 1.5 * int(np.sum(neighbours)) - 2.0 * np.sum(along**2) + np.sum(small * small.T)
+    mean = first / freedom
+    variance = 2.0 * (freedom * second - first**2) / (freedom**2 * (freedom + 2.0))
+    ratio = float(np.sum(rest * shifted(rest)) / np.sum(rest**2))
+    # From -1 to 1.
+    middle = 0.5 * (mean + 1.0)
+    precision = middle * (1.0 - middle) / (0.25 * variance) - 1.0
+    p_value = beta.sf(0.5 * (ratio + 1.0), middle * precision, (1.0 - middle) * precision)
+    return StructureTest('reading_before', True, float(p_value))
+
+
+def _within_poses(errors: FloatArray, rows: Rows, seconds: FloatArray) -> StructureTest | None:
+    """Test whether the deviation of a reading resembles that of the one before at the same pose.
+
+    In random order the sum of the products of neighbours of n deviations d is -Σ d² / n on
+    average; a t test over the poses.
+    """
+    group = rows.group_of_row
+    order = np.lexsort((seconds, group))
+    product = np.sum(errors[order][1:] * errors[order][:-1], axis=1)
+    product[np.diff(group[order]) != 0] = 0.0
+    chained = np.bincount(group[order][1:], product, len(rows.group_size))
+    squares = rows.group_sum(np.sum(errors**2, axis=1), axis=0)
+    several = rows.group_size > 2
+    if np.sum(several) < FEWEST_POSES:
+        return None
+    excess = (chained + squares / rows.group_size)[several]
+    score = excess.mean() / (excess.std(ddof=1) / np.sqrt(len(excess)))
+    return StructureTest('reading_before', False, float(t_distribution.sf(score, len(excess) - 1)))

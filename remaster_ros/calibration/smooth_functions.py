@@ -1,0 +1,116 @@
+"""What errors that no model has may look like: smooth functions, as columns beside the model's.
+
+Of the position in front of a sensor, of time, of each joint's own angle; and a displacement of
+each link and a tilt of each axis, which are constant in the link's frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.laplace import Mode
+from remaster_ros.calibration.noise import NoiseModel
+from remaster_ros.types import FloatArray
+
+# Degree of the polynomials of time, and number of harmonics of a joint's angle.
+TIME_DEGREE, HARMONICS = 3, 2
+# Rows that are looked at; of larger sessions those of evenly spread poses.
+MOST_ROWS = 10_000
+
+
+def spread_poses(rows: Rows) -> Rows:
+    """Return all rows, or of a large session those of evenly spread poses."""
+    every = -(-len(rows) // MOST_ROWS)
+    if every == 1:
+        return rows
+    kept = np.flatnonzero(rows.group_of_row % every == 0)
+    first = np.arange(0, len(rows.group_start), every)
+    size = rows.group_size[first]
+    cuts = [
+        (sensor, *np.searchsorted(kept, (s.start, s.stop)).tolist()) for sensor, s in rows.spans
+    ]
+    return Rows(
+        source=rows.source[kept],
+        q=rows.q[kept],
+        marker=rows.marker[kept],
+        target=rows.target[kept],
+        spans=tuple((sensor, slice(low, high)) for sensor, low, high in cuts),
+        group_start=np.cumsum(size) - size,
+        group_size=size,
+        group_sensor=rows.group_sensor[first],
+    )
+
+
+def whitened(mode: Mode, rows: Rows, families: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Return families of columns (n, 3, c) in units of the noise, 'errors' and 'model' as well."""
+    posterior = mode.linearisation.posterior
+    model = posterior.model
+    columns = {
+        'errors': (rows.target - model.predict(mode.z, rows))[:, :, None],
+        'model': model.jacobian(mode.z, rows)[:, :, posterior.free],
+        **families,
+    }
+    split = sorted({c.sensor for c in posterior.noise_model.channels if c.direction})
+    noise_model = NoiseModel.of(rows, model.reference, split)
+    noise = posterior.noise(mode.eta)
+    return {name: noise_model.whitened(part, noise) for name, part in columns.items()}
+
+
+def of_position(rows: Rows) -> FloatArray:
+    """Return polynomials of the measured position up to the second degree, (n, 3, 27 sensors)."""
+    place = np.empty_like(rows.target)
+    for _, span in rows.spans:
+        centred = rows.target[span] - rows.target[span].mean(axis=0)
+        place[span] = centred / max(float(np.std(centred)), 1e-9)
+    first, second = np.triu_indices(3)
+    products = place[:, first] * place[:, second]
+    return _by_sensor(rows, np.concatenate((place, products), axis=1))
+
+
+def of_time(rows: Rows, seconds: FloatArray) -> FloatArray:
+    """Return polynomials of time, s, (n,), without the constant, (n, 3, 9 sensors)."""
+    early, late = seconds.min(), seconds.max()
+    share = (2.0 * seconds - early - late) / max(late - early, 1e-9)
+    return _by_sensor(rows, legendre.legvander(share, TIME_DEGREE)[:, 1:])
+
+
+def of_joint_angles(mode: Mode, rows: Rows) -> FloatArray:
+    """Return what an error of each joint that follows its own angle does, (n, 3, 4 k)."""
+    by_joints = mode.linearisation.posterior.model.inner_pose(mode.z, rows).by_joints
+    return np.concatenate(
+        [
+            by_joints * wave(order * rows.q)[:, None, :]
+            for order in range(1, HARMONICS + 1)
+            for wave in (np.sin, np.cos)
+        ],
+        axis=2,
+    )
+
+
+def of_links(mode: Mode, rows: Rows) -> tuple[FloatArray, FloatArray]:
+    """Return what a displacement and what a tilt of each joint's frame does, (n, 3, 3 k) each."""
+    model = mode.linearisation.posterior.model
+    frames = model.chain.frames(rows.q, model.offsets(mode.z))
+    pose = model.inner_pose(mode.z, rows)
+    # (n, k, 3 axes, 3): the directions of the frames' axes.
+    axes = np.swapaxes(frames[..., :3, :3], -1, -2)
+    arms = pose.points[:, None, :] - frames[..., :3, 3]
+    turned = np.cross(axes, arms[:, :, None, :])
+
+    def columns(vectors: FloatArray) -> FloatArray:
+        return np.swapaxes(vectors.reshape(len(rows), -1, 3), 1, 2)
+
+    return columns(axes), columns(turned)
+
+
+def _by_sensor(rows: Rows, functions: FloatArray) -> FloatArray:
+    """Return functions (n, c) along each axis, each sensor's for itself, (n, 3, 3 c sensors)."""
+    columns = np.zeros((len(rows), 3, len(rows.spans), 3, functions.shape[1]))
+    for place, (_, span) in enumerate(rows.spans):
+        for axis in range(3):
+            columns[span, axis, place, axis] = functions[span]
+    return columns.reshape(len(rows), 3, -1)
