@@ -73,6 +73,7 @@ setup(
     install_requires=[
         'numpy>=1.26',
         'scipy>=1.11',
+        'argcomplete>=3',
         'arviz-stats>=0.4',
         'PyYAML>=6',
         'EAIK>=1.2',
@@ -89,6 +90,7 @@ setup(
         'mcap>=1.2',
         'python-dateutil>=2.8',
         'rosbags>=0.10',
+        'xacro>=2.0.8',
     ],
     extras_require={
         'jazzy': JAZZY,

@@ -1,5 +1,8 @@
 """The exceptions a caller may expect; each carries what is wrong and the remedy."""
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 _LONGEST = 1000
 """Characters of a message; what a stranger's file holds must not flood the terminal."""
 
@@ -36,3 +39,10 @@ class InsufficientDataError(RemasterError):
 
 class DeviceError(RemasterError):
     """A device does not answer, or answers what it must not; names the device and the remedy."""
+
+
+def did_you_mean(word: str, words: Iterable[str]) -> str:
+    """Return "; did you mean 'other'?" with the word that is most like it; '' where none is."""
+    by_folded = {known.casefold(): known for known in words}
+    close = get_close_matches(word.casefold(), by_folded, 1)
+    return f'; did you mean {by_folded[close[0]]!r}?' if close else ''

@@ -19,12 +19,14 @@ SEED = 11
 class Cell:
     """A small collection of real nodes on fake devices, and what they publish."""
 
-    def __init__(self, start, client, folder, require, sensors, candidates=2, reference_every=0):
+    def __init__(
+        self, start, client, folder, require, sensors, candidates=2, reference_every=0, cell='demo'
+    ):
         from remaster_ros.nodes.status import listen
 
         self.client, self.folder, self.session = client, folder, folder / 'session'
         print('seed', SEED)
-        self.world = make_world(folder / 'world', read_cell('demo'), SEED, 10.0)
+        self.world = make_world(folder / 'world', read_cell(cell), SEED, 10.0)
         self.said, self.messages, self.results, self.events = {}, {}, [], []
         listen(client, self._record, self._summary)
         command, data, tracker = free_ports(
@@ -49,6 +51,8 @@ class Cell:
         if 'tracker' in sensors:
             own['fake_laser_tracker'] = {'world': folder / 'world', 'port': tracker}
             own['laser_tracker_markers'] = {'port': tracker}
+        for name in own.keys() - {'fake_robot', 'fake_optitrack', 'fake_laser_tracker'}:
+            own[name]['cell'] = cell
         common = ROOT / 'config' / 'fake.yaml'
 
         def begin(name):

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from remaster_ros.calibration.metropolis import Chains
+from remaster_ros.calibration.metropolis import Chains, Method
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.types import FloatArray
 
@@ -23,6 +23,8 @@ MINIMUM_DRAWS = 8
 R_HAT_LIMIT = 1.01
 # Effective draws enough for two digits of a 95 % interval.
 ESS_LIMIT = 400.0
+# Importance weights whose tail has a larger shape than this are not relied on.
+PARETO_LIMIT = 0.7
 
 
 def r_hat(draws: FloatArray) -> FloatArray:
@@ -95,10 +97,15 @@ class SamplerInfo:
     seconds
         By the clock passed in; NaN without one.
     converged
-        Every R-hat at most 1.01 and every effective sample size at least what the precision
-        takes, 400 where none was asked for.
+        Every R-hat at most 1.01 (Pareto k below 0.7 of draws by importance) and every effective
+        sample size at least what the precision takes, 400 where none was asked for.
     message
         The verdict with its figures, for the report.
+    method
+        'metropolis', 'importance' or 'laplace', as `Chains` has it. The latter two have no
+        R-hat, and are judged by their importance weights.
+    pareto_k
+        Shape of the tail of these weights; NaN for chains.
     """
 
     name: str
@@ -115,6 +122,16 @@ class SamplerInfo:
     seconds: float
     converged: bool
     message: str
+    method: Method = 'metropolis'
+    pareto_k: float = float('nan')
+
+    @property
+    def wandering(self) -> bool:
+        """Whether these are chains that do not agree, or are worth too few draws to tell."""
+        if self.method != 'metropolis':
+            return False
+        few = np.min((self.ess_bulk, self.ess_tail)) < ESS_LIMIT
+        return bool(few or np.max(self.r_hat) > R_HAT_LIMIT)
 
     @classmethod
     def of(
@@ -125,23 +142,40 @@ class SamplerInfo:
         name: str,
         wanted: float | None,
         seconds: float,
+        weakest: str = '',
     ) -> SamplerInfo:
-        """Judge the chains of p named parameters; the rest as the attributes."""
+        """Judge the draws of p named parameters; the rest as the attributes.
+
+        ``weakest`` names the parameters that the observations determine worst together.
+        """
         draws = run.draws
-        figures = r_hat(draws), ess_bulk(draws), ess_tail(draws)
-        worst, least = float(np.max(figures[0])), float(np.min(figures[1:]))
-        converged = worst <= R_HAT_LIMIT and least >= (ESS_LIMIT if wanted is None else wanted**-2)
+        needed = ESS_LIMIT if wanted is None else wanted**-2
+        if run.method == 'metropolis':
+            figures = r_hat(draws), ess_bulk(draws), ess_tail(draws)
+            worst, least = float(np.max(figures[0])), float(np.min(figures[1:]))
+            sound = worst <= R_HAT_LIMIT
+            agreement = f'R-hat up to {worst:.3f} ({names[int(np.argmax(figures[0]))]})'
+        else:
+            least = run.effective
+            figures = (np.full(len(names), np.nan), *np.full((2, len(names)), least))
+            sound = run.method == 'importance' and run.pareto_k < PARETO_LIMIT
+            agreement = (
+                f'Pareto k of the importance weights {run.pareto_k:.2f}, '
+                f'{"below" if run.pareto_k < PARETO_LIMIT else "not below"} {PARETO_LIMIT:g}'
+            )
+        converged = sound and least >= needed
         precision = float(1.0 / np.sqrt(least))
         message = 'converged' if converged else 'NOT converged'
-        if not converged and wanted is not None:
+        if not converged and wanted is not None and run.method == 'metropolis':
             message += f' within {draws.shape[1]} draws a chain'
         message += (
-            f': R-hat up to {worst:.3f} ({names[int(np.argmax(figures[0]))]}), '
-            f'at least {least:.0f} effective draws, every mean within {100 * precision:.1f} % of '
-            'its standard deviation'
+            f': {agreement}, at least {least:.0f} effective draws, every mean within '
+            f'{100 * precision:.1f} % of its standard deviation'
         )
         if wanted is not None:
             message += f' ({100 * wanted:g} % wanted)'
+        if run.method != 'metropolis' and weakest:
+            message += f'; the observations hardly determine {weakest}'
         return cls(
             name,
             draws.shape[0],
@@ -155,4 +189,6 @@ class SamplerInfo:
             seconds,
             converged,
             message,
+            run.method,
+            run.pareto_k,
         )

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from remaster_ros.calibration.extension import Extension
 from remaster_ros.calibration.grouped_rows import Rows
-from remaster_ros.calibration.identifiability import Gauge, find_gauge
+from remaster_ros.calibration.identifiability import WEAK_ANGLE, Gauge, find_gauge
 from remaster_ros.calibration.initial_guess import robust_start
 from remaster_ros.calibration.laplace import Mode, find_mode
 from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.posterior import Posterior
-from remaster_ros.calibration.priors import Prior, base_prior, marker_prior, offset_prior
+from remaster_ros.calibration.priors import (
+    Prior,
+    base_prior,
+    marker_prior,
+    offset_prior,
+    plausible_offsets,
+)
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import (
@@ -158,6 +165,15 @@ class Problem:
             for name, known in self.priors.joint_offsets.items()
         )
 
+    def plausibility(self, model: Model, free: IntArray) -> tuple[Prior, ...]:
+        """Return a wide prior on the free offsets of which nothing else is known beforehand."""
+        unknown = [
+            joint
+            for joint, name in enumerate(self.chain.joint_names)
+            if joint in free and name not in self.priors.joint_offsets
+        ]
+        return (plausible_offsets(model, unknown),) if unknown else ()
+
     def empty_model(self, extension: Extension | None = None) -> Model:
         """Return a model with registrations still unknown."""
         count = len(self.sensor_names)
@@ -219,26 +235,34 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
         problem.fitted,
         problem.markers,
         float(np.max(problem.marker_std_m)),
-        problem.marker_priors(empty),
+        problem.marker_priors(empty) + problem.plausibility(empty, np.arange(len(problem.chain))),
     )
     priors = problem.marker_priors(model) + problem.other_priors(model)
     rows = Rows.of(measurements, problem.fitted, model.reference)
     gauge = find_gauge(model, model.natural(z), rows, priors)
     free = np.setdiff1d(np.arange(model.size), gauge.held)
+    known = priors
+    priors += problem.plausibility(model, free)
     z[gauge.held[gauge.held < model.joints]] = 0.0
 
-    def kept_posterior(keep: BoolArray) -> Posterior:
+    start = z
+
+    def fitted(keep: BoolArray) -> Mode:
+        # From the mode of the rows kept before: only the first search has far to go.
+        nonlocal start
         kept = Rows.of(measurements, np.sort(rows.source[keep]), model.reference)
-        return Posterior.of(model, kept, priors, free, z)
+        mode = find_mode(Posterior.of(model, kept, priors, free, start))
+        start = mode.z
+        return mode
 
     def refit(keep: BoolArray) -> FloatArray:
-        return rows.target - model.predict(find_mode(kept_posterior(keep)).z, rows)
+        return rows.target - model.predict(fitted(keep).z, rows)
 
     errors = rows.target - model.predict(z, rows)
     judgement = find_outliers(rows, refit, errors, model.sensor_names)
-    posterior = kept_posterior(~judgement.gross)
-    _require_information(posterior.rows, free, model)
-    mode = with_directions(find_mode(posterior))
+    _require_information(int(np.sum(~judgement.gross)), free, model)
+    mode = with_directions(fitted(~judgement.gross))
+    gauge = _judged_at(mode, gauge, known)
     left_out = [
         (int(rows.source[row]), judgement.why[row]) for row in np.flatnonzero(judgement.gross)
     ]
@@ -249,7 +273,7 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
         mode,
         hold_offsets(mode, np.zeros(model.joints)),
         tuple(sorted(left_out)),
-        np.sort(posterior.rows.source),
+        np.sort(rows.source[~judgement.gross]),
     )
 
 
@@ -299,10 +323,28 @@ def hold_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
     return find_mode(held)
 
 
-def _require_information(rows: Rows, free: IntArray, model: Model) -> None:
+def _judged_at(mode: Mode, gauge: Gauge, priors: Sequence[Prior]) -> Gauge:
+    """Return the gauge with what is badly determined at the mode, where any offset is.
+
+    The start that it was found at may lie far along such a direction.
+    """
+    posterior = mode.linearisation.posterior
+    std = np.sqrt(np.diag(mode.covariance))
+    if not any(
+        width > WEAK_ANGLE
+        for index, width in zip(posterior.free, std, strict=True)
+        if index < posterior.model.joints and not gauge.why[index]
+    ):
+        return gauge
+    model = posterior.model
+    found = find_gauge(model, model.natural(mode.z), posterior.rows, priors)
+    return found if np.array_equal(found.held, gauge.held) else gauge
+
+
+def _require_information(count: int, free: IntArray, model: Model) -> None:
     needed = int(np.sum(free < model.joints + 6 * len(model.sensor_names))) + 3
-    if 3 * len(rows) < needed:
+    if 3 * count < needed:
         raise InsufficientDataError(
-            f'{len(rows)} observations of 3 coordinates for {len(free)} unknowns; '
+            f'{count} observations of 3 coordinates for {len(free)} unknowns; '
             f'measure at least {-(-needed // 3)}, better ten times as many'
         )

@@ -138,4 +138,5 @@ def _fast(
         taken_as_known=np.zeros(model.joints),
         z_before=found.before.z,
         left_out=found.left_out,
+        weakest=found.mode.weakest,
     )

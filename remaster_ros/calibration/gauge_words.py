@@ -11,6 +11,11 @@ from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.priors import Prior, prior_rows
 from remaster_ros.types import FloatArray
 
+# Parameters of a direction that a message names: those above this share of the largest. Of more
+# than so many only some are listed.
+MOST_NAMED, MOST_LISTED = 5, 20
+LEAST_SHARE = 0.2
+
 
 def in_words(model: Model, direction: FloatArray) -> str:
     """Return which parameters change together without any effect, and what would separate them."""
@@ -25,6 +30,12 @@ def in_words(model: Model, direction: FloatArray) -> str:
     ]
     if len(joints) == 1 and not np.any(model.theta(direction)):
         joint, amount = model.names[joints[0]], direction[joints[0]]
+        effects = np.flatnonzero(direction[model.core :]) + model.core
+        if len(effects) and not sensors and not markers:
+            return (
+                f'{joint} offset = {_first([model.names[index] for index in effects])} changed '
+                'together; only what is known of these effects beforehand separates them'
+            )
         if not sensors and not markers:
             return f'{joint} moves no marker; a marker off its axis would show it'
         if joints[0] == 0 and not markers:
@@ -55,7 +66,26 @@ def together(model: Model, direction: FloatArray) -> str:
         for name, value in zip(model.names, direction, strict=True)
         if value != 0.0
     ]
-    return f'{listed(moved)} together'
+    return f'{_first(moved)} together'
+
+
+def _first(parts: Sequence[str]) -> str:
+    """Join parts; of very many, which the curve of a joint has, some and the number of others."""
+    if len(parts) > MOST_LISTED:
+        rest = len(parts) - MOST_NAMED
+        return listed([*parts[:MOST_NAMED], f'{rest} more'])
+    return listed(parts)
+
+
+def hardly_seen(names: Sequence[str], loadings: FloatArray) -> str:
+    """Name the parameters with the largest loadings (f,) of a direction, with their shares."""
+    size = np.abs(loadings) / np.max(np.abs(loadings))
+    order = [index for index in np.argsort(-size)[:MOST_NAMED] if size[index] > LEAST_SHARE]
+    if len(order) == 1:
+        return names[order[0]]
+    largest = loadings[order[0]]
+    parts = [f'{names[index]} ({loadings[index] / largest:+.2f})' for index in order]
+    return f'{listed(parts)}, which change together'
 
 
 def listed(parts: Sequence[str]) -> str:

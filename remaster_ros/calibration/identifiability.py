@@ -31,6 +31,8 @@ UNKNOWN_ANGLE = np.radians(5.0)
 WEAK_ANGLE = np.radians(0.2)
 WEAK_FACTOR = 5.0
 WEAK_SHARE = 0.1
+# A mastering is off by tenths of a degree: an offset known worse than this is not measured.
+OPEN_ANGLE = np.radians(1.0)
 # Entries of a direction below this share of its largest are rounding errors.
 NEGLIGIBLE = 1e-5
 # Rows whose derivatives are at hand at a time.
@@ -116,7 +118,10 @@ def find_gauge(
         for joint in np.flatnonzero(combination[: model.joints]):
             text = f'the data do not determine it: {words}; fixed by {fixed_by}'
             why[joint] = f'{why[joint]}; {text}' if why[joint] else text
-    directions += [_badly_determined(model, *found, scale) for found in weak]
+    for along, worst, std in weak:
+        directions.append(_badly_determined(model, along, worst, std, scale))
+        if std > OPEN_ANGLE and not why[worst]:
+            why[worst] = f'{directions[-1].fixed_by}: {directions[-1].why}'
     return Gauge(tuple(directions), np.array(sorted(held), dtype=np.int64), tuple(why))
 
 
@@ -134,6 +139,7 @@ def _badly_determined(
     """Describe a direction along which a joint's offset has a large ``std``, rad."""
     size = np.abs(direction * scale)
     main = np.where(size > WEAK_SHARE * size.max(), direction, 0.0)
+    main[joint] = direction[joint]
     combination = _about_origin(model, main, scale)
     words = (
         f'{together(model, combination)} hardly change the observations; poses that are spread '
@@ -205,9 +211,9 @@ def _nearly_null(
 ) -> list[tuple[FloatArray, int, float]]:
     """Return the directions along which an angle has a standard deviation above a limit, rad.
 
-    It is above a factor times the median of all angles as well. With the pivots of the null space
-    held the rest has a covariance; its column of the worst angle is how everything moves with that
-    angle. Then that one is held too.
+    It is above a factor times the median of all angles as well, or above `OPEN_ANGLE`. With the
+    pivots of the null space held the rest has a covariance; its column of the worst angle is how
+    everything moves with that angle. Then that one is held too.
     """
     found = []
     active = ~np.isin(np.arange(len(scale)), pivots)
@@ -216,7 +222,8 @@ def _nearly_null(
         covariance = (root @ root.T) / np.outer(scale[active], scale[active])
         std = np.where(angles[active], np.sqrt(np.diag(covariance)), 0.0)
         worst = int(np.argmax(std))
-        if std[worst] < max(limit, factor * float(np.median(std[angles[active]]))):
+        typical = float(np.median(std[angles[active]]))
+        if std[worst] < limit or std[worst] < min(factor * typical, OPEN_ANGLE):
             break
         direction = np.zeros(len(scale))
         direction[active] = covariance[worst] / covariance[worst, worst]

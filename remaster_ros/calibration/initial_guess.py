@@ -142,10 +142,15 @@ def _require_likeness(model: Model, rows: Rows, errors: FloatArray) -> None:
     for error, (sensor, span) in zip(spread, rows.spans, strict=True):
         extent = np.median(np.linalg.norm(rows.target[span] - model.centroid[sensor], axis=1))
         if error > LARGEST_RELATIVE_ERROR * extent:
+            # Without its further effects the same model has been fitted to the same rows before.
+            remedy = (
+                'check units, joint order and signs, the URDF, and which marker was measured'
+                if model.extension is None
+                else 'the sizes found for its further effects do not hold; fit without them'
+            )
             raise InsufficientDataError(
                 f"sensor '{model.sensor_names[sensor]}': the robot model leaves errors of "
-                f'{error * 1e3:.0f} mm in points {extent * 1e3:.0f} mm apart; check units, joint '
-                'order and signs, the URDF, and which marker was measured'
+                f'{error * 1e3:.0f} mm in points {extent * 1e3:.0f} mm apart; {remedy}'
             )
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from remaster_ros.calibration.gauge_words import hardly_seen
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.noise import RESOLUTION_M
 from remaster_ros.calibration.posterior import Posterior
@@ -22,7 +23,11 @@ from remaster_ros.types import FloatArray
 # predictions bend along a badly known direction they shorten slowly: then this is near enough for
 # proposals, which the sampler corrects.
 SETTLED, NEAR_ENOUGH = 1e-3, 0.1
-MOST_STEPS = 50
+FIRST_STEPS, MOST_STEPS = 12, 60
+# A longer step may lead to where the tangent no longer holds: it is halved until the density
+# rises, so many times at most.
+TRUSTED = 0.1
+HALVINGS = 10
 
 
 def linearise(posterior: Posterior, z: FloatArray) -> Linearisation:
@@ -144,6 +149,12 @@ class Mode:
         return float(marginal - self.linearisation.posterior.log_noise_prior(self.eta))
 
     @property
+    def weakest(self) -> str:
+        """Names of the parameters that are determined worst together."""
+        direction = open_direction(self.linearisation, self.eta)
+        return hardly_seen(self.linearisation.posterior.free_names, direction)
+
+    @property
     def covariance(self) -> FloatArray:
         """Covariance of the free pinned parameters at the mode's noise, (f, f)."""
         root = np.linalg.inv(self.linearisation.whitened(self.eta)[0])
@@ -163,32 +174,78 @@ def find_mode(posterior: Posterior, eta: FloatArray | None = None) -> Mode:
     Raises
     ------
     InsufficientDataError
-        When the steps do not settle: the rows do not determine the free parameters.
+        When the steps do not settle: the rows do not determine the free parameters. The message
+        names those along which they go.
     """
     z = posterior.reference
     eta = _noise_guess(posterior) if eta is None else eta
-    size = np.inf
+    size, step = np.inf, np.zeros(len(posterior.free))
+    previous, damping = step, 1.0
+    linearisation = linearise(posterior, z)
     try:
-        for _ in range(MOST_STEPS):
-            linearisation = linearise(posterior, z)
-            eta = _noise_peak(linearisation, eta)
+        for count in range(MOST_STEPS):
+            # Far from the mode the noise need not be exact.
+            eta = _noise_peak(linearisation, eta, 1e-4 if size < TRUSTED else 1e-2)
             mean, factor, _ = linearisation.conditional(eta)
             step = mean - z[posterior.free]
-            z = posterior.parameters(mean)
             # The step in units of the posterior's own spread.
-            size = float(np.linalg.norm(np.swapaxes(factor, -1, -2) @ step))
-            if size < SETTLED:
+            whitened = factor.T @ step
+            size = float(np.linalg.norm(whitened))
+            if whitened @ previous < -0.5 * size * np.linalg.norm(previous):
+                # The step before went too far, and the next one would as well.
+                damping *= 0.5
+            previous = whitened
+            if size > TRUSTED:
+                mean = _uphill(posterior, z[posterior.free], damping * step, eta)
+            else:
+                mean = z[posterior.free] + damping * step
+            z = posterior.parameters(mean)
+            linearisation = linearise(posterior, z)
+            if size < (SETTLED if count < FIRST_STEPS else NEAR_ENOUGH):
                 break
         if size < NEAR_ENOUGH:
-            linearisation = linearise(posterior, z)
             return Mode(z, eta, _noise_covariance(linearisation, eta), linearisation)
     except np.linalg.LinAlgError:
         # A parameter without any information: the same remedy as steps that never end.
         pass
+    weakest = hardly_seen(posterior.free_names, open_direction(linearisation, eta, step))
     raise InsufficientDataError(
-        'the fit does not settle: the observations hardly determine the parameters; '
-        'measure more poses, spread further'
+        f'the fit does not settle: the observations hardly determine {weakest}; measure more '
+        'poses, spread further, or give a prior on one of them'
     )
+
+
+def _uphill(
+    posterior: Posterior, free: FloatArray, step: FloatArray, eta: FloatArray
+) -> FloatArray:
+    """Return the free parameters after the longest of step, step / 2, … that raises the density.
+
+    Given the noise each Gauss-Newton step points uphill.
+    """
+    halved = step * 0.5 ** np.arange(HALVINGS)[:, None]
+    at_noise = np.broadcast_to(eta, (HALVINGS + 1, len(eta)))
+    tries = free + np.concatenate((np.zeros((1, len(free))), halved))
+    heights = posterior.log_density(np.concatenate((tries, at_noise), axis=1))
+    higher = np.flatnonzero(heights[1:] > heights[0])
+    return tries[1 + (higher[0] if len(higher) else HALVINGS - 1)]
+
+
+def open_direction(
+    linearisation: Linearisation, eta: FloatArray, step: FloatArray | None = None
+) -> FloatArray:
+    """Return loadings (f,) of the worst determined direction, or of that a step (f,) goes along.
+
+    Each in units of what the parameter alone does to the observations.
+    """
+    f = len(linearisation.posterior.free)
+    gram = linearisation.gram(eta)[:f, :f]
+    scale = np.sqrt(np.diag(gram))
+    if np.any(scale == 0.0):
+        return (scale == 0.0).astype(float)
+    vectors = np.linalg.eigh(gram / np.outer(scale, scale))[1]
+    chosen = 0 if step is None else np.argmax(np.abs(vectors.T @ (scale * step)))
+    loadings: FloatArray = vectors[:, chosen]
+    return loadings
 
 
 def _noise_guess(posterior: Posterior) -> FloatArray:
@@ -209,8 +266,11 @@ def _noise_guess(posterior: Posterior) -> FloatArray:
     return np.array(sigmas + ratios)
 
 
-def _noise_peak(linearisation: Linearisation, start: FloatArray) -> FloatArray:
-    """Climb to the peak of the noise's log density by Newton steps no longer than 1."""
+def _noise_peak(linearisation: Linearisation, start: FloatArray, shortest: float) -> FloatArray:
+    """Climb to the peak of the noise's log density by Newton steps no longer than 1.
+
+    They end below the shortest length that counts.
+    """
     peak = start
     for _ in range(100):
         value, gradient, precision = _noise_curvature(linearisation, peak)
@@ -218,11 +278,14 @@ def _noise_peak(linearisation: Linearisation, start: FloatArray) -> FloatArray:
         # Uphill also where the density is not yet concave.
         step = vectors @ ((vectors.T @ gradient) / np.maximum(np.abs(values), 0.1))
         step /= max(1.0, float(np.linalg.norm(step)))
-        if np.linalg.norm(step) < 1e-4:
+        if np.linalg.norm(step) < shortest:
             break
-        tries = peak + step * 0.5 ** np.arange(8.0)[:, None]
-        heights = linearisation.whitened(tries)[2]
-        if np.max(heights) <= value:
+        # With hundreds of parameters each try costs milliseconds; most often the first will do.
+        for tries in (peak[None] + step, peak + step * 0.5 ** np.arange(1.0, 8.0)[:, None]):
+            heights = linearisation.whitened(tries)[2]
+            if np.max(heights) > value:
+                break
+        else:
             break
         peak = tries[np.argmax(heights)]
     count = len(linearisation.posterior.noise_model.channels)

@@ -6,7 +6,7 @@ Both work in logarithms, run several chains at once and repeat the state on reje
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from remaster_ros.types import FloatArray
 # Proposals evaluated between two reports of progress.
 REPORTED = 2000
 LogDensity = Callable[[FloatArray], FloatArray]
+Method = Literal['metropolis', 'importance', 'laplace']
 
 
 class Chains(NamedTuple):
@@ -31,6 +32,12 @@ class Chains(NamedTuple):
     log_density_error, checked
         Where an approximate density was sampled: its largest difference from the exact one on so
         many of the draws. NaN and 0 where the exact density was.
+    method
+        'metropolis'; 'importance' for draws resampled by importance weights; 'laplace' for draws
+        of the Gaussian about the mode. The latter two are no chains.
+    pareto_k, effective
+        Of importance weights: the shape of their tail, and how many independent draws they are
+        worth. NaN for chains.
     """
 
     draws: FloatArray
@@ -38,6 +45,9 @@ class Chains(NamedTuple):
     trace: FloatArray
     log_density_error: float = float('nan')
     checked: int = 0
+    method: Method = 'metropolis'
+    pareto_k: float = float('nan')
+    effective: float = float('nan')
 
 
 class Proposal(Protocol):

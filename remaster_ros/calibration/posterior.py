@@ -3,7 +3,8 @@
 The noise is that of `noise`. Priors: flat in log sigma, which is the paper's p(sigma^2) ∝ sigma^-2
 d(sigma^2) (eq. 14), down to the resolution no sensor passes (`RESOLUTION_M`); pose_sigma / sigma
 half-Cauchy with scale 1, proper at zero and without a unit (Gelman 2006); registrations flat in
-the turn and shift of the pinned coordinates of `model`; inner joint offsets flat; markers and base
+the turn and shift of the pinned coordinates of `model`; inner joint offsets Gaussian about 0 with
+`priors.OFFSET_STD`, where nothing else is known; markers and base
 frames Gaussian where something is known of them.
 """
 
@@ -72,6 +73,11 @@ class Posterior:
     def rows(self) -> Rows:
         """The rows that it is fitted to."""
         return self.noise_model.rows
+
+    @property
+    def free_names(self) -> tuple[str, ...]:
+        """Names of the free parameters, f."""
+        return tuple(self.model.names[index] for index in self.free)
 
     def without_pose_sigma(self) -> Posterior:
         """Return the posterior under noise that is independent between all rows."""

@@ -19,6 +19,9 @@ from remaster_ros.types import BasePrior, FloatArray
 
 # A prior std of 0 in a session means "as good as known": a micrometre, a microradian.
 TIGHTEST_PRIOR = 1e-6
+# A mastering is off by tenths of a degree. This prior keeps an offset that the data leave open
+# from running away; one that they determine to 0.05 degrees it moves by 1 in 10,000 of its size.
+OFFSET_STD = np.radians(5.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +56,15 @@ def offset_prior(model: Model, joint: int, mean: float, std: float) -> Prior:
     return Prior(
         f'the prior on {model.chain.joint_names[joint]}, {np.degrees(std):g} deg',
         lambda x: (x[..., joint : joint + 1] - mean) / width,
+    )
+
+
+def plausible_offsets(model: Model, joints: Sequence[int]) -> Prior:
+    """Return what is known of any joint's offset: it is no more than some degrees."""
+    which = list(joints)
+    return Prior(
+        f'the size of a mastering error, {np.degrees(OFFSET_STD):g} deg',
+        lambda x: x[..., which] / OFFSET_STD,
     )
 
 

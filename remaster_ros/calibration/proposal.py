@@ -20,8 +20,10 @@ NOISE_FREEDOM = 10.0
 TAIL_SHARE = 0.05
 TAIL_FREEDOM = 5.0
 TAIL_WIDENING = 1.3
-# Draws at a time: the matrices of more do not fit into the processor's cache.
+# Draws at a time: the matrices of more do not fit into the processor's cache. With one matrix for
+# each draw they have so many entries at most.
 BLOCK = 1024
+BLOCK_ENTRIES = 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +77,11 @@ class LaplaceProposal:
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Return points (count, d) of the posterior and their log density (count,)."""
-        sizes = [min(BLOCK, count - start) for start in range(0, count, BLOCK)]
+        block = BLOCK
+        if self.factorised:
+            entries = len(self.mode.linearisation.posterior.free) ** 2
+            block = min(BLOCK, max(1, BLOCK_ENTRIES // entries))
+        sizes = [min(block, count - start) for start in range(0, count, block)]
         points, densities = zip(*(self._sample(size, rng) for size in sizes), strict=True)
         return np.concatenate(points), np.concatenate(densities)
 

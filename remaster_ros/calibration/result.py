@@ -181,6 +181,8 @@ class Sampled:
         Pinned parameters of the fit with offsets at zero, (size,).
     left_out
         (row of the measurements, reason) of the gross errors.
+    weakest
+        Names of the parameters that the observations determine worst together.
     """
 
     posterior: Posterior
@@ -195,6 +197,7 @@ class Sampled:
     taken_as_known: FloatArray
     z_before: FloatArray
     left_out: tuple[tuple[int, str], ...]
+    weakest: str = ''
 
 
 def sampled_columns(
@@ -284,7 +287,12 @@ def build_result(
         marker_std_m=by_marker(model.markers(x_draws).std(axis=0, ddof=1)),
         noise=_noise(posterior, noise),
         sampler=SamplerInfo.of(
-            sampled.run, names, name=sampled.name, wanted=sampled.precision, seconds=seconds
+            sampled.run,
+            names,
+            name=sampled.name,
+            wanted=sampled.precision,
+            seconds=seconds,
+            weakest=sampled.weakest,
         ),
         T_R_N_before=by_sensor(model.T_R_N(x_before)),
         residuals_before=measurements.position - predicted_before,

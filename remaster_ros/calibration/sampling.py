@@ -2,7 +2,7 @@
 
 `sample_posterior` is the one interface of the samplers: `metropolis` has the two kernels,
 `proposal` the densities that are proposed from, `surrogate` the density that costs the same for
-any number of observations.
+any number of observations, `importance` what remains where chains are not worth their length.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from remaster_ros.calibration import convergence
-from remaster_ros.calibration.convergence import R_HAT_LIMIT
+from remaster_ros.calibration.convergence import ESS_LIMIT, R_HAT_LIMIT
+from remaster_ros.calibration.importance import Weighted, adaptive_importance
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.metropolis import (
     Chains,
@@ -23,7 +24,7 @@ from remaster_ros.calibration.metropolis import (
     independence_sampler,
     random_walk_sampler,
 )
-from remaster_ros.calibration.proposal import LaplaceProposal, StudentT
+from remaster_ros.calibration.proposal import LaplaceProposal
 from remaster_ros.calibration.surrogate import Surrogate
 from remaster_ros.types import FloatArray
 
@@ -36,17 +37,30 @@ PRECISION = 0.02
 FIRST_DRAWS = 800
 # A chain is not made longer than this; the result then states that it has not converged.
 ALLOWANCE = 100_000
-# Below this share of proposals taken the proposal is adapted to a random walk's draws; should
-# that not help, a random walk is what remains.
+# Nor do all the chains together hold more numbers than this: 32 MB, a dozen times in all that is
+# derived from them.
+LARGEST_CHAINS = 4_000_000
+# The exact density is evaluated so many times in all, counted in rows of the session, which take
+# some 0.2 µs each, so that any session ends: at 2,000 rows 50,000 times. An evaluation costs as
+# much as so many rows whatever their number. Where there are very many rows it takes longer.
+EVALUATED_ROWS = 100_000_000
+ROWS_OF_AN_EVALUATION = 100
+FEWEST_EVALUATIONS = 4000
+# Chains are given up that promise to take so many times the draws they may have.
+HOPELESS = 4.0
+# Share of them for chains of independent proposals that are not adapted, and of what is then left
+# for importance sampling; the rest is for the random walk.
+CHAINS_SHARE, IMPORTANCE_SHARE = 0.25, 0.5
+# Below this share of proposals taken the proposal is adapted; should that not help, a random walk
+# is what remains.
 POOR_ACCEPTANCE = 0.15
 # Where independent draws by the proposal with the mode's noise are worth less than this share of
-# themselves, it is factorised for every draw. So many draws are tried.
+# themselves, it is factorised for every draw. So many draws are tried. Not where there are more
+# parameters than this: it would take a hundred times as long as a few more draws.
 POOR_WEIGHTS = 0.8
+MANY_PARAMETERS = 60
 TRIAL_DRAWS = 1000
-# In tens of dimensions a Student t of few degrees of freedom hardly ever hits the bulk.
-ADAPTED_FREEDOM = 15.0
-PILOT_CHAINS = 32
-PILOT_STEPS = 1000
+WALKS = 32
 WALK_STEPS_PER_DRAW = 20
 # Shares of a Gaussian's best step that are tried for the walk, for so many steps each.
 STEP_SCALES = (1.0, 0.7, 0.5, 0.35, 0.25)
@@ -54,8 +68,11 @@ SCALE_STEPS = 200
 # The second-order density may differ by this from the exact one on the draws it gave, of which so
 # many are checked (fewer where there are so many observations that it would take seconds).
 DENSITY_ERROR_LIMIT = 0.05
-CHECKED_DRAWS = 200
+# So few before anything is sampled by it.
+CHECKED_DRAWS, FIRST_CHECKED = 200, 20
 CHECKED_ROWS = 5_000_000
+# Weighted draws that are worth fewer than this are not shown instead of the Gaussian's.
+FEWEST_EFFECTIVE = 100.0
 
 
 class Sampling(NamedTuple):
@@ -96,8 +113,10 @@ def sample_posterior(
 
     Independent proposals from the linearised posterior, accepted by the second-order density
     (`surrogate`); that is compared with the exact one on draws it gave, and replaced by it where
-    they differ. Where too few proposals are taken they come from a Student t adapted to a pilot
-    run; at last a random walk.
+    they differ. Where too few proposals are taken, or chains of a stated length are worth too few
+    independent draws, importance sampling by proposals that are adapted; then a random walk. The
+    evaluations of the exact density are limited (`EVALUATED_ROWS`); where they do not suffice the
+    result is the best approximation, and its Pareto k states how good it is.
 
     Parameters
     ----------
@@ -109,7 +128,8 @@ def sample_posterior(
         Source of all randomness.
     draws
         Draws of each chain; None to sample in batches until R-hat is at most 1.01 and the
-        effective draws of every quantity reach the precision, or each chain has `ALLOWANCE`.
+        effective draws of every quantity reach the precision, or the chains are as long as they
+        may be (`ALLOWANCE`, `LARGEST_CHAINS`).
     precision
         Monte Carlo error of each mean over its standard deviation.
     quantities
@@ -118,87 +138,143 @@ def sample_posterior(
         Called with the stage and the share of it that is done.
     """
     posterior = mode.linearisation.posterior
-    task = _Task(draws, precision, quantities, rng, report)
+    evaluations = max(
+        FEWEST_EVALUATIONS, EVALUATED_ROWS // (len(posterior.rows) + ROWS_OF_AN_EVALUATION)
+    )
+    task = _Task(draws, precision, quantities, rng, report, evaluations)
     surrogate = Surrogate.of(mode)
     laplace = LaplaceProposal(mode)
     name = 'independence Metropolis-Hastings, Laplace proposal'
-    if _weight_share(laplace, surrogate.log_density, rng.spawn(1)[0]) < POOR_WEIGHTS:
+    few = len(posterior.free) < MANY_PARAMETERS
+    trial = Weighted.of(*_proposed(laplace, surrogate.log_density, rng.spawn(1)[0]), laplace)
+    if few and trial.effective < POOR_WEIGHTS * TRIAL_DRAWS:
         laplace = LaplaceProposal(mode, factorised=True)
         name += ' factorised for every draw'
     starts = laplace.dispersed(chains, rng)
-    run = task.independent(surrogate.log_density, laplace, starts)
+    likely = trial.resampled(FIRST_CHECKED, rng.spawn(1)[0])
+    if surrogate.log_density_error(likely) > DENSITY_ERROR_LIMIT:
+        return _exact(task, posterior.log_density, laplace, starts)
+    run, enough = task.independent(surrogate.log_density, laplace, starts)
     checked = max(20, min(CHECKED_DRAWS, CHECKED_ROWS // len(posterior.rows)))
     points = run.draws.reshape(-1, posterior.size)
     points = points[rng.choice(len(points), min(checked, len(points)), replace=False)]
     error = surrogate.log_density_error(points)
-    if error > DENSITY_ERROR_LIMIT or run.acceptance_rate < POOR_ACCEPTANCE:
+    if error > DENSITY_ERROR_LIMIT or not enough:
         return _exact(task, posterior.log_density, laplace, starts)
     return Sampling(run._replace(log_density_error=error, checked=len(points)), name)
 
 
-def _weight_share(
+def _proposed(
     proposal: LaplaceProposal, log_density: LogDensity, rng: np.random.Generator
-) -> float:
-    """Return what share of independent draws their importance weights are worth (Kish 1965)."""
+) -> tuple[FloatArray, FloatArray]:
+    """Return draws on trial, (n, d), and their log weights, (n,)."""
     points, log_proposal = proposal.sample(TRIAL_DRAWS, rng)
-    log_weight = log_density(points) - log_proposal
-    weight = np.exp(log_weight - log_weight.max())
-    return float(np.mean(weight) ** 2 / np.mean(weight**2))
+    return points, log_density(points) - log_proposal
 
 
 def _exact(
     task: _Task, log_density: LogDensity, laplace: LaplaceProposal, starts: FloatArray
 ) -> Sampling:
-    """Sample by the exact density, whatever it costs."""
-    run = task.independent(log_density, laplace, starts)
-    if run.acceptance_rate >= POOR_ACCEPTANCE:
+    """Sample by the exact density, with the evaluations that there are."""
+    chains, rng = len(starts), task.rng
+    most = int(CHAINS_SHARE * task.evaluations) // chains
+    run, enough = task.independent(log_density, laplace, starts, most)
+    if enough:
         return Sampling(
             run,
             'independence Metropolis-Hastings on the exact density, Laplace proposal '
             '(the density is not near enough to its second order)',
         )
 
-    rng, chains = task.rng, len(starts)
-    factor = _factor(laplace.sample(TRIAL_DRAWS, rng)[0])
-    pilot = random_walk_sampler(
+    weighted = adaptive_importance(
         log_density,
-        _gaussian_step(factor, PILOT_CHAINS),
-        start=laplace.dispersed(PILOT_CHAINS, rng),
-        steps=PILOT_STEPS,
-        burn_in=PILOT_STEPS // 2,
+        laplace,
+        wanted=task.wanted,
+        evaluations=int(IMPORTANCE_SHARE * task.evaluations),
         rng=rng,
-        thin=10,
         progress=lambda share: task.report('adapting the sampler', share),
-    ).draws
-    pooled = pilot.reshape(-1, pilot.shape[-1])
-    factor = _factor(pooled)
-    adapted = StudentT(pooled.mean(axis=0), factor, ADAPTED_FREEDOM)
-    start = pilot[rng.choice(PILOT_CHAINS, chains, replace=chains > PILOT_CHAINS), -1]
-    run = task.independent(log_density, adapted, start)
-    if run.acceptance_rate >= POOR_ACCEPTANCE:
+    )
+    if weighted.reliable and weighted.effective >= task.enough:
         return Sampling(
-            run,
-            'independence Metropolis-Hastings, Student t proposal adapted to a random walk '
-            '(too few of the Laplace proposals were taken)',
+            task.by_weights(weighted, chains),
+            'importance sampling, Student t proposal adapted to the weighted draws '
+            '(chains of independent proposals are worth too few draws)',
         )
 
-    # All of the pilot's chains go on: a batch of them costs hardly more than a few.
-    start = pilot[:, -1] if task.draws is None else start
-    run = task.walk(log_density, _step_scale(log_density, factor, start, rng) * factor, start)
-    return Sampling(run, 'random-walk Metropolis (too few independent proposals were taken)')
+    # All walks go on side by side: a batch of many costs hardly more than a few.
+    walks = WALKS if task.draws is None else chains
+    most = task.evaluations // (walks * WALK_STEPS_PER_DRAW) if task.draws is None else task.draws
+    if most >= FIRST_DRAWS or task.draws is not None:
+        start = weighted.resampled(walks, rng)
+        factor = weighted.adapted().factor
+        run, enough = task.walk(
+            log_density, _step_scale(log_density, factor, start, rng) * factor, start, most
+        )
+        if enough:
+            return Sampling(
+                run, 'random-walk Metropolis (too few independent proposals were taken)'
+            )
+    if weighted.effective >= FEWEST_EFFECTIVE:
+        return Sampling(
+            task.by_weights(weighted, chains),
+            'importance sampling (no sampler reached the precision with the evaluations allowed)',
+        )
+    points = laplace.sample(chains * FIRST_DRAWS, rng)[0].reshape(chains, FIRST_DRAWS, -1)
+    return Sampling(
+        Chains(
+            points,
+            float('nan'),
+            points,
+            method='laplace',
+            pareto_k=weighted.pareto_k,
+            effective=weighted.effective,
+        ),
+        'Gaussian about the mode (no sampler reached the precision with the evaluations allowed)',
+    )
 
 
 @dataclass(frozen=True)
 class _Task:
-    """How long to sample, and what is the same for every sampler; see `sample_posterior`."""
+    """How long to sample, and what is the same for every sampler; see `sample_posterior`.
+
+    ``evaluations`` of the exact density are allowed in all.
+    """
 
     draws: int | None
     precision: float
     quantities: Callable[[FloatArray], FloatArray]
     rng: np.random.Generator
     report: Progress
+    evaluations: int
 
-    def independent(self, target: LogDensity, proposal: Proposal, start: FloatArray) -> Chains:
+    @property
+    def wanted(self) -> float:
+        """Effective draws that the precision takes."""
+        return self.precision**-2
+
+    @property
+    def enough(self) -> float:
+        """Effective draws without which another sampler is tried."""
+        return min(self.wanted, ESS_LIMIT)
+
+    def by_weights(self, weighted: Weighted, chains: int) -> Chains:
+        """Return weighted draws as draws of equal weight, in as many parts as there are chains."""
+        draws = self.draws
+        if draws is None:
+            draws = max(FIRST_DRAWS, int(np.ceil(weighted.effective / chains)))
+        points = weighted.resampled(chains * draws, self.rng).reshape(chains, draws, -1)
+        return Chains(
+            points,
+            float('nan'),
+            points,
+            method='importance',
+            pareto_k=weighted.pareto_k,
+            effective=weighted.effective,
+        )
+
+    def independent(
+        self, target: LogDensity, proposal: Proposal, start: FloatArray, most: int = ALLOWANCE
+    ) -> tuple[Chains, bool]:
         """Sample by independent proposals; stop early where too few are taken."""
 
         def more(start: FloatArray, draws: int, warm_up: int) -> Chains:
@@ -212,9 +288,11 @@ class _Task:
                 progress=lambda share: self.report('sampling', share),
             )
 
-        return self._long_enough(more, start, POOR_ACCEPTANCE)
+        return self._long_enough(more, start, POOR_ACCEPTANCE, most)
 
-    def walk(self, target: LogDensity, factor: FloatArray, start: FloatArray) -> Chains:
+    def walk(
+        self, target: LogDensity, factor: FloatArray, start: FloatArray, most: int
+    ) -> tuple[Chains, bool]:
         """Sample by a random walk with steps of this factor, (d, d)."""
 
         def more(start: FloatArray, draws: int, warm_up: int) -> Chains:
@@ -230,36 +308,46 @@ class _Task:
                 progress=lambda share: self.report('sampling by random walk', share),
             )
 
-        return self._long_enough(more, start, 0.0)
+        return self._long_enough(more, start, 0.0, most)
 
     def _long_enough(
-        self, more: Callable[[FloatArray, int, int], Chains], start: FloatArray, poor: float
-    ) -> Chains:
-        """Sample in batches until the length is reached; give up early where acceptance is poor.
+        self,
+        more: Callable[[FloatArray, int, int], Chains],
+        start: FloatArray,
+        poor: float,
+        most: int,
+    ) -> tuple[Chains, bool]:
+        """Sample in batches until the length is reached, and return whether that is enough.
 
-        ``more`` continues from a state: (start, draws, warm-up) to chains.
+        ``more`` continues from a state: (start, draws, warm-up) to chains. Chains with a poor
+        acceptance are given up, as are those that ``most`` draws each will not make long enough.
         """
+        most = max(FIRST_DRAWS, min(most, ALLOWANCE, LARGEST_CHAINS // start.size))
         run = more(start, self.draws or FIRST_DRAWS, WARM_UP)
-        while self.draws is None and run.acceptance_rate >= poor:
+        if self.draws is not None:
+            return run, run.acceptance_rate >= poor
+        while run.acceptance_rate >= poor:
             count = run.draws.shape[1]
             values = self.quantities(run.draws)
             ess = np.minimum(convergence.ess_bulk(values), convergence.ess_tail(values))
             # What never moves has no effective draws.
-            least, wanted = float(np.min(np.nan_to_num(ess))), self.precision**-2
+            least = max(1.0, float(np.min(np.nan_to_num(ess))))
             mixed = np.max(convergence.r_hat(values)) <= R_HAT_LIMIT
-            if (mixed and least >= wanted) or count >= ALLOWANCE:
+            if (mixed and least >= self.wanted) or count >= most:
+                return run, bool(mixed and least >= self.enough)
+            if count * self.enough / least > HOPELESS * most:
                 break
             # A tenth more than the rate so far promises, but no more than three times as many.
-            expected = 1.1 * count * wanted / max(least, 1.0)
+            expected = 1.1 * count * self.wanted / least
             batch = int(np.clip(expected - count, count // 4, 3 * count))
-            part = more(run.draws[:, -1], min(batch, ALLOWANCE - count), 0)
+            part = more(run.draws[:, -1], min(batch, most - count), 0)
             added = part.draws.shape[1]
             run = Chains(
                 np.concatenate((run.draws, part.draws), axis=1),
                 (run.acceptance_rate * count + part.acceptance_rate * added) / (count + added),
                 np.concatenate((run.trace, part.trace[:, -added:]), axis=1),
             )
-        return run
+        return run, False
 
 
 def _step_scale(
@@ -289,8 +377,3 @@ def _gaussian_step(factor: FloatArray, chains: int) -> Callable[[np.random.Gener
     d = len(factor)
     scaled = 2.38 / np.sqrt(d) * factor
     return lambda rng: rng.standard_normal((chains, d)) @ scaled.T
-
-
-def _factor(points: FloatArray) -> FloatArray:
-    """Return the Cholesky factor of the covariance of points (n, d), (d, d)."""
-    return np.asarray(np.linalg.cholesky(np.cov(points.T)))

@@ -13,7 +13,7 @@ import numpy as np
 from remaster_ros.calibration.evaluate_offsets import OffsetsJudgement, accuracy_with_offsets
 from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
+from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit, require_own
 from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.session.reader import read_session
 from remaster_ros.types import Session
@@ -50,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--offsets', metavar='FIT', type=Path, required=True, help='fit.json with the offsets'
     )
     parser.add_argument('--out', metavar='FILE', type=Path, help='write the metrics as JSON')
+    parser.add_argument('--json', action='store_true', help='print them as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -59,21 +60,26 @@ def run(args: argparse.Namespace) -> int:
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     offsets, std = joint_offsets_rad(fit, chain.joint_names)
     warn_of_another_urdf(fit, session, args.offsets)
-    with progress_bar(args.quiet) as progress:
+    if args.out is not None and args.out.exists():
+        require_own(args.out, FORMAT)
+    with progress_bar(args.quiet or args.json) as progress:
         progress('fitting', 0.0)
         judged = accuracy_with_offsets(session, offsets, std, np.random.default_rng(args.seed))
+    content = {
+        'format': FORMAT,
+        'version': __version__,
+        'session': str(args.session),
+        'offsets': str(args.offsets),
+        'joint_offsets_deg': dict(zip(chain.joint_names, np.rad2deg(offsets).tolist())),
+        'accuracy': judged.accuracy,
+        'left_out': [{'observation': row, 'why': why} for row, why in judged.left_out],
+    }
     if args.out is not None:
-        content = {
-            'format': FORMAT,
-            'version': __version__,
-            'session': str(args.session),
-            'offsets': str(args.offsets),
-            'joint_offsets_deg': dict(zip(chain.joint_names, np.rad2deg(offsets).tolist())),
-            'accuracy': judged.accuracy,
-            'left_out': [{'observation': row, 'why': why} for row, why in judged.left_out],
-        }
         make_folder(args.out.parent)
         write_atomically(args.out, json.dumps(content, indent=2) + '\n')
+    if args.json:
+        print(json.dumps(content))
+        return 0
     show(args.quiet, table(judged))
     if args.out is not None:
         show(args.quiet, f'written: {args.out}')

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 
 @contextmanager
 def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
-    """Yield a function (stage, share done) that shows a bar where stderr is a terminal."""
+    """Yield a function (stage, share done) that shows a bar where stderr is a terminal.
+
+    It has the stage, the share of it that is done and the time that is left of it; a bar that runs
+    to and fro where neither is known.
+    """
     if quiet or not sys.stderr.isatty():
         yield lambda stage, share: None
         return
@@ -17,10 +24,37 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn('{task.description:>12s}'), BarColumn(), TimeElapsedColumn())
+    columns = (
+        TextColumn('{task.description:>12s}'),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TextColumn('{task.fields[left]}'),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task('', total=1.0)
-        yield lambda stage, share: bar.update(task, description=stage, completed=share)
+        task = bar.add_task('', total=None, left='')
+        begun = ('', time.monotonic())
+
+        def update(stage: str, share: float) -> None:
+            nonlocal begun
+            if stage != begun[0]:
+                begun = stage, time.monotonic()
+            left = ''
+            if share > 0.0:
+                seconds = (time.monotonic() - begun[1]) * (1.0 - share) / share
+                left = f'{100 * share:.0f} %, about {_duration(seconds)} left'
+            total = 1.0 if share > 0.0 else None
+            bar.update(task, description=stage, completed=share, total=total, left=left)
+
+        yield update
+
+
+def _duration(seconds: float) -> str:
+    return f'{seconds:.0f} s' if seconds < 90.0 else f'{seconds / 60.0:.0f} min'
+
+
+def show_file(path: Path) -> None:
+    """Print a JSON file on one line, for other programs."""
+    print(json.dumps(json.loads(path.read_text(encoding='utf-8'))))
 
 
 def show(quiet: bool, text: str) -> None:

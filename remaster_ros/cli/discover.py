@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from remaster_ros.calibration.predictions import Coverage
-from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.cli.console import progress_bar, show, show_file
 from remaster_ros.discovery.confirmation import (
     Confirmation,
     confirm,
@@ -25,7 +25,7 @@ from remaster_ros.reports.discovery_json import (
     predictions_of,
     save_discovery,
 )
-from remaster_ros.reports.fit_json import prepare_folder
+from remaster_ros.reports.fit_json import DISCOVERY_FILE, prepare_folder
 from remaster_ros.session.reader import read_session
 
 # Of a curve's hundred values the table has one line; discovery.json has them all.
@@ -36,6 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``remaster discover``."""
     parser.add_argument('session', metavar='SESSION', type=Path, help='session folder')
     parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='output folder')
+    parser.add_argument(
+        '--json', action='store_true', help='print discovery.json in place of a summary'
+    )
     parser.add_argument(
         '--confirm',
         metavar='OTHER',
@@ -51,8 +54,8 @@ def run(args: argparse.Namespace) -> int:
     if other is not None:
         # Not after the long search.
         require_other_session(session, other)
-    prepare_folder(args.out)
-    with progress_bar(args.quiet) as progress:
+    prepare_folder(args.out, DISCOVERY_FILE)
+    with progress_bar(args.quiet or args.json) as progress:
         found = discover_session(
             session,
             rng=np.random.default_rng(args.seed),
@@ -72,8 +75,11 @@ def run(args: argparse.Namespace) -> int:
         report = save_discovery(
             found, args.out, confirmation, figures=not args.no_figures, predictions=predictions
         )
-    show(args.quiet, summary(found, confirmation, held_out_coverage(found, predictions)))
-    show(args.quiet, f'written: {report}')
+    if args.json:
+        show_file(args.out / DISCOVERY_FILE)
+    else:
+        show(args.quiet, summary(found, confirmation, held_out_coverage(found, predictions)))
+        show(args.quiet, f'written: {report}')
     if refusal is not None:
         raise refusal
     return 0
@@ -88,8 +94,10 @@ def summary(
     lines = [f'verdict: {found.verdict}']
     for effect in found.effects:
         joints = f' {list(effect.joints)}' if effect.joints else ''
-        share = '' if effect.share is None else f', {100 * effect.share:.0f} % of the gain'
+        share = '' if effect.share is None else f', {percent(effect.share)} of the gain'
         lines.append(f'{effect.name}{joints}: {1e3 * effect.size_m:.3f} mm{share}; {effect.cause}')
+        if effect.remedy:
+            lines.append(f'    to do: {effect.remedy}')
         for alike in effect.confusable_with:
             where = f' {list(alike.joints)}' if alike.joints else ''
             lines.append(f'    could be {alike.name}{where}; to distinguish: {alike.separate_by}')

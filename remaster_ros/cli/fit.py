@@ -16,10 +16,10 @@ from remaster_ros.calibration.fit import (
     FitResult,
     fit_session,
 )
-from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.cli.console import progress_bar, show, show_file
 from remaster_ros.cli.options import integer, number
 from remaster_ros.collection.reference_session import changes
-from remaster_ros.reports.fit_json import prepare_folder, save_fit
+from remaster_ros.reports.fit_json import FIT_FILE, prepare_folder, save_fit
 from remaster_ros.session.priors import read_priors
 from remaster_ros.session.reader import read_session
 
@@ -30,6 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``remaster fit``."""
     parser.add_argument('session', metavar='SESSION', type=Path, help='session folder')
     parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='output folder')
+    parser.add_argument('--json', action='store_true', help='print fit.json in place of a summary')
     parser.add_argument(
         '--sampler',
         choices=('fast', 'paper'),
@@ -67,8 +68,8 @@ def run(args: argparse.Namespace) -> int:
     session = read_session(args.session)
     priors = read_priors(args.prior) if args.prior is not None else None
     # Before the fit: an hour of sampling must not end at a folder that cannot be written.
-    prepare_folder(args.out)
-    with progress_bar(args.quiet) as progress:
+    prepare_folder(args.out, FIT_FILE)
+    with progress_bar(args.quiet or args.json) as progress:
         result = fit_session(
             session,
             rng=np.random.default_rng(args.seed),
@@ -84,8 +85,11 @@ def run(args: argparse.Namespace) -> int:
         report = save_fit(result, args.out, figures=not args.no_figures)
     for line in result.implausible:
         log.warning('%s', line)
-    show(args.quiet, summary(result))
-    show(args.quiet, f'written: {report}')
+    if args.json:
+        show_file(args.out / FIT_FILE)
+    else:
+        show(args.quiet, summary(result))
+        show(args.quiet, f'written: {report}')
     return 0
 
 

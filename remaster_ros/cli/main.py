@@ -20,7 +20,9 @@ from remaster_ros.version import __version__
 # the rest take more than a second to load, and `remaster --help` needs none of it.
 VERBS = {
     'demo': 'The whole pipeline on fake hardware: real nodes, real DDS, real sockets.',
+    'init': 'Write a cell file for a robot (URDF or xacro), with what is proposed and why.',
     'import': "Make a session of anybody's table of joint angles and points, or of a ROS bag.",
+    'plan': 'Plan the poses of a cell: counts, times, expected precision; nothing moves.',
     'simulate': 'Make a session from a known truth, which is written beside it.',
     'fit': 'Fit the zero-offsets of a session: fit.json, figures and report.html.',
     'discover': 'Find what the offsets leave, name the cause, extend the model, prove the gain.',
@@ -28,6 +30,7 @@ VERBS = {
     'recover': 'Finish the files of a session whose recorder was killed; print what was lost.',
     'replay': 'Publish a recorded session again (as `ros2 bag play` does).',
 }
+SHELLS = ('bash', 'zsh', 'fish')
 TRACEBACK = 'REMASTER_TRACEBACK'
 
 
@@ -39,7 +42,12 @@ def build_parser(chosen: str | None) -> argparse.ArgumentParser:
         epilog='Exit status: 0 done, 1 the data allow no answer, 2 wrong usage or bad input.',
     )
     parser.add_argument('--version', action='version', version=f'remaster {__version__}')
-    verbs = parser.add_subparsers(dest='verb', required=True, metavar='VERB')
+    parser.add_argument(
+        '--completion',
+        choices=SHELLS,
+        help='print what completes this command in a shell: eval "$(remaster --completion bash)"',
+    )
+    verbs = parser.add_subparsers(dest='verb', metavar='VERB')
     for name, text in VERBS.items():
         verb = verbs.add_parser(name, help=text, description=text)
         if name != chosen:
@@ -64,7 +72,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     # wait for each other at full speed. NumPy looks at this when it is first imported.
     os.environ.setdefault('OMP_NUM_THREADS', '1')
     try:
-        args = build_parser(next(iter(argv), None)).parse_args(argv)
+        if '_ARGCOMPLETE' in os.environ:
+            _complete()
+        parser = build_parser(next(iter(argv), None))
+        args = parser.parse_args(argv)
+        if args.completion:
+            import argcomplete
+
+            print(argcomplete.shellcode(['remaster'], shell=args.completion))
+            return 0
+        if args.verb is None:
+            parser.print_help()
+            return 0
         logging.basicConfig(
             format='%(levelname)s: %(message)s',
             level=logging.ERROR if args.quiet else logging.WARNING,
@@ -97,6 +116,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             f'(set {TRACEBACK}=1 to see where)'
         )
         return 2
+
+
+def _complete() -> None:
+    """Answer a shell that asks how the line goes on, and exit."""
+    # Imported here: it is only of use to a shell.
+    import argcomplete
+
+    words = os.environ.get('COMP_LINE', '').split()
+    argcomplete.autocomplete(build_parser(next(iter(words[1:]), None)))
 
 
 def _complain(message: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 
 from remaster_ros.cli.console import show
@@ -15,6 +16,7 @@ LOST = 3
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``remaster recover``."""
     parser.add_argument('session', metavar='SESSION', type=Path, help='folder of the session')
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
     parser.epilog = (
         f'Exit status: 0 nothing was lost, {LOST} what was being written was lost (and what), '
         '2 no such session, one that is being written, or a damaged one.'
@@ -24,6 +26,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Recover the session; returns the exit status."""
     recovery = recover_session(args.session)
+    if args.json:
+        content = {'session': str(args.session), 'finished': recovery.finished}
+        print(json.dumps({**content, 'lost': list(recovery.lost)}))
+        return LOST if recovery.lost else 0
     for line in recovery.lost:
         print(f'lost: {line}')
     done = 'recovered' if recovery.finished else 'at rest, nothing to recover'

@@ -27,6 +27,7 @@ TRUTH_FILE = 'truth.json'
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``remaster simulate``."""
     parser.add_argument('out', metavar='OUT', type=Path, help='new session folder')
+    parser.add_argument('--json', action='store_true', help='print the truth as one JSON object')
     parser.add_argument('--cell', default='demo', help='cell file, or a shipped one (demo)')
     parser.add_argument(
         '--robot',
@@ -97,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
     cell = read_cell(args.cell)
     chain = choose_robot(cell, args.robot, args.base_link, args.tip_link)
     choose_sensors(cell, args.sensors)
-    with progress_bar(args.quiet) as progress:
+    with progress_bar(args.quiet or args.json) as progress:
         progress('planning', 0.0)
         made = simulate_workcell(
             cell,
@@ -115,6 +116,9 @@ def run(args: argparse.Namespace) -> int:
         write_session(args.out, made.session)
         truth = truth_to_dict(made.truth, chain, args.seed)
         write_atomically(args.out / TRUTH_FILE, json.dumps(truth, indent=2) + '\n')
+    if args.json:
+        print(json.dumps(truth))
+        return 0
     show(args.quiet, made.tour.describe())
     show(args.quiet, f'written: {args.out}, {len(made.session.measurements)} observations')
     return 0

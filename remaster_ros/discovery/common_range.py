@@ -79,6 +79,8 @@ def split(cell: Cell, mine: Context, theirs: Context) -> Split:
         columns=partial(_masked, columns=beyond, rows=lambda context: ~inside(context)),
         parameters=tuple(f'beyond_{i}' for i in range(len(penalty))),
         penalty=penalty,
+        largest=None,
+        sign=0,
         curve=None,
         variant=f'{cell.variant} beyond',
     )

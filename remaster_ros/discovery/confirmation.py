@@ -223,7 +223,8 @@ class _OtherSession:
     @classmethod
     def of(cls, discovery: Discovery, found: Estimate) -> _OtherSession:
         data = Residuals.of(found)
-        cells = discovery.selection.solution.cells
+        # What happened once is no property of the arm.
+        cells = [cell for group in discovery.groups for cell in group if np.isnan(cell.moment)]
         given = tuple(split(cell, discovery.residuals.part, data.context) for cell in cells)
         poses = data.context.measurements.pose[data.rows.source]
         parts = [

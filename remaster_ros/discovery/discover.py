@@ -139,7 +139,11 @@ def discover_session(
     residuals, solution = findings.residuals, findings.selection.solution
     structure, gross = structure_left(residuals, solution, fit, findings.structure)
     unexplained += structure
-    effects = tuple(effect.sampled(fit) for effect in findings.effects)
+    effects = tuple(
+        effect.sampled(fit, group, residuals.part)
+        for effect, group in itertools.zip_longest(findings.effects, findings.groups, fillvalue=())
+        if isinstance(effect, FoundEffect)
+    )
     verdict: Verdict = 'effects' if effects else 'unexplained' if unexplained else 'none'
     # A tie over a small remainder does not put the rest in doubt.
     if any(effect.tied and (effect.share or 0.0) > LEADING_SHARE for effect in effects):

@@ -87,7 +87,7 @@ class Solution:
         precision = np.diag(self.ridge)
         for cell, factor, where in zip(self.cells, self.smoothness, self.slices(), strict=True):
             if cell.penalty is not None:
-                precision[where, where] = factor * cell.penalty
+                precision[where, where] += factor * cell.penalty
         return precision
 
 
@@ -132,7 +132,16 @@ def solve(
     typical = LARGEST_M * np.sqrt(len(data)) / scale
     std = np.where(np.isnan(largest), typical, largest)
     p = data.base.shape[2]
-    ridge = np.concatenate((np.zeros(p), np.where(free, (std * scale) ** -2.0, 0.0)))
+    # Of free forms the heights of a curve have a plausible size, weights of kernels have none.
+    sized = np.array(
+        [
+            cell.penalty is None or cell.curve is not None
+            for cell in cells
+            for _ in cell.parameters
+        ],
+        dtype=bool,
+    )
+    ridge = np.concatenate((np.zeros(p), np.where(sized, (std * scale) ** -2.0, 0.0)))
     unit = np.concatenate((np.ones(p), scale))
     joined = np.concatenate((data.base, columns / scale, data.errors[:, :, None]), axis=2)
     grams = data.noise_model.gram(lambda _, where: joined[where], joined.shape[2])
@@ -171,6 +180,9 @@ class _System:
             scaled = penalty / np.outer(u, u)
             # Of order one in the scaled columns, so that the factors start near right.
             self.penalties.append(scaled)
+        # Of each, for the determinant beside the ridge, which is the same for all of a cell.
+        self.spectra = [np.linalg.eigvalsh(penalty) for penalty in self.penalties]
+        self.ridges = [float(self.ridge[self.where[i].start]) for i in self.penalised]
         free = np.ones(self.size, dtype=bool)
         for i in self.penalised:
             free[self.where[i]] = False
@@ -227,11 +239,12 @@ class _System:
             zip(self.penalised, self.penalties, factors, strict=True)
         ):
             where = self.where[index]
-            m = len(penalty)
+            prior = factor * self.spectra[i] + self.ridges[i]
+            smooth = np.sum(factor * self.spectra[i] / prior)
             quadratic = factor * beta[where] @ penalty @ beta[where]
             spread = factor * np.sum(inverse[where, where] * penalty)
-            value += 0.5 * (m * np.log(factor) - quadratic)
-            slope[len(eta) - len(self.penalised) + i] = 0.5 * (m - spread - quadratic)
+            value += 0.5 * (np.sum(np.log(prior)) - quadratic)
+            slope[len(eta) - len(self.penalised) + i] = 0.5 * (smooth - spread - quadratic)
         return -value, -slope
 
     def _solve(
@@ -306,9 +319,11 @@ class _System:
         value = 0.5 * n @ np.log(weights) - 0.5 * weights @ rss - logs[: self.p].sum()
         value -= 0.5 * (self.unpenalised - self.p) * np.log(n.sum() - self.p)
         value -= logs[self.unpenalised :].sum() + 0.5 * self.ridge @ beta**2
-        for index, penalty, factor in zip(self.penalised, self.penalties, factors, strict=True):
+        for index, penalty, spectrum, ridge, factor in zip(
+            self.penalised, self.penalties, self.spectra, self.ridges, factors, strict=True
+        ):
             where = self.where[index]
-            value += 0.5 * (len(penalty) * np.log(factor) + np.linalg.slogdet(penalty)[1])
+            value += 0.5 * np.sum(np.log(factor * spectrum + ridge))
             value -= 0.5 * factor * beta[where] @ penalty @ beta[where]
         return float(value)
 

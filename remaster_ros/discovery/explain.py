@@ -75,6 +75,10 @@ class FoundEffect:
         found by how far the fit moved a marker, not in the residuals.
     tied
         A look-alike that measurements could distinguish explains the data as well.
+    sizes
+        What each of its cells amounts to, in arc minutes and millimetres with uncertainty.
+    remedy
+        What to do about it.
     """
 
     name: str
@@ -90,9 +94,16 @@ class FoundEffect:
     size_m: float
     share: float | None = None
     tied: bool = False
+    sizes: tuple[str, ...] = ()
+    remedy: str = ''
 
-    def sampled(self, result: FitResult) -> FoundEffect:
-        """Return the effect with its parameters as the extended model's posterior has them."""
+    def sampled(
+        self, result: FitResult, group: Sequence[Cell] = (), context: Context | None = None
+    ) -> FoundEffect:
+        """Return the effect with its parameters as the extended model's posterior has them.
+
+        With its cells and the rows that they were fitted to, its sizes as well.
+        """
         index = {name: i for i, name in enumerate(result.theta_names)}
         parameters = tuple(
             replace(
@@ -104,7 +115,26 @@ class FoundEffect:
             else parameter
             for parameter in self.parameters
         )
-        return replace(self, parameters=parameters)
+        sizes = self.sizes
+        if context is not None and group:
+            draws = result.theta_draws.reshape(-1, len(index))
+            sizes = tuple(
+                EFFECTS[cell.name].size(
+                    context, cell, draws[:, [index[name] for name in cell.parameters]]
+                )
+                for cell in group
+            )
+        return replace(
+            self, parameters=parameters, sizes=sizes, cause=with_sizes(self.cause, sizes)
+        )
+
+
+def with_sizes(cause: str, sizes: Sequence[str]) -> str:
+    """Return the sentence of a cause with what it amounts to behind its first full stop."""
+    if not sizes:
+        return cause
+    first, stop, rest = cause.partition('. ')
+    return f'{first.removesuffix(".")}: {"; ".join(sizes)}.{" " if stop else ""}{rest}'
 
 
 def describe(
@@ -174,6 +204,7 @@ def _described(
         cause=in_words(group, data.part) + _also_called(alike),
         size_m=_size(data, solution, group),
         share=share,
+        remedy=EFFECTS[first.name].remedy,
         tied=any(not other.same and other.log_evidence_gain > gain - TIED for other in alike),
     )
     return effect

@@ -8,6 +8,11 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.types import FloatArray
+
+# A member of a family that the others explain to this share of its size is another name for them.
+FAMILY_ABSORBED = 1e-3
 
 FAMILIES: tuple[tuple[str, ...], ...] = tuple(
     tuple(name for name, effect in EFFECTS.items() if effect.family == family)
@@ -51,3 +56,29 @@ def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
             key += (str(cell.joints), cell.label if cause_per == 'variant' else '')
         groups.setdefault(key, []).append(cell)
     return [tuple(group) for group in groups.values()]
+
+
+def visible(data: Residuals, given: Sequence[Cell], cells: Sequence[Cell]) -> list[Cell]:
+    """Return the cells that add something to base, given and earlier ones, in order."""
+    if not cells:
+        return []
+    if cells[0].penalty is not None:
+        return list(cells)
+    fixed = [cell for cell in given if cell.penalty is None]
+    start = np.concatenate((data.base, data.columns(fixed)), axis=2)
+    known, _ = np.linalg.qr(_unit(start.reshape(3 * len(data), -1)))
+    kept = []
+    for cell in cells:
+        block = _unit(data.columns([cell]).reshape(3 * len(data), -1))
+        left = block - known @ (known.T @ block)
+        left -= known @ (known.T @ left)
+        if np.linalg.svd(left, compute_uv=False)[-1] < FAMILY_ABSORBED:
+            continue
+        kept.append(cell)
+        known = np.concatenate((known, np.linalg.qr(left)[0]), axis=1)
+    return kept
+
+
+def _unit(columns: FloatArray) -> FloatArray:
+    norm = np.linalg.norm(columns, axis=0)
+    return columns / np.where(norm > 0.0, norm, 1.0)

@@ -14,6 +14,7 @@ from scipy.stats import chi2
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.discovery.effects.marker_offset import EFFECT as MARKER_OFFSET
+from remaster_ros.discovery.effects.sizes import number
 from remaster_ros.discovery.evidence import Solution
 from remaster_ros.discovery.explain import FoundEffect, Parameter
 from remaster_ros.discovery.residuals import Residuals
@@ -129,6 +130,8 @@ def _effect(
             'around the last axis it trades with the zero-offset.'
         )
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    way = float(np.linalg.norm(moved))
+    off = number(1e3 * way, 1e3 * float(np.sqrt(moved @ covariance @ moved)) / way, ' mm')
     return FoundEffect(
         name=effect.name,
         joints=(),
@@ -143,5 +146,7 @@ def _effect(
         log_evidence_gain=0.5 * (square - rank),
         confusable_with=(),
         cause=cause,
-        size_m=float(np.linalg.norm(moved)),
+        size_m=way,
+        sizes=(f'{name} is {off} away from it',),
+        remedy=effect.remedy,
     )

@@ -3,7 +3,7 @@
 A round screens all cells beside the set found so far and tries the best of them, and every
 physical group as a whole (all joints compliant, all links wrong), less the members that do not
 raise the evidence.
-The proposal of the highest evidence joins if it passes two tests: its p-value over all cells
+The proposal of the highest evidence that passes two tests joins: its p-value over all cells
 tried, and its gain on poses left out in turn. After each round, cells that no longer raise the
 evidence are dropped, and each is swapped for what explains more in its place, because the first
 step acts on a mixture of causes.
@@ -21,10 +21,15 @@ from remaster_ros.discovery.cross_validation import held_out_error, worth_of
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import Solution, solve
-from remaster_ros.discovery.families import FAMILIES, family_log_prior, grouped, relatives
+from remaster_ros.discovery.families import (
+    FAMILIES,
+    family_log_prior,
+    grouped,
+    relatives,
+    visible,
+)
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, Screening, screen
-from remaster_ros.types import FloatArray
 
 # Family-wise error of one round.
 SIGNIFICANCE = 0.01
@@ -60,6 +65,14 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False)
+class Proposal:
+    """A set one step on, with the p-value of the step."""
+
+    solution: Solution
+    p_value: float
+
+
+@dataclass(frozen=True, eq=False)
 class Selection:
     """The outcome: the fit without and with the cells, and how they were found.
 
@@ -70,7 +83,7 @@ class Selection:
     steps
         What joined, in order.
     rejected
-        The last proposal, which failed a test; None where none was left.
+        The best proposal of the last round, which failed a test; None where there was none.
     """
 
     empty: Solution
@@ -124,17 +137,15 @@ class Search:
         for count in range(ROUNDS):
             self.progress(count / (count + 2.0))
             screening = screen(self.data, self.catalogue, solution, rng=self.rng, draws=DRAWS)
-            proposal = self.propose(solution, screening)
-            if proposal is None or proposal[0].log_evidence <= solution.log_evidence:
-                break
-            candidate, p_value = self.backward_elimination(proposal[0]), proposal[1]
-            if candidate.log_evidence <= solution.log_evidence:
-                break
-            share = self.held_out_share(solution, candidate)
-            new = tuple(cell for cell in candidate.cells if cell not in solution.cells)
-            step = Step(new, p_value, share, candidate.log_evidence - solution.log_evidence)
-            if p_value > SIGNIFICANCE or share < _least_share(solution, candidate):
-                rejected = step
+            rejected = None
+            for proposal in self.propose(solution, screening):
+                candidate, step = self._tested(solution, proposal, screening)
+                if step.p_value <= SIGNIFICANCE and step.held_out_share >= _least_share(
+                    solution, candidate
+                ):
+                    break
+                rejected = rejected or step
+            else:
                 break
             steps.append(step)
             solution = self.refine_moments(self.swap(self.prune(candidate)))
@@ -142,6 +153,21 @@ class Search:
         empty = self.fit(())
         assert empty is not None
         return Selection(empty, solution, tuple(steps), rejected)
+
+    def _tested(
+        self, solution: Solution, proposal: Proposal, screening: Screening
+    ) -> tuple[Solution, Step]:
+        """Return a proposal without its weak members, and how it does in the tests."""
+        candidate, p_value = self.backward_elimination(proposal.solution), proposal.p_value
+        gain = candidate.log_evidence - solution.log_evidence
+        new = tuple(cell for cell in candidate.cells if cell not in solution.cells)
+        if gain <= 0.0:
+            p_value = 1.0
+        elif len(new) == 1 and len(proposal.solution.cells) > len(solution.cells) + 1:
+            # What is left of a family is judged as what it is, one cell.
+            p_value = screening.p_value(float(screening.score[self.cells.index(new[0])]))
+        share = self.held_out_share(solution, candidate)
+        return candidate, Step(new, p_value, share, gain)
 
     def _judged(self, solution: Solution) -> Solution:
         """Set aside what the better model shows to be gross, and fit again without it."""
@@ -159,43 +185,35 @@ class Search:
             return None
         return solve(self.data, cells, start, prior=family_log_prior(cells, self.catalogue.cells))
 
-    def propose(self, solution: Solution, screening: Screening) -> tuple[Solution, float] | None:
-        """Return the set of the highest evidence one step on, with the p-value of the step."""
-        best: tuple[Solution, float] | None = None
+    def propose(self, solution: Solution, screening: Screening) -> list[Proposal]:
+        """Return sets one step on that raise the evidence, the best first."""
         shortlist = np.argsort(-screening.score)[:SHORTLIST]
         # Structure that hides in the noise common to a pose shows only when that is fitted again.
         hidden = np.setdiff1d(np.flatnonzero(self._structure), shortlist)
+        found = []
         for index in np.concatenate((shortlist, hidden)):
             if not np.isfinite(screening.score[index]):
                 continue
             candidate = self.fit((*solution.cells, self.catalogue.cells[index]), solution)
-            if (
-                candidate is not None
-                and not candidate.unphysical()
-                and (best is None or candidate.log_evidence > best[0].log_evidence)
-            ):
+            if candidate is not None and not candidate.unphysical():
                 score = float(screening.score[index])
                 if self._structure[index]:
                     score = max(score, candidate.log_evidence - solution.log_evidence)
-                best = candidate, screening.p_value(score)
+                found.append(Proposal(candidate, screening.p_value(score)))
         for family in FAMILIES:
-            if not self._promising(family, screening):
-                continue
             candidate = self.grown(solution, family)
-            if candidate is not None and (
-                best is None or candidate.log_evidence > best[0].log_evidence
-            ):
+            if candidate is not None:
                 gain = candidate.log_evidence - solution.log_evidence
-                best = candidate, screening.p_value(gain)
-        return best
-
-    def _promising(self, family: tuple[str, ...], screening: Screening) -> bool:
-        """Return whether at least one member of a family raises the evidence by itself."""
-        mine = [cell.name in family for cell in self.catalogue.cells]
-        return bool(np.any(screening.score[mine] > 0.0))
+                found.append(Proposal(candidate, screening.p_value(gain)))
+        found = [one for one in found if one.solution.log_evidence > solution.log_evidence]
+        return sorted(found, key=lambda one: -one.solution.log_evidence)
 
     def grown(self, solution: Solution, family: tuple[str, ...]) -> Solution | None:
-        """Return the set with all of a family whose members each raise the evidence."""
+        """Return the set with all of a family whose members each raise the evidence.
+
+        Also where none of them does so alone: errors of six joints may each be below the
+        threshold, and far above it together.
+        """
         members = [
             cell
             for cell in self.catalogue.cells
@@ -203,32 +221,11 @@ class Search:
         ]
         present = {(cell.name, cell.joints, cell.label) for cell in solution.cells}
         others = [cell for cell in members if (cell.name, cell.joints, cell.label) not in present]
-        new = self.visible(solution.cells, others)
+        new = visible(self.data, solution.cells, others)
         if len(new) < 2:
             return None
         grown = self.fit((*solution.cells, *new), solution)
         return None if grown is None else self.prune(grown, set(new))
-
-    def visible(self, given: Sequence[Cell], cells: Sequence[Cell]) -> list[Cell]:
-        """Return the cells that add something to base, given and earlier ones, in order."""
-        if not cells:
-            return []
-        if cells[0].penalty is not None:
-            return list(cells)
-        data = self.data
-        fixed = [cell for cell in given if cell.penalty is None]
-        start = np.concatenate((data.base, data.columns(fixed)), axis=2)
-        known, _ = np.linalg.qr(_unit(start.reshape(3 * len(data), -1)))
-        kept = []
-        for cell in cells:
-            block = _unit(data.columns([cell]).reshape(3 * len(data), -1))
-            left = block - known @ (known.T @ block)
-            left -= known @ (known.T @ left)
-            if np.linalg.svd(left, compute_uv=False)[-1] < FAMILY_ABSORBED:
-                continue
-            kept.append(cell)
-            known = np.concatenate((known, np.linalg.qr(left)[0]), axis=1)
-        return kept
 
     def prune(self, solution: Solution, among: set[Cell] | None = None) -> Solution:
         """Drop, one by one, the cells without which the evidence is higher.
@@ -405,12 +402,3 @@ def _least_share(solution: Solution, candidate: Solution) -> float:
     curves that stood in for a weaker cause gives way to it.
     """
     return LEAST_GAIN if len(candidate.parameters) > len(solution.parameters) else 0.0
-
-
-# A member of a family that the others explain to this share of its size is another name for them.
-FAMILY_ABSORBED = 1e-3
-
-
-def _unit(columns: FloatArray) -> FloatArray:
-    norm = np.linalg.norm(columns, axis=0)
-    return columns / np.where(norm > 0.0, norm, 1.0)

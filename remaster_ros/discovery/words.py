@@ -9,7 +9,7 @@ import numpy as np
 
 def percent(share: float) -> str:
     """Return a share as whole per cent: '35 %', never '-0 %'."""
-    return f'{round(100.0 * share) + 0:d} %'
+    return f'{round(100.0 * share)} %'
 
 
 def p_value_text(p_value: float, floor: float) -> str:

@@ -8,14 +8,13 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.arm_ends import likely_base, likely_tips
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.urdf import parse_urdf
-from remaster_ros.session.files import decode_text, read_limited
-from remaster_ros.session.reader import URDF_LIMIT
+from remaster_ros.session.robot_description import read_description
 
 
 def read_robot(
     path: Path, base_link: str | None = None, tip_link: str | None = None
 ) -> tuple[str, SerialChain]:
-    """Read a URDF and find the arm in it.
+    """Read a URDF, or expand a xacro, and find the arm in it.
 
     Parameters
     ----------
@@ -27,7 +26,7 @@ def read_robot(
     InputError
         Naming the file and the remedy.
     """
-    urdf = decode_text(read_limited(path, URDF_LIMIT, 'name a URDF file'), path)
+    urdf = read_description(path)
     try:
         model = parse_urdf(urdf)
         base = likely_base(model) if base_link is None else base_link

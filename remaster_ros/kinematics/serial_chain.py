@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from remaster_ros.errors import InputError
+from remaster_ros.errors import InputError, did_you_mean
 from remaster_ros.kinematics.transforms import (
     apply,
     inverse,
@@ -306,7 +306,10 @@ def _joints_between(model: UrdfModel, base_link: str, tip_link: str) -> list[Urd
     """Return the joints from base to tip, in that order."""
     for link in (base_link, tip_link):
         if link not in model.links:
-            raise InputError(f"URDF: there is no link '{link}'; it has {', '.join(model.links)}")
+            raise InputError(
+                f"URDF: there is no link '{link}'; it has {', '.join(model.links)}"
+                + did_you_mean(link, model.links)
+            )
     joints = []
     here = tip_link
     while here != base_link:

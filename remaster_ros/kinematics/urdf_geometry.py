@@ -63,6 +63,13 @@ def link_shapes(text: str, read_mesh: MeshReader) -> list[LinkShape]:
     return found
 
 
+def mesh_names(text: str) -> list[str]:
+    """Return the file names of the meshes of all collision elements, as they are written."""
+    names: list[str] = []
+    link_shapes(text, names.append)
+    return list(dict.fromkeys(names))
+
+
 def _shape(element: ElementTree.Element, where: str, read_mesh: MeshReader) -> Shape | None:
     if element.tag == 'box':
         return box(numbers(attribute(element, 'size', where), 3, f'the size of {where}'))

@@ -29,7 +29,13 @@ from remaster_ros.errors import RemasterError
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import LATCHED, NodeStatus, Summary
-from remaster_ros.reports.fit_json import FIT_FILE, prepare_folder, read_fit, save_fit
+from remaster_ros.reports.fit_json import (
+    DISCOVERY_FILE,
+    FIT_FILE,
+    prepare_folder,
+    read_fit,
+    save_fit,
+)
 from remaster_ros.session.priors import read_priors
 from remaster_ros.session.reader import read_session
 from remaster_ros.types import FloatArray
@@ -104,7 +110,7 @@ class Optimizer(RemasterNode):
         """Return the file to open, and the text for the status."""
         out = Path(self.p.out)
         session = read_session(self.p.session)
-        prepare_folder(out)
+        prepare_folder(out, FIT_FILE)
         result = fit_session(
             session,
             rng=np.random.default_rng(self.p.seed),
@@ -128,7 +134,7 @@ class Optimizer(RemasterNode):
 
         out = Path(self.p.discovery)
         session = read_session(self.p.session)
-        prepare_folder(out)
+        prepare_folder(out, DISCOVERY_FILE)
         found = discover_session(
             session,
             rng=np.random.default_rng(self.p.seed),

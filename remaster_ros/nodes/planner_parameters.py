@@ -5,7 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.nodes.parameters import parameter
+from remaster_ros.planning.travel_time import SPEED_SHARE, TravelTime
 from remaster_ros.session.workcell import Workcell
 
 
@@ -45,9 +49,33 @@ class Parameters:
     limit_margin_deg: float = parameter(
         1.0, 'distance kept from the joint limits', unit='deg', low=0.0, high=45.0
     )
+    speed_share: float = parameter(
+        SPEED_SHARE,
+        'as of robot_bridge: what `poses.design: optimal` and `poses.order: fastest` of a cell '
+        'file reckon with; commands nothing',
+        low=0.01,
+        high=1.0,
+    )
+    cartesian_speed_limit_m_s: float = parameter(
+        0.25, 'as of robot_bridge, likewise; 0 means no such limit', unit='m/s', low=0.0, high=10.0
+    )
+
+    def travel(self, cell: Workcell, model: CollisionModel) -> TravelTime:
+        """Return how long the arm takes, for choices of poses and their order."""
+        return TravelTime.of(
+            model,
+            self.speed_share,
+            self.cartesian_speed_limit_m_s or np.inf,
+            cell.acceleration_limits(model.chain),
+        )
 
     def plan_settings(self, cell: Workcell) -> dict[str, Any]:
         """Return what the plan depends on."""
+        design = cell.design_settings()
+        speeds = {
+            'speed_share': self.speed_share,
+            'cartesian_speed_limit_m_s': self.cartesian_speed_limit_m_s,
+        }
         return {
             'cell': cell.fingerprint(),
             'optimization_candidates': self.optimization_candidates,
@@ -56,4 +84,6 @@ class Parameters:
             'seed': self.seed,
             'reference_every': self.reference_every,
             'limit_margin_deg': self.limit_margin_deg,
+            # Other plans do not depend on them, and are those of older versions.
+            **(speeds if design.optimal or design.fastest else {}),
         }

@@ -77,12 +77,19 @@ class PosePlanner(RemasterNode):
             REGISTRATION: self.p.registration_candidates,
         }
         scene = self.cell.planning_scene(self.chain, np.deg2rad(self.p.limit_margin_deg))
-        tours = TourPlanner(scene, counts, self.p.seed, self.p.reference_every)
+        self._tours = TourPlanner(
+            scene,
+            counts,
+            self.p.seed,
+            self.p.reference_every,
+            self.cell.design_settings(),
+            self.p.travel(self.cell, scene.model),
+        )
         folder = Path(self.p.session)
         self.journal = PlanJournal(
-            folder, self.p.plan_settings(self.cell), self.chain, tours.model
+            folder, self.p.plan_settings(self.cell), self.chain, self._tours.model
         )
-        self.progress = TourProgress(self.journal, tours, PlanningThread())
+        self.progress = TourProgress(self.journal, self._tours, PlanningThread())
         # Of the run, and of what may be published only while it is running.
         self._lock = threading.RLock()
         self.run = CollectionRun(self.p.resume_within_s)
@@ -311,7 +318,9 @@ class PosePlanner(RemasterNode):
         tour = self.journal.tour
         if tour is not None and self.progress.phase != REGISTRATION and not self._described:
             self._described = True
-            self.status.event(events.TourPlanned(tour.describe()))
+            designed = self._tours.designed
+            expected = f'; {designed.describe()}' if designed is not None else ''
+            self.status.event(events.TourPlanned(tour.describe() + expected))
         with self._lock:
             # Paused or stopped while the pose was chosen and written: collect announces it.
             if self.run.state == 'running':

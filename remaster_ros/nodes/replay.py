@@ -2,6 +2,8 @@
 
 It never publishes onto a live graph: where other nodes publish what robot, bridge and planner
 publish, or where a controller subscribes, it ends. Commands to the arm are left out by default.
+Other messages are not: where some did not reach a subscriber, or a bag has a torn end, it names
+them and ends with status 1.
 """
 
 from __future__ import annotations
@@ -9,16 +11,18 @@ from __future__ import annotations
 import importlib
 import threading
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from remaster_ros.errors import InputError, RemasterError
+from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
 from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.old_bags import records_of
 from remaster_ros.nodes.parameters import declare, parameter
@@ -42,6 +46,12 @@ DISCOVERY_S = 4.0
 3 s, and its first announcement can get lost on a busy machine."""
 NEWCOMER_S = 0.5
 """How long after its first endpoint all others of a node are known, s."""
+DEPTH = 1000
+"""Messages that a publisher keeps for subscribers that have not taken them yet."""
+TAKEN_S = 10.0
+"""How long a subscriber may take for half of them before they count as dropped, s."""
+SHOWN_S = 5.0
+"""How often it is logged how far the replay is, s."""
 LOOK_S = 1.0
 """How often the graph is checked again for other nodes, s."""
 
@@ -71,6 +81,7 @@ class Replay(RemasterNode):
         if not self.p.bag:
             raise InputError('replay: parameter bag is empty; give the folder of a bag')
         folder = Path(self.p.bag)
+        self.get_logger().info(f'checking {folder}')
         self._reader = BagReader(folder / 'bag' if (folder / 'bag').is_dir() else folder)
         self._publishers_by_topic: dict[str, Publisher] = {}
         self._clock_publisher = (
@@ -81,6 +92,9 @@ class Replay(RemasterNode):
         # Number of subscribers, when last checked, of each topic that moves an arm.
         self._listeners: dict[str, int] = {}
         self.sent = 0
+        # Sent since all subscribers had taken all, by topic; and what they did not take.
+        self._untaken: Counter[str] = Counter()
+        self._dropped: Counter[str] = Counter()
         # Before anything is published, and again when discovery has found the other nodes.
         self._refuse_live()
         for topic, type_name in self._reader.topics.items():
@@ -101,7 +115,7 @@ class Replay(RemasterNode):
         """Return a publisher of a topic that was recorded under this name."""
         latched = topic in LATCHED_TOPICS
         qos = QoSProfile(
-            depth=1000,
+            depth=DEPTH,
             reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
@@ -115,6 +129,7 @@ class Replay(RemasterNode):
             self._send_all()
             # Give DDS the time to hand the last messages over.
             self._ending.wait(1.0)
+            self._require_all()
             self.finished = True
         except RemasterError as error:
             self.failure = error
@@ -172,7 +187,8 @@ class Replay(RemasterNode):
 
     def _send_all(self) -> None:
         start_wall = first = None
-        looked = time.monotonic()
+        looked = shown = time.monotonic()
+        last = self._reader.whole.last_ns or 0
         for topic, _, data, stamp_ns in self._reader:
             if start_wall is None or first is None:
                 start_wall, first = time.monotonic(), stamp_ns
@@ -185,6 +201,10 @@ class Replay(RemasterNode):
             if time.monotonic() - looked > LOOK_S:
                 looked = time.monotonic()
                 self._refuse_live()
+                if looked - shown > SHOWN_S:
+                    shown = looked
+                    left = (last - stamp_ns) * 1e-9 / self.p.rate
+                    self.get_logger().info(f'{self.sent} messages published, {left:.0f} s left')
             self._publish_clock(stamp_ns)
             publisher = self._publishers_by_topic.get(topic)
             if publisher is not None:
@@ -192,10 +212,46 @@ class Replay(RemasterNode):
                     self._look_who_listens(publisher)
                 publisher.publish(data)
                 self.sent += 1
+                self._untaken[topic] += 1
+                if self._untaken[topic] >= DEPTH // 2:
+                    self._await_taken(topic)
             if self._old_events is not None and topic == f'/{STATUS}':
                 for message in records_of(data):
                     self._old_events.publish(message)
         self.get_logger().info(f'{self.sent} messages published')
+
+    def _await_taken(self, topic: str) -> None:
+        """Wait until the subscribers of a topic have all that was sent, or count it as dropped.
+
+        Later messages would take the places of those that a slow subscriber has not taken yet.
+        """
+        publisher, count = self._publishers_by_topic[topic], self._untaken.pop(topic, 0)
+        if not self._ending.is_set() and not publisher.wait_for_all_acked(
+            Duration(seconds=TAKEN_S)
+        ):
+            self._dropped[topic] += count
+
+    def _require_all(self) -> None:
+        """Check that nothing was dropped.
+
+        Raises
+        ------
+        InsufficientDataError
+            Something was; with the topics.
+        """
+        for topic in list(self._untaken):
+            self._await_taken(topic)
+        lost = [
+            f'up to {count} messages of {topic} did not reach a subscriber in {TAKEN_S:g} s'
+            for topic, count in sorted(self._dropped.items())
+        ]
+        if self._reader.torn_bytes:
+            lost.append(
+                f'the last {self._reader.torn_bytes} bytes of the bag are no whole message (its '
+                'writer was killed)'
+            )
+        if lost and not self._ending.is_set():
+            raise InsufficientDataError(f'replay: {"; ".join(lost)}; the rest was published')
 
     def _publish_clock(self, time_ns: float) -> None:
         now = time.monotonic()

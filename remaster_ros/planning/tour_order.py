@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, takewhile
 from typing import NamedTuple
 
 import numpy as np
@@ -119,6 +119,9 @@ class Tour:
     reference_every
         How many configurations lie between two rounds of the references at most; a pose with more
         solutions than that is not interrupted.
+    order
+        Split, pose and solution of each visit, in order: a pose may be visited again for others of
+        its solutions. Without it the nearest pose is next, in all its solutions.
     """
 
     def __init__(
@@ -130,8 +133,10 @@ class Tour:
         one_solution: bool = False,
         model: CollisionModel | None = None,
         reference_every: int = 0,
+        order: Sequence[tuple[str, int, int]] = (),
     ) -> None:
         self._chain, self._model = chain, model
+        self.order = tuple(order)
         self.reference_every = reference_every
         self.in_order, self.one_solution = in_order, one_solution
         self.plans = dict(plans)
@@ -141,7 +146,15 @@ class Tour:
         # Which reference is next, of how many rounds that are due; and what was visited since.
         self._reference, self._rounds_due = 0, FIRST_ROUNDS if self.references else 0
         self._since = self.reference_stops = 0
-        self._left = {split: list(range(len(plan.poses))) for split, plan in once.items()}
+        # Of each pose the solutions that were not visited; poses without any are taken out.
+        self._left = {
+            split: {
+                index: list(range(len(pose.solutions))) for index, pose in enumerate(plan.poses)
+            }
+            for split, plan in once.items()
+        }
+        # A pose keeps its number when it is visited again.
+        self._numbers: dict[tuple[str, int], int] = {}
         self.poses = {split: len(plan.poses) for split, plan in once.items()}
         self.configurations = {
             split: sum(1 if one_solution else len(pose.solutions) for pose in plan.poses)
@@ -166,21 +179,40 @@ class Tour:
         left = [(split, index) for split, indices in self._left.items() for index in indices]
         if not left:
             return self._propose_reference(q) if self.references and self._since else None
-        here = self._chain.forward(q)[:3, 3]
-        places = [self.plans[split].poses[index].T_R_T[:3, 3] for split, index in left]
-        distances = np.linalg.norm(np.array(places) - here, axis=1)
-        split, index = left[0 if self.in_order else int(np.argmin(distances))]
-        solutions = self.plans[split].poses[index].solutions
-        route = self._route(split, index, range(len(solutions)), q)
+        split, index = self._nearest(left, q) if not self.order else self._next_in_order()
+        route = self._route(split, index, self._due(split, index), q)
         after = self._since + len(route.ids)
         if self.references and self._since and after > self.reference_every:
             return self._propose_reference(q)
         return self._stop(split, index, route)
 
+    def _nearest(self, left: Sequence[tuple[str, int]], q: FloatArray) -> tuple[str, int]:
+        """Return which pose is next where no order is given."""
+        here = self._chain.forward(q)[:3, 3]
+        places = [self.plans[split].poses[index].T_R_T[:3, 3] for split, index in left]
+        distances = np.linalg.norm(np.array(places) - here, axis=1)
+        return left[0 if self.in_order else int(np.argmin(distances))]
+
+    def _in_order(self) -> list[tuple[str, int, int]]:
+        """Return the visits of the given order that are left."""
+        return [v for v in self.order if v[2] in self._left[v[0]].get(v[1], ())]
+
+    def _next_in_order(self) -> tuple[str, int]:
+        """Return the pose of the next visit of the given order."""
+        split, index, _ = self._in_order()[0]
+        return split, index
+
+    def _due(self, split: str, index: int) -> list[int]:
+        """Return the solutions of a pose to visit now: all, or those next to each other."""
+        if not self.order:
+            return self._left[split][index]
+        run = takewhile(lambda visit: visit[:2] == (split, index), self._in_order())
+        return [number for _, _, number in run]
+
     @property
     def poses_begun(self) -> int:
         """How many poses were begun that are no references."""
-        return self.visited - self.reference_stops
+        return len(self._numbers)
 
     def ask_round(self) -> None:
         """Begin a round of the references with the next stop."""
@@ -243,7 +275,11 @@ class Tour:
         if split == REFERENCE:
             self._begin_reference(index)
         else:
-            self._left[split].remove(index)
+            self._numbers.setdefault((split, index), stop.pose)
+            done = {*ids, *unreached} if self.order else set(self._left[split][index])
+            left = [number for number in self._left[split].pop(index) if number not in done]
+            if left:
+                self._left[split][index] = left
             self._since += len(ids)
         self.visited += 1
         return stop
@@ -260,6 +296,7 @@ class Tour:
     def _stop(self, split: str, index: int, route: Route) -> PoseVisit:
         pose = self.plans[split].poses[index]
         number = self.visited if split != REGISTRATION else -1 - self.visited
+        number = self._numbers.get((split, index), number)
         ids, paths, unreached = tuple(route.ids), tuple(route.paths), tuple(route.unreached)
         solutions = pose.solutions[list(ids)]
         return PoseVisit(number, split, pose.T_R_T, solutions, index, ids, paths, unreached)

@@ -9,6 +9,12 @@ import numpy as np
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.planning.candidates import Plan, PlannedPose, PlanningScene, order_solutions
 from remaster_ros.planning.free_order import free_way
+from remaster_ros.planning.planned_design import (
+    Designed,
+    DesignSettings,
+    designed_plans,
+    visit_order,
+)
 from remaster_ros.planning.reference_choice import choose_references
 from remaster_ros.planning.tour_order import (
     REFERENCE,
@@ -16,6 +22,7 @@ from remaster_ros.planning.tour_order import (
     Tour,
     registration_tour,
 )
+from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.types import FloatArray
 
 MOST_TRIES = 5
@@ -35,24 +42,41 @@ class TourPlanner:
         Of the Latin hypercube.
     reference_every
         How many configurations lie between two rounds of the references; 0 for no references.
+    design
+        Which of the poses are visited, and in which order; all of them, nearest first, by default.
+    travel
+        How long the robot takes; where None it moves with the bridge's defaults.
 
     Attributes
     ----------
+    scene, design, travel
+        As given.
     model
         The arm and all that it must not hit.
+    designed
+        What an optimal design has led to; None without one.
     """
 
     def __init__(
-        self, scene: PlanningScene, counts: Mapping[str, int], seed: int, reference_every: int = 0
+        self,
+        scene: PlanningScene,
+        counts: Mapping[str, int],
+        seed: int,
+        reference_every: int = 0,
+        design: DesignSettings | None = None,
+        travel: TravelTime | None = None,
     ) -> None:
-        self._scene, self._counts, self._seed = scene, counts, seed
+        self.scene, self._counts, self._seed = scene, counts, seed
         self._every = reference_every
         self._chain, self.model = scene.model.chain, scene.model
+        self.design = design or DesignSettings()
+        self.travel = travel or TravelTime.of(scene.model)
+        self.designed: Designed | None = None
 
     def registration(self) -> Tour:
         """Plan poses for the three-point registration, before sensors at their rough places."""
-        plan = self._plan(REGISTRATION, self._scene.rough_R)
-        markers = [sight.marker_T for sight in self._scene.sights]
+        plan = self._plan(REGISTRATION, self.scene.rough_R)
+        markers = [sight.marker_T for sight in self.scene.sights]
         return registration_tour(self._chain, plan, markers, self.model)
 
     def collection(self, T_R_N: Mapping[str, FloatArray]) -> Tour:
@@ -69,12 +93,21 @@ class TourPlanner:
             for split, count in self._counts.items()
             if count and split != REGISTRATION
         }
-        if self._every and plans['optimization'].poses:
-            plans[REFERENCE] = self._references(plans)
-        tour = Tour(self._chain, plans, model=self.model, reference_every=self._every)
         if not plans['optimization'].poses:
-            raise InsufficientDataError(f'{tour.describe()}: no pose is left to fit on')
-        return tour
+            nothing = Tour(self._chain, plans).describe()
+            raise InsufficientDataError(f'{nothing}: no pose is left to fit on')
+        if self.design.optimal:
+            rng = np.random.default_rng([self._seed, *b'design'])
+            self.designed = designed_plans(
+                self.scene, self.design, plans, sensors_R, self.travel, rng
+            )
+            plans = dict(self.designed.plans)
+        order = []
+        if self.design.fastest:
+            order = visit_order(plans, self.model, self.travel)
+        if self._every:
+            plans[REFERENCE] = self._references(plans)
+        return Tour(self._chain, plans, model=self.model, reference_every=self._every, order=order)
 
     def _references(self, plans: Mapping[str, Plan]) -> Plan:
         """Choose references among the planned configurations, each with a way from the last."""
@@ -84,7 +117,7 @@ class TourPlanner:
             for pose in plan.poses
             for q in pose.solutions
         ]
-        seen = {sight.sensor: (sight.marker, sight.marker_T) for sight in self._scene.sights}
+        seen = {sight.sensor: (sight.marker, sight.marker_T) for sight in self.scene.sights}
         chosen: list[PlannedPose] = []
         for _ in range(MOST_TRIES):
             q = np.array([pose.solutions[0] for pose in poses])
@@ -117,4 +150,4 @@ class TourPlanner:
     def _plan(self, split: str, sensors_R: Mapping[str, FloatArray]) -> Plan:
         # Each split has its own draws: the same plan, whatever was planned before a restart.
         rng = np.random.default_rng([self._seed, *split.encode()])
-        return self._scene.plan(self._counts[split], sensors_R, rng)
+        return self.scene.plan(self._counts[split], sensors_R, rng)

@@ -12,10 +12,12 @@ from remaster_ros.calibration.predictions import Coverage, Predictions, predict
 from remaster_ros.compensation.export import GEOMETRY_FILE
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.discover import Discovery
+from remaster_ros.discovery.stepwise_selection import DRAWS
 from remaster_ros.reports import schemas
 from remaster_ros.reports.discovery_apply import applied
 from remaster_ros.reports.fit_json import (
     APPLY_FOLDER,
+    DISCOVERY_FILE,
     fit_content,
     read_result,
     remove_report,
@@ -25,7 +27,7 @@ from remaster_ros.reports.predictions_csv import PREDICTIONS_FILE, predictions_t
 from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.version import __version__
 
-DISCOVERY_FILE = 'discovery.json'
+LEAST_P_VALUE = 1.0 / (1.0 + DRAWS)
 
 
 def predictions_of(discovery: Discovery) -> Predictions:
@@ -69,6 +71,8 @@ def discovery_content(
         'registration': fit.registration,
         'markers': fit.markers,
         'covariance': _covariance(discovery),
+        # That of a cause which no surrogate residuals reach: its p-value is below.
+        'least_p_value': LEAST_P_VALUE,
         'predicted_regions95': _regions(discovery, predictions),
     }
     if discovery.thinning is not None:

@@ -10,7 +10,6 @@ from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.stepwise_selection import DRAWS
 from remaster_ros.reports import schemas
 from remaster_ros.reports.discovery_figures import draw_discovery
 from remaster_ros.reports.pages import inlined, page, write_report
@@ -50,7 +49,6 @@ def write_discovery_report(
         equations={name: effect.equation for name, effect in EFFECTS.items()},
         sources={name: effect.source for name, effect in EFFECTS.items()},
         most_parameters=MOST_PARAMETERS,
-        least_p=1.0 / (1.0 + DRAWS),
         confirmed=in_words(discovery, confirmation) if confirmation else (),
         drawings={name: inlined(name, text) for name, text in drawings.items()},
     )

@@ -112,7 +112,8 @@ def posteriors(result: FitResult) -> Figure:
         if high - low < WHOLE_TURN_DEG:
             ax.axvspan(low, high, color=color, alpha=0.13, linewidth=0)
             ax.axvline(mean, color=color, linewidth=1.4)
-            source = '' if result.identifiable[i] else 'from the prior alone: '
+            unseen = result.why[i].startswith('the data do not determine')
+            source = 'from the prior alone: ' if unseen and not result.identifiable[i] else ''
             text = f'{source}{mean:+.4f}° ± {std:.4f}°'.replace('-', '\N{MINUS SIGN}')
         ax.set_title(text, loc='right', fontweight='normal')
         ax.set_yticks([])

@@ -15,7 +15,13 @@ from remaster_ros.compensation.export import exports
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.reports import schemas
-from remaster_ros.session.files import cannot_write, make_folder, read_limited, write_atomically
+from remaster_ros.session.files import (
+    cannot_write,
+    make_folder,
+    read_limited,
+    write_atomically,
+    writing,
+)
 from remaster_ros.types import FloatArray, Session
 from remaster_ros.version import __version__
 
@@ -25,6 +31,10 @@ if TYPE_CHECKING:
 FIT_FILE = 'fit.json'
 REPORT_FILE = 'report.html'
 APPLY_FOLDER = 'apply'
+DISCOVERY_FILE = 'discovery.json'
+FORMATS = {FIT_FILE: schemas.FIT_FORMAT, DISCOVERY_FILE: schemas.DISCOVERY_FORMAT}
+# What the commands write beside their result.
+WRITTEN = (REPORT_FILE, APPLY_FOLDER, 'figures', 'predictions.csv')
 FIT_LIMIT = 64 * 1024**2
 
 
@@ -229,21 +239,51 @@ def joint_offsets_rad(
     return np.radians([row['mean_deg'] for row in ordered]), np.radians(std)
 
 
-def prepare_folder(folder: str | os.PathLike[str]) -> None:
+def prepare_folder(folder: str | os.PathLike[str], result: str) -> None:
     """Create the folder for results and make sure that files can be written there.
+
+    Parameters
+    ----------
+    result
+        The file that the command writes there, `FIT_FILE` or `DISCOVERY_FILE`. With it in the
+        folder, and without that of the other, the folder is one of the command's own.
 
     Raises
     ------
     InputError
-        They cannot. This is checked before the long work, not after it.
+        They cannot, or would replace what this command has not written. This is checked before
+        the long work, not after it.
     """
     folder = Path(folder)
     make_folder(folder)
+    with writing(folder):
+        there = sorted(path.name for path in folder.iterdir())
+    (other,) = {FIT_FILE, DISCOVERY_FILE} - {result}
+    foreign = [
+        name for name in there if name == other or (name in WRITTEN and result not in there)
+    ]
+    if result in there:
+        require_own(folder / result, FORMATS[result])
+    if foreign:
+        raise InputError(
+            f'{folder}: holds {", ".join(foreign)}, not written by this command, some of which it '
+            'would replace; name another folder'
+        )
     try:
         # A file without a name: an interrupt leaves nothing behind.
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise cannot_write(folder, error) from None
+
+
+def require_own(path: Path, format_: str) -> None:
+    """Refuse to replace a file that is no JSON of this format, or not of this program."""
+    try:
+        content = msgspec.json.decode(read_limited(path, FIT_LIMIT, 'it was there'))
+    except msgspec.DecodeError:
+        content = None
+    if not isinstance(content, dict) or content.get('format') != format_:
+        raise InputError(f'{path}: is there and is no {format_}; it is not replaced, name another')
 
 
 def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = True) -> Path:

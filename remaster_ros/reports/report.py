@@ -99,18 +99,23 @@ def verdict(result: FitResult) -> Headline:
     changes = _references(result)[1]
     points = [_compared(check) for check in unexplained] + changes
     mood = 'caution'
-    if not result.sampler.converged:
+    if result.sampler.wandering and not result.sampler.converged:
         mood = 'bad'
         headline = (
             'The chains have not converged, so nothing is decided yet: '
             f'for now the mean position error goes from {change}.'
+        )
+    elif not result.sampler.converged and result.sampler.method != 'metropolis':
+        headline = (
+            'The data leave some parameters so open that their distribution is known only '
+            f'approximately. The mean position error goes from {change}.'
         )
     elif gain >= NOTICEABLE_GAIN:
         times = f'{gain:.1f} times' if gain < 10 else f'{gain:.0f} times'
         headline = f'The mean position error falls from {change}: {times} smaller.'
         if unexplained:
             headline += f' {_dominated(unexplained)}'
-        elif validated and not changes:
+        elif validated and not changes and result.sampler.converged:
             mood = 'good'
     elif gain > 1 / NOTICEABLE_GAIN:
         headline = (
@@ -129,13 +134,22 @@ def verdict(result: FitResult) -> Headline:
             'There are no validation poses, so the gain is not proven: measure some and fit again.'
         )
     sampler = result.sampler
-    if sampler.converged:
+    if sampler.converged and sampler.method == 'metropolis':
         points.append(f'The chains agree with each other ({sampler.message}).')
-    else:
+    elif sampler.converged:
+        points.append(f'The weighted draws pass their check ({sampler.message}).')
+    elif sampler.method != 'metropolis':
+        points.append(
+            f'Do not trust the uncertainties ({sampler.message}): measure poses that are spread '
+            'further and turn the tool, or state what is known of these parameters (--prior).'
+        )
+    elif sampler.wandering:
         points.append(
             f'Do not trust offsets or uncertainties ({sampler.message}); '
             'fit again with more draws.'
         )
+    else:
+        points.append(f'The chains agree, but are shorter than asked for ({sampler.message}).')
     unknown = [
         joint
         for joint, known in zip(result.joint_names, result.identifiable, strict=True)

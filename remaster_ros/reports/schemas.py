@@ -110,6 +110,9 @@ class Sampler(Struct):
 
     ``precision`` is the Monte Carlo error of the worst mean in standard deviations;
     ``log_density_error_max`` that of the second-order density on the draws that were checked.
+    ``method`` is 'metropolis' for chains, 'importance' for weighted draws, 'laplace' for a
+    Gaussian about the mode; for the latter two ``pareto_k`` is the check of their weights, passed
+    below 0.7.
     """
 
     name: str
@@ -125,6 +128,8 @@ class Sampler(Struct):
     precision_wanted: float | UnsetType | None = UNSET
     log_density_error_max: float | UnsetType | None = UNSET
     log_density_checked_draws: int | UnsetType = UNSET
+    method: Literal['metropolis', 'importance', 'laplace'] | UnsetType = UNSET
+    pareto_k: float | UnsetType | None = UNSET
 
 
 class SampledParameter(Struct):
@@ -205,7 +210,10 @@ class LookAlike(Struct):
 
 
 class Effect(Struct):
-    """A cause; ``size_m`` is the RMS at the marker after absorption, ``share`` of the gain."""
+    """A cause; ``size_m`` is the RMS at the marker after absorption, ``share`` of the gain.
+
+    ``sizes`` are its parts in arc minutes and millimetres, ``remedy`` is what to do about it.
+    """
 
     name: str
     joints: list[int]
@@ -219,6 +227,8 @@ class Effect(Struct):
     cause: str
     size_m: float | UnsetType = UNSET
     share: float | UnsetType | None = UNSET
+    sizes: list[str] | UnsetType = UNSET
+    remedy: str | UnsetType = UNSET
 
 
 class Gain(Struct):
@@ -363,6 +373,7 @@ class Discovered(Struct):
     registration: dict[str, Registration] | UnsetType = UNSET
     markers: dict[str, Marker] | UnsetType = UNSET
     covariance: JointCovariance | UnsetType = UNSET
+    least_p_value: float | UnsetType = UNSET
     predicted_regions95: PredictedRegions | UnsetType = UNSET
     rows_searched: SearchedRows | UnsetType = UNSET
     confirmation: Confirmed | UnsetType = UNSET

@@ -14,6 +14,7 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.session.files import read_limited
+from remaster_ros.session.packages import find_package
 from remaster_ros.types import FloatArray
 
 MESH_LIMIT = 64 * 1024**2
@@ -25,8 +26,8 @@ def mesh_reader(urdf: Path, mesh_path: Sequence[Path] = ()) -> Callable[[str], F
 
     ``package://NAME/rest`` is looked for as ``NAME/rest`` in the folders of `mesh_path`, in the
     share folders of AMENT_PREFIX_PATH, and beside and above the URDF (a package's own URDF lies
-    inside it). ``file://`` and plain names are taken relative to the URDF's folder, then to
-    those of `mesh_path`.
+    inside it), also where a package's folder has another name than the package. ``file://`` and
+    plain names are taken relative to the URDF's folder, then to those of `mesh_path`.
 
     Parameters
     ----------
@@ -41,13 +42,18 @@ def mesh_reader(urdf: Path, mesh_path: Sequence[Path] = ()) -> Callable[[str], F
         File name as written -> vertices, m, (n, 3). It raises InputError where there is no such
         file or none that can be read; a link without its mesh would be a link that hits nothing.
     """
-    return cache(lambda name: read_mesh(_find(name, urdf, mesh_path)))
+    return cache(lambda name: read_mesh(find_mesh(name, urdf, mesh_path)))
 
 
-def _find(name: str, urdf: Path, mesh_path: Sequence[Path]) -> Path:
+def find_mesh(name: str, urdf: Path, mesh_path: Sequence[Path]) -> Path:
+    """Return the file of a mesh; arguments as of `mesh_reader`, an `InputError` where none is."""
     folders: list[Path] = [*mesh_path]
     if name.startswith('package://'):
         inside = unquote(name.removeprefix('package://'))
+        package, _, rest = inside.partition('/')
+        folder = find_package(package, urdf, mesh_path)
+        if folder is not None and (folder / rest).is_file():
+            return folder / rest
         prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
         folders += [Path(prefix) / 'share' for prefix in prefixes if prefix]
         folders += list(urdf.resolve().parents)

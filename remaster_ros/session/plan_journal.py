@@ -45,6 +45,8 @@ class _Tour(msgspec.Struct, tag_field='kind', tag='tour'):
     one_solution: bool
     # Plans of older versions have no references, and go on without them.
     reference_every: int = 0
+    # Empty where the nearest pose is next.
+    order: tuple[tuple[str, int, int], ...] = ()
 
 
 class _Route(msgspec.Struct, tag_field='kind', tag='route'):
@@ -195,6 +197,7 @@ class PlanJournal:
                     one_solution=record.one_solution,
                     model=self._model,
                     reference_every=record.reference_every,
+                    order=record.order,
                 )
             case _Stop() if tour is not None:
                 self._take(tour.go_to(record.split, record.index, *record.route(joints)))
@@ -242,7 +245,9 @@ class PlanJournal:
 
     def begin(self, tour: Tour) -> None:
         """Note a new tour."""
-        self._append(_Tour(tour.plans, tour.in_order, tour.one_solution, tour.reference_every))
+        self._append(
+            _Tour(tour.plans, tour.in_order, tour.one_solution, tour.reference_every, tour.order)
+        )
         # As it was set before there was a file to keep it in.
         self._append(_State(self.state, self.run))
         self.tour, self.stop = tour, None

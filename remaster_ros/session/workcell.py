@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-from math import degrees, pi, radians
+from math import radians
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 import numpy as np
 
-from remaster_ros.errors import InputError
+from remaster_ros.errors import InputError, did_you_mean
 from remaster_ros.kinematics.bodies import Body, Shape, box, cylinder, obstacle, sphere
 from remaster_ros.kinematics.collision import HALF_STEP_M, CollisionModel, arm_bodies
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
@@ -22,20 +22,22 @@ from remaster_ros.planning.candidates import (
     LIMIT_MARGIN_RAD,
     LineOfSight,
     PlanningScene,
-    PoseRanges,
 )
+from remaster_ros.planning.expected_sensors import POSE_SIGMA_M, SIGMA_M, ExpectedSensor
+from remaster_ros.planning.planned_design import DesignSettings
+from remaster_ros.session.cell_poses import RANGES, CellPoses
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.meshes import mesh_reader
 from remaster_ros.session.reader import URDF_LIMIT
+from remaster_ros.session.yaml_places import with_line
 from remaster_ros.session.yaml_records import YAML_LIMIT, Bounds, Triple, read_yaml
 from remaster_ros.types import FARTHEST_M, FloatArray
 
-Range = tuple[float, float]
-# No arm or tool of those that this is for reaches so far.
-REACH = Bounds(-10.0, 10.0, 'm')
 ON_TOOL = Bounds(-3.0, 3.0, 'm')
 # A marker is placed better than this; a session file may give more, where nothing is known.
 MARKER_STD = Bounds(0.0, 0.02, 'm', above=True)
+# From the resolution of an interferometer to a depth camera's noise.
+NOISE = Bounds(1e-7, 0.05, 'm')
 # A retroreflector or sphere is seen from further round than this.
 VIEW = Bounds(3.5, 180.0, 'degrees')
 CLEARANCE = Bounds(HALF_STEP_M, 1.0, 'm', remedy='; half the step of a path check is the least')
@@ -68,6 +70,9 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     max_angle_deg
         Largest angle between the tool's z axis and the line to the sensor at which the marker
         is seen.
+    noise_m, pose_noise_m
+        Standard deviations per axis that are expected: of a reading, and of the error that all
+        readings at one pose share. Only plans depend on them; a fit estimates its own.
     """
 
     marker: str
@@ -76,6 +81,8 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     single_shot: bool = False
     measure_service: str = ''
     max_angle_deg: Annotated[float, VIEW] = 60.0
+    noise_m: Annotated[float, NOISE] = SIGMA_M
+    pose_noise_m: Annotated[float, Bounds(0.0, 0.05, 'm')] = POSE_SIGMA_M
 
 
 class CellBox(msgspec.Struct, forbid_unknown_fields=True):
@@ -123,24 +130,6 @@ class CellToolBody(msgspec.Struct, forbid_unknown_fields=True):
         return Body(name, len(chain), self.shape(), T, 'tool')
 
 
-class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
-    """Ranges of the Latin hypercube of poses."""
-
-    azimuth_deg: Range = (0.0, 360.0)
-    radius_m: Annotated[Range, Bounds(0.0, 10.0, 'm')] = (0.2, 0.5)
-    height_m: Annotated[Range, REACH] = (0.4, 0.8)
-    roll_deg: Range = (0.0, 360.0)
-
-    def ranges(self) -> PoseRanges:
-        """Return the ranges in SI units."""
-        return PoseRanges(
-            azimuth_rad=(radians(self.azimuth_deg[0]), radians(self.azimuth_deg[1])),
-            radius_m=self.radius_m,
-            height_m=self.height_m,
-            roll_rad=(radians(self.roll_deg[0]), radians(self.roll_deg[1])),
-        )
-
-
 class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     """A cell file; see config/cells/demo.yaml for what each key means."""
 
@@ -173,8 +162,16 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
 
     def fingerprint(self) -> str:
         """Return a checksum of all that a plan depends on."""
-        content = msgspec.json.encode(msgspec.structs.replace(self, file=''))
-        return hashlib.sha256(content).hexdigest()
+        plain = msgspec.to_builtins(msgspec.structs.replace(self, file=''))
+        # Keys that files of older versions have not count where they are not as by default: plans
+        # of those versions go on.
+        given = self.poses.given()
+        plain['poses'] = {k: v for k, v in plain['poses'].items() if k in RANGES or k in given}
+        for sensor in plain['sensors'].values():
+            for key, usual in (('noise_m', SIGMA_M), ('pose_noise_m', POSE_SIGMA_M)):
+                if sensor[key] == usual:
+                    del sensor[key]
+        return hashlib.sha256(msgspec.json.encode(plain)).hexdigest()
 
     def held(self, chain: SerialChain) -> dict[int, tuple[float, ...]] | None:
         """Return the held joint's index and values (rad), or None."""
@@ -261,6 +258,20 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
             limit_margin_rad,
         )
 
+    def design_settings(self) -> DesignSettings:
+        """Return which of the poses are to be visited, and in which order."""
+        expected = [
+            ExpectedSensor(
+                name,
+                np.array(sensor.rough_position_m),
+                {sensor.marker: np.array(self.markers[sensor.marker])},
+                sensor.noise_m,
+                sensor.pose_noise_m,
+            )
+            for name, sensor in self.sensors.items()
+        ]
+        return self.poses.settings(tuple(expected), self.marker_std_m)
+
 
 def _no_mesh(name: str) -> None:
     """Leave a mesh out."""
@@ -296,7 +307,12 @@ def read_cell(path: str | Path) -> Workcell:
     path = Path(path)
     if not path.suffix and not path.exists():
         path = config_path(f'cells/{path}.yaml')
-    cell = read_yaml(read_limited(path, YAML_LIMIT, 'name a cell file'), path, Workcell)
+    return parse_cell(read_limited(path, YAML_LIMIT, 'name a cell file'), path)
+
+
+def parse_cell(data: bytes, path: Path) -> Workcell:
+    """Check the content of a cell file, which need not be written yet; errors as `read_cell`."""
+    cell = read_yaml(data, path, Workcell)
     urdf = path.parent / cell.robot.urdf
     cell.file = str(path)
     missing = (
@@ -304,24 +320,26 @@ def read_cell(path: str | Path) -> Workcell:
         'URDF there, or give its absolute path'
     )
     cell.urdf_text = decode_text(read_limited(urdf.resolve(), URDF_LIMIT, missing), urdf)
-    _check(path, cell)
+    _check(path, cell, decode_text(data, path))
     return cell
 
 
-def _check(path: Path, cell: Workcell) -> None:
+def _check(path: Path, cell: Workcell, text: str) -> None:
     """Refuse names that point nowhere and values that contradict each other."""
     try:
         chain = cell.chain()
     except InputError as error:
         raise InputError(f'{path.parent / cell.robot.urdf}: {error}') from None
     if problem := _problem(cell, chain):
-        raise InputError(f'{path}: {problem}')
+        raise InputError(f'{path}: {with_line(text, problem)}')
 
 
 def _problem(cell: Workcell, chain: SerialChain) -> str:
     """Return what is wrong between the keys of a cell file; '' where nothing is."""
     if cell.held_joint and cell.held_joint not in chain.joint_names:
-        return f'held_joint {cell.held_joint!r} is none of {", ".join(chain.joint_names)}'
+        known = ', '.join(chain.joint_names)
+        meant = did_you_mean(cell.held_joint, chain.joint_names)
+        return f'held_joint {cell.held_joint!r} is none of {known}{meant}'
     if cell.held_joint and not cell.held_values_deg:
         return 'held_values_deg is empty; give at least one angle'
     if not cell.sensors:
@@ -329,18 +347,13 @@ def _problem(cell: Workcell, chain: SerialChain) -> str:
     for name, sensor in cell.sensors.items():
         if sensor.marker not in cell.markers:
             known = ', '.join(cell.markers)
-            return f'sensor {name} follows marker {sensor.marker!r}; markers has {known}'
+            meant = did_you_mean(sensor.marker, cell.markers)
+            return f'sensors.{name}.marker is {sensor.marker!r}; markers has {known}{meant}'
     if cell.aim_at not in cell.sensors:
-        return f'aim_at {cell.aim_at!r} is none of the sensors {", ".join(cell.sensors)}'
-    for key in cell.poses.__struct_fields__:
-        low, high = getattr(cell.poses, key)
-        if low > high:
-            return f'poses.{key} goes from {low:g} down to {high:g}; give the smaller one first'
-        if key.endswith('_deg') and low < high and max(abs(low), abs(high)) < 2.0 * pi + 0.01:
-            return (
-                f'poses.{key} is {low:g} to {high:g}, a range of {high - low:.3g} degrees; if '
-                f'radians were meant, write {degrees(low):.4g}, {degrees(high):.4g}'
-            )
+        meant = did_you_mean(cell.aim_at, cell.sensors)
+        return f'aim_at {cell.aim_at!r} is none of the sensors {", ".join(cell.sensors)}{meant}'
+    if problem := cell.poses.problem():
+        return problem
     limits = cell.acceleration_limit_rad_s2
     if isinstance(limits, list) and len(limits) != len(chain):
         return (

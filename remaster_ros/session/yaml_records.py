@@ -21,6 +21,7 @@ import numpy as np
 from remaster_ros.errors import InputError
 from remaster_ros.session.files import decode_text
 from remaster_ros.session.safe_yaml import YamlError, load_yaml
+from remaster_ros.session.yaml_places import explained, with_line
 from remaster_ros.types import BasePrior
 
 YAML_LIMIT = 256 * 1024
@@ -107,12 +108,15 @@ def read_yaml(data: bytes, path: Path, record: type[Record], remedy: str = '') -
     InputError
         One line naming file, line or key, and the remedy.
     """
+    text = decode_text(data, path)
     try:
-        content = msgspec.convert(load_yaml(decode_text(data, path)), record)
-    except (YamlError, msgspec.ValidationError) as error:
+        content = msgspec.convert(load_yaml(text), record)
+    except YamlError as error:
         raise InputError(f'{path}: {error}{remedy}') from None
+    except msgspec.ValidationError as error:
+        raise InputError(f'{path}: {explained(text, record, str(error))}{remedy}') from None
     if problem := out_of_bounds(content):
-        raise InputError(f'{path}: {problem}')
+        raise InputError(f'{path}: {with_line(text, problem)}')
     return content
 
 

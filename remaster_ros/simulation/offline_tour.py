@@ -8,7 +8,9 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.planning.planned_design import designed_plans
 from remaster_ros.planning.tour_order import Tour
+from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import FloatArray
 
@@ -48,6 +50,10 @@ def plan_tour(
     if places is not None:
         sensors_R = {name: T_R_N[:3, 3] for name, T_R_N in places.items()}
     plans = {split: scene.plan(n, sensors_R, rng) for split, n in counts.items() if n}
+    settings = cell.design_settings()
+    if settings.optimal and plans['optimization'].poses:
+        travel = TravelTime.of(scene.model, acceleration=cell.acceleration_limits(chain))
+        plans = dict(designed_plans(scene, settings, plans, sensors_R, travel, rng).plans)
     tour = Tour(chain, plans)
     if not tour.poses['optimization']:
         raise InputError(

@@ -219,6 +219,27 @@ def test_accuracy_on_the_own_session_and_on_another(made: Path, tmp_path: Path) 
     assert other['relative']['after']['mean_mm'] > 1.0
 
 
+def test_json_is_all_that_is_printed_and_what_the_files_hold(made: Path, tmp_path: Path) -> None:
+    session, file = made / 'session', made / 'fit/fit.json'
+    out = ('--out', tmp_path / 'fit', '--no-figures')
+    found = {}
+    for verb, *args in (
+        ('simulate', tmp_path / 'made', *SIZE),
+        ('fit', session, *out),
+        ('accuracy', session, '--offsets', file),
+        ('recover', tmp_path / 'made'),
+    ):
+        process = remaster(verb, *args, '--json')
+        assert (process.returncode, process.stderr) == (0, ''), verb
+        found[verb] = json.loads(process.stdout)
+        assert isinstance(found[verb], dict)
+    assert found['simulate'] == json.loads((tmp_path / 'made/truth.json').read_text())
+    assert found['fit'] == json.loads((tmp_path / 'fit/fit.json').read_text())
+    assert found['fit']['joint_offsets'] == json.loads(file.read_text())['joint_offsets']
+    assert found['accuracy']['format'] == 'remaster-accuracy/1'
+    assert found['recover']['lost'] == []
+
+
 def test_figures_cost_their_libraries_only_where_they_are_drawn(
     made: Path, tmp_path: Path
 ) -> None:

@@ -134,7 +134,7 @@ def test_a_xacro_file_is_named_as_such(session: Path, tmp_path: Path) -> None:
     )
     line = refusal('simulate', tmp_path / 'out', '--robot', xacro)
     assert 'arm.urdf.xacro: URDF: this is xacro' in line
-    assert 'expand it: ros2 run xacro xacro FILE > robot.urdf' in line
+    assert 'expand it: remaster init FILE (or ros2 run xacro xacro FILE > robot.urdf)' in line
     copy = Path(shutil.copytree(session, tmp_path / 's'))
     shutil.copy(xacro, copy / 'robot.urdf')
     assert 'robot.urdf: URDF: this is xacro' in refusal('fit', copy, '--out', tmp_path / 'fit')

@@ -191,3 +191,44 @@ def test_another_namespace_is_another_graph(start, client, old_bag):
     until(client, lambda: process.poll() is not None, 60, 'the end')
     assert process.returncode == 0, process.communicate()
     assert (len(heard['left']), len(heard['right'])) == (0, 40)
+
+
+def test_a_torn_end_is_told_and_ends_with_1(start, client, bag):
+    from sensor_msgs.msg import JointState
+
+    heard = []
+    client.create_subscription(JointState, '/joint_states', heard.append, 100)
+    (file,) = bag.glob('*.mcap')
+    (bag / 'SHA256SUMS').unlink(missing_ok=True)
+    whole = BagReader(bag).counts['/joint_states']
+    data = file.read_bytes()
+    # In the middle of a message, as a killed writer leaves it.
+    file.write_bytes(data[: data.rindex(b'joint_7') - 10])
+    process = start('remaster_ros.cli.main', 'replay', bag, '--wait-for', '/joint_states')
+    out, err = spun(client, process).communicate()
+    assert process.returncode == 1, out + err
+    (line,) = (line for line in err.splitlines() if line.startswith('error:'))
+    assert 'bytes of the bag are no whole message' in line
+    assert 0 < len(heard) < whole + 1
+
+
+def test_messages_that_a_subscriber_does_not_take_are_told(monkeypatch, bag):
+    """A publisher that is never acknowledged stands for a subscriber that hangs."""
+    import rclpy
+
+    from remaster_ros.errors import InsufficientDataError
+    from remaster_ros.nodes import replay
+
+    monkeypatch.setattr(replay, 'DISCOVERY_S', 0.1)
+    monkeypatch.setattr(replay, 'DEPTH', 20)
+    monkeypatch.setattr(replay.Publisher, 'wait_for_all_acked', lambda self, timeout: False)
+    rclpy.init(args=['--ros-args', '-p', f'bag:={bag}', '-p', 'rate:=100.0'])
+    try:
+        node = replay.Replay()
+        wait_until(lambda: node.failure or node.finished, 30, 'the end')
+        assert isinstance(node.failure, InsufficientDataError)
+        assert 'up to 40 messages of /joint_states did not reach a subscriber' in str(node.failure)
+        node.close()
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown()

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 
 from remaster_ros.discovery.effects.base import Cell, Effect, needs_approach
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import angle
+from remaster_ros.types import FloatArray
 
 
 def cells(context: Context) -> Iterator[Cell]:
@@ -16,6 +18,10 @@ def cells(context: Context) -> Iterator[Cell]:
         ['half_backlash_{joint}'],
         drawn_from=context.joints,
     )
+
+
+def _play(context: Context, cell: Cell, draws: FloatArray) -> str:
+    return f'joint {cell.joints[0]} stops {angle(2.0 * draws[:, 0])} apart, side by side'
 
 
 EFFECT = Effect(
@@ -30,6 +36,8 @@ EFFECT = Effect(
     sign=1,
     sentence='Where {subject} stops depends on the side it comes from (gear play).',
     separate_by='each pose approached from both sides, by small and by large moves',
+    remedy='Approach every pose from the same side, and have the play of the gearbox adjusted.',
+    size=_play,
     cells=cells,
     needs=needs_approach,
     family='backlashes',

@@ -172,6 +172,11 @@ class Effect:
         drives) and ``{driver}`` are filled in.
     separate_by
         Which measurements distinguish it from others.
+    remedy
+        What to do about it: a sentence for whoever answers for the arm.
+    size
+        What a cell amounts to, for a sentence: of context, cell and draws of its parameters
+        (draws, m); see `sizes`.
     cells
         All of its cells for a context.
     needs
@@ -210,6 +215,8 @@ class Effect:
     plausible: tuple[float, float] | None
     sentence: str
     separate_by: str
+    remedy: str
+    size: Callable[[Context, Cell, FloatArray], str]
     cells: Callable[[Context], Iterable[Cell]]
     needs: Callable[[Context], str] = field(default=lambda context: '')
     family: str = ''

@@ -9,6 +9,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, needs_gravity, turned
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import angle, largest
 from remaster_ros.types import FloatArray
 
 
@@ -26,6 +27,16 @@ def _tipped(context: Context, axes: list[FloatArray]) -> Design:
     return turned(context, [context.base_moment * axis for axis in axes], np.zeros(3))
 
 
+def _tips(context: Context, cell: Cell, draws: FloatArray) -> str:
+    moment = largest(np.linalg.norm(context.base_moment, axis=1))
+    about = cell.parameters if cell.size > 1 else ('',)
+    return ' and '.join(
+        f'the base tips by {angle(draws[:, i] * moment)} under {moment:.0f} N m'
+        + (f' about {name[-1]}' if name else '')
+        for i, name in enumerate(about)
+    )
+
+
 EFFECT = Effect(
     name='base_compliance',
     place='base_rotation',
@@ -38,6 +49,8 @@ EFFECT = Effect(
     sign=1,
     sentence='The base gives way under the weight of the arm (loose bolts or a soft stand).',
     separate_by='the same poses at several angles of joint 1, with and without a payload',
+    remedy='Tighten the bolts of the base and stiffen the stand.',
+    size=_tips,
     cells=cells,
     needs=needs_gravity,
 )

@@ -9,6 +9,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Effect
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import up_to
 from remaster_ros.types import FloatArray
 
 # Orders tried together: the disc off centre, the disc or its bearing oval, both.
@@ -43,6 +44,9 @@ EFFECT = Effect(
     plausible=(1e-5, 5e-3),
     sentence='The angle reading of {subject} errs once or twice per turn (encoder off centre).',
     separate_by='poses that turn the joint through its whole range, at the same gravity torque',
+    remedy='Correct the angle by the wave that was found; where the wave is large, have the '
+    'disc of the encoder centred.',
+    size=up_to('joint {joint} errs'),
     cells=cells,
     family='encoder eccentricities',
     in_family=lambda cell: cell.variant == '1+2',

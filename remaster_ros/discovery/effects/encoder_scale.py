@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from remaster_ros.discovery.effects.base import Cell, Effect
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import angle, number
+from remaster_ros.types import FloatArray
 
 
 def cells(context: Context) -> Iterator[Cell]:
@@ -15,6 +19,17 @@ def cells(context: Context) -> Iterator[Cell]:
         lambda context, joint: [context.measurements.q[:, joint - 1]],
         ['scale_{joint}'],
         drawn_from=context.joints,
+    )
+
+
+def _scaled(context: Context, cell: Cell, draws: FloatArray) -> str:
+    joint, scale = cell.joints[0], draws[:, 0]
+    more = 'more' if scale.mean() >= 0.0 else 'less'
+    span = np.ptp(context.measurements.q[:, joint - 1])
+    share = 100.0 * np.abs(scale.mean())
+    return (
+        f'joint {joint} turns {number(share, 100.0 * scale.std(), " %")} {more} than it reports, '
+        f'{angle(np.abs(scale) * span)} over the {np.degrees(span):.0f}° that it took'
     )
 
 
@@ -29,6 +44,8 @@ EFFECT = Effect(
     plausible=(1e-6, 1e-2),
     sentence='The true turn of {subject} is not what is reported (gear ratio or encoder scale).',
     separate_by='poses that turn the joint through its whole range',
+    remedy='Check the gear ratio and the encoder resolution that are set in the controller.',
+    size=_scaled,
     cells=cells,
     family='encoder scales',
 )

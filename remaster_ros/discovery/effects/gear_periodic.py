@@ -9,6 +9,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Effect
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import angle
 from remaster_ros.types import FloatArray
 
 # Lower orders are the encoder's. Twice the ratio of a 200:1 harmonic drive is the highest known.
@@ -35,6 +36,11 @@ def _waves(context: Context, joint: int, order: int) -> list[FloatArray]:
     return [np.sin(phase), np.cos(phase)]
 
 
+def _wave(context: Context, cell: Cell, draws: FloatArray) -> str:
+    amplitude = np.hypot(draws[:, 0], draws[:, 1])
+    return f'joint {cell.joints[0]} errs by ±{angle(amplitude)}, {cell.variant} times a turn'
+
+
 EFFECT = Effect(
     name='gear_periodic',
     place='joint_angle',
@@ -46,6 +52,9 @@ EFFECT = Effect(
     plausible=(1e-5, 1e-3),
     sentence='The gearbox of {subject} runs unevenly, in step with its teeth.',
     separate_by='poses that step the joint finely through one period, all else held',
+    remedy='Correct it by the wave that was found; where it grows from session to session, '
+    'the gearbox wears.',
+    size=_wave,
     cells=cells,
     cause_per='joints',
     costly=True,

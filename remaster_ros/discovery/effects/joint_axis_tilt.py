@@ -9,6 +9,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, ModelChange, turned
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import angle
 from remaster_ros.types import FloatArray
 
 # A tilt along the axis before is, with that joint's zero-offset, another name for a shift of the
@@ -47,6 +48,12 @@ def tilt_directions(context: Context, joint: int) -> dict[str, FloatArray]:
     }
 
 
+def _tilt(context: Context, cell: Cell, draws: FloatArray) -> str:
+    size = np.linalg.norm(draws, axis=1) if cell.size > 1 else draws[:, 0]
+    axes = ' and '.join(cell.variant)
+    return f'the axis of joint {cell.joints[0]} is tilted by {angle(size)} about {axes}'
+
+
 EFFECT = Effect(
     name='joint_axis_tilt',
     place='link_rotation',
@@ -58,6 +65,8 @@ EFFECT = Effect(
     plausible=(1e-5, 2e-2),
     sentence='The axis of {subject} is tilted against its drawing.',
     separate_by='all joint solutions of each pose: the tilt changes sign with the branch',
+    remedy='Put the tilts into the robot model: apply/robot_geometry.urdf has them.',
+    size=_tilt,
     cells=cells,
     family='geometry',
     in_family=lambda cell: cell.size == 1,

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 
 from remaster_ros.discovery.effects.base import Cell, Effect, needs_gravity
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import angle, largest
+from remaster_ros.types import FloatArray
 
 
 def cells(context: Context) -> Iterator[Cell]:
@@ -16,6 +18,12 @@ def cells(context: Context) -> Iterator[Cell]:
         ['compliance_{joint}'],
         drawn_from=context.joints,
     )
+
+
+def _turned(context: Context, cell: Cell, draws: FloatArray) -> str:
+    joint = cell.joints[0]
+    torque = largest(context.gravity_torque[:, joint - 1])
+    return f'joint {joint} turns {angle(draws[:, 0] * torque)} under {torque:.0f} N m'
 
 
 EFFECT = Effect(
@@ -30,6 +38,9 @@ EFFECT = Effect(
     sign=1,
     sentence='The weight it carries winds up {subject} (soft gearbox or bearing).',
     separate_by='the same poses with and without a payload on the tool',
+    remedy='Have the gearbox and the bearing of the joint checked for play and wear; correct '
+    'what is left by the torque, and state the payload.',
+    size=_turned,
     cells=cells,
     needs=needs_gravity,
     family='joint compliances',

@@ -9,6 +9,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import up_to
 
 
 def cells(context: Context) -> Iterator[Cell]:
@@ -51,6 +52,9 @@ EFFECT = Effect(
     plausible=(1e-6, 1e-2),
     sentence='The angle of {subject} follows the angle of {other} (coupled drives).',
     separate_by='poses that turn one of the two joints and hold the other',
+    remedy='Check the coupling that is set in the controller for these joints; correct what '
+    'is left by the angle of the other joint.',
+    size=up_to('joint {joint} turns with joint {other}'),
     cells=cells,
     cause_per='joints',
     driven_by_joint=True,

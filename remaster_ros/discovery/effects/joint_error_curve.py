@@ -10,10 +10,14 @@ import numpy as np
 from remaster_ros.discovery.effects.base import Cell, Design, Effect
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import angle_of
+from remaster_ros.discovery.effects.sizes import ARC_MINUTE, number
 from remaster_ros.discovery.effects.splines import Curve
+from remaster_ros.types import FloatArray
 
 # The finest: gearbox errors have structure down to a few degrees; finer overfits any session.
 FINEST_KNOTS = np.radians(4.0)
+# Draws of the curve from which the uncertainty of its size is taken.
+DRAWS = 200
 # A shape with a name that explains as much is the better answer.
 RARITY = 10
 # Below this many configurations per knot the curve is coarser.
@@ -39,6 +43,17 @@ def _splines(context: Context, joint: int, curve: Curve) -> Design:
     return Design(joint - 1, curve.columns(context.measurements.q[:, joint - 1]))
 
 
+def _range(context: Context, cell: Cell, draws: FloatArray) -> str:
+    joint = cell.joints[0]
+    values = cell.columns(context).values
+    middle = values @ draws.mean(axis=0) / ARC_MINUTE
+    rms = np.sqrt(np.mean((draws[:DRAWS] @ values.T / ARC_MINUTE) ** 2, axis=1))
+    return (
+        f'joint {joint} errs by {middle.min():+.1f}′ to {middle.max():+.1f}′, '
+        f'{number(float(np.sqrt(np.mean(middle**2))), float(rms.std()), "′")} RMS'
+    ).replace('-', '−')
+
+
 EFFECT = Effect(
     name='joint_error_curve',
     place='joint_angle',
@@ -48,10 +63,13 @@ EFFECT = Effect(
     source='Eilers & Marx 1996, Statistical Science 11 (P-splines)',
     unit='rad',
     plausible=(1e-6, 5e-3),
-    sentence='The error of {subject} follows its own angle (gearbox or encoder): '
-    'the curve shows where.',
+    sentence='The error of {subject} follows its own angle (gearbox or encoder).',
     separate_by='poses that step the joint through its range, all else held; '
     'with and without a payload',
+    remedy='Correct the angle by the curve that was found, within the angles that were '
+    'measured; where it grows from session to session, have gearbox and encoder '
+    'checked.',
+    size=_range,
     cells=cells,
     family='joint error curves',
 )

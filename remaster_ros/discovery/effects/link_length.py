@@ -15,6 +15,7 @@ from remaster_ros.discovery.effects.base import (
     displaced,
 )
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import length
 from remaster_ros.types import FloatArray
 
 
@@ -52,6 +53,15 @@ def link_directions(context: Context, link: int) -> dict[str, FloatArray]:
     }
 
 
+def _longer(context: Context, cell: Cell, draws: FloatArray) -> str:
+    link, value = cell.joints[0], draws[:, 0]
+    if cell.variant == 'along':
+        longer = 'longer' if value.mean() >= 0.0 else 'shorter'
+        return f'link {link} is {length(np.abs(value))} {longer} than the model'
+    side = '+' if value.mean() >= 0.0 else '−'
+    return f'link {link} ends {length(np.abs(value))} off, along {side}{cell.variant} of its frame'
+
+
 EFFECT = Effect(
     name='link_length',
     place='link_translation',
@@ -63,6 +73,8 @@ EFFECT = Effect(
     plausible=(1e-5, 5e-3),
     sentence='The link after {subject} is longer, shorter or offset against its drawing.',
     separate_by='poses that fold and stretch the arm, with the tool turned at each',
+    remedy='Put the lengths into the robot model: apply/robot_geometry.urdf has them.',
+    size=_longer,
     cells=cells,
     family='geometry',
     in_family=lambda cell: cell.size == 1,

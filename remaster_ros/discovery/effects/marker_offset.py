@@ -7,6 +7,7 @@ from functools import partial
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import up_to
 
 
 def cells(context: Context) -> Iterator[Cell]:
@@ -40,6 +41,9 @@ EFFECT = Effect(
     plausible=(1e-5, 2e-2),
     sentence='The marker {subject} is not at its stated place on the tool.',
     separate_by='the marker measured against the tool plate, or the last joint turned by itself',
+    remedy='Correct the place of the marker in session.yaml, or measure it against the tool '
+    'plate.',
+    size=up_to('marker {subject} is off'),
     cells=cells,
     moves_the_fit=True,
 )

@@ -9,6 +9,8 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced, needs_time
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import length
+from remaster_ros.types import FloatArray
 
 
 def cells(context: Context) -> Iterator[Cell]:
@@ -37,6 +39,12 @@ def _crept(context: Context, sensor: int, turning: bool) -> Design:
     return displaced(*shifts)
 
 
+def _moved_by(context: Context, cell: Cell, draws: FloatArray) -> str:
+    hours = float(np.ptp(context.elapsed_s)) / 3600.0
+    way = np.linalg.norm(draws[:, :3], axis=1) * hours * 3600.0
+    return f'{cell.subject} moves by {length(way)} in {hours:.1f} h'
+
+
 EFFECT = Effect(
     name='registration_drift',
     place='sensor_frame',
@@ -48,6 +56,9 @@ EFFECT = Effect(
     plausible=(1e-10, 2e-6),
     sentence='The sensor {subject} creeps against the robot base while measuring.',
     separate_by='fixed reference markers measured again and again, and poses repeated in time',
+    remedy='Fix the mount of the sensor, let the sensor warm up, and watch references while '
+    'measuring.',
+    size=_moved_by,
     cells=cells,
     needs=needs_time,
 )

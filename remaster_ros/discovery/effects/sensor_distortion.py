@@ -9,6 +9,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import up_to
 from remaster_ros.types import FloatArray
 
 # No lens distorts lengths about the sensor's origin, and in most rooms it resembles a scale.
@@ -73,5 +74,7 @@ EFFECT = Effect(
     plausible=(1e-5, 1e-1),
     sentence='The sensor {subject} distorts towards the edge of its view (lens calibration).',
     separate_by='poses towards the edges of the sensor view, or the sensor moved and turned',
+    remedy='Calibrate the lenses of the sensor again, and measure in the middle of its view.',
+    size=up_to('{subject} errs'),
     cells=cells,
 )

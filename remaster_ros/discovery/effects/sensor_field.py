@@ -17,7 +17,8 @@ from scipy.spatial.distance import cdist
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.splines import basis, knot_vector, roughness
+from remaster_ros.discovery.effects.sizes import up_to
+from remaster_ros.discovery.effects.splines import basis, knot_vector, mean_penalty, roughness
 from remaster_ros.types import FloatArray
 
 # Lengths of the kernel, of the RMS distance from the middle of the volume: about a quadratic and
@@ -61,7 +62,7 @@ def cells(context: Context) -> Iterator[Cell]:
         yield EFFECT.cell(
             partial(_along_sight, sensor=index, knots=knots),
             [f'field_range_{name}_{i}' for i in range(len(knots) - 4)],
-            penalty=roughness(len(knots) - 4),
+            penalty=roughness(len(knots) - 4) + mean_penalty(len(knots) - 4),
             drawn_from=rarity,
             variant='range',
             subject=name,
@@ -105,6 +106,9 @@ EFFECT = Effect(
     plausible=(1e-6, 5e-3),
     sentence='The errors follow the place in the view of the sensor {subject}.',
     separate_by='the same poses measured with the sensor moved and turned',
+    remedy='Measure with the sensor somewhere else, and calibrate its lenses; the errors '
+    'follow its volume.',
+    size=up_to('{subject} errs'),
     cells=cells,
     is_cause=False,
 )

@@ -9,6 +9,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import number
 from remaster_ros.types import FloatArray
 
 
@@ -40,6 +41,18 @@ def _stretched(context: Context, sensor: int, directions: list[FloatArray]) -> D
     )
 
 
+def _long(context: Context, cell: Cell, draws: FloatArray) -> str:
+    axes = [f' along {name.split("_")[1]}' if 'scale_' in name else '' for name in cell.parameters]
+    if cell.size == 1 and not cell.variant:
+        axes = ['']
+    return ' and '.join(
+        f'{cell.subject} measures 1 m{axis} '
+        f'{number(1e3 * abs(float(s.mean())), 1e3 * float(s.std()), " mm")} too '
+        f'{"long" if s.mean() >= 0.0 else "short"}'
+        for axis, s in zip(axes, draws.T, strict=True)
+    )
+
+
 EFFECT = Effect(
     name='sensor_scale',
     place='sensor_frame',
@@ -51,5 +64,7 @@ EFFECT = Effect(
     plausible=(1e-6, 1e-2),
     sentence='The sensor {subject} measures lengths in the wrong scale (calibrate it again).',
     separate_by='a calibrated length bar in several places of the volume',
+    remedy='Calibrate the sensor again, with a length standard of certified length.',
+    size=_long,
     cells=cells,
 )

@@ -15,6 +15,7 @@ from scipy.interpolate import BSpline
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced, needs_time
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import up_to
 from remaster_ros.types import FloatArray
 
 # Correlation lengths, as a share of the session.
@@ -74,6 +75,8 @@ EFFECT = Effect(
     sentence='The errors of the sensor {subject} follow each other: a reading errs as the ones '
     'before it (serial correlation).',
     separate_by='fixed reference markers measured again and again, and poses repeated in time',
+    remedy='Fix the mount of the sensor, let it warm up, and watch references while measuring.',
+    size=up_to('{subject} wanders'),
     cells=cells,
     needs=needs_time,
     is_cause=False,

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from remaster_ros.discovery.effects.base import Cell, Effect, needs_approach
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import angle, largest
+from remaster_ros.types import FloatArray
 
 
 def cells(context: Context) -> Iterator[Cell]:
@@ -16,6 +20,12 @@ def cells(context: Context) -> Iterator[Cell]:
         ['settling_{joint}'],
         drawn_from=context.joints,
     )
+
+
+def _short(context: Context, cell: Cell, draws: FloatArray) -> str:
+    joint = cell.joints[0]
+    move = largest(context.last_move[:, joint - 1])
+    return f'joint {joint} is {angle(draws[:, 0] * move)} short after {np.degrees(move):.0f}°'
 
 
 EFFECT = Effect(
@@ -30,6 +40,9 @@ EFFECT = Effect(
     sign=1,
     sentence='When measured, {subject} still lags by a share of the last move (wait longer).',
     separate_by='longer waiting before each measurement, and large moves from both sides',
+    remedy='Wait longer before each measurement, and in use before each action that must be '
+    'exact; check the integral gain of the servo.',
+    size=_short,
     cells=cells,
     needs=needs_approach,
     family='settling joints',

@@ -13,6 +13,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced, needs_time
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.sizes import angle, length
 from remaster_ros.types import FloatArray
 
 MOMENTS = 40
@@ -122,6 +123,16 @@ def _sensor_moved(
 
 # A belt or a coupling that slips by more is seen without a measurement.
 LARGEST_RAD = 2e-2
+
+
+def _jump(context: Context, cell: Cell, draws: FloatArray) -> str:
+    if cell.place == 'joint_angle':
+        return f'joint {cell.joints[0]} by {angle(np.abs(draws[:, 0]))}'
+    way = length(np.linalg.norm(draws[:, :3], axis=1))
+    turn = f' and {angle(np.linalg.norm(draws[:, 3:], axis=1))}' if cell.size > 3 else ''
+    return f'{cell.subject or "the base"} by {way}{turn}'
+
+
 EFFECT = Effect(
     name='step',
     reported_as='unnamed',
@@ -134,6 +145,8 @@ EFFECT = Effect(
     plausible=(1e-5, 2e-2),
     sentence='The {place} jumped {when} and stayed so: something slipped or was bumped.',
     separate_by='reference poses measured again and again during the session',
+    remedy='Find what slipped or was bumped, fasten it, and measure again.',
+    size=_jump,
     cells=cells,
     needs=needs_time,
     cause_per='variant',

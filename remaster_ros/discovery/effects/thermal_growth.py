@@ -9,7 +9,8 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import NO_TIMES, Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.drivers import Driver, slow_drivers
+from remaster_ros.discovery.effects.drivers import Driver, driver_named, slow_drivers
+from remaster_ros.discovery.effects.sizes import length
 from remaster_ros.types import FloatArray
 
 # What grows by 1e-4 per K grows by this per s in a warm-up of 10 K in a quarter of an hour.
@@ -64,6 +65,16 @@ def needs_warming(context: Context) -> str:
     return 'neither temperature nor time varies' if context.timed else NO_TIMES
 
 
+def _grown_by(context: Context, cell: Cell, draws: FloatArray) -> str:
+    part = f'of link {cell.joints[0]}' if cell.joints else 'of the arm'
+    driver = driver_named(cell.driver, 0)
+    assert driver is not None
+    span = float(np.ptp(driver.value(context)))
+    grows = 'grows' if draws.mean() >= 0.0 else 'shrinks'
+    amount = f'{span / driver.per_shown:.1f} {driver.shown_unit}'
+    return f'1 m {part} {grows} by {length(np.abs(draws[:, 0]) * span)} over {amount}'
+
+
 EFFECT = Effect(
     name='thermal_growth',
     place='link_translation',
@@ -75,6 +86,9 @@ EFFECT = Effect(
     plausible=(1e-6, 1e-4),
     sentence='The arm grows with {driver} (it warms up while measuring).',
     separate_by='the same poses repeated cold and warm, with the temperature recorded',
+    remedy='Let the arm warm up before it must be exact, or correct its lengths by the '
+    'temperature.',
+    size=_grown_by,
     cells=cells,
     needs=needs_warming,
 )

@@ -26,6 +26,7 @@ from remaster_ros.discovery.effects.drivers import (
     slow_drivers,
     torque_of,
 )
+from remaster_ros.discovery.effects.sizes import at_most
 from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.types import BoolArray, FloatArray
 
@@ -294,6 +295,11 @@ def _sensor_forms(context: Context, sensor: int) -> Iterator[_Form]:
                 yield form
 
 
+def _size(context: Context, cell: Cell, draws: FloatArray) -> str:
+    what = f'joint {cell.joints[0]} errs' if cell.place == 'joint_angle' else 'the marker is moved'
+    return f'{what} by up to {at_most(context, cell, draws)}'
+
+
 EFFECT = Effect(
     name='unnamed',
     place='joint_angle',
@@ -305,6 +311,9 @@ EFFECT = Effect(
     plausible=None,
     sentence='No named cause: {place} follows {driver}.',
     separate_by='poses in which {driver} changes and all else is held',
+    remedy='Find the cause with the measurements named; until then the model that is '
+    'returned corrects it where it was measured.',
+    size=_size,
     cells=cells,
     cause_per='variant',
 )

@@ -46,6 +46,7 @@ def test_a_terminal_shows_the_stage():
     out, shown = on_a_terminal()
     assert out == 'the result\nTrue\n'
     assert 'sampling' in shown
+    assert '50 %, about 0 s left' in shown
 
 
 def test_quiet_shows_and_prints_nothing():

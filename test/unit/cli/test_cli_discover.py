@@ -1,6 +1,7 @@
 """What `remaster discover` prints."""
 
 import types
+from dataclasses import replace
 
 from remaster_ros.cli.discover import summary
 from remaster_ros.discovery.confirmation import Confirmation, ConfirmedCause
@@ -22,6 +23,7 @@ EFFECT = FoundEffect(
     cause='The weight it carries winds up joints 2 and 4.',
     size_m=0.5e-3,
     share=1.0,
+    remedy='Stiffen it.',
 )
 
 
@@ -41,6 +43,9 @@ def test_causes_look_alikes_and_gain_are_said():
     text = summary(found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {}))
     assert 'verdict: effects' in text
     assert 'joint_compliance [2, 4]: 0.500 mm, 100 % of the gain' in text
+    assert 'to do: Stiffen it.' in text
+    nothing = summary(found((replace(EFFECT, share=-0.004),), Gain(None, None, 1e-4, {}), {}))
+    assert ', 0 % of the gain' in nothing
     assert 'could be encoder_scale [2]; to distinguish: a payload' in text
     assert '1.000 mm RMS before, 0.300 mm after; the noise alone is 0.280 mm' in text
 

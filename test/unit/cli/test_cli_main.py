@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import types
 
 import pytest
@@ -72,3 +75,47 @@ def test_help_lists_the_verbs(capsys):
     out = capsys.readouterr().out
     assert all(verb in out for verb in cli.VERBS)
     assert 'Exit status' in out
+
+
+def test_without_a_verb_it_shows_its_help(capsys):
+    assert cli.main([]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith('usage: remaster')
+    assert all(verb in out for verb in cli.VERBS)
+
+
+@pytest.mark.parametrize('shell', cli.SHELLS)
+def test_it_prints_what_completes_it_in_a_shell(shell, capsys):
+    assert cli.main(['--completion', shell]) == 0
+    assert 'remaster' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ('line', 'words'),
+    [
+        ('remaster im', {'import '}),
+        ('remaster recover --', {'--json', '--seed', '--quiet', '--no-figures', '--help'}),
+        ('remaster replay --w', {'--wait-for', '--with-commands'}),
+    ],
+)
+def test_a_shell_that_asks_is_answered(line, words, tmp_path):
+    """As argcomplete asks: the line in the environment, the answer on file descriptor 8."""
+    answer = tmp_path / 'answer'
+    environment = {
+        **os.environ,
+        '_ARGCOMPLETE': '1',
+        '_ARGCOMPLETE_IFS': '\v',
+        'COMP_LINE': line,
+        'COMP_POINT': str(len(line)),
+        'COMP_TYPE': '9',
+    }
+    command = f'"{sys.executable}" -m remaster_ros.cli.main 8>"{answer}" 9>/dev/null'
+    subprocess.run(['bash', '-c', command], env=environment, check=True, timeout=60)
+    assert set(answer.read_text().split('\v')) == words
+
+
+def test_every_verb_that_prints_results_takes_json():
+    without = {'demo', 'replay'}
+    for verb in set(cli.VERBS) - without:
+        parser = cli.build_parser(verb)._subparsers._group_actions[0].choices[verb]
+        assert '--json' in parser._option_string_actions, verb

@@ -13,6 +13,7 @@ from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
 from remaster_ros.discovery.cross_validation import held_out_error
 from remaster_ros.discovery.discover import Findings, discover_session, find_causes
+from remaster_ros.discovery.effects.base import Design
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import _System, solve
 from remaster_ros.discovery.screening import Catalogue, screen
@@ -180,6 +181,21 @@ def test_restricted_likelihood_has_the_gradient_it_says(name, split):
         step[i] = 1e-5
         numeric = (system.evaluate(eta + step)[0] - system.evaluate(eta - step)[0]) / 2e-5
         assert gradient[i] == pytest.approx(numeric, rel=1e-3, abs=1e-3)
+
+
+def test_a_curve_has_a_plausible_size_where_the_data_leave_it_open():
+    data = residuals()
+    cell = cells_named('joint_error_curve')[1]
+    # Displacements of nanometres: the rows do not show the curve.
+    blind = replace(
+        cell,
+        columns=lambda context: Design(1, 1e-6 * cell.columns(context).values),
+    )
+    fit = solve(data, (blind,))
+    assert fit is not None
+    std = np.sqrt(np.diag(fit.covariance))
+    assert std.max() <= 1.001 * cell.largest
+    assert np.abs(fit.parameters).max() < 3.0 * cell.largest
 
 
 def test_screening_scores_agree_with_a_least_squares_fit_of_each_cell():

@@ -14,6 +14,7 @@ from discovery_scenes import residuals_of, session_with
 from remaster_ros.discovery.effects.base import PLACES, Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.effects.sizes import number
 from remaster_ros.discovery.effects.splines import Curve, basis, centers, knot_vector, roughness
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, rotation_vector_to_matrix, transform
@@ -190,6 +191,69 @@ def test_gravity_moment_about_the_axis_is_the_torque():
     axes = CHAIN.axes_in_base(scene.frames)
     along = np.sum(axes * scene.gravity_moment, axis=-1)
     np.testing.assert_allclose(along, scene.gravity_torque, atol=1e-9)
+
+
+@pytest.mark.parametrize('name', EFFECTS)
+def test_every_cell_has_a_size_in_words_and_its_effect_a_remedy(name):
+    scene, effect = scene_of(), EFFECTS[name]
+    assert effect.remedy.endswith('.')
+    seed = 12
+    print(f'seed {seed}')
+    rng = np.random.default_rng(seed)
+    for cell in cells_of(name)[::7]:
+        draws = 1e-4 * (1.0 + 0.1 * rng.standard_normal((50, cell.size)))
+        text = effect.size(scene, cell, draws)
+        assert re.search('[′ ]', text), text
+        assert re.search('(′|mm)', text), text
+        assert '±' in text
+        assert 'nan' not in text
+        assert '-' not in text
+        # All signs: a negative length is a shorter link, not a negative longer one.
+        assert effect.size(scene, cell, -draws)
+
+
+def draws_of(*values: float, share: float = 0.02) -> np.ndarray:
+    """Return 400 draws about values with standard deviations that are a share of the first."""
+    rng = np.random.default_rng(13)
+    return np.array(values) + share * abs(values[0]) * rng.standard_normal((400, len(values)))
+
+
+def test_sizes_are_the_ones_that_were_put_in():
+    scene = scene_of()
+
+    def size(name, draws, **chosen):
+        cell = next(
+            c
+            for c in cells_of(name)
+            if all(getattr(c, key) == value for key, value in chosen.items())
+        )
+        return EFFECTS[name].size(scene, cell, draws)
+
+    text = size('link_length', draws_of(0.75e-3), joints=(2,), variant='along')
+    assert re.fullmatch(r'link 2 is 0\.7[45]\d? mm ± 0\.01\d mm longer than the model', text), text
+    assert 'shorter' in size('link_length', draws_of(-0.75e-3), joints=(2,), variant='along')
+    torque = np.abs(scene.gravity_torque[:, 1]).max()
+    text = size('joint_compliance', draws_of(5.0 * np.radians(1 / 60) / torque), joints=(2,))
+    assert re.fullmatch(rf'joint 2 turns [45]\.\d+′ ± 0\.1\d?′ under {torque:.0f} N m', text), text
+    text = size('backlash', draws_of(np.radians(1 / 60)), joints=(4,))
+    assert re.match(r'joint 4 stops (2\.0|1\.9)', text), text
+    text = size('sensor_scale', draws_of(-2e-3), subject='mocap', variant='')
+    assert re.fullmatch(r'mocap measures 1 m [12]\.\d+ mm ± 0\.0\d mm too short', text), text
+    text = size('gear_periodic', draws_of(3e-4, 4e-4), joints=(3,), variant='51')
+    assert re.match(r'joint 3 errs by ±1\.7\d?′ ± 0\.\d+′, 51 times a turn', text), text
+    # The wave of the cell, drawn at the angles that the joint took.
+    q = scene.measurements.q[:, 1]
+    wave = 1e-3 * np.sin(q)
+    most = np.abs(wave - wave.mean()).max() / np.radians(1 / 60)
+    text = size('encoder_eccentricity', draws_of(1e-3, 0.0, share=1e-4), joints=(2,), variant='1')
+    assert abs(float(re.search(r'up to ([\d.]+)′', text)[1]) - most) < 0.01, text
+
+
+def test_a_number_has_the_digits_that_its_uncertainty_leaves():
+    assert number(0.7532, 0.03, ' mm') == '0.75 mm ± 0.03 mm'
+    assert number(-0.7532, 0.013, ' mm') == '−0.753 mm ± 0.013 mm'
+    assert number(-0.0001, 0.3, '′') == '0.0′ ± 0.3′'
+    assert number(132.2, 25.0, '′') == '132′ ± 25′'
 
 
 def test_splines_sum_to_one_and_repeat_straight_lines():

@@ -290,3 +290,55 @@ def test_a_round_can_be_asked_for():
     assert stop.split == 'optimization'
     tour.ask_round()
     assert [tour.next(q).split for _ in range(3)] == ['reference', 'reference', 'optimization']
+
+
+def scattered(plans, seed):
+    """Return all visits of some plans in a random order."""
+    visits = [
+        (split, index, number)
+        for split, plan in plans.items()
+        for index, pose in enumerate(plan.poses)
+        for number in range(len(pose.solutions))
+    ]
+    return [visits[i] for i in np.random.default_rng(seed).permutation(len(visits))]
+
+
+def test_a_given_order_is_kept_and_a_pose_keeps_its_number():
+    plans = {
+        'optimization': plan_of(random_joints(28, 4)),
+        'validation': plan_of(random_joints(29, 3)),
+    }
+    order = scattered(plans, 30)
+    tour = Tour(CHAIN, plans, order=order)
+    stops = walk(tour, np.zeros(7))
+    visited = [(stop.split, stop.index, number) for stop in stops for number in stop.ids]
+    # Two solutions of a pose that are next to each other are one stop, nearest first.
+    assert sorted(visited) == sorted(order)
+    assert [visit[:2] for visit in visited] == [visit[:2] for visit in order]
+    numbers = {}
+    for stop in stops:
+        numbers.setdefault((stop.split, stop.index), set()).add(stop.pose)
+    assert all(len(number) == 1 for number in numbers.values())
+    assert len(set.union(*numbers.values())) == 7
+    assert tour.poses_begun == 7
+
+
+def test_references_come_between_the_visits_of_a_given_order():
+    plans = {'optimization': plan_of(random_joints(31, 4))}
+    order = scattered(plans, 32)
+    plans['reference'] = references_of(random_joints(33, 2))
+    stops = walk(Tour(CHAIN, plans, reference_every=4, order=order), np.zeros(7))
+    splits = ''.join('r' if stop.split == 'reference' else '.' * len(stop.ids) for stop in stops)
+    assert splits == 'rrrr....rr....rr'
+
+
+def test_what_cannot_be_reached_in_a_given_order_is_not_tried_again():
+    chain = planar_arm(1, limit=3.0)
+    post = obstacle('post', [0.25 * np.sin(0.5), 0, 0.3 + 0.25 * np.cos(0.5)], [0.01, 0.4, 0.01])
+    model = CollisionModel(chain, [*arm_bodies(chain, [], 0.02), post], floor_z=None)
+    pose = PlannedPose(chain.forward([0.0]), np.array([[0.0], [1.0], [-0.3]]))
+    order = [('optimization', 0, number) for number in range(3)]
+    tour = Tour(chain, {'optimization': Plan((pose,))}, model=model, order=order)
+    stop = tour.next(np.array([-0.1]))
+    assert (sorted(stop.ids), list(stop.unreached)) == ([0, 2], [1])
+    assert tour.next(np.array([-0.3])) is None

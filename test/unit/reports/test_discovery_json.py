@@ -52,6 +52,10 @@ def test_discovery_json_keeps_its_contract(saved):
     for other in effect['confusable_with']:
         assert other.keys() == {'name', 'joints', 'log_evidence_gain', 'separate_by'}
         assert other['separate_by']
+    assert re.search(r'joint 2 errs by up to [45]\.\d+′ ± 0\.\d+′', effect['cause'])
+    assert effect['sizes'][0] in effect['cause']
+    assert effect['remedy'].endswith('.')
+    assert content['least_p_value'] == pytest.approx(1.0 / 301.0)
     assert content['gain']['held_out_rms_after_m'] < content['gain']['held_out_rms_before_m']
     assert content['joint_offsets_after'][1].keys() >= {'joint', 'mean_deg', 'std_deg'}
     assert content['confirmation']['confirmed'] is True
@@ -63,6 +67,8 @@ def test_the_report_needs_nothing_else_and_names_the_cause(saved):
     page = (folder / 'report.html').read_text()
     assert not re.findall(r'(?:src|href)="(?!#)[^"]', page)
     assert found.effects[0].cause in page
+    assert f'What to do: {found.effects[0].remedy}' in page
+    assert 'p &lt; 0.0033 over all causes' in page
     assert 'sin2_2' in page
     for name in ('gain', 'drivers', 'causes'):
         ElementTree.parse(folder / 'figures' / f'{name}.svg')

@@ -25,6 +25,7 @@ from remaster_ros.reports.fit_json import (
     joint_offsets_rad,
     prepare_folder,
     read_fit,
+    save_fit,
     write_fit,
 )
 
@@ -109,12 +110,12 @@ def test_what_is_no_fit_json_is_refused(data, tmp_path):
 
 
 def test_an_output_folder_is_tried_before_the_work(tmp_path):
-    prepare_folder(tmp_path / 'out')
-    prepare_folder(tmp_path / 'out')
+    prepare_folder(tmp_path / 'out', 'fit.json')
+    prepare_folder(tmp_path / 'out', 'fit.json')
     assert list((tmp_path / 'out').iterdir()) == []
     (tmp_path / 'file').write_text('')
     with pytest.raises(InputError, match='cannot be written'):
-        prepare_folder(tmp_path / 'file')
+        prepare_folder(tmp_path / 'file', 'fit.json')
 
 
 def test_the_calibrated_urdf_is_the_robot_with_offsets(fit_result):
@@ -208,3 +209,26 @@ def test_all_joints_or_none_may_be_applied(fit_result, known):
     chain = SerialChain.from_urdf(urdf, result.chain.base_link, result.chain.tip_link)
     assert np.array_equal(chain.lower, result.chain.lower) != known
     assert ('left out' in urdf) != known
+
+
+def test_results_of_others_are_not_replaced(fit_result, tmp_path):
+    save_fit(fit_result, tmp_path / 'fit', figures=False)
+    prepare_folder(tmp_path / 'fit', 'fit.json')
+    with pytest.raises(InputError, match=r'holds apply, fit\.json, not written by this command'):
+        prepare_folder(tmp_path / 'fit', 'discovery.json')
+    for name, words in (
+        ('report.html', r'holds report\.html, not written by this command'),
+        ('figures', 'holds figures, '),
+        ('fit.json', r'fit\.json: is there and is no remaster-fit/1'),
+        ('discovery.json', r'holds discovery\.json, '),
+    ):
+        folder = tmp_path / f'with_{name}'
+        folder.mkdir()
+        (folder / name).write_text('{"format": "mine"}')
+        with pytest.raises(InputError, match=words):
+            prepare_folder(folder, 'fit.json')
+        assert (folder / name).read_text() == '{"format": "mine"}'
+    # What the command does not write is in nobody's way.
+    (tmp_path / 'notes').mkdir()
+    (tmp_path / 'notes' / 'mine.txt').write_text('')
+    prepare_folder(tmp_path / 'notes', 'fit.json')

@@ -200,7 +200,8 @@ def with_accuracy(result, split, before, after):
     ],
 )
 def test_the_verdict_is_honest(fit_result, split, before, after, converged, mood, words):
-    sampler = replace(fit_result.sampler, converged=converged)
+    r_hat = fit_result.sampler.r_hat if converged else np.full(3, 1.2)
+    sampler = replace(fit_result.sampler, converged=converged, r_hat=r_hat)
     result = replace(with_accuracy(fit_result, split, before, after), sampler=sampler)
     judged = verdict(result)
     assert judged.mood == mood
@@ -208,6 +209,19 @@ def test_the_verdict_is_honest(fit_result, split, before, after, converged, mood
     told = ' '.join(judged.points)
     assert ('fit again with more draws' in told) != converged
     assert ('no validation poses' in told) == (split == 'optimization')
+
+
+def test_an_approximation_that_fails_its_check_is_never_green(fit_result):
+    message = 'NOT converged: Pareto k of the importance weights 1.40, not below 0.7'
+    sampler = replace(
+        fit_result.sampler, converged=False, method='laplace', pareto_k=1.4, message=message
+    )
+    judged = verdict(replace(with_accuracy(fit_result, 'validation', 4.0, 0.5), sampler=sampler))
+    assert judged.mood == 'caution'
+    assert 'known only approximately' in judged.headline
+    assert any(message in point for point in judged.points)
+    text = report_html(replace(fit_result, sampler=sampler), {})
+    assert 'No chain reached the precision' in text
 
 
 MOVED = NoiseCheck('tracker', 2.337e-3, None, 0.11e-3, poses=12)

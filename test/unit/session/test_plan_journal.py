@@ -266,3 +266,33 @@ def test_records_that_are_no_plan_are_refused(chain, tmp_path, records):
         PlanJournal(tmp_path, SETTINGS, chain)
     # And it is not held any longer.
     Journal(tmp_path / 'plan.jsonl').close()
+
+
+def test_a_tour_in_a_given_order_goes_on_in_it(chain, tmp_path):
+    seed = 18
+    print('seed', seed)
+    rng = np.random.default_rng(seed)
+    plans = {'optimization': plan_of(chain, 1, 5, 3), 'validation': plan_of(chain, 2, 3, 2)}
+    visits = [
+        (split, index, number)
+        for split, plan in plans.items()
+        for index, pose in enumerate(plan.poses)
+        for number in range(len(pose.solutions))
+    ]
+    order = [visits[i] for i in rng.permutation(len(visits))]
+    one_run = Tour(chain, plans, order=order)
+    book = PlanJournal(tmp_path, SETTINGS, chain)
+    book.begin(Tour(chain, plans, order=order))
+    q = np.zeros(len(chain))
+    while (wanted := one_run.next(q)) is not None:
+        stop = book.tour.next(q)
+        book.open_stop(stop)
+        assert (stop.pose, stop.split, stop.ids) == (wanted.pose, wanted.split, wanted.ids)
+        for number in stop.ids:
+            book.outcome(number, 'recorded')
+        book.close()
+        book = PlanJournal(tmp_path, SETTINGS, chain)
+        q = stop.solutions[-1]
+    assert book.tour.next(q) is None
+    assert book.outcomes['recorded'] == len(visits)
+    book.close()

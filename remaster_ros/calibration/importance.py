@@ -1,0 +1,169 @@
+"""Importance sampling with its own check: Pareto-smoothed weights, the proposal adapted in rounds.
+
+Independent draws of a proposal, weighted by density over proposal, have the moments of the density
+whatever the proposal, if the weights have a variance. Their largest ones are smoothed by a Pareto
+distribution; its shape k tells whether they can be relied on, below 0.7 (Vehtari, Simpson, Gelman,
+Yao and Gabry 2024, "Pareto smoothed importance sampling", JMLR 25(72); as arviz-stats has it).
+Where the proposal is poor its mean and covariance are moved to those of the weighted draws
+(population Monte Carlo; Cappé, Guillin, Marin and Robert 2004, doi:10.1198/106186004X12803).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from remaster_ros.calibration.convergence import PARETO_LIMIT
+from remaster_ros.calibration.metropolis import LogDensity, Proposal
+from remaster_ros.calibration.proposal import StudentT
+from remaster_ros.types import FloatArray
+
+# Below this one the proposal is not adapted further.
+GOOD_SHAPE = 0.5
+ROUNDS = 8
+ROUND_DRAWS = 4000
+# Share of the evaluations that all of the rounds may take.
+ADAPTING = 0.5
+# In tens of dimensions a Student t of few degrees of freedom hardly ever hits the bulk.
+FREEDOM = 15.0
+# Effective draws that moments take for each dimension. Where that is more than this share of the
+# draws nothing is adapted.
+DRAWS_PER_DIMENSION = 5.0
+LARGEST_NEED = 0.25
+# Of the weights, tried one after the other.
+POWERS = 0.7 ** np.arange(1.0, 25.0)
+
+
+class Weighted(NamedTuple):
+    """Draws of a proposal with their weights.
+
+    Attributes
+    ----------
+    points
+        (n, d).
+    log_weight
+        Log density over proposal, (n,).
+    weight
+        Smoothed, with sum 1, (n,).
+    pareto_k
+        Shape of their upper tail.
+    proposal
+        What they were drawn from.
+    """
+
+    points: FloatArray
+    log_weight: FloatArray
+    weight: FloatArray
+    pareto_k: float
+    proposal: Proposal
+
+    @classmethod
+    def of(cls, points: FloatArray, log_weight: FloatArray, proposal: Proposal) -> Weighted:
+        """Smooth the weights."""
+        from arviz_stats.base import array_stats
+
+        finite = np.isfinite(log_weight)
+        # Draws where there is no density count for nothing.
+        least = np.min(log_weight[finite], initial=0.0) - 100.0
+        log_weight = np.where(finite, log_weight, least)
+        # arviz-stats smooths the weights 1 / likelihood of a left-out observation: the sign turns.
+        smoothed, pareto_k = array_stats.psislw(-log_weight)
+        weight = np.exp(smoothed - np.max(smoothed))
+        return cls(points, log_weight, weight / weight.sum(), float(pareto_k), proposal)
+
+    @property
+    def effective(self) -> float:
+        """What number of independent draws they are worth."""
+        return _effective(self.weight)
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the weights' tail passes its check."""
+        return self.pareto_k < PARETO_LIMIT
+
+    def adapted(self) -> StudentT:
+        """Return a proposal nearer to the density: with the moments of the weighted draws.
+
+        Where these are worth too few draws to have moments the weights are raised to a power below
+        1, which leads part of the way.
+        """
+        needed = DRAWS_PER_DIMENSION * self.points.shape[1]
+        weight = self.weight
+        for power in POWERS:
+            if _effective(weight) >= needed:
+                break
+            weight = np.exp(power * (self.log_weight - np.max(self.log_weight)))
+            weight /= weight.sum()
+        mean = weight @ self.points
+        apart = self.points - mean
+        covariance = (apart * weight[:, None]).T @ apart
+        return StudentT(mean, np.asarray(np.linalg.cholesky(covariance)), FREEDOM)
+
+    def resampled(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """Return draws of equal weight in random order, (count, d) (systematic resampling)."""
+        places = (np.arange(count) + rng.random()) / count
+        chosen = np.searchsorted(np.cumsum(self.weight), places)
+        points: FloatArray = self.points[rng.permutation(np.minimum(chosen, len(self.weight) - 1))]
+        return points
+
+
+def adaptive_importance(
+    log_density: LogDensity,
+    proposal: Proposal,
+    *,
+    wanted: float,
+    evaluations: int,
+    rng: np.random.Generator,
+    progress: Callable[[float], None],
+) -> Weighted:
+    """Draw from the best of several proposals until the weighted draws are worth what is wanted.
+
+    Parameters
+    ----------
+    log_density
+        Points (n, d) to log density (n,), up to a constant.
+    proposal
+        To begin with.
+    wanted
+        Effective draws.
+    evaluations
+        Of the density, at most.
+    rng
+        Source of all randomness.
+    progress
+        Called with the share of the evaluations done.
+    """
+    spent = 0
+
+    def drawn(source: Proposal, count: int) -> tuple[FloatArray, FloatArray]:
+        nonlocal spent
+        points, log_proposal = source.sample(count, rng)
+        log_weight = log_density(points) - log_proposal
+        spent += count
+        progress(min(1.0, spent / evaluations))
+        return points, log_weight
+
+    count = int(np.clip(ADAPTING * evaluations / ROUNDS, 100, ROUND_DRAWS))
+    best = Weighted.of(*drawn(proposal, count), proposal)
+    last, needed = best, DRAWS_PER_DIMENSION * best.points.shape[1]
+    for _ in range(ROUNDS - 1):
+        if best.pareto_k < GOOD_SHAPE or needed > LARGEST_NEED * count:
+            break
+        proposal = last.adapted()
+        last = Weighted.of(*drawn(proposal, count), proposal)
+        best = min(best, last, key=lambda weighted: weighted.pareto_k)
+    while best.reliable and best.effective < wanted and spent < evaluations:
+        # A tenth more than the rate so far promises.
+        missing = len(best.points) * (1.1 * wanted / best.effective - 1.0)
+        more = drawn(best.proposal, int(np.clip(missing, count // 4, evaluations - spent + 1)))
+        points = np.concatenate((best.points, more[0]))
+        log_weight = np.concatenate((best.log_weight, more[1]))
+        best = Weighted.of(points, log_weight, best.proposal)
+    return best
+
+
+def _effective(weight: FloatArray) -> float:
+    """Return what number of independent draws weights with sum 1 are worth (Kish 1965)."""
+    return float(1.0 / np.sum(weight**2))

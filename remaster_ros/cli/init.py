@@ -1,0 +1,260 @@
+"""Write a workcell file for a robot, with what is proposed and why."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.cli.options import names, number
+from remaster_ros.errors import InputError, did_you_mean
+from remaster_ros.kinematics.arm_ends import likely_base, likely_tips
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.urdf import parse_urdf
+from remaster_ros.kinematics.urdf_geometry import chain_bodies, mesh_names
+from remaster_ros.planning.candidates import candidate_poses
+from remaster_ros.planning.cell_proposal import (
+    marker_height,
+    propose_held_joint,
+    ranges_around,
+    reach_of,
+    widest_ranges,
+)
+from remaster_ros.session.cell_template import SENSORS, CellProposal, cell_text
+from remaster_ros.session.files import make_folder, write_atomically
+from remaster_ros.session.meshes import find_mesh, mesh_reader
+from remaster_ros.session.robot_description import read_description
+from remaster_ros.session.workcell import Workcell, parse_cell
+from remaster_ros.simulation.offline_tour import plan_tour
+
+# Tool poses by which the joints to hold are compared; poses that are planned to find the ranges,
+# and those of the trial.
+COMPARED = 80
+TRIED = 200
+# Fewer that can be visited do not show ranges.
+FEWEST = 12
+TRIAL = {'optimization': 20, 'validation': 10}
+# How far the sensor stands behind what the arm reaches, m.
+SENSOR_BEHIND_M = 1.2
+REMEDY = 'give another name with --out'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``remaster init``."""
+    parser.add_argument('robot', metavar='FILE', type=Path, help='robot.urdf or robot.urdf.xacro')
+    parser.add_argument(
+        'arguments', metavar='NAME:=VALUE', nargs='*', help='arguments of a xacro file'
+    )
+    parser.add_argument(
+        '--out', metavar='CELL', type=Path, default=Path('cell.yaml'), help='default: cell.yaml'
+    )
+    parser.add_argument('--base-link', metavar='LINK', help='frame R (default: the likely one)')
+    parser.add_argument('--tip-link', metavar='LINK', help='frame T (default: the likely one)')
+    parser.add_argument(
+        '--package-path',
+        metavar='DIR',
+        type=Path,
+        action='append',
+        default=[],
+        help='a folder with ROS packages, or a package; may be repeated',
+    )
+    parser.add_argument(
+        '--sensors',
+        metavar='NAME,…',
+        type=names,
+        default=('tracker',),
+        help=f'of {", ".join(SENSORS)} (default: tracker)',
+    )
+    parser.add_argument(
+        '--sensor-at',
+        metavar=('X', 'Y', 'Z'),
+        type=number(-200.0, 200.0, 'm'),
+        nargs=3,
+        help='where it stands in the base link, m, roughly (default: in front of the arm)',
+    )
+    parser.add_argument('--no-floor', action='store_true', help='the arm hangs, or stands high')
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read the robot, try what is proposed, write the cell file, and plan a little in it."""
+    for sensor in args.sensors:
+        if sensor not in SENSORS:
+            meant = did_you_mean(sensor, SENSORS)
+            raise InputError(f'--sensors: {sensor!r} is none of {", ".join(SENSORS)}{meant}')
+    if args.out.exists():
+        raise InputError(f'{args.out}: already there, and not overwritten; {REMEDY}')
+    rng = np.random.default_rng(args.seed)
+    with progress_bar(args.quiet or args.json) as progress:
+        progress('reading', 0.0)
+        text = read_description(args.robot, _arguments(args.arguments), args.package_path)
+        urdf = _urdf_file(args.robot, args.out, text)
+        make_folder(args.out.parent)
+        if urdf != args.robot:
+            write_atomically(urdf, text)
+        progress('trying', 0.1)
+        widest = _propose(args, text, urdf, rng)
+        progress('planning', 0.4)
+        proposal = _narrowed(widest, _cell(widest, args.out), rng)
+        write_atomically(args.out, cell_text(proposal))
+        progress('planning', 0.9)
+        said = _trial(_cell(proposal, args.out), bool(proposal.missing_meshes), rng)
+    if args.json:
+        print(json.dumps(_as_json(args.out, proposal, said)))
+        return 0
+    show(args.quiet, _as_text(proposal))
+    show(args.quiet, said)
+    show(args.quiet, f'written: {args.out}; look at its lines marked CHECK')
+    return 0
+
+
+def _arguments(given: list[str]) -> dict[str, str]:
+    """Return the arguments of a xacro file."""
+    found = {}
+    for text in given:
+        name, sign, value = text.partition(':=')
+        if not sign or not name:
+            raise InputError(f'{text!r} is not NAME:=VALUE, such as ur_type:=ur5e')
+        found[name] = value
+    return found
+
+
+def _urdf_file(robot: Path, out: Path, text: str) -> Path:
+    """Return the URDF that the cell names: the robot's own, or what xacro was made into."""
+    if robot.suffix != '.xacro' and '<xacro:' not in robot.read_text(errors='replace'):
+        return robot
+    name = robot.name.removesuffix('.xacro').removesuffix('.urdf')
+    urdf = out.parent / f'{name}.urdf'
+    if urdf.exists() and urdf.read_text(errors='replace') != text:
+        raise InputError(f'{urdf}: already there with other content; move it, or {REMEDY}')
+    return urdf
+
+
+def _propose(
+    args: argparse.Namespace, text: str, urdf: Path, rng: np.random.Generator
+) -> CellProposal:
+    try:
+        model = parse_urdf(text)
+        base = likely_base(model) if args.base_link is None else args.base_link
+        tips = likely_tips(model, base)
+        tip = tips[0] if args.tip_link is None else args.tip_link
+        chain = SerialChain.from_urdf(text, base, tip)
+        reach = reach_of(chain, rng)
+        place = args.sensor_at or [
+            reach.reach_m + SENSOR_BEHIND_M,
+            0.0,
+            0.5 * (max(reach.low_m, 0.0) + reach.high_m),
+        ]
+        floor = None if args.no_floor else 0.0
+        ranges = widest_ranges(reach, floor)
+        facing = candidate_poses(COMPARED, ranges, np.array(place), rng)
+        held = propose_held_joint(chain, facing)
+    except InputError as error:
+        raise InputError(f'{args.robot}: {error}') from None
+    found, missing = _meshes(text, args.robot, args.package_path)
+    read_mesh = mesh_reader(urdf, [Path(folder) for folder in found])
+    bodies = chain_bodies(text, chain, lambda name: None if name in missing else read_mesh(name))
+    return CellProposal(
+        source=args.robot.name,
+        urdf=os.path.relpath(urdf, args.out.parent),
+        chain=chain,
+        tips=tips,
+        held=held,
+        reach=reach,
+        ranges=ranges,
+        kept='',
+        marker_z=marker_height(chain, bodies),
+        sensor_R=place,
+        sensors=args.sensors,
+        mesh_path=found,
+        missing_meshes=missing,
+        floor_z=floor,
+    )
+
+
+def _meshes(text: str, robot: Path, package_path: list[Path]) -> tuple[list[str], list[str]]:
+    """Return the folders in which the collision meshes were found, and those that were not."""
+    folders: dict[str, None] = {}
+    missing = []
+    for name in mesh_names(text):
+        try:
+            path = find_mesh(name, robot, package_path).resolve()
+        except InputError:
+            missing.append(name)
+            continue
+        package, _, rest = name.removeprefix('package://').partition('/')
+        if name.startswith('package://'):
+            folder = Path(str(path).removesuffix(rest))
+            # The folder that holds the package, or the package where it has another name.
+            folders[str(folder.parent if folder.name == package else folder)] = None
+        elif not Path(name.removeprefix('file://')).is_absolute():
+            folders[str(path).removesuffix(name).rstrip('/')] = None
+    return list(folders), missing
+
+
+def _cell(proposal: CellProposal, out: Path) -> Workcell:
+    return parse_cell(cell_text(proposal).encode(), out)
+
+
+def _narrowed(p: CellProposal, cell: Workcell, rng: np.random.Generator) -> CellProposal:
+    """Return the proposal with ranges around the poses that can be visited."""
+    scene = cell.planning_scene(p.chain, without_meshes=bool(p.missing_meshes))
+    plan = scene.plan(TRIED, scene.rough_R, rng)
+    lost = ', '.join(f'{count} {why}' for why, count in plan.dropped.items())
+    found = f'Of {TRIED} poses everywhere around the arm {len(plan.poses)} can be visited ({lost})'
+    if len(plan.poses) < FEWEST:
+        return replace(p, kept=f'{found}: too few to propose ranges.')
+    places = np.array([pose.T_R_T[:3, 3] for pose in plan.poses])
+    return replace(p, ranges=ranges_around(places), kept=f'{found}; these ranges are around them.')
+
+
+def _trial(cell: Workcell, without_meshes: bool, rng: np.random.Generator) -> str:
+    """Plan a few poses in the new cell; return what became of them."""
+    try:
+        tour = plan_tour(cell.chain(), cell, None, TRIAL, rng, without_meshes=without_meshes)
+    except InputError as error:
+        return f'a trial plan found nothing: {error}'
+    return f'a trial of {sum(TRIAL.values())} poses: {tour.describe()}'
+
+
+def _as_text(p: CellProposal) -> str:
+    chain, held = p.chain, p.held
+    lines = [
+        f'{chain.name}: {len(chain)} joints between {chain.base_link} and {chain.tip_link}'
+        + (f' (or {", ".join(p.tips[1:4])})' if len(p.tips) > 1 else ''),
+        f'reach {p.reach.reach_m:.2f} m; the sensor is taken to be at '
+        f'{", ".join(f"{value:.1f}" for value in p.sensor_R)} m',
+    ]
+    if held.joint is not None:
+        angles = ', '.join(f'{np.degrees(value):.0f}' for value in held.values_rad)
+        lines.append(
+            f'{chain.joint_names[held.joint]} is held at {angles} degrees, which gives the most '
+            f'joint solutions of a pose: {held.solutions:.1f} on average'
+        )
+    lines.append(p.kept)
+    if p.missing_meshes:
+        lines.append(
+            f'warning: {len(p.missing_meshes)} meshes were not found, such as '
+            f'{p.missing_meshes[0]}; give the folder of the package with --package-path'
+        )
+    return '\n'.join(lines)
+
+
+def _as_json(out: Path, p: CellProposal, said: str) -> dict[str, Any]:
+    held = p.held
+    return {
+        'cell': str(out),
+        'base_link': p.chain.base_link,
+        'tip_link': p.chain.tip_link,
+        'other_tips': [tip for tip in p.tips if tip != p.chain.tip_link],
+        'held_joint': None if held.joint is None else p.chain.joint_names[held.joint],
+        'solutions': held.solutions,
+        'missing_meshes': list(p.missing_meshes),
+        'trial': said,
+    }

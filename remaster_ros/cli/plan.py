@@ -1,0 +1,108 @@
+"""What a collection would do, and what its fit is expected to state, before anything moves."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+import numpy as np
+
+from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.cli.options import integer, number
+from remaster_ros.kinematics.transforms import transform
+from remaster_ros.planning.collection_plan import CollectionPlan, plan_collection
+from remaster_ros.planning.tour_planner import TourPlanner
+from remaster_ros.planning.travel_time import DWELL_S, SETTLE_S, SPEED_SHARE, TravelTime
+from remaster_ros.reports.plan_json import plan_text, plan_to_dict
+from remaster_ros.session.workcell import Workcell, read_cell
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``remaster plan``; their defaults are those of the nodes."""
+    parser.add_argument('cell', metavar='CELL', help='cell file, or a shipped one (demo)')
+    parser.add_argument(
+        '--poses',
+        type=integer(1),
+        default=60,
+        metavar='N',
+        help='candidate poses to fit (default 60)',
+    )
+    parser.add_argument(
+        '--validation',
+        type=integer(0),
+        default=60,
+        metavar='N',
+        help='candidate poses held out (default 60)',
+    )
+    parser.add_argument(
+        '--reference-every',
+        type=integer(0),
+        default=25,
+        metavar='N',
+        help='configurations between two visits to the references (default 25; 0 for none)',
+    )
+    parser.add_argument(
+        '--speed-share',
+        type=number(0.01, 1.0),
+        default=SPEED_SHARE,
+        metavar='S',
+        help=f"share of the joints' velocity limits that is used (default {SPEED_SHARE:g})",
+    )
+    parser.add_argument(
+        '--cartesian-speed-limit',
+        type=number(0.0, 10.0, 'm/s'),
+        default=0.25,
+        metavar='V',
+        help='largest speed of the fastest point, m/s (default 0.25; 0 for no such limit)',
+    )
+    parser.add_argument(
+        '--settle',
+        type=number(0.0, 60.0, 's'),
+        default=SETTLE_S,
+        metavar='S',
+        help=f'standstill before a reading, s (default {SETTLE_S:g})',
+    )
+    parser.add_argument(
+        '--dwell',
+        type=number(0.0, 60.0, 's'),
+        default=DWELL_S,
+        metavar='S',
+        help=f'how long a reading takes, s (default {DWELL_S:g})',
+    )
+    parser.add_argument(
+        '--json', action='store_true', help='print one JSON object and nothing else'
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Plan, and print what is planned."""
+    cell = read_cell(args.cell)
+    with progress_bar(args.quiet or args.json) as progress:
+        progress('planning', 0.0)
+        plan = planned(cell, args)
+    if args.json:
+        print(json.dumps(plan_to_dict(plan), indent=2))
+    else:
+        show(args.quiet, plan_text(plan, cell.design_settings()))
+    return 0
+
+
+def planned(cell: Workcell, args: argparse.Namespace) -> CollectionPlan:
+    """Return the collection as the nodes plan it, before sensors at their rough places."""
+    chain = cell.chain()
+    scene = cell.planning_scene(chain)
+    travel = TravelTime.of(
+        scene.model,
+        args.speed_share,
+        args.cartesian_speed_limit or np.inf,
+        cell.acceleration_limits(chain),
+        args.settle,
+        args.dwell,
+    )
+    counts = {'optimization': args.poses, 'validation': args.validation}
+    planner = TourPlanner(
+        scene, counts, args.seed, args.reference_every, cell.design_settings(), travel
+    )
+    places = {name: transform(np.eye(3), origin) for name, origin in scene.rough_R.items()}
+    start = np.clip(np.zeros(len(chain)), chain.lower, chain.upper)
+    return plan_collection(planner, places, start)

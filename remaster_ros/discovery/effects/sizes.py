@@ -1,0 +1,79 @@
+"""Sizes in sentences: arc minutes and millimetres with their uncertainty.
+
+Each effect has a function of context, cell and draws of the cell's parameters (draws, m) that
+returns what the cell amounts to in this session, as part of a sentence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.types import FloatArray
+
+ARC_MINUTE = np.radians(1.0 / 60.0)
+MM = 1e-3
+
+
+def number(value: float, std: float, unit: str) -> str:
+    """Return '5.1′ ± 0.3′', with the digits that the uncertainty leaves."""
+    digits = 3
+    if std > 0.0 and np.isfinite(std):
+        exponent = int(np.floor(np.log10(std)))
+        leading = std / 10.0**exponent
+        digits = int(np.clip(-exponent + (leading < 2.0), 0, 4))
+    return f'{_plain(value, digits)}{unit} ± {_plain(std, digits)}{unit}'
+
+
+def _plain(value: float, digits: int) -> str:
+    text = f'{value:.{digits}f}'
+    return text.removeprefix('-') if float(text) == 0.0 else text.replace('-', '−')
+
+
+def angle(values: FloatArray) -> str:
+    """Return the mean and standard deviation of angles, rad, (draws,), in arc minutes."""
+    return number(float(np.mean(values) / ARC_MINUTE), float(np.std(values) / ARC_MINUTE), '′')
+
+
+def length(values: FloatArray) -> str:
+    """Return the mean and standard deviation of lengths, m, (draws,), in millimetres."""
+    return number(float(np.mean(values) / MM), float(np.std(values) / MM), ' mm')
+
+
+def largest(values: FloatArray) -> float:
+    """Return the largest absolute value; 0 of none."""
+    return float(np.abs(values).max(initial=0.0))
+
+
+def at_most(context: Context, cell: Cell, draws: FloatArray) -> str:
+    """Return the largest angle that a cell adds, less its mean, or its largest displacement.
+
+    In the row where the mean of the draws has it: the largest of each draw would be larger.
+    """
+    columns = cell.columns(context)
+    if columns.at is not None:
+        turns = columns.values - columns.values.mean(axis=0)
+        row = int(np.argmax(np.abs(turns @ draws.mean(axis=0))))
+        there = draws @ turns[row]
+        return angle(there * np.sign(there.mean()))
+    row = int(np.argmax(np.linalg.norm(columns.values @ draws.mean(axis=0), axis=1)))
+    return length(np.linalg.norm(draws @ columns.values[row].T, axis=1))
+
+
+def up_to(words: str) -> Callable[[Context, Cell, FloatArray], str]:
+    """Return a size of the form 'joint 2 errs by up to 5.1′ ± 0.3′'.
+
+    ``{joint}``, ``{other}`` (the joint that drives) and ``{subject}`` of ``words`` are filled in.
+    """
+
+    def size(context: Context, cell: Cell, draws: FloatArray) -> str:
+        joint = cell.joints[0] if cell.joints else ''
+        start = words.format(
+            joint=joint, other=cell.joints[-1] if cell.joints else '', subject=cell.subject
+        )
+        return f'{start} by up to {at_most(context, cell, draws)}'
+
+    return size

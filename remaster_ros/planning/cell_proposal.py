@@ -1,0 +1,182 @@
+"""What a cell file may hold for an arm that is not known yet: which joint is held, which poses.
+
+Everything is tried on the arm itself: the closed form with each joint held, and which tool poses
+that face a sensor the arm can take within its limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.bodies import Body
+from remaster_ros.kinematics.inverse_kinematics import FREE_JOINTS, InverseKinematics
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import apply, inverse
+from remaster_ros.planning.candidates import PoseRanges
+from remaster_ros.types import FloatArray
+
+# With fewer joint solutions of a pose on average the joint is held at several values, rad.
+FEW_SOLUTIONS = 1.5
+OTHER_VALUES = tuple(np.radians((-40.0, 0.0, 40.0)).tolist())
+# A marker in front of the tool plate, and how far it is kept from the last link, m.
+LEAST_MARKER_M = 0.05
+CLEAR_M = 0.04
+# A joint that goes on turning counts as one of a turn each way.
+_TURN = np.pi
+
+
+@dataclass(frozen=True)
+class HeldJoint:
+    """Which joint to hold so that poses have closed-form solutions.
+
+    Attributes
+    ----------
+    joint
+        Its index; None where the arm has six.
+    values_rad
+        Where it is held.
+    solutions
+        Mean number of joint solutions of a pose, those that cannot be reached among them.
+    tried
+        Name of each joint that was tried -> that number, or why it leaves no closed form.
+    """
+
+    joint: int | None
+    values_rad: tuple[float, ...]
+    solutions: float
+    tried: Mapping[str, float | str]
+
+    def values(self) -> dict[int, tuple[float, ...]]:
+        """Return what `InverseKinematics` takes."""
+        return {} if self.joint is None else {self.joint: self.values_rad}
+
+
+def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
+    """Find the joint whose holding gives poses the most joint solutions.
+
+    Parameters
+    ----------
+    facing
+        Tool poses to try it on, (n, 4, 4), such as those drawn from `widest_ranges`.
+
+    Raises
+    ------
+    InputError
+        An arm with other than six or seven joints, or without a closed form; with the reason.
+    """
+    if len(chain) == FREE_JOINTS:
+        return HeldJoint(None, (), _mean_solutions(InverseKinematics(chain, {}), facing), {})
+    if len(chain) != FREE_JOINTS + 1:
+        raise InputError(
+            f"robot '{chain.name}' has {len(chain)} joints between '{chain.base_link}' and "
+            f"'{chain.tip_link}'; poses are planned for six, or for seven with one held"
+        )
+    tried: dict[str, float | str] = {}
+    best: tuple[float, int, float] | None = None
+    for joint, name in enumerate(chain.joint_names):
+        value = _resting(chain, joint)
+        try:
+            kinematics = InverseKinematics(chain, {joint: (value,)})
+        except InputError as error:
+            tried[name] = str(error)
+            continue
+        count = tried[name] = _mean_solutions(kinematics, facing)
+        if best is None or count > best[0]:
+            best = count, joint, value
+    if best is None:
+        reasons = '; '.join(f'{name}: {why}' for name, why in tried.items())
+        raise InputError(
+            f"robot '{chain.name}' has no closed form, whichever joint is held: {reasons}"
+        )
+    count, joint, value = best
+    values = (value,)
+    if count < FEW_SOLUTIONS:
+        span = chain.lower[joint], chain.upper[joint]
+        values = tuple(value + step for step in OTHER_VALUES if span[0] < value + step < span[1])
+        count = _mean_solutions(InverseKinematics(chain, {joint: values}), facing)
+    return HeldJoint(joint, values, count, tried)
+
+
+def _resting(chain: SerialChain, joint: int) -> float:
+    """Return 0 where it is well inside the limits of a joint, else their middle, rad."""
+    low, high = chain.lower[joint], chain.upper[joint]
+    if not np.isfinite(high - low):
+        return 0.0
+    margin = 0.2 * (high - low)
+    middle = float(np.round(np.degrees(0.5 * (low + high)) / 5.0) * np.radians(5.0))
+    return 0.0 if low + margin < 0.0 < high - margin else middle
+
+
+def _random_joints(chain: SerialChain, count: int, rng: np.random.Generator) -> FloatArray:
+    low, high = np.maximum(chain.lower, -_TURN), np.minimum(chain.upper, _TURN)
+    return rng.uniform(low, high, (count, len(chain)))
+
+
+def _mean_solutions(kinematics: InverseKinematics, poses: FloatArray) -> float:
+    return float(np.mean([len(kinematics.solutions(T)) for T in poses]))
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far an arm reaches.
+
+    Attributes
+    ----------
+    reach_m
+        From the axis of the first joint, m.
+    low_m, high_m
+        Heights that the tool takes, m.
+    """
+
+    reach_m: float
+    low_m: float
+    high_m: float
+
+
+def reach_of(chain: SerialChain, rng: np.random.Generator) -> Reach:
+    """Return how far the tool gets from the axis of the first joint, and at which heights."""
+    places = chain.forward(_random_joints(chain, 3000, rng))[:, :3, 3]
+    first = chain.T_fixed[0]
+    radius = np.linalg.norm((places - first[:3, 3])[:, :2], axis=1)
+    return Reach(float(radius.max()), float(places[:, 2].min()), float(places[:, 2].max()))
+
+
+def widest_ranges(reach: Reach, floor_z: float | None) -> PoseRanges:
+    """Return ranges of poses everywhere around an arm."""
+    lowest = reach.low_m if floor_z is None else max(reach.low_m, floor_z + 0.1 * reach.reach_m)
+    return PoseRanges(
+        azimuth_rad=(-np.pi, np.pi),
+        radius_m=(0.15 * reach.reach_m, reach.reach_m),
+        height_m=(lowest, reach.high_m),
+    )
+
+
+def ranges_around(places: FloatArray) -> PoseRanges:
+    """Return ranges around the middle of places that an arm can take, m, (n, 3)."""
+    radius = np.quantile(np.linalg.norm(places[:, :2], axis=1), (0.1, 0.9))
+    height = np.quantile(places[:, 2], (0.1, 0.9))
+    azimuth = np.quantile(np.arctan2(places[:, 1], places[:, 0]), (0.05, 0.95))
+    wide = azimuth[1] - azimuth[0] > np.radians(300.0)
+    return PoseRanges(
+        azimuth_rad=(0.0, 2.0 * np.pi) if wide else _rounded(azimuth, np.radians(5.0)),
+        radius_m=_rounded(radius, 0.01),
+        height_m=_rounded(height, 0.01),
+    )
+
+
+def marker_height(chain: SerialChain, bodies: Sequence[Body]) -> float:
+    """Return how far along the tool's Z axis a marker is clear of the last link, m."""
+    last = [body.outline for body in bodies if body.link == len(chain)]
+    if not last:
+        return LEAST_MARKER_M
+    along = apply(inverse(chain.T_fixed[-1]), np.concatenate(last))[:, 2].max()
+    return max(LEAST_MARKER_M, float(np.ceil(100.0 * (along + CLEAR_M)) / 100.0))
+
+
+def _rounded(values: FloatArray, step: float) -> tuple[float, float]:
+    low, high = np.round(values / step) * step
+    return float(low), float(high)

@@ -1,0 +1,289 @@
+"""From the poses that can be measured to a designed plan, with free ways, and to its order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+
+from remaster_ros.kinematics.collision import CollisionModel
+from remaster_ros.kinematics.free_paths import is_straight_free
+from remaster_ros.planning.candidates import Plan, PlannedPose, PlanningScene
+from remaster_ros.planning.design_information import DesignInformation
+from remaster_ros.planning.expected_sensors import ExpectedSensor, ToolBox
+from remaster_ros.planning.free_order import free_way
+from remaster_ros.planning.pose_design import (
+    HELD_OUT_POSES,
+    HELD_OUT_SOLUTIONS,
+    Floors,
+    Goal,
+    choose,
+)
+from remaster_ros.planning.travel_time import TravelTime
+from remaster_ros.planning.visit_order import fastest_order
+from remaster_ros.types import FloatArray, IntArray, Priors
+
+NOT_NEEDED = 'not needed by the design'
+POOL_CANDIDATES = 400
+"""Candidate poses that a design chooses from, besides those of the plan that it replaces."""
+MOST_CANDIDATES = 1500
+"""Configurations that it chooses from at most: about a second of choice for each hundred."""
+MOST_TRIES = 5
+"""So often a design, or an order, is made anew where a way is not free."""
+DETOUR = 2.0
+"""A way around something counts as so many times the straight one, until it is planned."""
+
+
+@dataclass(frozen=True)
+class DesignSettings:
+    """What the poses to fit are chosen by; see `pose_design`.
+
+    Attributes
+    ----------
+    optimal
+        False for all poses of the Latin hypercube.
+    fastest
+        Visit configurations in the order of least travel, not all solutions of a pose at a time.
+    sensors
+        What will measure, with its expected noise.
+    marker_std_m
+        How well the markers' positions are known, m.
+    tool_share
+        See `Goal`.
+    joint_std_rad, tool_std_m
+        What is to be reached; None for what the Latin hypercube's poses reach.
+    box
+        Where the tool is to be accurate; None for wherever the poses are.
+    priors
+        What is known beforehand.
+    """
+
+    optimal: bool = False
+    fastest: bool = False
+    sensors: tuple[ExpectedSensor, ...] = ()
+    marker_std_m: float = 0.5e-3
+    tool_share: float = 0.0
+    joint_std_rad: float | None = None
+    tool_std_m: float | None = None
+    box: ToolBox | None = None
+    priors: Priors = field(default_factory=Priors)
+
+    def before(self, sensors_R: Mapping[str, FloatArray]) -> DesignSettings:
+        """Return them for sensors that stand at these places in R, m, (3,) each."""
+        placed = [
+            replace(sensor, position_R=sensors_R[sensor.name])
+            for sensor in self.sensors
+            if sensor.name in sensors_R
+        ]
+        return replace(self, sensors=tuple(placed))
+
+    def information(self, scene: PlanningScene, poses: Sequence[PlannedPose]) -> DesignInformation:
+        """Return what poses tell; errors as of `DesignInformation.of`."""
+        chain = scene.model.chain
+        return DesignInformation.of(
+            chain, poses, self.sensors, self.marker_std_m, self.priors, self.box
+        )
+
+
+@dataclass(frozen=True)
+class Designed:
+    """Plans by a design.
+
+    Attributes
+    ----------
+    plans
+        Split -> its poses, each with the solutions that were chosen.
+    goal
+        What was to be reached.
+    reached
+        Whether it is, with the floors.
+    joint_rms, tool_rms
+        What is expected, rad and m.
+    """
+
+    plans: Mapping[str, Plan]
+    goal: Goal
+    reached: bool
+    joint_rms: float
+    tool_rms: float
+
+    def describe(self) -> str:
+        """Return what is expected, in a line."""
+        goal = (
+            ''
+            if self.reached
+            else (
+                f'; not reached: {np.degrees(self.goal.joint_std_rad):.4f} deg for the offsets or '
+                f'{self.goal.tool_std_m * 1e3:.3f} mm for the tool'
+            )
+        )
+        return (
+            f'expected std of the offsets {np.degrees(self.joint_rms):.4f} deg (RMS), '
+            f'error of the predicted markers {self.tool_rms * 1e3:.3f} mm (RMS){goal}'
+        )
+
+
+def designed_plans(
+    scene: PlanningScene,
+    settings: DesignSettings,
+    plans: Mapping[str, Plan],
+    sensors_R: Mapping[str, FloatArray],
+    travel: TravelTime,
+    rng: np.random.Generator,
+) -> Designed:
+    """Choose configurations for the precision of these plans, or a stated one, in the least time.
+
+    Parameters
+    ----------
+    scene
+        What poses are planned from.
+    settings
+        What they are chosen by.
+    plans
+        Of Latin hypercubes, by split. The poses to fit are among those to choose from, so that
+        what they reach can be reached; of those held out as many stay as are needed.
+    sensors_R
+        Origin in R of each sensor that has to see its marker, m, (3,).
+    travel
+        What configurations cost.
+    rng
+        Of the further candidates, and of the choice.
+    """
+    plan, pool = plans['optimization'], scene.plan(POOL_CANDIDATES, sensors_R, rng)
+    poses = [*plan.poses, *pool.poses]
+    information = settings.before(sensors_R).information(scene, poses)
+    count = sum(len(pose.solutions) for pose in plan.poses)
+    reference = range(count)
+    goal = Goal(
+        settings.joint_std_rad or information.joint_rms(reference),
+        settings.tool_std_m or information.tool_rms(reference),
+        settings.tool_share,
+    )
+    number = np.concatenate([np.arange(len(pose.solutions)) for pose in poses])
+    left: IntArray = np.arange(min(len(information), max(MOST_CANDIDATES, count)))
+    for _ in range(MOST_TRIES):
+        design = choose(information.only(left), travel, goal, rng, _floors(information, left))
+        chosen = left[np.array(design.chosen, dtype=np.int64)]
+        lost = _without_way(scene.model, information.q[chosen], travel)
+        if not lost:
+            break
+        left = np.setdiff1d(left, chosen[lost])
+    kept = [
+        PlannedPose(poses[index].T_R_T, poses[index].solutions[number[mine]])
+        for index in np.unique(information.pose[chosen])
+        for mine in [np.sort(chosen[information.pose[chosen] == index])]
+    ]
+    dropped = _sum(plan.dropped, pool.dropped, {NOT_NEEDED: len(poses) - len(kept)})
+    solutions = _sum(
+        plan.dropped_solutions,
+        pool.dropped_solutions,
+        {NOT_NEEDED: len(information) - len(chosen)},
+    )
+    designed = {**plans, 'optimization': Plan(tuple(kept), dropped, solutions)}
+    if 'validation' in plans:
+        designed['validation'] = _held_out(plans['validation'], rng)
+    return Designed(
+        designed,
+        goal,
+        design.reached,
+        information.joint_rms(chosen.tolist()),
+        information.tool_rms(chosen.tolist()),
+    )
+
+
+def _floors(information: DesignInformation, left: IntArray) -> Floors:
+    """Return the floors, lower where these configurations have not so many poses."""
+    count = np.unique(information.pose[left], return_counts=True)[1]
+    whole = Floors()
+    return Floors(min(whole.poses, len(count)), min(whole.repeated, int(np.sum(count > 1))))
+
+
+def _held_out(plan: Plan, rng: np.random.Generator) -> Plan:
+    """Return as many of the held-out poses as are needed, and solutions of each."""
+    kept = tuple(
+        PlannedPose(
+            pose.T_R_T,
+            pose.solutions[np.sort(rng.permutation(len(pose.solutions))[:HELD_OUT_SOLUTIONS])],
+        )
+        # In the order of a Latin hypercube neighbours have nothing in common.
+        for pose in plan.poses[:HELD_OUT_POSES]
+    )
+    before = sum(len(pose.solutions) for pose in plan.poses)
+    after = sum(len(pose.solutions) for pose in kept)
+    return Plan(
+        kept,
+        _sum(plan.dropped, {NOT_NEEDED: len(plan.poses) - len(kept)}),
+        _sum(plan.dropped_solutions, {NOT_NEEDED: before - after}),
+    )
+
+
+def visit_order(
+    plans: Mapping[str, Plan],
+    model: CollisionModel,
+    travel: TravelTime,
+) -> list[tuple[str, int, int]]:
+    """Order all configurations of some plans by travel time.
+
+    Parameters
+    ----------
+    plans
+        Split -> its plan; those to fit and those held out are mixed.
+    model
+        What the arm must not hit: a way that is not straight counts as longer.
+    travel
+        How long the ways take.
+
+    Returns
+    -------
+    list of (str, int, int)
+        Split, pose and solution of each visit.
+    """
+    visits = [
+        (split, index, number)
+        for split, plan in plans.items()
+        for index, pose in enumerate(plan.poses)
+        for number in range(len(pose.solutions))
+    ]
+    if not visits:
+        return []
+    q = np.array([plans[split].poses[index].solutions[number] for split, index, number in visits])
+    # The arm may come from anywhere: as near to all.
+    times = np.zeros((len(q) + 1, len(q) + 1))
+    times[1:, 1:] = travel.between(q)
+    order = fastest_order(times)
+    judged: set[tuple[int, int]] = set()
+    for _ in range(MOST_TRIES):
+        legs = {(min(leg), max(leg)) for leg in pairwise(order)} - judged
+        judged |= legs
+        blocked = [leg for leg in legs if not is_straight_free(model, *q[np.array(leg) - 1])]
+        if not blocked:
+            break
+        for a, b in blocked:
+            times[a, b] = times[b, a] = DETOUR * times[a, b]
+        order = fastest_order(times)
+    return [visits[place - 1] for place in order]
+
+
+def _without_way(model: CollisionModel, q: FloatArray, travel: TravelTime) -> list[int]:
+    """Return which of some configurations (n, k) no free way leads to from its two nearest."""
+    times = travel.between(q)
+    np.fill_diagonal(times, np.inf)
+    limits = model.chain.velocity_limits
+    return [
+        index
+        for index in range(len(q))
+        if len(q) > 1
+        and all(
+            free_way(model, q[other], q[index], limits, index) is None
+            for other in np.argsort(times[index])[:2]
+        )
+    ]
+
+
+def _sum(*counts: Mapping[str, int]) -> dict[str, int]:
+    """Add counts by name; zeros are left out."""
+    names = dict.fromkeys(name for count in counts for name in count)
+    total = {name: sum(count.get(name, 0) for count in counts) for name in names}
+    return {name: count for name, count in total.items() if count}

@@ -1,0 +1,298 @@
+"""Choose configurations that tell the most in the least time: greedy, then exchange of poses.
+
+A-optimal for the joint offsets (least sum of their variances), I-optimal for the tool (least mean
+variance of the predicted markers in a box), or a mixture of both. Configurations are added one by
+one, each the one that lowers the criterion the most for its time, until the wanted standard
+deviations are reached; those that are not needed any more are left out. Then poses are exchanged
+while that saves robot time: one is brought in with all its solutions, or some are left out and
+what is missing is filled up, and again what is not needed is left out.
+
+Single configurations are not exchanged, as V. V. Fedorov's and T. J. Mitchell's (DETMAX)
+algorithms do: the error that the configurations of a pose share makes the first of a pose tell
+little, and all of them together much, so that such exchanges end in poor local optima. For the
+same reason the information of configurations does not add up, and designs by weights (convex
+relaxations) apply to whole poses only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.discovery.screening import FEWEST_POSES
+from remaster_ros.planning.design_information import DesignInformation
+from remaster_ros.planning.travel_time import TravelTime
+from remaster_ros.types import BoolArray, FloatArray, IntArray
+
+REPEATED_POSES = 6
+"""Poses measured in two solutions or more, at least. Their differences alone distinguish the noise
+of a reading from the error that a pose shares: with M markers, 6 of them give a standard deviation
+of the former that is known to 1 / sqrt(2 * 18 M), 17 % with one marker."""
+HELD_OUT_POSES = 12
+"""Poses held out, at least: from 12 on the p-values of a search for causes come from flipped poses
+(`discovery.screening`), on held-out rows as on the others, and 12 poses of 3 coordinates give the
+RMS error on them to 12 %."""
+HELD_OUT_SOLUTIONS = 2
+"""Solutions of each: two solutions of a pose are what the relative metric compares."""
+MOST_CONFIGURATIONS = 400
+"""A design that needs more is not reached."""
+MOST_EXCHANGES, EFFORT = 200, 6000
+"""Exchanges of poses that are tried; with many configurations fewer, as each takes longer."""
+MOST_MORE = 6
+"""Configurations that a design may have more than before, before it is thinned."""
+WORTHWHILE_S = 1e-3
+"""What an exchange must gain, s."""
+URGENCY = 0.5
+"""Gain is weighed against this power of its time. With 0 the fewest configurations are chosen,
+with 1 many that are near to one another; between them lies the least time."""
+FIRST, LOOKED_AT = 12, 64
+"""From so many chosen on, only the candidates that promise the most to first order are tried."""
+
+
+@dataclass(frozen=True)
+class Floors:
+    """What a design has at the least, so that a search for causes finds what no one expected.
+
+    A design for the offsets alone would repeat few poses. The offsets' model is then fitted where
+    it is bent the most, and nothing looks whether it holds in between.
+
+    Attributes
+    ----------
+    poses
+        Different poses to fit; `discovery.screening` needs as many for its p-values.
+    repeated
+        Of them with at least two solutions.
+    """
+
+    poses: int = FEWEST_POSES
+    repeated: int = REPEATED_POSES
+
+    def hold(self, pose: IntArray) -> bool:
+        """Tell whether chosen configurations of these poses (n,) reach them."""
+        count = np.unique(pose, return_counts=True)[1]
+        return len(count) >= self.poses and int(np.sum(count > 1)) >= self.repeated
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What is to be reached, and what to weigh by.
+
+    Attributes
+    ----------
+    joint_std_rad
+        Root mean square of the standard deviations of the identifiable joints, rad.
+    tool_std_m
+        Root mean square of the 3-D error of the predicted markers in the box, m.
+    tool_share
+        0 for the joints alone (A-optimal), 1 for the tool alone (I-optimal); between them for a
+        mixture, in which each counts in units of what is to be reached.
+    """
+
+    joint_std_rad: float
+    tool_std_m: float
+    tool_share: float = 0.0
+
+    def weights(self, information: DesignInformation) -> FloatArray:
+        """Return L with criterion = trace(L' M^-1 L), (f, r), 1 or less at the goal."""
+        parts = []
+        if self.tool_share < 1.0:
+            places = sorted(information.identifiable.values())
+            joints = np.zeros((len(information.scale), len(places)))
+            joints[places, np.arange(len(places))] = information.scale[places]
+            share = (1.0 - self.tool_share) / len(places)
+            parts.append(np.sqrt(share) / self.joint_std_rad * joints)
+        if self.tool_share > 0.0:
+            values, vectors = np.linalg.eigh(information.tool)
+            root = vectors * np.sqrt(np.maximum(values, 0.0))
+            parts.append(np.sqrt(self.tool_share) / self.tool_std_m * root)
+        return np.concatenate(parts, axis=1)
+
+    def is_reached(self, information: DesignInformation, chosen: Sequence[int]) -> bool:
+        """Tell whether each of what counts is reached."""
+        joints = self.tool_share == 1.0 or information.joint_rms(chosen) <= self.joint_std_rad
+        tool = self.tool_share == 0.0 or information.tool_rms(chosen) <= self.tool_std_m
+        return joints and tool
+
+
+@dataclass(frozen=True)
+class Design:
+    """Chosen configurations.
+
+    Attributes
+    ----------
+    chosen
+        Indices of the configurations, in no order.
+    reached
+        Whether the goal and the floors are reached.
+    """
+
+    chosen: tuple[int, ...]
+    reached: bool
+
+
+def choose(
+    information: DesignInformation,
+    travel: TravelTime,
+    goal: Goal,
+    rng: np.random.Generator,
+    floors: Floors = Floors(),
+    most: int = MOST_CONFIGURATIONS,
+    exchanges: int = MOST_EXCHANGES,
+) -> Design:
+    """Choose configurations.
+
+    Parameters
+    ----------
+    information
+        Of all that can be measured.
+    travel
+        What they cost.
+    goal, floors
+        What is to be reached.
+    rng
+        Which poses are tried in exchange.
+    most
+        Configurations chosen at most.
+    exchanges
+        Tried at most.
+    """
+    search = _Search(information, travel, goal, floors)
+    chosen = search.filled([], min(most, len(information)))
+    if not search.is_done(chosen):
+        return Design(tuple(chosen), reached=False)
+    best = search.thinned(chosen)
+    for _ in range(min(exchanges, EFFORT // len(best))):
+        tried = search.with_other_poses(best, rng)
+        if search.is_done(tried):
+            tried = search.thinned(tried)
+            if search.spent(tried) < search.spent(best) - WORTHWHILE_S:
+                best = tried
+    return Design(tuple(best), reached=True)
+
+
+class _Search:
+    """The criterion of candidates, and what they cost."""
+
+    def __init__(
+        self, information: DesignInformation, travel: TravelTime, goal: Goal, floors: Floors
+    ) -> None:
+        self._information, self._travel, self._goal = information, travel, goal
+        self._floors, self._root = floors, goal.weights(information)
+        self._near: dict[int, FloatArray] = {}
+
+    def _criteria(self, matrices: FloatArray) -> FloatArray:
+        """Return trace(L' M^-1 L) of information (..., f, f), (...)."""
+        finite = self._information.finite(matrices)
+        root = np.broadcast_to(self._root, (*finite.shape[:-2], *self._root.shape))
+        return np.einsum('ij,...ij->...', self._root, np.linalg.solve(finite, root))
+
+    def _with_each(self, chosen: Sequence[int], allowed: BoolArray) -> tuple[IntArray, FloatArray]:
+        """Return the configurations that promise the most, and the criterion with each, (m,)."""
+        information = self._information
+        allowed = allowed.copy()
+        allowed[np.array(chosen, dtype=np.int64)] = False
+        among = np.flatnonzero(allowed)
+        if len(among) > LOOKED_AT and len(chosen) > FIRST:
+            total = information.finite(information.total(chosen))
+            steps = np.asarray(np.linalg.solve(total, self._root), dtype=np.float64)
+            gains = information.gains(chosen, steps)[among] / self._times(chosen)[among] ** URGENCY
+            among = among[np.argpartition(-gains, LOOKED_AT)[:LOOKED_AT]]
+        return among, self._criteria(information.with_each(chosen, among))
+
+    def _times(self, chosen: Sequence[int]) -> FloatArray:
+        """Return what each configuration adds to the robot's time beside the chosen, s, (n,)."""
+        if not chosen:
+            return np.full(len(self._information), self._travel.measuring_s)
+        near = np.min([self._near_to(index) for index in chosen], axis=0)
+        return near + self._travel.measuring_s
+
+    def _near_to(self, index: int) -> FloatArray:
+        """Return the time from one configuration to each, s, (n,)."""
+        if index not in self._near:
+            q = self._information.q
+            self._near[index] = self._travel.straight(q[index], q)
+            # Its own place is no neighbour of it.
+            self._near[index][index] = np.inf
+        return self._near[index]
+
+    def is_done(self, chosen: Sequence[int]) -> bool:
+        return self._floors.hold(self._poses(chosen)) and self._goal.is_reached(
+            self._information, chosen
+        )
+
+    def _poses(self, chosen: Sequence[int]) -> IntArray:
+        """Return the pose of each of the chosen, (m,)."""
+        return self._information.pose[np.array(chosen, dtype=np.int64)]
+
+    def _best_addition(self, chosen: Sequence[int]) -> int:
+        """Return which configuration gains the most per second."""
+        allowed = np.ones(len(self._information), bool)
+        if chosen and self._goal.is_reached(self._information, chosen):
+            # Only the floors are missing.
+            poses, repeated, count = self._floor_counts(chosen)
+            new = (count == 0) & (poses < self._floors.poses)
+            second = (count == 1) & (repeated < self._floors.repeated)
+            allowed = new | second if np.any(new | second) else allowed
+        among, criteria = self._with_each(chosen, allowed)
+        now = self._criteria(self._information.total(chosen))
+        return int(
+            among[np.argmax(np.log(now / criteria) / self._times(chosen)[among] ** URGENCY)]
+        )
+
+    def _floor_counts(self, chosen: Sequence[int]) -> tuple[int, int, IntArray]:
+        """Return the poses, those with two, and how many are at each configuration's, (n,)."""
+        pose = self._information.pose
+        count = np.bincount(self._poses(chosen), minlength=int(pose.max()) + 1)
+        return int(np.sum(count > 0)), int(np.sum(count > 1)), count[pose]
+
+    def filled(self, chosen: Sequence[int], most: int) -> list[int]:
+        """Add what gains the most for its time until goal and floors are reached."""
+        chosen = list(chosen)
+        while len(chosen) < most and not self.is_done(chosen):
+            chosen.append(self._best_addition(chosen))
+        return chosen
+
+    def with_other_poses(self, chosen: Sequence[int], rng: np.random.Generator) -> list[int]:
+        """Bring a pose in with all its solutions, or leave a few out and fill up again."""
+        pose = self._information.pose
+        own = np.unique(self._poses(chosen))
+        if rng.random() < 0.5:
+            others = np.setdiff1d(pose, own)
+            if not len(others):
+                return list(chosen)
+            return [*chosen, *np.flatnonzero(pose == rng.choice(others)).tolist()]
+        out = rng.choice(own, rng.integers(1, max(2, min(5, len(own) // 3 + 1))), replace=False)
+        left = [index for index in chosen if pose[index] not in out]
+        return self.filled(left, len(chosen) + MOST_MORE)
+
+    def thinned(self, chosen: Sequence[int]) -> list[int]:
+        """Leave out one after the other while goal and floors are reached."""
+        chosen = list(chosen)
+        while True:
+            fewer = self._without_least(chosen)
+            if not self.is_done(fewer):
+                return chosen
+            chosen = fewer
+
+    def _without_least(self, chosen: Sequence[int]) -> list[int]:
+        """Leave out the one that tells the least for its time, the floors kept if possible."""
+        which = np.array(chosen, dtype=np.int64)
+        without = [[other for other in chosen if other != index] for index in chosen]
+        matrices = np.array([self._information.total(rest) for rest in without])
+        near = np.array([self._near_to(index)[which] for index in chosen])
+        spent = [
+            np.sum(np.min(np.delete(np.delete(near, i, 0), i, 1), axis=0))
+            for i in range(len(chosen))
+        ]
+        measuring = (len(chosen) - 1) * self._travel.measuring_s
+        cost = np.log(self._criteria(matrices)) + URGENCY * np.log(np.array(spent) + measuring)
+        kept = np.array([self._floors.hold(self._poses(rest)) for rest in without])
+        return without[int(np.argmin(np.where(kept | ~kept.any(), cost, np.inf)))]
+
+    def spent(self, chosen: Sequence[int]) -> float:
+        """Return about how long the robot takes, s: each is reached from the nearest other one."""
+        which = np.array(chosen, dtype=np.int64)
+        near = np.min([self._near_to(index)[which] for index in chosen], axis=0)
+        return float(np.sum(near)) + len(chosen) * self._travel.measuring_s

@@ -1,0 +1,116 @@
+"""How long an arm takes from one configuration to another, and for a whole tour.
+
+The lines are those of `motion.trajectory`, at the speeds of the motion gate; here the same is
+computed for many pairs at a time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.kinematics.collision import CollisionModel
+from remaster_ros.motion.limits import ACCELERATION, MotionLimits
+from remaster_ros.motion.path_check import PointSpeeds
+from remaster_ros.motion.trajectory import HEADROOM, RAMP_S, STOPPABLE, Trajectory, plan_trajectory
+from remaster_ros.types import FloatArray
+
+SPEED_SHARE = 0.3
+"""Where nothing else is stated the arm moves and measures as bridge and recorder do by default."""
+SETTLE_S = 3.0
+DWELL_S = 0.5
+SAMPLES = 5
+"""Where on a line the speed of the fastest point is looked at."""
+
+
+@dataclass(frozen=True, eq=False)
+class TravelTime:
+    """Times of motion and of measuring.
+
+    Attributes
+    ----------
+    limits
+        Speeds and accelerations of the bridge.
+    speeds
+        Of the fastest point of arm and tool.
+    settle_s, dwell_s
+        How long the arm stands still before a reading, and the reading takes, s.
+    """
+
+    limits: MotionLimits
+    speeds: PointSpeeds
+    settle_s: float = SETTLE_S
+    dwell_s: float = DWELL_S
+
+    @classmethod
+    def of(
+        cls,
+        model: CollisionModel,
+        speed_share: float = SPEED_SHARE,
+        tool_speed: float = np.inf,
+        acceleration: FloatArray | float = ACCELERATION,
+        settle_s: float = SETTLE_S,
+        dwell_s: float = DWELL_S,
+    ) -> TravelTime:
+        """Return the times of an arm.
+
+        Parameters
+        ----------
+        model
+            The arm and its tool.
+        speed_share
+            Share of each joint's velocity limit that is used.
+        tool_speed
+            Largest speed of the fastest point of arm and tool, m/s; infinite for none.
+        acceleration
+            Largest joint acceleration, rad/s², for all joints or (k,).
+        settle_s, dwell_s
+            See the attributes.
+        """
+        limits = MotionLimits.of(
+            model.chain, speed_share, acceleration=acceleration, tool_speed=tool_speed
+        )
+        speeds = PointSpeeds(model.chain, model.extent_points)
+        return cls(limits, speeds, settle_s, dwell_s)
+
+    @property
+    def measuring_s(self) -> float:
+        """Time at a configuration, s."""
+        return self.settle_s + self.dwell_s
+
+    def straight(self, start: FloatArray, ends: FloatArray) -> FloatArray:
+        """Return the time of the straight line from one configuration to each of n others, s.
+
+        Parameters
+        ----------
+        start, ends
+            rad, (k,) and (n, k).
+        """
+        way = ends - start
+        size = np.maximum(np.abs(way), 1e-12)
+        speeds = np.minimum(self.limits.velocity, STOPPABLE * self.limits.acceleration * RAMP_S)
+        rate = np.min(speeds / size, axis=1)
+        if np.isfinite(self.limits.tool_speed):
+            at = np.linspace(0.0, 1.0, SAMPLES)[:, None, None]
+            q = (start + at * way).reshape(-1, len(start))
+            fastest = self.speeds.fastest(q, np.tile(way, (SAMPLES, 1))).reshape(SAMPLES, -1)
+            peak = np.maximum(fastest.max(axis=0), 1e-12)
+            rate = np.minimum(rate, self.limits.tool_speed / peak)
+        return 1.0 / np.minimum(HEADROOM * rate, 1.0 / RAMP_S) + RAMP_S
+
+    def between(self, q: FloatArray) -> FloatArray:
+        """Return the times of the straight lines from each to each, s, (n, n), q is (n, k)."""
+        return np.array([self.straight(start, q) for start in q])
+
+    def along(self, points: FloatArray) -> float:
+        """Return the time along a polyline (n + 1, k), with the rests between its lines, s."""
+        return self.trajectory(points)[0].duration_s
+
+    def trajectory(self, points: FloatArray) -> tuple[Trajectory, float]:
+        """Return the trajectory along a polyline (n + 1, k), and the tool's largest speed, m/s."""
+        peaks = self.speeds.peaks_m(points)
+        limited = peaks if np.isfinite(self.limits.tool_speed) else ()
+        trajectory = plan_trajectory(self.limits, points, limited)
+        rates = [line.rate for line in trajectory.lines]
+        return trajectory, float(np.max(np.multiply(peaks, rates)))

@@ -1,0 +1,95 @@
+"""A planned collection as JSON and as text."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.planning.collection_plan import CollectionPlan
+from remaster_ros.planning.planned_design import DesignSettings
+
+FITTED, HELD_OUT = 'optimization', 'validation'
+
+
+def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
+    """Return what ``remaster plan --json`` prints.
+
+    ``dropped`` counts poses that lost all their solutions, ``dropped_configurations`` solutions.
+    ``expected_tool_std_mm`` is the root mean square of the 3-D error of the predicted markers.
+    """
+    visits = Counter(visit.split for visit in plan.visits)
+    design = plan.designed
+    return {
+        'configurations': len(plan.visits),
+        'poses': sum(plan.tour.poses.values()),
+        'dropped': dict(plan.tour.dropped),
+        'robot_time_s': round(plan.robot_time_s, 1),
+        'expected_std_deg': {
+            name: None if std is None else float(np.degrees(std))
+            for name, std in plan.joint_std.items()
+        },
+        'expected_tool_std_mm': plan.tool_rms * 1e3,
+        'max_tool_speed_m_s': round(plan.max_tool_speed_m_s, 4),
+        'splits': {
+            split: {'poses': plan.tour.poses.get(split, plan.tour.references), 'visits': count}
+            for split, count in visits.items()
+        },
+        'dropped_configurations': plan.dropped,
+        'expected_rms_std_deg': float(np.degrees(plan.joint_rms)),
+        'goal': None
+        if design is None
+        else {
+            'rms_std_deg': float(np.degrees(design.goal.joint_std_rad)),
+            'tool_std_mm': design.goal.tool_std_m * 1e3,
+            'tool_share': design.goal.tool_share,
+            'reached': design.reached,
+        },
+    }
+
+
+def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
+    """Return the same for people, one subject a line."""
+    visits = Counter(visit.split for visit in plan.visits)
+    minutes = plan.robot_time_s / 60
+    poses = plan.tour.poses
+    lines = [
+        f'to fit: {visits[FITTED]} configurations at {poses[FITTED]} poses'
+        + (', chosen for what they tell' if settings.optimal else ' of a Latin hypercube'),
+        f'held out: {visits[HELD_OUT]} configurations at {poses.get(HELD_OUT, 0)} poses',
+    ]
+    if plan.tour.references:
+        lines.append(
+            f'references: {plan.tour.references} configurations, {visits["reference"]} visits'
+        )
+    lines += [
+        f'dropped poses: {_counts(plan.tour.dropped)}',
+        f'dropped configurations: {_counts(plan.dropped)}',
+        f'robot time: {minutes:.1f} min, fastest point at {plan.max_tool_speed_m_s:.2f} m/s',
+        'expected standard deviation of the offsets:',
+    ]
+    for name, std in plan.joint_std.items():
+        value = 'not identifiable' if std is None else f'{np.degrees(std):.4f} deg'
+        lines.append(f'  {name:20s} {value}')
+    lines.append(f'  {"root mean square":20s} {np.degrees(plan.joint_rms):.4f} deg')
+    lines.append(f'expected error of the predicted markers: {plan.tool_rms * 1e3:.3f} mm (RMS)')
+    if plan.designed is not None and not plan.designed.reached:
+        lines.append(_missed(plan))
+    return '\n'.join(lines)
+
+
+def _missed(plan: CollectionPlan) -> str:
+    assert plan.designed is not None
+    goal = plan.designed.goal
+    return (
+        f'not reached: {np.degrees(goal.joint_std_rad):.4f} deg for the offsets or '
+        f'{goal.tool_std_m * 1e3:.3f} mm for the tool, with the poses that a search for causes '
+        'needs; wider ranges under poses, further values in held_values_deg or a longer lever of '
+        'the marker would help'
+    )
+
+
+def _counts(counts: dict[str, int] | Counter[str]) -> str:
+    ordered = Counter(counts).most_common()
+    return ', '.join(f'{count} {reason}' for reason, count in ordered) or 'none'

@@ -1,0 +1,214 @@
+"""The text of a new cell file: every key with what it means, and why it is proposed so."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from textwrap import wrap
+
+import numpy as np
+
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.planning.candidates import PoseRanges
+from remaster_ros.planning.cell_proposal import HeldJoint, Reach
+from remaster_ros.session.safe_yaml import load_yaml
+
+_PLAIN = re.compile(r'[A-Za-z/.][\w./+-]*')
+
+
+@dataclass(frozen=True)
+class NewSensor:
+    """A sensor of a new cell; see `session.workcell.CellSensor`."""
+
+    marker: str
+    topic: str
+    single_shot: bool
+    measure_service: str
+    max_angle_deg: float
+    why: str
+
+
+SENSORS = {
+    'tracker': NewSensor(
+        'smr', 'laser_tracker/marker', True, 'laser_tracker/measure', 25.0, 'a retroreflector'
+    ),
+    'mocap': NewSensor(
+        'sir', 'optitrack/marker', False, '', 60.0, 'a sphere is seen from far round'
+    ),
+}
+
+
+@dataclass(frozen=True)
+class CellProposal:
+    """What `cell_text` writes.
+
+    Attributes
+    ----------
+    urdf
+        As the cell file is to name it.
+    tips
+        Links that may be the tool frame, the proposed one first.
+    sensor_R
+        Rough place of the sensors in the base, m, (3,).
+    sensors
+        Names among `SENSORS`.
+    mesh_path
+        Folders in which the meshes were found.
+    missing_meshes
+        Those that were not.
+    kept
+        What became of poses everywhere around the arm, for people; '' before it is known.
+    marker_z
+        Where the markers are along the tool's Z axis, m.
+    """
+
+    source: str
+    urdf: str
+    chain: SerialChain
+    tips: Sequence[str]
+    held: HeldJoint
+    reach: Reach
+    ranges: PoseRanges
+    kept: str
+    marker_z: float
+    sensor_R: Sequence[float]
+    sensors: Sequence[str]
+    mesh_path: Sequence[str]
+    missing_meshes: Sequence[str]
+    floor_z: float | None
+
+
+def cell_text(p: CellProposal) -> str:
+    """Return the YAML text of a cell file."""
+    chain, ranges = p.chain, p.ranges
+    others = ', '.join(tip for tip in p.tips if tip != chain.tip_link)
+    limits = ', '.join(
+        f'{name} {_limit(low)} to {_limit(high)}'
+        for name, low, high in zip(chain.joint_names, chain.lower, chain.upper)
+    )
+    azimuth = np.degrees(ranges.azimuth_rad)
+    azimuth = np.degrees(ranges.azimuth_rad)
+    parts = [
+        *_comment(
+            f'A cell for {chain.name}, proposed by "remaster init {p.source}". Lines marked CHECK '
+            'need your eyes: what they state cannot be read from a robot description. Lengths in '
+            'metres; angles in degrees where the name has deg. Every key: config/cells/demo.yaml.'
+        ),
+        '',
+        *_comment(
+            'The markers are in the frame of tip_link; its Z axis faces the sensor.'
+            + (f' Other links behind the last joint: {others}.' if others else '')
+        ),
+        *_comment(f'Joints between base_link and tip_link, limits in degrees: {limits}.'),
+        'robot:',
+        f'  urdf: {_value(p.urdf)}   # relative to this file',
+        f'  base_link: {_value(chain.base_link)}',
+        f'  tip_link: {_value(chain.tip_link)}',
+        '',
+        *_held_lines(p),
+        '',
+        *_comment(
+            'CHECK: nominal marker positions in tip_link, and how well they are known per axis. '
+            'Proposed: in front of the last link.'
+        ),
+        'markers:',
+        *(f'  {SENSORS[name].marker}: [0.0, 0.0, {p.marker_z:.2f}]' for name in p.sensors),
+        'marker_std_m: 0.002',
+        '',
+        *_comment(
+            'CHECK: where a sensor stands, in base_link; 0.3 m is good enough. It turns the tool '
+            'to it for the first three poses, after which the place is measured. Proposed: in '
+            f'front of the arm, which reaches {p.reach.reach_m:.2f} m.'
+        ),
+        'sensors:',
+        *(line for name in p.sensors for line in _sensor_lines(name, p.sensor_R)),
+        '',
+        *_comment("The tool's Z axis points at this sensor."),
+        f'aim_at: {p.sensors[0]}',
+        '',
+        *_comment(
+            'CHECK that this space is free: ranges of the poses, about the Z axis of base_link. '
+            + p.kept
+        ),
+        'poses:',
+        f'  azimuth_deg: [{azimuth[0]:.1f}, {azimuth[1]:.1f}]',
+        f'  radius_m: [{ranges.radius_m[0]:.2f}, {ranges.radius_m[1]:.2f}]',
+        f'  height_m: [{ranges.height_m[0]:.2f}, {ranges.height_m[1]:.2f}]',
+        '  roll_deg: [0.0, 360.0]',
+        '',
+        *_comment('CHECK: what the arm must not hit. Boxes in base_link, by name:'),
+        '#   table: {center_m: [0.8, 0.0, 0.2], size_m: [0.5, 1.0, 0.4], yaw_deg: 15.0}',
+        'obstacles: {}',
+        *_comment('In base_link; null where there is none (an arm that hangs).'),
+        f'floor_z_m: {_value(p.floor_z)}',
+        *_comment('CHECK: parts of the tool that the robot description has not, in tip_link:'),
+        '#   plate: {size_m: [0.2, 0.04, 0.01], center_m: [0.0, 0.0, 0.005]}',
+        'tool: {}',
+        '',
+        *_mesh_lines(p),
+        '',
+    ]
+    return '\n'.join(parts)
+
+
+def _held_lines(p: CellProposal) -> list[str]:
+    held, chain = p.held, p.chain
+    if held.joint is None:
+        text = f'no joint is held. A pose has {held.solutions:.1f} joint solutions on average.'
+        return [*_comment(f'Six joints: {text}'), "held_joint: ''"]
+    tried = ', '.join(
+        f'{name} {count:.1f}' if isinstance(count, float) else f'{name} none (no closed form)'
+        for name, count in held.tried.items()
+    )
+    return [
+        *_comment(
+            'Seven joints leave one free: this one is held, which gives poses the most joint '
+            f'solutions. Tried, solutions of a pose on average: {tried}. Several values give more '
+            'poses, and determine the offset of this joint better.'
+        ),
+        f'held_joint: {_value(chain.joint_names[held.joint])}',
+        f'held_values_deg: [{", ".join(f"{np.degrees(value):.1f}" for value in held.values_rad)}]',
+    ]
+
+
+def _sensor_lines(name: str, place: Sequence[float]) -> list[str]:
+    sensor = SENSORS[name]
+    service = [f'    measure_service: {sensor.measure_service}'] if sensor.measure_service else []
+    return [
+        f'  {name}:',
+        f'    marker: {sensor.marker}',
+        f'    topic: {sensor.topic}',
+        f'    single_shot: {_value(sensor.single_shot)}',
+        *service,
+        f'    rough_position_m: [{", ".join(f"{value:.1f}" for value in place)}]',
+        f'    max_angle_deg: {sensor.max_angle_deg}   # {sensor.why}',
+    ]
+
+
+def _mesh_lines(p: CellProposal) -> list[str]:
+    lines = _comment('Folders in which the meshes are that the robot description names.')
+    if p.missing_meshes:
+        lines += _comment(
+            'CHECK: these were not found; give the folder of their package here (--package-path):'
+        )
+        lines += [f'#   {name}' for name in p.missing_meshes]
+    if not p.mesh_path:
+        return [*lines, 'mesh_path: []']
+    return [*lines, 'mesh_path:', *(f'  - {_value(folder)}' for folder in p.mesh_path)]
+
+
+def _comment(text: str) -> list[str]:
+    return [f'# {line}' for line in wrap(text, 97, break_long_words=False)]
+
+
+def _limit(angle: float) -> str:
+    return f'{np.degrees(angle):.0f}' if np.isfinite(angle) else 'without end'
+
+
+def _value(value: str | float | bool | None) -> str:
+    """Return a value as YAML has it, quoted where it must be."""
+    if isinstance(value, str) and _PLAIN.fullmatch(value) and load_yaml(value) == value:
+        return value
+    return json.dumps(value)

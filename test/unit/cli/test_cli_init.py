@@ -1,0 +1,172 @@
+"""Robot descriptions become cell files in which poses can be planned, without an edit."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from robot_descriptions import ROBOTS, Description, xarm7
+
+from remaster_ros.cli.main import main
+from remaster_ros.session.workcell import read_cell
+
+XACRO = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
+
+
+@pytest.fixture
+def do(tmp_path, capsys):
+    def run(*args, out='cell.yaml'):
+        capsys.readouterr()
+        status = main(['init', *map(str, args), '--out', str(tmp_path / out)])
+        printed = capsys.readouterr()
+        print(printed.out, printed.err)
+        return status, printed.out, printed.err
+
+    return run
+
+
+def written(folder, description: Description, name='robot.urdf'):
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(description.urdf)
+    return path
+
+
+@pytest.mark.parametrize(
+    ('robot', 'held'),
+    [
+        ('ur5e', ''),
+        ('irb120', ''),
+        ('panda', 'panda_joint5'),
+        ('iiwa14', 'lbr_A3'),
+        ('xarm7', 'joint5'),
+    ],
+)
+def test_known_arms_go_through_without_an_edit(robot, held, do, tmp_path):
+    description = {**ROBOTS, 'xarm7': xarm7}[robot]()
+    status, out, _ = do(written(tmp_path, description), '--json')
+    assert status == 0
+    found = json.loads(out)
+    assert (found['held_joint'] or '') == held
+    cell = read_cell(tmp_path / 'cell.yaml')
+    assert cell.held_joint == held
+    assert (cell.robot.base_link, cell.robot.tip_link) == (found['base_link'], found['tip_link'])
+    # The trial has 20 candidates to fit.
+    planned = int(found['trial'].split('planned ')[1].split()[0])
+    print(robot, found['trial'])
+    assert planned >= 3
+
+
+def test_the_held_joint_is_the_one_with_the_most_solutions(do, tmp_path):
+    assert do(written(tmp_path, ROBOTS['iiwa14']()))[0] == 0
+    text = (tmp_path / 'cell.yaml').read_text().replace('\n# ', ' ')
+    tried = dict(
+        part.rsplit(' ', 1)
+        for part in text.split('on average: ')[1].split('. Several')[0].split(', ')
+        if 'none' not in part
+    )
+    assert max(tried, key=lambda name: float(tried[name])) == 'lbr_A3'
+    assert 'lbr_A4 none (no closed form)' in text
+
+
+def macro(folder, description, package='my_arm'):
+    """Write a description in xacro, with an argument, as a package in a folder of another name."""
+    home = folder / 'src' / 'clone_of_it'
+    (home / 'urdf').mkdir(parents=True)
+    (home / 'package.xml').write_text(f'<package><name>{package}</name></package>')
+    body = description.urdf[
+        description.urdf.index('<material') : description.urdf.index('</robot>')
+    ]
+    (home / 'urdf' / 'arm.xacro').write_text(f'<robot {XACRO}>{body}</robot>')
+    (home / 'urdf' / 'robot.urdf.xacro').write_text(
+        f'<robot name="$(arg name)" {XACRO}>'
+        f'<xacro:include filename="$(find {package})/urdf/arm.xacro"/></robot>'
+    )
+    return home / 'urdf' / 'robot.urdf.xacro'
+
+
+def test_xacro_is_expanded_beside_the_cell_with_packages_found_by_their_name(do, tmp_path):
+    path = macro(tmp_path, ROBOTS['irb120']())
+    status, _, error = do(path)
+    assert status == 2
+    assert 'Undefined substitution argument name; give it behind the file: name:=VALUE' in error
+    status, _, _ = do(path, 'name:=mine')
+    assert status == 0
+    cell = read_cell(tmp_path / 'cell.yaml')
+    assert cell.robot.urdf == 'robot.urdf'
+    assert cell.chain().name == 'mine'
+    assert 'xacro:' not in cell.urdf_text.split('-->', 1)[1]
+
+
+def test_a_package_that_is_elsewhere_is_asked_for_and_found(do, tmp_path):
+    path = macro(tmp_path, ROBOTS['irb120']())
+    elsewhere = tmp_path / 'elsewhere'
+    (tmp_path / 'src' / 'clone_of_it').rename(elsewhere)
+    apart = tmp_path / 'apart' / 'robot.urdf.xacro'
+    apart.parent.mkdir()
+    (elsewhere / 'urdf' / path.name).rename(apart)
+    (elsewhere / 'package.xml').rename(elsewhere / 'package.xml.off')
+    status, _, error = do(apart, 'name:=mine')
+    assert status == 2
+    assert 'it needs the ROS package my_arm' in error
+    assert '--package-path' in error
+    (elsewhere / 'package.xml.off').rename(elsewhere / 'package.xml')
+    assert do(apart, 'name:=mine', '--package-path', elsewhere)[0] == 0
+
+
+def test_meshes_are_found_or_named(do, tmp_path):
+    description = ROBOTS['irb120']()
+    mesh = '<geometry><mesh filename="package://abb/meshes/{}.stl"/></geometry>'
+    cylinder = '<geometry><cylinder radius="0.06" length="0.2"/></geometry>'
+    urdf = description.urdf.replace(cylinder, mesh.format('part'), 1)
+    assert urdf != description.urdf
+    robot = tmp_path / 'robots' / 'robot.urdf'
+    robot.parent.mkdir()
+    robot.write_text(urdf)
+    status, out, _ = do(robot)
+    assert status == 0
+    assert '1 meshes were not found, such as package://abb/meshes/part.stl' in out
+    assert '#   package://abb/meshes/part.stl' in (tmp_path / 'cell.yaml').read_text()
+
+    import trimesh
+
+    folder = tmp_path / 'workspace' / 'abb' / 'meshes'
+    folder.mkdir(parents=True)
+    trimesh.creation.box((0.1, 0.1, 0.2)).export(folder / 'part.stl')
+    status, out, _ = do(robot, '--package-path', tmp_path / 'workspace', out='found.yaml')
+    assert 'not found' not in out
+    cell = read_cell(tmp_path / 'found.yaml')
+    assert cell.mesh_path == [str(tmp_path / 'workspace')]
+    cell.collision_model(cell.chain())
+
+
+def test_what_cannot_be_is_refused_in_one_line(do, tmp_path):
+    robot = written(tmp_path, ROBOTS['irb120']())
+    for args, words in (
+        ([robot, '--tip-link', 'tool'], "there is no link 'tool'; it has base_link"),
+        ([robot, '--tip-link', 'link_5'], 'has 5 joints between'),
+        ([robot, '--sensors', 'traker'], "did you mean 'tracker'?"),
+        ([robot, 'name=x'], "'name=x' is not NAME:=VALUE"),
+        ([tmp_path / 'nothing.urdf'], 'no such file'),
+    ):
+        status, _, error = do(*args)
+        assert status == 2
+        assert error.count('\n') == 1
+        assert words in error
+        assert not (tmp_path / 'cell.yaml').exists()
+    assert do(robot)[0] == 0
+    status, _, error = do(robot)
+    assert status == 2
+    assert 'already there, and not overwritten' in error
+
+
+def test_a_place_and_both_sensors_can_be_told(do, tmp_path):
+    robot = written(tmp_path, ROBOTS['ur5e']())
+    status, _, _ = do(robot, '--sensors', 'mocap,tracker', '--sensor-at', 0, -2.5, 1, '--no-floor')
+    assert status == 0
+    cell = read_cell(tmp_path / 'cell.yaml')
+    assert list(cell.sensors) == ['mocap', 'tracker']
+    assert cell.aim_at == 'mocap'
+    np.testing.assert_allclose(cell.sensors['mocap'].rough_position_m, [0.0, -2.5, 1.0])
+    assert cell.floor_z_m is None

@@ -1,0 +1,112 @@
+"""`remaster plan`: what is printed, as text and as JSON, and what is refused."""
+
+import json
+
+import pytest
+
+from remaster_ros.cli import main as cli
+from remaster_ros.planning import planned_design, pose_design
+from remaster_ros.session.workcell import config_path
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    monkeypatch.setattr(planned_design, 'POOL_CANDIDATES', 60)
+    monkeypatch.setattr(pose_design, 'EFFORT', 300)
+
+
+def cell_with(folder, poses):
+    text = config_path('cells/demo.yaml').read_text(encoding='utf-8')
+    text = text.replace('../robots', str(config_path('robots')))
+    path = folder / 'cell.yaml'
+    path.write_text(text.replace('poses:\n', f'poses:\n{poses}', 1), encoding='utf-8')
+    return path
+
+
+def run(capsys, *args):
+    status = cli.main(['plan', *map(str, args)])
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+def as_json(capsys, *args):
+    status, out, err = run(capsys, *args, '--json')
+    assert (status, err) == (0, '')
+    return json.loads(out)
+
+
+FEW = ('--poses', 16, '--validation', 16)
+
+
+def test_the_object_says_what_is_planned(capsys):
+    found = as_json(capsys, 'demo', *FEW, '--reference-every', 0)
+    assert found['poses'] == sum(part['poses'] for part in found['splits'].values())
+    assert found['configurations'] == sum(part['visits'] for part in found['splits'].values())
+    assert found['poses'] + sum(found['dropped'].values()) == 32
+    assert found['goal'] is None
+    std = found['expected_std_deg']
+    assert list(std) == [f'joint_{i}' for i in range(1, 8)]
+    assert std['joint_1'] is None
+    assert 0.0 < std['joint_2'] < 0.1
+    assert 0.0 < found['expected_tool_std_mm'] < 1.0
+    assert found['max_tool_speed_m_s'] <= 0.25
+    assert found['robot_time_s'] > 3.5 * found['configurations']
+
+
+def test_an_optimal_design_is_as_precise_in_less_time(tmp_path, capsys):
+    whole = as_json(capsys, 'demo', *FEW)
+    path = cell_with(tmp_path, '  design: optimal\n  order: fastest\n')
+    optimal = as_json(capsys, path, *FEW)
+    assert optimal['goal']['reached']
+    assert optimal['expected_rms_std_deg'] <= whole['expected_rms_std_deg'] * 1.0001
+    assert optimal['configurations'] < whole['configurations']
+    assert optimal['robot_time_s'] < whole['robot_time_s']
+    assert optimal['dropped']['not needed by the design'] > 0
+
+
+def test_people_read_a_subject_a_line(capsys):
+    status, out, err = run(capsys, 'demo', *FEW)
+    assert (status, err) == (0, '')
+    for words in ('to fit: ', 'held out: ', 'references: ', 'dropped poses: ', 'robot time: '):
+        assert words in out
+    assert 'joint_1              not identifiable' in out
+    assert run(capsys, 'demo', *FEW, '--quiet')[1] == ''
+
+
+def test_the_time_is_that_of_the_stated_speeds(capsys):
+    slow = as_json(capsys, 'demo', *FEW)
+    fast = as_json(capsys, 'demo', *FEW, '--cartesian-speed-limit', 0)
+    assert fast['robot_time_s'] < slow['robot_time_s']
+    assert fast['max_tool_speed_m_s'] > 0.25
+    patient = as_json(capsys, 'demo', *FEW, '--settle', 5)
+    more = patient['robot_time_s'] - slow['robot_time_s']
+    assert more == pytest.approx(2.0 * slow['configurations'], abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ('poses', 'status', 'words'),
+    [
+        ('  design: best\n', 2, 'poses.design'),
+        (
+            '  design: optimal\n  tool_box: {center_m: [3, 0, 0], size_m: [1, 1, 1]}\n',
+            2,
+            'no configuration has the tool in the box',
+        ),
+    ],
+)
+def test_a_wrong_cell_is_one_line(tmp_path, capsys, poses, status, words):
+    found, out, err = run(capsys, cell_with(tmp_path, poses), *FEW)
+    assert (found, out) == (status, '')
+    assert err.startswith('error: ')
+    assert words in err
+    assert err.count('\n') == 1
+
+
+def test_a_cell_without_reachable_poses_is_one_line(tmp_path, capsys):
+    path = cell_with(tmp_path, '')
+    text = path.read_text(encoding='utf-8')
+    path.write_text(text.replace('radius_m: [0.2, 0.5]', 'radius_m: [3.0, 3.5]'), encoding='utf-8')
+    status, out, err = run(capsys, path)
+    assert (status, out) == (1, '')
+    assert 'no pose is left to fit on' in err
+    assert err.count('\n') == 1

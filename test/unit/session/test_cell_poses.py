@@ -1,0 +1,80 @@
+"""The keys that choose poses: one clear line for each that is wrong."""
+
+import pytest
+
+from remaster_ros.errors import InputError
+from remaster_ros.session.workcell import config_path, read_cell
+
+
+def cell_file(folder, poses='', sensor=''):
+    text = config_path('cells/demo.yaml').read_text(encoding='utf-8')
+    robots = config_path('robots')
+    text = text.replace('../robots', str(robots)).replace('poses:\n', f'poses:\n{poses}', 1)
+    text = text.replace('    max_angle_deg: 60.0', f'{sensor}    max_angle_deg: 60.0', 1)
+    path = folder / 'cell.yaml'
+    path.write_text(text, encoding='utf-8')
+    return path
+
+
+@pytest.mark.parametrize(
+    ('poses', 'message'),
+    [
+        ('  design: best\n', "poses.design is 'best'; write latin_hypercube or optimal"),
+        ('  order: fast\n', "poses.order is 'fast'; write nearest or fastest"),
+        ('  tool_share: 0.5\n', 'poses.tool_share has no effect with design: latin_hypercube'),
+        ('  joint_std_deg: 0.003\n', 'poses.joint_std_deg has no effect with design'),
+        ('  design: optimal\n  tool_share: 2\n', 'poses.tool_share is 2; it must be from 0 to 1'),
+        ('  design: optimal\n  joint_std_deg: 0\n', 'poses.joint_std_deg is 0; it must be above'),
+        ('  design: optimal\n  tool_std_m: 0.0001\n', 'poses.tool_std_m has no effect with tool'),
+        (
+            '  design: optimal\n  tool_share: 1.0\n  joint_std_deg: 0.003\n',
+            'poses.joint_std_deg has no effect with tool_share: 1',
+        ),
+        (
+            '  design: optimal\n  tool_box: {center_m: [0.4, 0, 0.5], size_m: [0.2, 0, 0.2]}\n',
+            'poses.tool_box.size_m is 0; it must be above 0',
+        ),
+        ('  design: optimal\n  tool_std_m: 0.3\n', 'if millimetres were meant, write 0.0003'),
+    ],
+)
+def test_wrong_keys_are_one_line(tmp_path, poses, message):
+    with pytest.raises(InputError) as caught:
+        read_cell(cell_file(tmp_path, poses))
+    assert message in str(caught.value)
+    assert 'cell.yaml' in str(caught.value)
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('noise', ['noise_m: 0', 'noise_m: 0.1', 'pose_noise_m: -1'])
+def test_noise_that_cannot_be_is_one_line(tmp_path, noise):
+    with pytest.raises(InputError, match=r'sensors\.mocap.*noise_m is'):
+        read_cell(cell_file(tmp_path, sensor=f'    {noise}\n'))
+
+
+def test_keys_reach_the_design(tmp_path):
+    poses = (
+        '  design: optimal\n  order: fastest\n  tool_share: 0.25\n  joint_std_deg: 0.003\n'
+        '  tool_box: {center_m: [0.4, 0, 0.5], size_m: [0.2, 0.3, 0.2]}\n'
+    )
+    noise = '    noise_m: 0.0003\n    pose_noise_m: 0.003\n'
+    settings = read_cell(cell_file(tmp_path, poses, noise)).design_settings()
+    assert settings.optimal
+    assert settings.fastest
+    assert settings.tool_share == 0.25
+    assert settings.joint_std_rad == pytest.approx(5.236e-5, rel=1e-3)
+    assert settings.box is not None
+    assert settings.box.size_m.tolist() == [0.2, 0.3, 0.2]
+    bar, tracker = settings.sensors
+    assert (bar.sigma_m, bar.pose_sigma_m) == (3e-4, 3e-3)
+    assert (tracker.sigma_m, tracker.pose_sigma_m) == (1e-4, 2e-4)
+
+
+def test_a_plan_depends_on_the_keys_and_defaults_are_as_before(tmp_path):
+    plain = read_cell(cell_file(tmp_path)).fingerprint()
+    # Of the demo cell, before there were these keys.
+    assert read_cell('demo').fingerprint().startswith('d9d9704393f6')
+    stated = cell_file(tmp_path, '  design: latin_hypercube\n', '    noise_m: 1.0e-4\n')
+    assert read_cell(stated).fingerprint() == plain
+    assert read_cell(cell_file(tmp_path, '  order: fastest\n')).fingerprint() != plain
+    noisy = cell_file(tmp_path, sensor='    noise_m: 2.0e-4\n')
+    assert read_cell(noisy).fingerprint() != plain
