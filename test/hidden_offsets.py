@@ -52,7 +52,7 @@ def _same_as_offsets(world: HiddenWorld, tilt: HiddenEffect) -> FloatArray:
     left = responses - nuisance @ taken_up
     size, direction = np.linalg.eigh(left.T @ left)
     # Directions of which next to nothing is left; about the own axis it is the joint's own offset.
-    same = direction[:, size < 1e-6 * np.sum(responses**2)]
+    same = direction[:, size < 1e-4 * np.sum(responses**2)]
     steps = taken_up @ (same @ (same.T @ tilt.values)) / 1e-4
     found: FloatArray = steps[: world.arm.joints]
     return found
