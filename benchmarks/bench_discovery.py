@@ -226,7 +226,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or '').partition('\n')[0])
     parser.add_argument('--results', type=Path, default=Path('bench_discovery.jsonl'))
     parser.add_argument('--only', nargs='+', choices=tuple(GROUPS), default=list(GROUPS))
-    parser.add_argument('--kind', nargs='+', help='only sessions with these effects')
+    parser.add_argument(
+        '--kind', nargs='+', help='only sessions with these effects, or this noise'
+    )
     parser.add_argument('--count', type=int, help='sessions (of each kind) instead of all')
     parser.add_argument('--above', type=float, default=0.0, help='only larger multiples than this')
     parser.add_argument('--jobs', type=int, default=os.cpu_count())
@@ -237,7 +239,7 @@ def main() -> None:
         name: recipe
         for group in args.only
         for name, recipe in recipes(group, args.count or GROUPS[group].count)
-        if not args.kind or set(args.kind) & set(recipe.kinds)
+        if not args.kind or set(args.kind) & {*recipe.kinds, recipe.noise}
         if recipe.multiple > args.above or not recipe.kinds
     }
     if args.session:

@@ -13,6 +13,7 @@ pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
 from discovery_scenes import residuals_of
 from hidden_arm import PinocchioArm
 from hidden_judge import part_of
+from hidden_offsets import true_offsets
 from hidden_oracle import Oracle
 from hidden_tours import robot, visits, world
 from hidden_world import HiddenWorld, Noise
@@ -299,6 +300,20 @@ def test_a_third_set_is_of_the_same_arm_and_time(iiwa: HiddenWorld) -> None:
     seen = other.without_noise(()).measurements
     assert len(np.unique(seen.pose)) > 8
     assert not set(map(tuple, seen.q)) & set(map(tuple, iiwa.visits.q))
+
+
+def test_what_is_the_same_as_an_offset_counts_as_one() -> None:
+    """Axis 5 of the six-joint arm meets axis 4, so one of its tilts turns joint 4."""
+    hidden = world('six', np.random.default_rng(59))
+    tilt = HiddenEffect('joint_axis_tilt', (5,), np.array([1e-3, 0.0, 5e-4]))
+    scale = HiddenEffect('encoder_scale', (2,), np.array([1e-3]))
+    _, truth = hidden.measure((tilt, scale), Noise(), np.random.default_rng(61))
+    added = true_offsets(hidden, truth, set()) - truth.joint_offsets
+    fitted = hidden.visits.q[~hidden.visits.is_validation]
+    assert added[3] == pytest.approx(1e-3, abs=1e-5)
+    assert added[1] == pytest.approx(1e-3 * fitted[:, 1].mean(), abs=1e-5)
+    named = true_offsets(hidden, truth, {('encoder_scale', 2)}) - truth.joint_offsets
+    assert abs(named[1]) < 1e-5
 
 
 def test_noise_has_the_given_size_and_shape() -> None:
