@@ -10,8 +10,8 @@ what is missing is filled up, and again what is not needed is left out.
 Single configurations are not exchanged, as V. V. Fedorov's and T. J. Mitchell's (DETMAX)
 algorithms do: the error that the configurations of a pose share makes the first of a pose tell
 little, and all of them together much, so that such exchanges end in poor local optima. For the
-same reason the information of configurations does not add up, and designs by weights (convex
-relaxations) apply to whole poses only.
+same reason the information of configurations does not add up: a design by weights (convex
+relaxation) has to weigh subsets of the solutions of a pose. benchmarks/RESULTS.md compares them.
 """
 
 from __future__ import annotations

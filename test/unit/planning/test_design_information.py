@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from designed_sessions import MARKER_STD, measured
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.model import predict_in_sensor
@@ -18,11 +19,10 @@ from remaster_ros.planning.expected_sensors import (
     nominal_model,
 )
 from remaster_ros.session.workcell import read_cell
-from remaster_ros.types import Priors, Session
+from remaster_ros.types import Priors
 
 CELL = read_cell('demo')
 CHAIN = CELL.chain()
-MARKER_STD = 0.5e-3
 
 
 def planned(count, seed=1):
@@ -121,30 +121,6 @@ def test_a_repeat_at_a_pose_tells_less_than_the_same_at_another_pose():
     assert loss.max() > 0
 
 
-def measured(q, pose, expected, rng):
-    """Return a session of these configurations with that noise."""
-    model, x = nominal_model(CHAIN, q, expected, Priors())
-    rows = expected_measurements(model, q, pose, expected)
-    markers = model.markers(x)
-    offsets = np.radians(0.2) * rng.standard_normal(7)
-    points = predict_in_sensor(CHAIN, rows, offsets, model.reference, markers)
-    for index, sensor in enumerate(expected):
-        mine = np.flatnonzero(rows.sensor == index)
-        common = sensor.pose_sigma_m * rng.standard_normal((pose.max() + 1, 3))
-        points[mine] += common[rows.pose[mine]]
-        points[mine] += sensor.sigma_m * rng.standard_normal((len(mine), 3))
-    session = Session(
-        urdf=CELL.urdf_text,
-        base_link=CHAIN.base_link,
-        tip_link=CHAIN.tip_link,
-        markers=dict(zip(model.marker_names, markers)),
-        sensors={'bar': 'a', 'tracker': 'b'},
-        measurements=replace(rows, position=points),
-        marker_std_m=MARKER_STD,
-    )
-    return session, offsets
-
-
 def test_the_fit_states_the_standard_deviations_that_were_expected():
     expected = sensors()
     information = DesignInformation.of(CHAIN, POSES, expected, MARKER_STD)
@@ -154,7 +130,7 @@ def test_the_fit_states_the_standard_deviations_that_were_expected():
     rng = np.random.default_rng(5)
     ratios, errors = [], []
     for _ in range(12):
-        session, offsets = measured(q, pose, expected, rng)
+        session, offsets = measured(CHAIN, CELL.urdf_text, (q, pose), expected, rng)
         found = estimate(Problem.of(session))
         free = found.posterior.free.tolist()
         std = np.sqrt(np.diag(found.mode.covariance))
