@@ -26,7 +26,12 @@ from remaster_ros.planning.cell_proposal import (
     reach_of,
     widest_ranges,
 )
-from remaster_ros.session.cell_template import SENSORS, CellProposal, cell_text
+from remaster_ros.session.cell_template import (
+    LINK_RADIUS_M,
+    SENSORS,
+    CellProposal,
+    cell_text,
+)
 from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.session.meshes import find_mesh, mesh_reader
 from remaster_ros.session.robot_description import read_description
@@ -169,7 +174,7 @@ def _propose(
         reach=reach,
         ranges=ranges,
         kept='',
-        marker_z=marker_height(chain, bodies),
+        marker_z=marker_height(chain, bodies, LINK_RADIUS_M),
         sensor_R=place,
         sensors=args.sensors,
         mesh_path=found,
