@@ -70,6 +70,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     arm = parser.add_argument_group('corrections of the joints, by column or joint')
     arm.add_argument(
+        '--couple',
+        metavar='JOINT=JOINT',
+        type=_couple,
+        action='append',
+        default=[],
+        help='add a joint to another (J3=J2 on FANUC; J3=-J2 subtracts); before the next two',
+    )
+    arm.add_argument(
         '--reverse', metavar='JOINT,…', type=names, default=(), help='counts the other way round'
     )
     arm.add_argument(
@@ -111,6 +119,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     session.add_argument(
         '--unchecked', action='store_true', help='write it also where it does not fit the robot'
     )
+
+
+def _couple(text: str) -> tuple[str, tuple[str, float]]:
+    """Argument type: a joint, and one that is added to it or subtracted."""
+    name, sign, other = text.partition('=')
+    if not (name and sign and other.lstrip('+-')):
+        raise argparse.ArgumentTypeError(f'{text!r} is not JOINT=JOINT, such as J3=J2')
+    return name, (other.lstrip('+-'), -1.0 if other.startswith('-') else 1.0)
 
 
 def _offset(text: str) -> tuple[str, float]:
@@ -179,6 +195,7 @@ def _read(args: argparse.Namespace, chain: SerialChain) -> RawRows:
 
 def _session_options(args: argparse.Namespace) -> SessionOptions:
     return SessionOptions(
+        couple=dict(args.couple),
         reverse=args.reverse,
         add_rad={name: np.radians(angle) for name, angle in args.offset},
         sensor=args.sensor,

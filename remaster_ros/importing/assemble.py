@@ -37,8 +37,9 @@ class SessionOptions:
 
     Attributes
     ----------
-    reverse, add_rad, order
-        Corrections of the joints by column: signs that are reversed, and angles added, rad.
+    couple, reverse, add_rad
+        Corrections of the joints by column, in this order: another joint that is added, with its
+        sign; signs that are reversed; angles added, rad.
     marker_m, marker_std_m
         Where the marker is in the tool frame, m; None where nothing is known.
     hold_out
@@ -47,6 +48,7 @@ class SessionOptions:
         Whether each row's configuration was reached from that of the row before.
     """
 
+    couple: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     reverse: tuple[str, ...] = ()
     add_rad: Mapping[str, float] = field(default_factory=dict)
     sensor: str = 'sensor'
@@ -60,6 +62,9 @@ class SessionOptions:
 def corrected(rows: RawRows, chain: SerialChain, options: SessionOptions) -> FloatArray:
     """Return the joint angles with the corrections that were told, rad, (n, k)."""
     q = rows.q.copy()
+    for name, (other, sign) in options.couple.items():
+        added = rows.q[:, _joint(other, rows, chain, '--couple')]
+        q[:, _joint(name, rows, chain, '--couple')] += sign * added
     for name in options.reverse:
         q[:, _joint(name, rows, chain, '--reverse')] *= -1.0
     for name, angle in options.add_rad.items():

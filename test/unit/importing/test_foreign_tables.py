@@ -59,8 +59,8 @@ def test_degrees_millimetres_decimal_commas(arm, do, tmp_path):
     status, out, _, session = do(path)
     assert status == 0
     assert 'semicolons between the columns, decimal comma, CP1252' in out
-    assert 'A3 [°]  joint 3 (joint_3), deg, header' in out
-    assert 'Y [mm]  y of the marker, mm, header' in out
+    assert 'A3 [°]  joint 3 (joint_3), deg (header)' in out
+    assert 'Y [mm]  y of the marker, mm (header)' in out
     assert '10 of 40 poses held out' in out
     np.testing.assert_allclose(session.measurements.q, arm.q, atol=1e-8)
     np.testing.assert_allclose(session.measurements.position, arm.points, atol=1e-8)
@@ -104,8 +104,8 @@ def test_no_times_no_units_no_header(arm, do, tmp_path):
     status, out, _, session = do(write(tmp_path, 'table.txt', text([], columns, '  ')))
     assert status == 0
     assert 'no header' in out
-    assert 'rad, guessed, by its place' in out
-    assert 'm, guessed, by its place' in out
+    assert 'rad (guessed), by its place' in out
+    assert 'm (guessed), by its place' in out
     assert 'no times: causes driven by time are untestable' in out
     assert not session.timed
     assert_fits(session, arm)
@@ -157,7 +157,7 @@ def test_json_has_the_columns_and_the_hint(arm, do, tmp_path):
     assert status == 1
     assert found['session'] is None
     assert found['hint'].endswith('--reverse A2,A4')
-    assert found['columns']['A1'] == 'joint 1 (joint_1), deg, guessed'
+    assert found['columns']['A1'] == 'joint 1 (joint_1), deg (guessed)'
     assert found['columns']['remark'] == 'not used'
     status, out, _, session = do(path, '--json', '--unchecked')
     assert status == 0
