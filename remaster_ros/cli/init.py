@@ -116,6 +116,7 @@ def run(args: argparse.Namespace) -> int:
     show(args.quiet, _as_text(proposal))
     show(args.quiet, said)
     show(args.quiet, f'written: {args.out}; look at its lines marked CHECK')
+    show(args.quiet, f'go on with: remaster plan {args.out}')
     return 0
 
 
