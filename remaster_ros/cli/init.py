@@ -247,7 +247,8 @@ def _as_text(p: CellProposal) -> str:
     if p.missing_meshes:
         lines.append(
             f'warning: {len(p.missing_meshes)} meshes were not found, such as '
-            f'{p.missing_meshes[0]}; give the folder of the package with --package-path'
+            f'{p.missing_meshes[0]}; nothing is planned without them: give the folder of the '
+            'package with --package-path, or as mesh_path in the cell file'
         )
     return '\n'.join(lines)
 
