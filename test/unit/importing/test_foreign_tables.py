@@ -147,6 +147,31 @@ def test_a_wrong_tip_is_named_by_the_marker(arm, do, tmp_path):
     assert_fits(session, arm)
 
 
+def test_a_cell_file_has_robot_sensor_and_marker(arm, tmp_path, capsys):
+    (tmp_path / 'arm.urdf').write_text(arm.urdf)
+    cell = tmp_path / 'cell.yaml'
+    cell.write_text(
+        'robot: {urdf: arm.urdf, base_link: base_link, tip_link: tool0}\n'
+        f'markers: {{smr: {MARKER.tolist()}}}\n'
+        'marker_std_m: 0.001\n'
+        'sensors: {leica: {marker: smr, topic: t, rough_position_m: [2.0, 0.0, 0.5]}}\n'
+        'aim_at: leica\n'
+    )
+    header = [*joint_names(arm), 'X_mm', 'Y_mm', 'Z_mm']
+    path = write(tmp_path, 't.csv', text(header, [*degrees(arm), *(1e3 * arm.points.T)]))
+    out = tmp_path / 'session'
+    assert main(['import', str(path), '--cell', str(cell), '--out', str(out)]) == 0
+    session = read_session(out)
+    assert (session.sensors, session.tip_link) == ({'leica': 'smr'}, 'tool0')
+    np.testing.assert_allclose(session.markers['smr'], MARKER)
+    assert session.marker_std_m == 0.001
+    status = main(
+        ['import', str(path), '--cell', str(cell), '--out', f'{out}2', '--tip-link', 'link_6']
+    )
+    assert status == 1
+    assert 'with the tip link tool0 the marker is' in capsys.readouterr().err
+
+
 def test_json_has_the_columns_and_the_hint(arm, do, tmp_path):
     header = [*joint_names(arm), 'X', 'Y', 'Z', 'remark']
     reversed_ = arm.q * [1, -1, 1, -1, 1, 1]
