@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,6 +26,8 @@ HOLD_OUT_ONE_OF = 4
 FEWEST_POSES = 12
 # Where nothing is known of a marker's place (the session format's own advice).
 UNKNOWN_MARKER_STD_M = 0.3
+# 3 January 2000: times of day without a date do not reach it, nor do seconds since some start.
+FIRST_DATE_S = 946_684_800.0 + 2 * 86_400.0
 _SPLITS = {
     **dict.fromkeys(('optimization', 'fit', 'train', 'training', 'calibration', 'opt'), 0),
     **dict.fromkeys(('validation', 'test', 'held_out', 'holdout', 'val', 'check'), 1),
@@ -145,9 +148,18 @@ def assemble(
         marker_std_m=std if options.marker_std_m is None else options.marker_std_m,
         settle_s=None,
         timed=rows.stamp_s is not None,
+        exit_status='complete',
+        created=_date(rows),
         notes=notes,
     )
     return session, [how_pose, how_split]
+
+
+def _date(rows: RawRows) -> str:
+    """Return when the first row was measured, ISO 8601; '' where the times are not since 1970."""
+    if rows.stamp_s is None or rows.stamp_s[0] < FIRST_DATE_S:
+        return ''
+    return datetime.fromtimestamp(float(rows.stamp_s[0])).isoformat(timespec='seconds')
 
 
 def refuse_outside_limits(rows: RawRows, chain: SerialChain, q: FloatArray) -> None:

@@ -65,6 +65,7 @@ def test_degrees_millimetres_decimal_commas(arm, do, tmp_path):
     np.testing.assert_allclose(session.measurements.q, arm.q, atol=1e-8)
     np.testing.assert_allclose(session.measurements.position, arm.points, atol=1e-8)
     assert not session.timed
+    assert session.created == ''
     assert_fits(session, arm)
 
 
@@ -94,6 +95,8 @@ def test_a_trackers_export_and_the_joints_beside_it(arm, do, tmp_path):
     assert 'X           x of the marker, mm' in out.replace('points.txt: ', '')
     assert session.timed
     assert np.ptp(session.measurements.stamp_s) == 39 * 60
+    assert session.created == '2026-05-04T10:00:30'
+    assert session.exit_status == 'complete'
     np.testing.assert_allclose(session.measurements.q, arm.q[order], atol=1e-8)
     assert_fits(session, arm)
 
