@@ -60,6 +60,9 @@ class Arrangement:
         What is added to each joint, in quarters of a turn.
     angle_scale
         What the angles are multiplied by.
+    coupled
+        What joint 3 takes of joint 2: 1 or -1 on arms that count it from the horizontal (FANUC,
+        and arms with a parallelogram), else 0.
     mirrored
         True where X and Y of the points are exchanged.
     length_scale
@@ -72,6 +75,7 @@ class Arrangement:
     signs: tuple[int, ...]
     quarters: tuple[int, ...]
     angle_scale: float = 1.0
+    coupled: int = 0
     mirrored: bool = False
     length_scale: float = 1.0
     shift: int = 0
@@ -90,6 +94,7 @@ class Arrangement:
             + sum(sign < 0 for sign in self.signs)
             + sum(turn != 0 for turn in self.quarters)
             + (self.angle_scale != 1.0)
+            + abs(self.coupled)
             # Rarer than one reversed joint.
             + 2 * self.mirrored
             + (self.length_scale != 1.0)
@@ -98,8 +103,10 @@ class Arrangement:
 
     def joints(self, columns: FloatArray) -> FloatArray:
         """Return the robot's joint angles, rad, (n, k), of the columns (n, k)."""
-        turned = columns[:, list(self.order)] * self.angle_scale * np.array(self.signs)
-        return turned + _QUARTER * np.array(self.quarters)
+        turned = columns[:, list(self.order)] * self.angle_scale
+        if self.coupled:
+            turned[:, 2] += self.coupled * turned[:, 1]
+        return turned * np.array(self.signs) + _QUARTER * np.array(self.quarters)
 
     def points(self, points: FloatArray) -> FloatArray:
         """Return the points, m, (n, 3), of the table's."""
@@ -244,7 +251,7 @@ def search(session: Session, given: Fitted, lengths: Sequence[float] = ()) -> li
     arm with some joints reversed.
 
     Simpler changes come first: units and signs, then the order, then zero positions by quarters of
-    a turn, then rows shifted by one; the last three with any signs.
+    a turn, then joint 3 coupled to joint 2, then rows shifted by one; all of them with any signs.
 
     Parameters
     ----------
@@ -295,6 +302,8 @@ def _stages(joints: int) -> Iterator[list[Arrangement]]:
     yield [
         replace(plain, signs=some, quarters=turns) for turns in _turns(joints) for some in signs
     ]
+    if joints > 2:
+        yield [replace(plain, signs=some, coupled=share) for share in (1, -1) for some in signs]
     yield [replace(plain, signs=some, shift=shift) for shift in (-1, 1) for some in signs]
 
 

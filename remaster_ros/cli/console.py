@@ -9,6 +9,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+# So long a stage has to run before it is told how long it still takes, s.
+LEAST_S = 1.0
+
 
 @contextmanager
 def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
@@ -38,10 +41,11 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
             nonlocal begun
             if stage != begun[0]:
                 begun = stage, time.monotonic()
-            left = ''
-            if share > 0.0:
-                seconds = (time.monotonic() - begun[1]) * (1.0 - share) / share
-                left = f'{100 * share:.0f} %, about {_duration(seconds)} left'
+            passed = time.monotonic() - begun[1]
+            left = f'{100 * share:.0f} %' if share > 0.0 else ''
+            # Of a stage that has only begun nothing can be told.
+            if share > 0.0 and passed > LEAST_S:
+                left += f', about {_duration(passed * (1.0 - share) / share)} left'
             total = 1.0 if share > 0.0 else None
             bar.update(task, description=stage, completed=share, total=total, left=left)
 

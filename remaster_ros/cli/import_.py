@@ -26,6 +26,7 @@ from remaster_ros.importing.sense import Sense, check_sense
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import write_session
+from remaster_ros.session.workcell import Workcell, read_cell
 from remaster_ros.types import Session
 
 SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'bar': '|', 'blank': ' '}
@@ -42,7 +43,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='a table with joints and points, or two to be joined; or a ROS bag',
     )
     parser.add_argument('--out', metavar='SESSION', type=Path, required=True, help='new folder')
-    parser.add_argument('--urdf', metavar='FILE', type=Path, required=True, help='the nominal arm')
+    robot = parser.add_mutually_exclusive_group(required=True)
+    robot.add_argument('--urdf', metavar='FILE', type=Path, help='the nominal arm')
+    robot.add_argument(
+        '--cell', metavar='CELL', help='a cell file: its arm, sensor (aim_at) and marker'
+    )
     parser.add_argument('--base-link', metavar='LINK', help='frame R (default: the root link)')
     parser.add_argument(
         '--tip-link', metavar='LINK', help='frame T, in which the marker is (default: proposed)'
@@ -70,6 +75,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     arm = parser.add_argument_group('corrections of the joints, by column or joint')
     arm.add_argument(
+        '--couple',
+        metavar='JOINT=JOINT',
+        type=_couple,
+        action='append',
+        default=[],
+        help='add a joint to another (J3=J2 on FANUC; J3=-J2 subtracts); before the next two',
+    )
+    arm.add_argument(
         '--reverse', metavar='JOINT,…', type=names, default=(), help='counts the other way round'
     )
     arm.add_argument(
@@ -81,8 +94,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='add an angle to a joint; may be repeated',
     )
     session = parser.add_argument_group('the session')
-    session.add_argument('--sensor', metavar='NAME', default='sensor', help='default: sensor')
-    session.add_argument('--marker', metavar='NAME', default='marker', help='default: marker')
+    session.add_argument('--sensor', metavar='NAME', help='default: sensor')
+    session.add_argument('--marker', metavar='NAME', help='default: marker')
     session.add_argument(
         '--marker-mm',
         metavar=('X', 'Y', 'Z'),
@@ -113,6 +126,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _couple(text: str) -> tuple[str, tuple[str, float]]:
+    """Argument type: a joint, and one that is added to it or subtracted."""
+    name, sign, other = text.partition('=')
+    if not (name and sign and other.lstrip('+-')):
+        raise argparse.ArgumentTypeError(f'{text!r} is not JOINT=JOINT, such as J3=J2')
+    return name, (other.lstrip('+-'), -1.0 if other.startswith('-') else 1.0)
+
+
 def _offset(text: str) -> tuple[str, float]:
     """Argument type: a joint and an angle in degrees."""
     name, sign, angle = text.rpartition('=')
@@ -123,11 +144,16 @@ def _offset(text: str) -> tuple[str, float]:
 
 def run(args: argparse.Namespace) -> int:
     """Read, show what was read, try it against the robot, write."""
-    urdf, chain = read_robot(args.urdf, args.base_link, args.tip_link)
+    cell = None if args.cell is None else read_cell(args.cell)
+    if cell is None:
+        urdf, chain = read_robot(args.urdf, args.base_link, args.tip_link)
+    else:
+        urdf, base = cell.urdf_text, args.base_link or cell.robot.base_link
+        chain = SerialChain.from_urdf(urdf, base, args.tip_link or cell.robot.tip_link)
     with progress_bar(args.quiet or args.json) as progress:
         progress('reading', 0.0)
         rows = _read(args, chain).in_order()
-        options = _session_options(args)
+        options = _session_options(args, cell)
         q = corrected(rows, chain, options)
         notes = f'imported from {", ".join(path.name for path in args.files)}'
         rng = np.random.default_rng(args.seed)
@@ -177,14 +203,22 @@ def _read(args: argparse.Namespace, chain: SerialChain) -> RawRows:
     )
 
 
-def _session_options(args: argparse.Namespace) -> SessionOptions:
+def _session_options(args: argparse.Namespace, cell: Workcell | None) -> SessionOptions:
+    sensor, marker, place, std = args.sensor, args.marker, args.marker_mm, args.marker_std_mm
+    if cell is not None:
+        sensor = sensor or cell.aim_at
+        marker = marker or cell.sensors[cell.aim_at].marker
+        if place is None and marker in cell.markers:
+            place = [1e3 * value for value in cell.markers[marker]]
+            std = 1e3 * cell.marker_std_m if std is None else std
     return SessionOptions(
+        couple=dict(args.couple),
         reverse=args.reverse,
         add_rad={name: np.radians(angle) for name, angle in args.offset},
-        sensor=args.sensor,
-        marker=args.marker,
-        marker_m=None if args.marker_mm is None else tuple(1e-3 * v for v in args.marker_mm),
-        marker_std_m=None if args.marker_std_mm is None else 1e-3 * args.marker_std_mm,
+        sensor=sensor or 'sensor',
+        marker=marker or 'marker',
+        marker_m=None if place is None else tuple(1e-3 * value for value in place),
+        marker_std_m=None if std is None else 1e-3 * std,
         hold_out=args.hold_out,
         visited_in_order=args.visited_in_order,
     )

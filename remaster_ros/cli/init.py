@@ -26,7 +26,12 @@ from remaster_ros.planning.cell_proposal import (
     reach_of,
     widest_ranges,
 )
-from remaster_ros.session.cell_template import SENSORS, CellProposal, cell_text
+from remaster_ros.session.cell_template import (
+    LINK_RADIUS_M,
+    SENSORS,
+    CellProposal,
+    cell_text,
+)
 from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.session.meshes import find_mesh, mesh_reader
 from remaster_ros.session.robot_description import read_description
@@ -111,6 +116,7 @@ def run(args: argparse.Namespace) -> int:
     show(args.quiet, _as_text(proposal))
     show(args.quiet, said)
     show(args.quiet, f'written: {args.out}; look at its lines marked CHECK')
+    show(args.quiet, f'go on with: remaster plan {args.out}')
     return 0
 
 
@@ -169,7 +175,7 @@ def _propose(
         reach=reach,
         ranges=ranges,
         kept='',
-        marker_z=marker_height(chain, bodies),
+        marker_z=marker_height(chain, bodies, LINK_RADIUS_M),
         sensor_R=place,
         sensors=args.sensors,
         mesh_path=found,
@@ -241,7 +247,8 @@ def _as_text(p: CellProposal) -> str:
     if p.missing_meshes:
         lines.append(
             f'warning: {len(p.missing_meshes)} meshes were not found, such as '
-            f'{p.missing_meshes[0]}; give the folder of the package with --package-path'
+            f'{p.missing_meshes[0]}; nothing is planned without them: give the folder of the '
+            'package with --package-path, or as mesh_path in the cell file'
         )
     return '\n'.join(lines)
 

@@ -9,12 +9,18 @@ import numpy as np
 
 from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.options import integer, number
+from remaster_ros.kinematics.body_pairs import RESERVE_M
+from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.planning.collection_plan import CollectionPlan, plan_collection
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.planning.travel_time import DWELL_S, SETTLE_S, SPEED_SHARE, TravelTime
 from remaster_ros.reports.plan_json import plan_text, plan_to_dict
 from remaster_ros.session.workcell import Workcell, read_cell
+from remaster_ros.types import FloatArray
+
+# Configurations at which the arm may begin that are tried, from zero outwards.
+TRIED_STARTS = 200
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -104,5 +110,17 @@ def planned(cell: Workcell, args: argparse.Namespace) -> CollectionPlan:
         scene, counts, args.seed, args.reference_every, cell.design_settings(), travel
     )
     places = {name: transform(np.eye(3), origin) for name, origin in scene.rough_R.items()}
-    start = np.clip(np.zeros(len(chain)), chain.lower, chain.upper)
-    return plan_collection(planner, places, start)
+    return plan_collection(planner, places, free_start(scene.model, args.seed))
+
+
+def free_start(model: CollisionModel, seed: int) -> FloatArray:
+    """Return joints at which the arm can stand, rad, (k,): zero where it can, else near to it.
+
+    At zero some arms lie stretched out along the floor (a UR does), from where no way is free.
+    """
+    chain = model.chain
+    spread = np.linspace(0.0, np.pi, TRIED_STARTS)[:, None]
+    tried = spread * np.random.default_rng(seed).uniform(-1.0, 1.0, (TRIED_STARTS, len(chain)))
+    tried = np.clip(tried, chain.lower, chain.upper)
+    free = np.flatnonzero(model.reasons(tried, RESERVE_M) == '')
+    return tried[free[0] if len(free) else 0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,6 +26,8 @@ HOLD_OUT_ONE_OF = 4
 FEWEST_POSES = 12
 # Where nothing is known of a marker's place (the session format's own advice).
 UNKNOWN_MARKER_STD_M = 0.3
+# 3 January 2000: times of day without a date do not reach it, nor do seconds since some start.
+FIRST_DATE_S = 946_684_800.0 + 2 * 86_400.0
 _SPLITS = {
     **dict.fromkeys(('optimization', 'fit', 'train', 'training', 'calibration', 'opt'), 0),
     **dict.fromkeys(('validation', 'test', 'held_out', 'holdout', 'val', 'check'), 1),
@@ -37,8 +40,9 @@ class SessionOptions:
 
     Attributes
     ----------
-    reverse, add_rad, order
-        Corrections of the joints by column: signs that are reversed, and angles added, rad.
+    couple, reverse, add_rad
+        Corrections of the joints by column, in this order: another joint that is added, with its
+        sign; signs that are reversed; angles added, rad.
     marker_m, marker_std_m
         Where the marker is in the tool frame, m; None where nothing is known.
     hold_out
@@ -47,6 +51,7 @@ class SessionOptions:
         Whether each row's configuration was reached from that of the row before.
     """
 
+    couple: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     reverse: tuple[str, ...] = ()
     add_rad: Mapping[str, float] = field(default_factory=dict)
     sensor: str = 'sensor'
@@ -60,6 +65,9 @@ class SessionOptions:
 def corrected(rows: RawRows, chain: SerialChain, options: SessionOptions) -> FloatArray:
     """Return the joint angles with the corrections that were told, rad, (n, k)."""
     q = rows.q.copy()
+    for name, (other, sign) in options.couple.items():
+        added = rows.q[:, _joint(other, rows, chain, '--couple')]
+        q[:, _joint(name, rows, chain, '--couple')] += sign * added
     for name in options.reverse:
         q[:, _joint(name, rows, chain, '--reverse')] *= -1.0
     for name, angle in options.add_rad.items():
@@ -140,9 +148,18 @@ def assemble(
         marker_std_m=std if options.marker_std_m is None else options.marker_std_m,
         settle_s=None,
         timed=rows.stamp_s is not None,
+        exit_status='complete',
+        created=_date(rows),
         notes=notes,
     )
     return session, [how_pose, how_split]
+
+
+def _date(rows: RawRows) -> str:
+    """Return when the first row was measured, ISO 8601; '' where the times are not since 1970."""
+    if rows.stamp_s is None or rows.stamp_s[0] < FIRST_DATE_S:
+        return ''
+    return datetime.fromtimestamp(float(rows.stamp_s[0])).isoformat(timespec='seconds')
 
 
 def refuse_outside_limits(rows: RawRows, chain: SerialChain, q: FloatArray) -> None:

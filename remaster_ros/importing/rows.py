@@ -190,8 +190,8 @@ def _values(
                 i,
                 found if is_joints else replace(found, joints=(), from_joints=()),
                 chain,
-                f'{angle}, {how_angle}',
-                f'{length}, {how_length}' if is_points else '',
+                f'{angle} ({how_angle})',
+                f'{length} ({how_length})' if is_points else '',
             )
             meanings[f'{prefix}{name}'] = meaning
     return RawRows(

@@ -106,8 +106,11 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
             f'{max(1.0, np.degrees(np.abs(found.joint_offsets).max())):.1f} degrees; without, one '
             f'is {largest:.0f} degrees'
         )
-    if len(fitting) > 1:
-        other, instead = _in_words(fitting[1].arrangement, rows, chain)
+    others = [
+        fit for fit in fitting[1:] if fit.arrangement.changes <= found.arrangement.changes + 1
+    ]
+    if others:
+        other, instead = _in_words(others[0].arrangement, rows, chain)
         lead += f'; with {other} ({instead}) they fit as well, and the data cannot tell which'
     return Sense(False, lead, options, as_given.error_m)
 
@@ -152,6 +155,12 @@ def _in_words(found: Arrangement, rows: RawRows, chain: SerialChain) -> tuple[st
         unit = _unit_of(found.length_scale, rows)
         words.append(f'the points in {unit}')
         options.append(f'--length {unit}')
+    if found.coupled:
+        sign = '' if found.coupled > 0 else '-'
+        words.append(
+            f'{sign or "+"}{columns[1]} added to {columns[2]} (it counts from the horizontal)'
+        )
+        options.append(f'--couple {quote(f"{columns[2]}={sign}{columns[1]}")}')
     reversed_ = [columns[i] for i, sign in enumerate(found.signs) if sign < 0]
     if reversed_:
         words.append(f'{" and ".join(reversed_)} reversed')
@@ -185,7 +194,7 @@ def length_in_use(rows: RawRows) -> str:
     """Return the unit that the points were taken for."""
     for meaning in rows.columns.values():
         if meaning.startswith('x of the marker, '):
-            return meaning.split(', ')[1]
+            return meaning.split(', ')[1].split()[0]
     return 'm'
 
 

@@ -28,6 +28,12 @@ MAX_RESPAWNS = 5
 """How often a node that was killed, or crashed, is started again."""
 WRONG = 2
 """The exit status of a node that is configured wrongly, or whose device does not answer."""
+FOLDERS = {
+    'pose_planner': {'session': 'session'},
+    'recorder': {'session': 'session'},
+    'optimizer': {'session': 'session', 'out': 'fit', 'discovery': 'discovery', 'prior': ''},
+}
+"""Parameters that are paths, with their defaults."""
 COMMANDS = 'joint_trajectory_controller/joint_trajectory'
 
 
@@ -118,6 +124,9 @@ def real_nodes(
     # The recorder does not wait for a sensor whose node is not started.
     require = {'require': wanted[0]} if len(wanted) == 1 < len(known) else {}
     values = {'pose_planner': own, 'robot_bridge': own, 'recorder': {**own, **require}}
+    for name, folders in FOLDERS.items():
+        beside = _beside(params, sections[name], folders)
+        values[name] = {**values.get(name, {}), **beside}
     nodes = [start(name, name, **values.get(name, {})) for name in CORE]
     for sensor in wanted:
         node = by_sensor.get(sensor, '')
@@ -130,6 +139,13 @@ def real_nodes(
             )
         nodes.append(start(kind if kind in SENSORS else GENERIC, node, **own))
     return nodes
+
+
+def _beside(params: str, section: Mapping[str, Any], folders: Mapping[str, str]) -> dict[str, str]:
+    """Return paths of a section as absolute ones: relative to the file, wherever launch is."""
+    home = Path(params).resolve().parent
+    given = {key: str(section.get(key, default)) for key, default in folders.items()}
+    return {key: str(home / path) for key, path in given.items() if path}
 
 
 def fake_nodes(params: str, namespace: str = '') -> list[NodeToStart]:

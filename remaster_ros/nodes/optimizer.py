@@ -73,6 +73,8 @@ class Optimizer(RemasterNode):
         super().__init__('optimizer')
         self.p = declare(self, Parameters)
         self._state, self._ending = 'waiting', False
+        # Whether the last call failed: until the next one, that is this node's state.
+        self._failed = False
         self._busy = threading.Lock()
         self._means = self.create_publisher(JointState, 'remaster/joint_offsets', LATCHED)
         self._stds = self.create_publisher(JointState, 'remaster/joint_offsets_std', LATCHED)
@@ -96,12 +98,13 @@ class Optimizer(RemasterNode):
         if not self._busy.acquire(blocking=False):
             response.message = 'a fit is under way'
             return response
+        self._failed = False
         try:
             report, self._state = work()
             response.success, response.message = True, str(report)
         except Exception as error:
             response = self.failed(error, response)
-            self._state = response.message
+            self._state, self._failed = response.message, True
         finally:
             self._busy.release()
         return response
@@ -178,7 +181,8 @@ class Optimizer(RemasterNode):
         self._ending = True
 
     def _summary(self) -> Summary:
-        return Summary('ok', self._state, {'session': self.p.session, 'out': self.p.out})
+        level = 'error' if self._failed else 'ok'
+        return Summary(level, self._state, {'session': self.p.session, 'out': self.p.out})
 
 
 def main(args: list[str] | None = None) -> int:

@@ -24,7 +24,7 @@ FEW_SOLUTIONS = 1.5
 OTHER_VALUES = tuple(np.radians((-40.0, 0.0, 40.0)).tolist())
 # A marker in front of the tool plate, and how far it is kept from the last link, m.
 LEAST_MARKER_M = 0.05
-CLEAR_M = 0.04
+CLEAR_M = 0.03
 # A joint that goes on turning counts as one of a turn each way.
 _TURN = np.pi
 
@@ -168,13 +168,23 @@ def ranges_around(places: FloatArray) -> PoseRanges:
     )
 
 
-def marker_height(chain: SerialChain, bodies: Sequence[Body]) -> float:
-    """Return how far along the tool's Z axis a marker is clear of the last link, m."""
+def marker_height(chain: SerialChain, bodies: Sequence[Body], link_radius: float) -> float:
+    """Return how far along the tool's Z axis a marker is clear of the arm, m.
+
+    Parameters
+    ----------
+    bodies
+        The collision geometry.
+    link_radius
+        How thick links are for the line of sight, m.
+    """
     last = [body.outline for body in bodies if body.link == len(chain)]
-    if not last:
-        return LEAST_MARKER_M
-    along = apply(inverse(chain.T_fixed[-1]), np.concatenate(last))[:, 2].max()
-    return max(LEAST_MARKER_M, float(np.ceil(100.0 * (along + CLEAR_M)) / 100.0))
+    # The last joint's origin ends the link before it.
+    T_T_joint = inverse(chain.T_fixed[-1])
+    along = [T_T_joint[2, 3] + link_radius]
+    if last:
+        along.append(apply(T_T_joint, np.concatenate(last))[:, 2].max())
+    return max(LEAST_MARKER_M, float(np.ceil(100.0 * (max(along) + CLEAR_M)) / 100.0))
 
 
 def _rounded(values: FloatArray, step: float) -> tuple[float, float]:

@@ -15,6 +15,8 @@ from remaster_ros.planning.candidates import PoseRanges
 from remaster_ros.planning.cell_proposal import HeldJoint, Reach
 from remaster_ros.session.safe_yaml import load_yaml
 
+# As of `session.workcell`: arms of some 7 to 20 kg.
+LINK_RADIUS_M = 0.075
 _PLAIN = re.compile(r'[A-Za-z/.][\w./+-]*')
 
 
@@ -111,7 +113,7 @@ def cell_text(p: CellProposal) -> str:
         '',
         *_comment(
             'CHECK: nominal marker positions in tip_link, and how well they are known per axis. '
-            'Proposed: in front of the last link.'
+            'Proposed: in front of the last link, clear of it.'
         ),
         'markers:',
         *(f'  {SENSORS[name].marker}: [0.0, 0.0, {p.marker_z:.2f}]' for name in p.sensors),
@@ -141,6 +143,11 @@ def cell_text(p: CellProposal) -> str:
         *_comment('CHECK: what the arm must not hit. Boxes in base_link, by name:'),
         '#   table: {center_m: [0.8, 0.0, 0.2], size_m: [0.5, 1.0, 0.4], yaw_deg: 15.0}',
         'obstacles: {}',
+        *_comment(
+            'How thick links are for the line of sight, and for collisions where the robot '
+            'description has no geometry. A marker nearer to the last joint counts as hidden.'
+        ),
+        f'link_radius_m: {LINK_RADIUS_M}',
         *_comment('In base_link; null where there is none (an arm that hangs).'),
         f'floor_z_m: {_value(p.floor_z)}',
         *_comment('CHECK: parts of the tool that the robot description has not, in tip_link:'),

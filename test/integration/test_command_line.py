@@ -227,7 +227,6 @@ def test_json_is_all_that_is_printed_and_what_the_files_hold(made: Path, tmp_pat
         ('simulate', tmp_path / 'made', *SIZE),
         ('fit', session, *out),
         ('accuracy', session, '--offsets', file),
-        ('recover', tmp_path / 'made'),
     ):
         process = remaster(verb, *args, '--json')
         assert (process.returncode, process.stderr) == (0, ''), verb
@@ -237,7 +236,6 @@ def test_json_is_all_that_is_printed_and_what_the_files_hold(made: Path, tmp_pat
     assert found['fit'] == json.loads((tmp_path / 'fit/fit.json').read_text())
     assert found['fit']['joint_offsets'] == json.loads(file.read_text())['joint_offsets']
     assert found['accuracy']['format'] == 'remaster-accuracy/1'
-    assert found['recover']['lost'] == []
 
 
 def test_figures_cost_their_libraries_only_where_they_are_drawn(

@@ -68,10 +68,24 @@ def test_an_optimizer_started_again_publishes_the_last_fit(start, client, tmp_pa
 
 
 def test_a_fit_without_a_session_is_refused_with_the_reason(start, client, tmp_path):
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+
     start('remaster_ros.nodes.optimizer', *node_arguments(session=tmp_path / 'none'))
+    shown = []
+    client.create_subscription(
+        DiagnosticArray, '/remaster/status', lambda array: shown.extend(array.status), 10
+    )
     response = call(client, '/remaster/fit')
     assert not response.success
     assert str(tmp_path / 'none') in response.message
+
+    def failed():
+        client.spin_some()
+        return shown and shown[-1].level == DiagnosticStatus.ERROR
+
+    # A failed fit must not show as OK.
+    wait_until(failed, 20, 'the status of a failed fit')
+    assert str(tmp_path / 'none') in shown[-1].message
 
 
 FAULTY = """

@@ -47,6 +47,11 @@ MALFORMED_IN_A_ROW = 3
 """Then the version has probably changed, and CONNECT is sent again."""
 NEGOTIATION_TRIES = 4
 MAX_DATAGRAM_BYTES = 1 << 16
+# What servers and other clients of a multicast group tell each other, and what has no place here.
+_KNOWN = frozenset(map(int, MessageId))
+_OF_OTHERS = frozenset(
+    {MessageId.KEEPALIVE, MessageId.DISCOVERY, MessageId.ECHOREQUEST, MessageId.CONNECT}
+)
 _FRAME_ID = MessageId.FRAMEOFDATA.to_bytes(2, 'little')
 
 
@@ -217,6 +222,8 @@ class NatNetClient(MarkerFollower):
         try:
             message_id, _payload = natnet.split_datagram(datagram)
             is_frame = message_id == MessageId.FRAMEOFDATA
+            if _is_of_no_use(message_id, from_data_socket):
+                return
             if from_data_socket and not is_frame:
                 raise ProtocolError(f'message {message_id} on the data port')
             if self._status.version is None and (is_frame or message_id == MessageId.MODELDEF):
@@ -295,3 +302,14 @@ class NatNetClient(MarkerFollower):
                 self._status.version = natnet.parse_version(version)
         elif answer.code == 0:
             self._status.version = self._settings.wanted_version
+
+
+def _is_of_no_use(message_id: int, from_data_socket: bool) -> bool:
+    """Return whether a message is sound NatNet that a client does without: it is not malformed.
+
+    On the data port, where a multicast server also sends its notes and answers to others, that is
+    all but frames.
+    """
+    if from_data_socket:
+        return message_id in _KNOWN and message_id != MessageId.FRAMEOFDATA
+    return message_id in _OF_OTHERS

@@ -68,6 +68,7 @@ def one(joints, joint, value, otherwise):
         (dict(q=np.deg2rad), 'angle_scale'),
         (dict(q=lambda q: q[:, ::-1]), 'order'),
         (dict(q=lambda q: q - np.where(np.arange(q.shape[1]) == 1, np.pi / 2, 0.0)), 'quarters'),
+        (dict(q=lambda q: q - np.eye(q.shape[1])[2] * q[:, 1:2]), 'coupled'),
         (dict(points=lambda p: p * [1.0, 1.0, -1.0]), 'mirrored'),
         (dict(points=lambda p: 1e3 * p), 'length_scale'),
         (dict(q=lambda q: np.roll(q, 1, axis=0)), 'shift'),

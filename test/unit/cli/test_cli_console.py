@@ -11,9 +11,12 @@ import pytest
 
 SCRIPT = """
 import sys
+import time
 from remaster_ros.cli.console import progress_bar, show
 quiet = 'quiet' in sys.argv
 with progress_bar(quiet) as progress:
+    progress('sampling', 0.25)
+    time.sleep(1.1)
     progress('sampling', 0.5)
 show(quiet, 'the result')
 print('rich' in sys.modules)
@@ -46,7 +49,7 @@ def test_a_terminal_shows_the_stage():
     out, shown = on_a_terminal()
     assert out == 'the result\nTrue\n'
     assert 'sampling' in shown
-    assert '50 %, about 0 s left' in shown
+    assert '50 %, about 1 s left' in shown
 
 
 def test_quiet_shows_and_prints_nothing():

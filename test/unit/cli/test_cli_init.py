@@ -9,6 +9,7 @@ import pytest
 from robot_descriptions import ROBOTS, Description, xarm7
 
 from remaster_ros.cli.main import main
+from remaster_ros.cli.plan import free_start
 from remaster_ros.session.workcell import read_cell
 
 XACRO = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
@@ -170,3 +171,16 @@ def test_a_place_and_both_sensors_can_be_told(do, tmp_path):
     assert cell.aim_at == 'mocap'
     np.testing.assert_allclose(cell.sensors['mocap'].rough_position_m, [0.0, -2.5, 1.0])
     assert cell.floor_z_m is None
+
+
+def test_an_arm_that_lies_on_the_floor_at_zero_is_planned_from_elsewhere(do, tmp_path, capsys):
+    """A UR's zero is stretched out; no way to anywhere is free from there."""
+    assert do(written(tmp_path, ROBOTS['ur5e']()))[0] == 0
+    cell = read_cell(tmp_path / 'cell.yaml')
+    model = cell.planning_scene(cell.chain()).model
+    assert model.reasons(np.zeros((1, 6)))[0] == 'hits the floor'
+    assert model.reasons(free_start(model, 0)[None])[0] == ''
+    capsys.readouterr()
+    few = ('--poses', '4', '--validation', '0', '--reference-every', '0', '--json')
+    assert main(['plan', str(tmp_path / 'cell.yaml'), *few]) == 0
+    assert json.loads(capsys.readouterr().out)['configurations'] > 0

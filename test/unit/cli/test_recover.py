@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 
 import pytest
@@ -33,6 +34,9 @@ def test_nothing_was_lost(killed, capsys):
     assert run(capsys, killed) == (0, f'{killed}: recovered\n', '')
     assert run(capsys, killed) == (0, f'{killed}: at rest, nothing to recover\n', '')
     assert run(capsys, '--quiet', killed) == (0, '', '')
+    status, out, err = run(capsys, '--json', killed)
+    assert json.loads(out) == {'session': str(killed), 'finished': False, 'lost': []}
+    assert (status, err) == (0, '')
     session = read_session(killed)
     assert len(session.measurements) == before
     assert session.exit_status == 'aborted'

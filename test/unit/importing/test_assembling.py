@@ -206,6 +206,19 @@ def test_a_zero_position_a_quarter_off_is_proposed_and_corrected(do):
     np.testing.assert_allclose(made.q, arm.q, atol=1e-7)
 
 
+def test_a_joint_that_counts_from_the_horizontal_is_proposed_and_coupled(do):
+    """As FANUC's pendants show joint 3."""
+    arm, run = do
+    q = np.rad2deg(arm.q)
+    q[:, 2] -= q[:, 1]
+    table = [*q.T, *(1e3 * arm.points.T)]
+    error = run(HEADER, table)
+    assert '+A2 added to A3 (it counts from the horizontal)' in error
+    assert 'add --couple A3=A2;' in error
+    made = run(HEADER, table, '--couple', 'A3=A2').measurements
+    np.testing.assert_allclose(made.q, arm.q, atol=1e-7)
+
+
 def test_units_that_were_stated_wrongly_are_proposed(do):
     arm, run = do
     error = run(HEADER, columns(arm), '--length', 'in')

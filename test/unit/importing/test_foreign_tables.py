@@ -59,12 +59,13 @@ def test_degrees_millimetres_decimal_commas(arm, do, tmp_path):
     status, out, _, session = do(path)
     assert status == 0
     assert 'semicolons between the columns, decimal comma, CP1252' in out
-    assert 'A3 [°]  joint 3 (joint_3), deg, header' in out
-    assert 'Y [mm]  y of the marker, mm, header' in out
+    assert 'A3 [°]  joint 3 (joint_3), deg (header)' in out
+    assert 'Y [mm]  y of the marker, mm (header)' in out
     assert '10 of 40 poses held out' in out
     np.testing.assert_allclose(session.measurements.q, arm.q, atol=1e-8)
     np.testing.assert_allclose(session.measurements.position, arm.points, atol=1e-8)
     assert not session.timed
+    assert session.created == ''
     assert_fits(session, arm)
 
 
@@ -94,6 +95,8 @@ def test_a_trackers_export_and_the_joints_beside_it(arm, do, tmp_path):
     assert 'X           x of the marker, mm' in out.replace('points.txt: ', '')
     assert session.timed
     assert np.ptp(session.measurements.stamp_s) == 39 * 60
+    assert session.created == '2026-05-04T10:00:30'
+    assert session.exit_status == 'complete'
     np.testing.assert_allclose(session.measurements.q, arm.q[order], atol=1e-8)
     assert_fits(session, arm)
 
@@ -104,8 +107,8 @@ def test_no_times_no_units_no_header(arm, do, tmp_path):
     status, out, _, session = do(write(tmp_path, 'table.txt', text([], columns, '  ')))
     assert status == 0
     assert 'no header' in out
-    assert 'rad, guessed, by its place' in out
-    assert 'm, guessed, by its place' in out
+    assert 'rad (guessed), by its place' in out
+    assert 'm (guessed), by its place' in out
     assert 'no times: causes driven by time are untestable' in out
     assert not session.timed
     assert_fits(session, arm)
@@ -147,6 +150,31 @@ def test_a_wrong_tip_is_named_by_the_marker(arm, do, tmp_path):
     assert_fits(session, arm)
 
 
+def test_a_cell_file_has_robot_sensor_and_marker(arm, tmp_path, capsys):
+    (tmp_path / 'arm.urdf').write_text(arm.urdf)
+    cell = tmp_path / 'cell.yaml'
+    cell.write_text(
+        'robot: {urdf: arm.urdf, base_link: base_link, tip_link: tool0}\n'
+        f'markers: {{smr: {MARKER.tolist()}}}\n'
+        'marker_std_m: 0.001\n'
+        'sensors: {leica: {marker: smr, topic: t, rough_position_m: [2.0, 0.0, 0.5]}}\n'
+        'aim_at: leica\n'
+    )
+    header = [*joint_names(arm), 'X_mm', 'Y_mm', 'Z_mm']
+    path = write(tmp_path, 't.csv', text(header, [*degrees(arm), *(1e3 * arm.points.T)]))
+    out = tmp_path / 'session'
+    assert main(['import', str(path), '--cell', str(cell), '--out', str(out)]) == 0
+    session = read_session(out)
+    assert (session.sensors, session.tip_link) == ({'leica': 'smr'}, 'tool0')
+    np.testing.assert_allclose(session.markers['smr'], MARKER)
+    assert session.marker_std_m == 0.001
+    status = main(
+        ['import', str(path), '--cell', str(cell), '--out', f'{out}2', '--tip-link', 'link_6']
+    )
+    assert status == 1
+    assert 'with the tip link tool0 the marker is' in capsys.readouterr().err
+
+
 def test_json_has_the_columns_and_the_hint(arm, do, tmp_path):
     header = [*joint_names(arm), 'X', 'Y', 'Z', 'remark']
     reversed_ = arm.q * [1, -1, 1, -1, 1, 1]
@@ -157,7 +185,7 @@ def test_json_has_the_columns_and_the_hint(arm, do, tmp_path):
     assert status == 1
     assert found['session'] is None
     assert found['hint'].endswith('--reverse A2,A4')
-    assert found['columns']['A1'] == 'joint 1 (joint_1), deg, guessed'
+    assert found['columns']['A1'] == 'joint 1 (joint_1), deg (guessed)'
     assert found['columns']['remark'] == 'not used'
     status, out, _, session = do(path, '--json', '--unchecked')
     assert status == 0

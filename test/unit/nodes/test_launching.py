@@ -19,6 +19,7 @@ from remaster_ros.nodes.launching import (
     COMMANDS,
     CORE,
     FAKES,
+    FOLDERS,
     SENSORS,
     exit_ends_launch,
     fake_nodes,
@@ -46,15 +47,36 @@ def test_every_node_is_started_with_the_cell_and_the_file():
         assert node.executable == name
         assert node.parameters[0] == REAL
         assert node.remappings == ()
-        if name != 'optimizer':
+        if name not in FOLDERS:
             assert node.parameters[1] == {'cell': CELL}
+
+
+def test_folders_are_beside_the_parameter_file_wherever_launch_was_started(tmp_path, monkeypatch):
+    def change(data):
+        data['/**/optimizer']['ros__parameters'] |= {'out': 'results/fit', 'prior': '/abs/known'}
+        del data['/**/pose_planner']['ros__parameters']['cell']
+
+    params = Path(edited(tmp_path, change))
+    elsewhere = tmp_path / 'elsewhere'
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    nodes = {node.name: node for node in real_nodes(CELL, f'../{params.name}')}
+    session = {'session': str(tmp_path / 'session')}
+    assert nodes['recorder'].parameters[1] == {'cell': CELL, **session}
+    assert nodes['pose_planner'].parameters[1] == {'cell': CELL, **session}
+    assert nodes['optimizer'].parameters[1] == {
+        **session,
+        'out': str(tmp_path / 'results/fit'),
+        'discovery': str(tmp_path / 'discovery'),
+        'prior': '/abs/known',
+    }
 
 
 def test_sensors_by_the_names_of_the_cell(tmp_path, monkeypatch):
     nodes = {node.name: node for node in real_nodes(CELL, REAL, 'mocap')}
     assert set(nodes) == {*CORE, 'optitrack_markers'}
     # Nobody waits for the one that is not there.
-    assert nodes['recorder'].parameters[1] == {'cell': CELL, 'require': 'mocap'}
+    assert nodes['recorder'].parameters[1]['require'] == 'mocap'
     both = real_nodes(CELL, REAL, 'tracker, mocap')
     assert [node.name for node in both[len(CORE) :]] == [
         'laser_tracker_markers',

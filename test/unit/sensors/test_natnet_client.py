@@ -16,7 +16,7 @@ from optitrack_world import RATE, SENSOR, MarkerWorld, eventually, free_port, op
 
 from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.optitrack import client as natnet_client
-from remaster_ros.sensors.optitrack.client import NatNetClient
+from remaster_ros.sensors.optitrack.client import NatNetClient, _is_of_no_use
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
 from remaster_ros.sensors.optitrack.protocol import natnet
 from remaster_ros.sensors.optitrack.protocol.frames import (
@@ -365,6 +365,26 @@ def test_no_datagram_ends_the_thread(peer_and_client):
     assert eventually(takes_good_ones)
     for sample in client.samples:
         np.testing.assert_allclose(sample.position, [0.5, 0.25, 2.0], atol=0.01)
+
+
+def test_a_servers_own_messages_are_not_malformed(peer_and_client):
+    """Keep-alives, notes and requests to others are sound, and a client does without them."""
+    peer, client = peer_and_client
+    before = client.status().dropped[Dropped.MALFORMED]
+    for message_id in ('KEEPALIVE', 'DISCOVERY', 'ECHOREQUEST', 'MESSAGESTRING'):
+        for _ in range(5):
+            peer.send_bytes(natnet.join_datagram(natnet.MessageId[message_id], b'hello\0'))
+    send_until_believed(peer, client.samples)
+    assert client.status().dropped[Dropped.MALFORMED] == before
+    peer.send_bytes(natnet.join_datagram(77, b'hello'))
+    assert eventually(lambda: client.status().dropped[Dropped.MALFORMED] == before + 1)
+
+
+@pytest.mark.parametrize('message_id', list(natnet.MessageId))
+def test_on_the_data_port_only_frames_and_strangers_matter(message_id):
+    is_frame = message_id == natnet.MessageId.FRAMEOFDATA
+    assert _is_of_no_use(int(message_id), from_data_socket=True) is not is_frame
+    assert not _is_of_no_use(77, from_data_socket=True)
 
 
 def test_another_address_is_counted_and_never_believed(peer_and_client):

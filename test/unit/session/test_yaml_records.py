@@ -73,16 +73,40 @@ def test_a_quaternion_is_normalised_or_refused() -> None:
 @pytest.mark.parametrize(
     ('old', 'new', 'words'),
     [
-        ('markers:', 'markerz:', "line 15: unknown key 'markerz'; did you mean 'markers'?"),
-        ('    topic: opt', '    topc: opt', "line 25: unknown key 'topc'; did you mean 'topic'?"),
-        ('floor_z_m:', 'q:', "line 62: unknown key 'q'; the keys here are robot, mar"),
-        ('single_shot: false', 'single_shot: 3', 'line 26: sensors.mocap.single_shot: Expected'),
-        ('smr: [-0.1, 0.0, 0.0]', 'smr: [-0.1]', 'line 17: markers.smr: Expected `array` of len'),
-        ('marker_std_m: 0.5e-3', 'marker_std_m: 5', 'line 18: marker_std_m is 5; it must be'),
-        ('max_angle_deg: 25.0', 'max_angle_deg: 1', 'line 35: sensors.tracker.max_angle_deg is'),
-        ('aim_at: tracker', 'aim_at: traker', "line 38: aim_at 'traker' is none of the sensors "),
+        ('markers:', 'markerz:', "line {line}: unknown key 'markerz'; did you mean 'markers'?"),
+        (
+            '    topic: opt',
+            '    topc: opt',
+            "line {line}: unknown key 'topc'; did you mean 'topic'?",
+        ),
+        ('floor_z_m:', 'q:', "line {line}: unknown key 'q'; the keys here are robot, mar"),
+        (
+            'single_shot: false',
+            'single_shot: 3',
+            'line {line}: sensors.mocap.single_shot: Expected',
+        ),
+        (
+            'smr: [-0.1, 0.0, 0.0]',
+            'smr: [-0.1]',
+            'line {line}: markers.smr: Expected `array` of len',
+        ),
+        ('marker_std_m: 0.5e-3', 'marker_std_m: 5', 'line {line}: marker_std_m is 5; it must be'),
+        (
+            'max_angle_deg: 25.0',
+            'max_angle_deg: 1',
+            'line {line}: sensors.tracker.max_angle_deg is',
+        ),
+        (
+            'aim_at: tracker',
+            'aim_at: traker',
+            "line {line}: aim_at 'traker' is none of the sensors ",
+        ),
         ('marker: smr', 'marker: smrr', "sensors.tracker.marker is 'smrr'; markers has sir, smr"),
-        ('held_joint: joint_3', 'held_joint: joint3', "line 11: held_joint 'joint3' is none of "),
+        (
+            'held_joint: joint_3',
+            'held_joint: joint3',
+            "line {line}: held_joint 'joint3' is none of ",
+        ),
         ('tip_link: tool', 'tip_link: Tol', "there is no link 'Tol'; it has base_link"),
     ],
 )
@@ -94,6 +118,7 @@ def test_a_wrong_cell_names_line_key_and_what_was_meant(old, new, words, tmp_pat
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(InputError) as error:
         read_cell(path)
-    assert words in str(error.value)
+    line = text[: text.index(old)].count('\n') + 1
+    assert words.format(line=line) in str(error.value)
     named = ('markerz', 'topc', 'traker', 'smrr', 'joint3', 'Tol')
     assert ('did you mean' in str(error.value)) == any(name in new for name in named)
