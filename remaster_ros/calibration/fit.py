@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -37,6 +38,7 @@ def fit_session(
     clock: Callable[[], float] | None = None,
     extension: Extension | None = None,
     priors: Priors | None = None,
+    unmodelled: FloatArray | None = None,
 ) -> FitResult:
     """Fit a session's optimization rows.
 
@@ -64,6 +66,9 @@ def fit_session(
         Further physical effects to fit; the paper's model has none.
     priors
         What is known beforehand, in place of the session's own priors; the paper's model has none.
+    unmodelled
+        How c causes outside the model move its parameters, one standard deviation of each,
+        (size, c): the posterior is widened by them. Not in paper mode.
 
     Raises
     ------
@@ -98,6 +103,8 @@ def fit_session(
         )
     else:
         sampled = _fast(estimate(problem, extension), chains, draws, precision, rng, report)
+        if unmodelled is not None:
+            sampled = replace(sampled, unmodelled=unmodelled)
     seconds = clock() - started if clock is not None else np.nan
     return build_result(problem, sampled, seconds, rng)
 

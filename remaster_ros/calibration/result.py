@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -186,6 +186,9 @@ class Sampled:
         (row of the measurements, reason) of the gross errors.
     mode
         Of the posterior; None where it was not sought.
+    unmodelled
+        How c causes outside the model move the parameters, one standard deviation of each,
+        (size, c); None where none are expected.
     """
 
     posterior: Posterior
@@ -201,6 +204,14 @@ class Sampled:
     z_before: FloatArray
     left_out: tuple[tuple[int, str], ...]
     mode: Mode | None = None
+    unmodelled: FloatArray | None = None
+
+    def widened(self, rng: np.random.Generator) -> Sampled:
+        """Return the same with the draws moved by causes outside the model."""
+        if self.unmodelled is None:
+            return self
+        causes = rng.standard_normal((*self.z.shape[:-1], self.unmodelled.shape[1]))
+        return replace(self, z=self.z + causes @ self.unmodelled.T)
 
 
 def sampled_columns(
@@ -237,6 +248,10 @@ def build_result(
     model = posterior.model
     # In pinned coordinates any value of a joint that is not identifiable fits as well as 0.
     unfixed = np.isin(np.arange(model.joints), gauge.held)
+    by_data = _offset_summary(
+        sampled.z[..., : model.joints].reshape(-1, model.joints), unfixed, sampled.taken_as_known
+    )[1]
+    sampled = sampled.widened(rng)
     z = sampled.z.copy()
     z[..., np.flatnonzero(unfixed)] = 0.0
     flat = z.reshape(-1, model.size)
@@ -292,7 +307,7 @@ def build_result(
         joint_offsets=mean,
         joint_offsets_std=widening * std,
         joint_offsets_interval95=mean[:, None] + widening[:, None] * (interval - mean[:, None]),
-        identifiable=_identifiable(gauge.why, std),
+        identifiable=_identifiable(gauge.why, by_data),
         why=gauge.why,
         gauge=gauge.directions,
         T_R_N=by_sensor(T_R_N),

@@ -36,6 +36,7 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.stepwise_selection import Search, Selection
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
 from remaster_ros.discovery.to_extension import extension_of
+from remaster_ros.discovery.undetected import undetected
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Session
 
@@ -178,11 +179,13 @@ def discover_session(
 class Findings:
     """What is found before anything is sampled; fields as in `Discovery`.
 
-    ``before`` is the fit of the session as it is, without any effect, ``structure`` what the
+    ``before`` is the fit of the session as it is, without any effect, ``found`` the one that the
+    search began with (its priors let moved markers go where they are), ``structure`` what the
     search located without a cause.
     """
 
     before: Estimate
+    found: Estimate
     residuals: Residuals
     selection: Selection
     groups: tuple[tuple[Cell, ...], ...]
@@ -198,6 +201,7 @@ class Findings:
         assert empty is not None
         return replace(
             self,
+            found=self.before,
             residuals=residuals,
             selection=Selection(empty, empty, (), None),
             groups=(),
@@ -223,6 +227,7 @@ def _sampled(
         priors=loosened(session, findings.effects),
         precision=PRECISION,
         extension=extension_of(residuals, solution) if solution.cells else None,
+        unmodelled=undetected(findings.found, residuals, solution),
         progress=lambda _, share: report('sampling the extended model', share),
     )
     return fit, gain_of(findings.before, residuals, solution, fit, rng)
@@ -274,7 +279,9 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
             residuals, found.kept, residuals.rows.source, selection.empty, selection.solution
         )
     groups = tuple(itertools.compress(groups, causes))
-    return Findings(before, residuals, selection, groups, effects, structure, untestable, thinning)
+    return Findings(
+        before, found, residuals, selection, groups, effects, structure, untestable, thinning
+    )
 
 
 def _offsets(found: Estimate) -> tuple[FloatArray, FloatArray]:

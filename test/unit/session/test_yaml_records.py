@@ -114,6 +114,8 @@ def test_a_wrong_cell_names_line_key_and_what_was_meant(old, new, words, tmp_pat
     demo = config_path('cells/demo.yaml')
     text = demo.read_text().replace('../robots', str(demo.parents[1] / 'robots'))
     assert old in text
+    line = 1 + text[: text.index(old)].count('\n') + new.count('\n')
+    words = words.format(line=line)
     path = tmp_path / 'cell.yaml'
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(InputError) as error:
