@@ -18,7 +18,7 @@ from remaster_ros.discovery.confirmation import (
 from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.side_by_side import rms_sigmas
-from remaster_ros.discovery.words import percent
+from remaster_ros.discovery.words import percent, shown
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.reports.discovery_json import (
     held_out_coverage,
@@ -148,9 +148,10 @@ def side_by_side(found: Discovery, confirmation: Confirmation) -> list[str]:
                 'deviations on the average'
             )
             continue
-        lines += [
-            f'    {row.name:{width}}  {row.value:+.4g} ± {row.std:.2g}  '
-            f'{row.other_value:+.4g} ± {row.other_std:.2g} {row.unit}  {row.sigmas:+.1f} σ'
-            for row in rows
-        ]
+        for row in rows:
+            here = ' ± '.join(shown(row.value, row.std, row.unit)[:2])
+            value, std, unit = shown(row.other_value, row.other_std, row.unit)
+            sigmas = f'{row.sigmas:+.1f}'.replace('-', '−')
+            there = f'{value} ± {std}'
+            lines.append(f'    {row.name:{width}}  {here:>18}  {there:>18} {unit:7}  {sigmas} σ')
     return ['here and there, and the difference in standard deviations:', *lines] if lines else []

@@ -7,7 +7,7 @@ import numpy as np
 from remaster_ros.discovery.confirmation import LEAST_GAIN, Confirmation, ConfirmedCause
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.explain import FoundEffect
-from remaster_ros.discovery.words import percent
+from remaster_ros.discovery.words import called, percent
 
 
 def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
@@ -63,19 +63,20 @@ def _summary(found: Confirmation) -> str:
 
 def _share_in_words(effect: FoundEffect, cause: ConfirmedCause) -> str:
     share = cause.carried_over
+    name = called(effect.name, effect.joints)
     change = f'{1e3 * cause.rms_without_m:.3f} to {1e3 * cause.rms_frozen_m:.3f} mm RMS'
     if not np.isfinite(cause.rms_frozen_m):
-        return f'{effect.cause} The other session does not determine it.'
+        return f'{name}: the other session does not determine it.'
     if share > 0.5:
         return (
-            f'{effect.cause} Confirmed: {percent(share)} of what the other session could gain '
-            f'from it ({change}).'
+            f'{name}. Confirmed: {percent(share)} of what the other session could gain from it '
+            f'({change}).'
         )
     if share > 0.1:
         return (
-            f'{effect.cause} Changed: as found here it brings {percent(share)} of what the other '
-            f'session could gain from it ({change}).'
+            f'{name}. Changed: as found here it brings {percent(share)} of what the other session '
+            f'could gain from it ({change}).'
         )
     if cause.rms_frozen_m > (1.0 + LEAST_GAIN) * cause.rms_without_m:
-        return f'{effect.cause} Not there any more: as found here it goes from {change}.'
-    return f'{effect.cause} The other session gains nothing from it ({change}).'
+        return f'{name}. Not there any more: as found here it goes from {change}.'
+    return f'{name}: the other session gains nothing from it ({change}).'

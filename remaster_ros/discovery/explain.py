@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
@@ -351,7 +352,4 @@ def _when(cell: Cell, context: Context) -> str:
 
 
 def _listed(joints: Sequence[int]) -> str:
-    names = [str(joint) for joint in joints]
-    if len(names) < 2:
-        return f'joint {"".join(names)}'
-    return f'joints {", ".join(names[:-1])} and {names[-1]}'
+    return f'joint{"s" if len(joints) > 1 else ""} {listed([str(joint) for joint in joints])}'

@@ -40,7 +40,8 @@ class Compared:
     other_value, other_std
         In the other session.
     sigmas
-        The difference, other less this, over the standard deviation of both together.
+        The difference, other less this, over the standard deviation of both together; NaN where
+        that is zero.
     """
 
     name: str
@@ -56,13 +57,15 @@ class Compared:
         cls, name: str, unit: str, here: tuple[float, float], there: tuple[float, float]
     ) -> Compared:
         """Compare two pairs of value and standard deviation."""
-        sigmas = (there[0] - here[0]) / float(np.hypot(here[1], there[1]))
+        total = float(np.hypot(here[1], there[1]))
+        sigmas = (there[0] - here[0]) / total if total > 0.0 else float('nan')
         return cls(name, unit, *here, *there, sigmas)
 
 
 def rms_sigmas(rows: Sequence[Compared]) -> float:
     """Return the root mean square of the differences in standard deviations; NaN of none."""
-    return float(np.sqrt(np.mean([row.sigmas**2 for row in rows]))) if rows else float('nan')
+    squares = [row.sigmas**2 for row in rows if not np.isnan(row.sigmas)]
+    return float(np.sqrt(np.mean(squares))) if squares else float('nan')
 
 
 def compare_offsets(

@@ -1,10 +1,31 @@
-"""Numbers in sentences: shares, p-values, lists."""
+"""Numbers and names in sentences."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
+
+from remaster_ros.calibration.gauge_words import listed
+from remaster_ros.discovery.effects.sizes import rounded
+
+# Unit of a parameter -> the unit for people, and how many of those one is.
+SHOWN_UNITS = {
+    'rad': ('′', 60.0 * 180.0 / np.pi),
+    'rad/(N m)': ('′/(N m)', 60.0 * 180.0 / np.pi),
+    'rad/rad': ('′/°', 60.0),
+    'm': ('mm', 1e3),
+    'm/m': ('mm/m', 1e3),
+    'm/s': ('mm/h', 3.6e6),
+    '1/K': ('µm/(m K)', 1e6),
+    '1/s': ('µm/(m h)', 3.6e9),
+}
+
+
+def shown(value: float, std: float, unit: str) -> tuple[str, str, str]:
+    """Return value, standard deviation and unit of a parameter as people read them."""
+    words, times = SHOWN_UNITS.get(unit, (unit, 1.0))
+    return *rounded(times * value, times * std, '+'), words
 
 
 def percent(share: float) -> str:
@@ -19,8 +40,9 @@ def p_value_text(p_value: float, floor: float) -> str:
     return f'p < {floor:.2g}' if p_value <= floor * (1.0 + 1e-9) else f'p = {p_value:.2g}'
 
 
-def listed(parts: Sequence[str]) -> str:
-    """Join parts by commas and an `and`."""
-    if len(parts) < 2:
-        return ''.join(parts)
-    return f'{", ".join(parts[:-1])} and {parts[-1]}'
+def called(name: str, joints: Sequence[int]) -> str:
+    """Return an effect as people call it: 'link length of joints 2 and 3'."""
+    words = name.replace('_', ' ')
+    if not joints:
+        return words
+    return f'{words} of joint{"s" if len(joints) > 1 else ""} {listed([str(j) for j in joints])}'

@@ -9,7 +9,7 @@ import numpy as np
 from remaster_ros.compensation.export import GEOMETRY_FILE, Geometry, exports
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.explain import FoundEffect
-from remaster_ros.discovery.words import listed
+from remaster_ros.discovery.words import called
 
 
 def applied(discovery: Discovery) -> dict[str, str]:
@@ -50,12 +50,7 @@ def geometry_of(discovery: Discovery) -> Geometry | None:
 
 
 def _named(effects: Sequence[FoundEffect]) -> str:
-    joints: dict[str, list[int]] = {}
+    joints: dict[str, set[int]] = {}
     for effect in effects:
-        joints.setdefault(effect.name.replace('_', ' '), []).extend(effect.joints)
-    return ', '.join(
-        f'{name} of joint{"s" if len(numbers) > 1 else ""} {listed([str(n) for n in numbers])}'
-        if numbers
-        else name
-        for name, numbers in ((name, sorted(set(found))) for name, found in joints.items())
-    )
+        joints.setdefault(effect.name, set()).update(effect.joints)
+    return ', '.join(called(name, sorted(numbers)) for name, numbers in joints.items())

@@ -200,6 +200,7 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
     chosen = [index[name] for name in cell.parameters]
     draws = discovery.fit.theta_draws[..., chosen].reshape(-1, len(chosen)) / ARC_MINUTE
+    mean = draws.mean(axis=0)
     draws = draws[:: max(1, len(draws) // 400)]
     columns = cell.columns(context)
     assert columns.at is not None
@@ -208,14 +209,14 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     if cell.form == 'sin/cos':
         # Its mean is a zero-offset.
         values = values - values[fitted].mean(axis=0)
-    effect = values @ parameters
+    effect = values @ mean
     motion = context.jacobian[:, :, columns.at]
     # What is left, as an angle of this joint: only where the marker is far from its axis.
     square = np.sum(motion**2, axis=1)
     far = fitted & (square > 0.1 * np.median(square))
     angle = np.sum(motion * left, axis=1)[far] / square[far] / ARC_MINUTE
     shown = slice(None, None, max(1, int(far.sum()) // SCATTER_POINTS))
-    points = (effect[far] + angle)[shown]
+    points = (values[far] @ parameters + angle)[shown]
     if cell.driver.startswith('approach'):
         band = 2.0 * (values @ draws.T).std(axis=1)
         _sides(ax, x, effect, band, (x[far][shown], points))
@@ -225,7 +226,7 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
             # Everywhere, so that the band opens where nothing was measured; the line is not there.
             x, at = cell.curve.in_turn(x), cell.curve.grid()
             values = cell.curve.columns(at)
-            line = np.where(cell.curve.seen(at, NEAR), values @ parameters, np.nan)
+            line = np.where(cell.curve.seen(at, NEAR), values @ mean, np.nan)
         else:
             values = values[np.argsort(x)]
             if cell.form == 'sin/cos':
@@ -233,7 +234,7 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
                 gap = np.diff(at, prepend=at[0]) > WIDE_GAP * np.ptp(at)
                 line = np.where(gap, np.nan, line)
         spread = 2.0 * (values @ draws.T).std(axis=1)
-        middle = values @ parameters
+        middle = values @ mean
         ax.plot(x[far][shown] / per_shown, points, '.', color=BEFORE, markersize=2.5, alpha=0.6)
         ax.fill_between(
             at / per_shown, middle - spread, middle + spread, color=AFTER, alpha=0.25, linewidth=0

@@ -15,6 +15,7 @@ from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.stepwise_selection import DRAWS
 from remaster_ros.reports import schemas
 from remaster_ros.reports.discovery_apply import applied
+from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.fit_json import (
     APPLY_FOLDER,
     DISCOVERY_FILE,
@@ -39,7 +40,7 @@ def discovery_content(
     discovery: Discovery,
     confirmation: Confirmation | None = None,
     predictions: Predictions | None = None,
-) -> schemas.Discovered:
+) -> Discovered:
     """Return a discovery as discovery.json has it; predictions are made where none are given."""
     predictions = predictions_of(discovery) if predictions is None else predictions
     fit = fit_content(discovery.fit)
@@ -86,7 +87,7 @@ def discovery_content(
                 for effect, cause in zip(discovery.effects, confirmation.effects, strict=False)
             ],
         }
-    return schemas.checked(content, schemas.Discovered)
+    return schemas.checked(content, Discovered)
 
 
 def _covariance(discovery: Discovery) -> dict[str, Any]:
@@ -170,5 +171,5 @@ def read_discovery(path: str | os.PathLike[str]) -> dict[str, Any]:
         One line naming the file, the key and the remedy.
     """
     return read_result(
-        Path(path), schemas.Discovered, schemas.DISCOVERY_FORMAT, DISCOVERY_FILE, 'discover'
+        Path(path), Discovered, schemas.DISCOVERY_FORMAT, DISCOVERY_FILE, 'discover'
     )

@@ -10,8 +10,8 @@ from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.reports import schemas
 from remaster_ros.reports.discovery_figures import draw_discovery
+from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.pages import inlined, page, write_report
 
 # Long lists of spline coefficients are for other programs; the figure shows the curve.
@@ -21,7 +21,7 @@ MOST_PARAMETERS = 8
 def write_discovery_report(
     discovery: Discovery,
     confirmation: Confirmation | None,
-    content: schemas.Discovered,
+    content: Discovered,
     folder: Path,
 ) -> Path:
     """Write report.html and the figures of what was found; return its path.

@@ -15,6 +15,7 @@ from remaster_ros.compensation.export import exports
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.reports import schemas
+from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.session.files import (
     cannot_write,
     make_folder,
@@ -177,7 +178,7 @@ def read_fit(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def read_result(
     path: Path,
-    schema: type[schemas.Fit | schemas.Discovered],
+    schema: type[schemas.Fit | Discovered],
     form: str,
     name: str,
     verb: str,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.resources
-import math
 import re
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
-from remaster_ros.discovery.words import p_value_text, percent
+from remaster_ros.discovery.words import p_value_text, percent, shown
 from remaster_ros.reports.figures import GRID, INK, PAPER
 from remaster_ros.reports.fit_json import REPORT_FILE
 from remaster_ros.session.files import make_folder, write_atomically
@@ -31,7 +30,7 @@ def page(template: str, **content: Any) -> str:
         'signed': _signed,
         'percent': percent,
         'p_value': p_value_text,
-        'shown_in': shown_in,
+        'shown': shown,
     }
     return environment.get_template(template).render(**content)
 
@@ -65,24 +64,6 @@ def write_report(folder: Path, drawings: dict[str, str], html: str) -> Path:
         write_atomically(folder / 'figures' / f'{name}.svg', text)
     write_atomically(folder / REPORT_FILE, html)
     return folder / REPORT_FILE
-
-
-# Unit of a parameter -> the unit for people, and how many of those one is.
-SHOWN_UNITS = {
-    'rad': ('′', 60.0 * 180.0 / math.pi),
-    'rad/(N m)': ('′/(N m)', 60.0 * 180.0 / math.pi),
-    'rad/rad': ('′/°', 60.0),
-    'm': ('mm', 1e3),
-    'm/m': ('mm/m', 1e3),
-    'm/s': ('mm/h', 3.6e6),
-    '1/K': ('µm/(m K)', 1e6),
-    '1/s': ('µm/(m h)', 3.6e9),
-}
-
-
-def shown_in(unit: str) -> tuple[str, float]:
-    """Return the unit in which people read a parameter, and how many of those one is."""
-    return SHOWN_UNITS.get(unit, (unit, 1.0))
 
 
 def _fixed(number: float | None, digits: int) -> str:

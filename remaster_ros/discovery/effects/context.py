@@ -258,8 +258,8 @@ class Context:
 
     @cached_property
     def moving(self) -> tuple[int, ...]:
-        """Joints (1-based) that take more than one angle."""
-        span = np.ptp(self.measurements.q, axis=0)
+        """Joints (1-based) that take more than one angle in the rows to fit."""
+        span = np.ptp(self.measurements.q[self.to_fit], axis=0)
         return tuple(int(joint) + 1 for joint in np.flatnonzero(span > LEAST_TURN_RAD))
 
     def links(self) -> Sequence[int]:

@@ -20,17 +20,24 @@ MM = 1e-3
 
 def number(value: float, std: float, unit: str) -> str:
     """Return '5.1′ ± 0.3′', with the digits that the uncertainty leaves."""
+    text, std_text = rounded(value, std)
+    return f'{text}{unit} ± {std_text}{unit}'
+
+
+def rounded(value: float, std: float, sign: str = '-') -> tuple[str, str]:
+    """Return value and standard deviation with the digits that the latter leaves.
+
+    With ``sign`` '+' the value has a sign in any case.
+    """
     digits = 3
     if std > 0.0 and np.isfinite(std):
         exponent = int(np.floor(np.log10(std)))
         leading = std / 10.0**exponent
-        digits = int(np.clip(-exponent + (leading < 2.0), 0, 4))
-    return f'{_plain(value, digits)}{unit} ± {_plain(std, digits)}{unit}'
-
-
-def _plain(value: float, digits: int) -> str:
-    text = f'{value:.{digits}f}'
-    return text.removeprefix('-') if float(text) == 0.0 else text.replace('-', '−')
+        digits = max(0, -exponent + (leading < 2.0))
+    text = f'{value:{sign}.{digits}f}'
+    if float(text) == 0.0:
+        text = text.removeprefix('-')
+    return text.replace('-', '−'), f'{std:.{digits}f}'
 
 
 def angle(values: FloatArray) -> str:

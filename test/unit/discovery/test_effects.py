@@ -309,6 +309,19 @@ def test_a_closed_curve_runs_into_itself():
     np.testing.assert_allclose(below, above, atol=1e-7)
 
 
+def test_a_joint_that_moves_in_held_out_rows_alone_is_not_tested():
+    scene = scene_of()
+    m = scene.measurements
+    held_out = m.pose % 3 == 0
+    q = m.q.copy()
+    q[~held_out, 2] = 0.3
+    still = replace(scene, measurements=replace(m, q=q, is_validation=held_out))
+    assert 3 not in still.moving
+    joints = {cell.joints for cell in EFFECTS['joint_error_curve'].cells(still)}
+    assert (3,) not in joints
+    assert (2,) in joints
+
+
 def test_a_curve_is_seen_where_it_was_measured():
     x = np.radians(np.r_[np.arange(-170.0, -100.0), np.arange(-50.0, 30.0)])
     curve = Curve.of(x, 0.0, finest=np.radians(4.0), turns_over=True)

@@ -1,0 +1,206 @@
+"""What discovery.json holds beside what it shares with fit.json (`schemas`): each key once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from msgspec import UNSET, Struct, UnsetType
+
+from remaster_ros.reports.schemas import (
+    JointOffset,
+    Marker,
+    MeasuredSession,
+    Noise,
+    Registration,
+    Robot,
+    Sampler,
+)
+
+
+class EffectParameter(Struct):
+    """A parameter of an effect, in its unit."""
+
+    name: str
+    value: float
+    std: float
+    unit: str
+
+
+class LookAlike(Struct):
+    """What could be mistaken for an effect, and what would separate the two."""
+
+    name: str
+    joints: list[int]
+    log_evidence_gain: float
+    separate_by: str
+
+
+class Effect(Struct):
+    """A cause; ``size_m`` is the RMS at the marker after absorption, ``share`` of the gain.
+
+    ``sizes`` are its parts in arc minutes and millimetres, ``remedy`` is what to do about it.
+    """
+
+    name: str
+    joints: list[int]
+    place: str
+    driver: str
+    form: str
+    parameters: list[EffectParameter]
+    p_value: float
+    log_evidence_gain: float
+    confusable_with: list[LookAlike]
+    cause: str
+    size_m: float | UnsetType = UNSET
+    share: float | UnsetType | None = UNSET
+    sizes: list[str] | UnsetType = UNSET
+    remedy: str | UnsetType = UNSET
+
+
+class Gain(Struct):
+    """RMS of the 3-D error over every validation row, and what the noise alone makes."""
+
+    held_out_rms_before_m: float | None
+    held_out_rms_after_m: float | None
+    noise_floor_m: float
+
+
+class NoiseOfDiscovery(Struct):
+    """What the search found of the noise."""
+
+    pose_common_fraction: float
+    outliers: list[int]
+    heteroscedastic: Mapping[str, Any]
+    sensors: dict[str, Noise] | UnsetType = UNSET
+
+
+class OffsetBefore(Struct):
+    """A joint's zero-offset without the effects; None where nothing bounds it."""
+
+    joint: str
+    mean_deg: float
+    std_deg: float | None
+
+
+class SearchedRows(Struct):
+    """Of a session of which the search saw a part."""
+
+    searched: int
+    rows: int
+    others_rms_before_m: float | None
+    others_rms_after_m: float | None
+
+
+class Compared(Struct):
+    """A parameter in both sessions, and by how many standard deviations of both they differ."""
+
+    name: str
+    unit: str
+    value: float
+    std: float
+    other_value: float
+    other_std: float
+    sigmas: float | None
+
+
+class ConfirmedEffect(Struct):
+    """How an effect does in the other session.
+
+    ``rows_common`` of its rows have its driver where it was seen; ``carried_over`` is the share of
+    what it could gain there; None where that is nothing.
+    """
+
+    name: str
+    joints: list[int]
+    carried_over: float | None
+    rows_common: int | UnsetType = UNSET
+    rms_without_m: float | UnsetType | None = UNSET
+    rms_frozen_m: float | UnsetType | None = UNSET
+    parameters: list[Compared] | UnsetType = UNSET
+
+
+class Confirmed(Struct):
+    """How the effects do in another session of the arm; see `confirmation.Confirmation`."""
+
+    rms_before_m: float | None
+    rms_after_m: float | None
+    rms_own_m: float | None
+    same_offsets: bool
+    carried_over: float | None
+    confirmed: bool
+    effects: list[ConfirmedEffect]
+    rows: int | UnsetType = UNSET
+    rows_common: int | UnsetType = UNSET
+    rms_frozen_offsets_m: float | UnsetType | None = UNSET
+    joint_offsets: list[Compared] | UnsetType = UNSET
+    offsets_rms_sigmas: float | UnsetType | None = UNSET
+    parameters_rms_sigmas: float | UnsetType | None = UNSET
+    why: str | UnsetType = UNSET
+
+
+class Coverage(Struct):
+    """How many rows lie in their 95 % regions; the interval takes the rows as independent."""
+
+    rows: int
+    inside: int
+    share: float | None
+    interval95: tuple[float, float] | None
+
+
+class PredictedRegions(Struct):
+    """The 95 % regions of predictions.csv: ``widening`` is the factor on their size.
+
+    It is what the fitted rows take when their pose is left out, so that 95 % of them lie inside.
+    """
+
+    widening: float
+    held_out: Coverage
+    fitted: Coverage
+
+
+class JointCovariance(Struct):
+    """Covariance of the zero-offsets that are identifiable and of all of the causes' parameters.
+
+    ``matrix`` is in the units of its parameters, to six figures.
+    """
+
+    names: list[str]
+    units: list[str]
+    matrix: list[list[float]]
+
+
+class Unexplained(Struct):
+    """Structure that no cause explains: where it shows, its size, and what to do next."""
+
+    where: str
+    driver: str
+    size_m: float
+    p_value: float | None
+    next: str
+
+
+class Discovered(Struct):
+    """discovery.json."""
+
+    format: str
+    verdict: Literal['effects', 'none', 'undetermined', 'unexplained']
+    effects: list[Effect]
+    gain: Gain
+    noise: NoiseOfDiscovery
+    joint_offsets_after: list[JointOffset]
+    version: str | UnsetType = UNSET
+    robot: Robot | UnsetType = UNSET
+    session: MeasuredSession | UnsetType = UNSET
+    metrics: Mapping[str, Any] | UnsetType = UNSET
+    untestable: dict[str, str] | UnsetType = UNSET
+    unexplained: list[Unexplained] | UnsetType = UNSET
+    joint_offsets_before: list[OffsetBefore] | UnsetType = UNSET
+    sampler: Sampler | UnsetType = UNSET
+    registration: dict[str, Registration] | UnsetType = UNSET
+    markers: dict[str, Marker] | UnsetType = UNSET
+    covariance: JointCovariance | UnsetType = UNSET
+    least_p_value: float | UnsetType = UNSET
+    predicted_regions95: PredictedRegions | UnsetType = UNSET
+    rows_searched: SearchedRows | UnsetType = UNSET
+    confirmation: Confirmed | UnsetType = UNSET
