@@ -14,26 +14,175 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, Struct, UnsetType
 
-from remaster_ros.reports.schema_parts import (
-    Accuracy,
-    GaugeCombination,
-    JointOffset,
-    LeftOut,
-    Marker,
-    MeasuredSession,
-    Noise,
-    NoiseCheck,
-    Registration,
-    Robot,
-    SampledParameter,
-    Sampler,
-    StructureTest,
-)
-
 FIT_FORMAT = 'remaster-fit/1'
 DISCOVERY_FORMAT = 'remaster-discovery/1'
 
+Triple = tuple[float, float, float]
 Content = TypeVar('Content', bound=Struct)
+
+
+class Robot(Struct):
+    """Whose offsets these are."""
+
+    name: str
+    urdf_sha256: str
+    joint_names: list[str]
+    base_link: str
+    tip_link: str
+
+
+class Counts(Struct):
+    """What was measured of a split."""
+
+    observations: int
+    configurations: int
+    poses: int
+
+
+class MeasuredSession(Struct):
+    """What was measured: counts, sensor -> marker, when, how it ended; if it has no times."""
+
+    optimization: Counts
+    validation: Counts
+    sensors: dict[str, str]
+    created: str
+    exit_status: str
+    times: Literal['none'] | UnsetType = UNSET
+
+
+class JointOffset(Struct):
+    """One joint's zero-offset; where ``identifiable`` is false, ``why`` is the reason.
+
+    ``model_std_deg`` stands where ``std_deg`` is wider than the model has it (``intervals``).
+    """
+
+    joint: str
+    mean_deg: float
+    std_deg: float
+    interval95_deg: tuple[float, float]
+    identifiable: bool
+    why: str
+    model_std_deg: float | UnsetType = UNSET
+
+
+class GaugeCombination(Struct):
+    """A combination of parameters that the data do not determine, and what fixes it."""
+
+    combination: dict[str, float]
+    why: str
+    fixed_by: str
+
+
+class Registration(Struct):
+    """T_R_N: the sensor's frame N in the robot base R."""
+
+    translation_m: Triple
+    rotation_xyzw: tuple[float, float, float, float]
+    std_m: Triple
+    std_rad: Triple
+
+
+class Marker(Struct):
+    """A marker's position in the tool frame T."""
+
+    position_m: Triple
+    std_m: Triple
+
+
+class Noise(Struct):
+    """A sensor's noise per axis: of one row, and common to a pose (None: not separable).
+
+    Where it differs along and across the line of sight, both stand there as well.
+    """
+
+    sigma_m: float
+    std_m: float
+    pose_sigma_m: float | None
+    pose_std_m: float | UnsetType | None = UNSET
+    along_sigma_m: float | UnsetType = UNSET
+    along_std_m: float | UnsetType = UNSET
+    along_pose_sigma_m: float | UnsetType | None = UNSET
+    along_pose_std_m: float | UnsetType | None = UNSET
+    across_sigma_m: float | UnsetType = UNSET
+    across_std_m: float | UnsetType = UNSET
+    across_pose_sigma_m: float | UnsetType | None = UNSET
+    across_pose_std_m: float | UnsetType | None = UNSET
+
+
+class Sampler(Struct):
+    """How the posterior was sampled; ``draws`` are kept draws of each chain.
+
+    ``precision`` is the Monte Carlo error of the worst mean in standard deviations;
+    ``log_density_error_max`` that of the second-order density on the draws that were checked.
+    ``method`` is 'metropolis' for chains, 'importance' for weighted draws, 'laplace' for a
+    Gaussian about the mode; for the latter two ``pareto_k`` is the check of their weights, passed
+    below 0.7.
+    """
+
+    name: str
+    chains: int
+    draws: int
+    r_hat_max: float | None
+    ess_min: float | None
+    seconds: float | None
+    acceptance_rate: float | UnsetType | None = UNSET
+    converged: bool | UnsetType = UNSET
+    message: str | UnsetType = UNSET
+    precision: float | UnsetType | None = UNSET
+    precision_wanted: float | UnsetType | None = UNSET
+    log_density_error_max: float | UnsetType | None = UNSET
+    log_density_checked_draws: int | UnsetType = UNSET
+    method: Literal['metropolis', 'importance', 'laplace'] | UnsetType = UNSET
+    pareto_k: float | UnsetType | None = UNSET
+
+
+class SampledParameter(Struct):
+    """A parameter in the unit of its name (m, rad), and how well it was sampled."""
+
+    name: str
+    mean: float
+    std: float
+    r_hat: float | None
+    ess_bulk: float | None
+    ess_tail: float | None
+
+
+class Accuracy(Struct):
+    """The three metrics by split; ``validation`` is None where nothing was held out."""
+
+    optimization: Mapping[str, Any] | None
+    validation: Mapping[str, Any] | None
+
+
+class LeftOut(Struct):
+    """A row that was not fitted, and why."""
+
+    observation: int
+    why: str
+
+
+class NoiseCheck(Struct):
+    """Does noise explain what is left of a sensor's errors?
+
+    ``after_m`` is the mean error after (held out where there are such rows, without the worst
+    twentieth), ``noise_m`` what the noise makes that the sensor states and that shows within poses
+    (None where neither does).
+    """
+
+    explained: bool | None
+    after_m: float
+    noise_m: float | None
+    stated_std_m: float | None
+    within_pose_std_m: float | None
+
+
+class StructureTest(Struct):
+    """Do the residuals follow a driver: in the means of the poses, or in deviations from them?"""
+
+    driver: str
+    between_poses: bool
+    p_value: float
+    found: bool
 
 
 class Fit(Struct):
