@@ -211,6 +211,7 @@ class Sampled:
         if self.unmodelled is None:
             return self
         causes = rng.standard_normal((*self.z.shape[:-1], self.unmodelled.shape[1]))
+        causes -= causes.mean(axis=(0, 1))
         return replace(self, z=self.z + causes @ self.unmodelled.T)
 
 
@@ -248,10 +249,8 @@ def build_result(
     model = posterior.model
     # In pinned coordinates any value of a joint that is not identifiable fits as well as 0.
     unfixed = np.isin(np.arange(model.joints), gauge.held)
-    by_data = _offset_summary(
-        sampled.z[..., : model.joints].reshape(-1, model.joints), unfixed, sampled.taken_as_known
-    )[1]
-    sampled = sampled.widened(rng)
+    # Causes outside the model move parameters, but hardly the predictions.
+    by_data, sampled = sampled, sampled.widened(rng)
     z = sampled.z.copy()
     z[..., np.flatnonzero(unfixed)] = 0.0
     flat = z.reshape(-1, model.size)
@@ -259,6 +258,9 @@ def build_result(
     predicted_before = predicted_rows(problem, model, sampled.z_before)
     predicted_after = predicted_rows(problem, model, sampled.z_mean)
     mean, std, interval = _offset_summary(flat[:, : model.joints], unfixed, sampled.taken_as_known)
+    std_by_data = _offset_summary(
+        by_data.z[..., : model.joints].reshape(-1, model.joints), unfixed, sampled.taken_as_known
+    )[1]
     T_R_N, markers = model.T_R_N(x_after), model.markers(x_after)
     x_draws = model.natural(flat)
     T_draws = model.T_R_N(x_draws)
@@ -285,7 +287,7 @@ def build_result(
         model=model,
         before=sampled.z_before,
         after=sampled.z_mean,
-        draws=sampled.z.reshape(-1, model.size),
+        draws=by_data.z.reshape(-1, model.size),
         sigma=total_noise.reshape(-1, *total_noise.shape[2:]),
     )
     names = _sampled_names(posterior, sampled.moved)
@@ -307,7 +309,7 @@ def build_result(
         joint_offsets=mean,
         joint_offsets_std=widening * std,
         joint_offsets_interval95=mean[:, None] + widening[:, None] * (interval - mean[:, None]),
-        identifiable=_identifiable(gauge.why, by_data),
+        identifiable=_identifiable(gauge.why, std_by_data),
         why=gauge.why,
         gauge=gauge.directions,
         T_R_N=by_sensor(T_R_N),

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from remaster_ros.discovery.cross_validation import held_out_error, worth_of
+from remaster_ros.discovery.dating import refine_moments
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import Solution, solve
@@ -48,6 +49,8 @@ MOST_EXCHANGED = 6
 MOST_MERGED = 4
 # So many cells of one family are a family.
 WHOLE = 3
+# Members of a family of which none raises the evidence alone have to raise it by this together.
+TOGETHER = 10.0
 # A member of a family has to raise the evidence by this: a free form of no size costs nothing.
 MEMBER = 1.0
 # A cell whose removal would cost this much evidence is kept without a test by itself.
@@ -148,7 +151,8 @@ class Search:
             else:
                 break
             steps.append(step)
-            solution = self.refine_moments(self.swap(self.prune(candidate)))
+            solution = self.swap(self.prune(candidate))
+            solution = refine_moments(solution, self.cells, self.data.part, self.fit)
             solution = self._judged(self.backward_elimination(self.drop_unpredictive(solution)))
         empty = self.fit(())
         assert empty is not None
@@ -204,7 +208,9 @@ class Search:
             candidate = self.grown(solution, family)
             if candidate is not None:
                 gain = candidate.log_evidence - solution.log_evidence
-                found.append(Proposal(candidate, screening.p_value(gain)))
+                mine = [cell.name in family for cell in self.catalogue.cells]
+                if gain > TOGETHER or np.any(screening.score[mine] > 0.0):
+                    found.append(Proposal(candidate, screening.p_value(gain)))
         found = [one for one in found if one.solution.log_evidence > solution.log_evidence]
         return sorted(found, key=lambda one: -one.solution.log_evidence)
 
@@ -289,24 +295,6 @@ class Search:
             return None
         return best
 
-    def refine_moments(self, solution: Solution) -> Solution:
-        """Move what happened at one moment to the best moment nearby, as finely as rows allow."""
-        for cell in solution.cells:
-            between = EFFECTS[cell.name].between
-            if between is None:
-                continue
-            tried = np.unique([other.moment for other in self.cells if other.name == cell.name])
-            low = np.max(tried[tried < cell.moment], initial=-np.inf)
-            high = np.min(tried[tried > cell.moment], initial=np.inf)
-            rest = tuple(other for other in solution.cells if other is not cell)
-            fits = []
-            for other in between(self.data.part, float(low), float(high)):
-                if other.parameters == cell.parameters:
-                    moved = self.fit((*rest, other), solution)
-                    fits += [moved] if moved is not None else []
-            solution = _dated(fits) if fits else solution
-        return solution
-
     def drop_unpredictive(self, solution: Solution) -> Solution:
         """Drop the causes without which poses left out are predicted better."""
         for group in grouped(solution.cells):
@@ -382,17 +370,6 @@ class Search:
             self._last_held_out = larger, float(after.sum())
         before = held_out_error(self.data, smaller, larger.noise, self._fold_of_pose)
         return float(1.0 - self._last_held_out[1] / before.sum())
-
-
-def _dated(fits: Sequence[Solution]) -> Solution:
-    """Return the best of fits whose last cell differs in its moment, with the moment's std."""
-    evidence = np.array([fit.log_evidence for fit in fits])
-    best = fits[int(np.argmax(evidence))]
-    weight = np.exp(evidence - evidence.max())
-    moment = np.array([fit.cells[-1].moment for fit in fits])
-    spread = np.sqrt(np.average((moment - best.cells[-1].moment) ** 2, weights=weight))
-    dated = replace(best.cells[-1], moment_std=float(spread))
-    return replace(best, cells=(*best.cells[:-1], dated))
 
 
 def _least_share(solution: Solution, candidate: Solution) -> float:

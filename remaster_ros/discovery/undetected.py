@@ -21,11 +21,14 @@ from remaster_ros.discovery.evidence import Solution
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.types import FloatArray
 
-# A cause is found from about so many standard deviations on; those that are not lie anywhere below.
+# A cause is found from about so many standard deviations on; the others lie anywhere below.
 DETECTED = 4.5
 # So many of them are expected in an arm: with two, the intervals of sessions with two small causes
 # held 99 % instead of 95.
 MISSED = 1.0
+# Shares of a cause's size that what was found, and the offsets model, have to leave of it.
+IMITATED = 0.3
+ABSORBED = 0.02
 
 
 def undetected(found: Estimate, data: Residuals, solution: Solution) -> FloatArray:
@@ -54,23 +57,36 @@ def undetected(found: Estimate, data: Residuals, solution: Solution) -> FloatArr
     both = np.concatenate((fitted, columns), axis=2)
     white = data.noise_model.whitened(both, solution.noise).reshape(3 * len(data), -1)
     known, unknown = white[:, : fitted.shape[2]], white[:, fitted.shape[2] :]
-    precision = np.zeros((len(free) + own.shape[2],) * 2)
+    precision = np.zeros((known.shape[1],) * 2)
     rows = prior_rows(model, found.posterior.priors, found.mode.z)[1][:, free]
     precision[: len(free), : len(free)] = rows.T @ rows
     precision[len(free) :, len(free) :] = solution.prior_precision()
-    # In units of each parameter's own: those of rad and of m/s differ by ten decades.
-    gram = known.T @ known + precision
-    unit = np.diag(gram) ** -0.5
-    scaled = gram * np.outer(unit, unit) + 1e-12 * np.eye(len(gram))
-    moved = -unit[:, None] * np.linalg.solve(scaled, unit[:, None] * (known.T @ unknown))
+    moved = _response(known, precision, unknown)
     left = np.linalg.norm(unknown + known @ moved, axis=0)
-    seen = DETECTED * np.sqrt(MISSED / 3.0 / max(count, 1))
+    # What the causes found can imitate is not undetected, and what the offsets model imitates
+    # altogether is no error of it.
+    core = known[:, : len(free)]
+    alone = _response(core, precision[: len(free), : len(free)], unknown)
+    left_by_core = np.linalg.norm(unknown + core @ alone, axis=0)
+    whole = np.linalg.norm(unknown, axis=0)
+    apart = (left > IMITATED * left_by_core) & (left_by_core > ABSORBED * whole)
+    seen = DETECTED * np.sqrt(MISSED / 3.0 / max(int(apart.sum()), 1))
     largest = np.array([cell.largest or np.inf for cell in cells for _ in cell.parameters])
-    std = np.minimum(largest, seen / np.maximum(left, np.finfo(float).tiny))
+    std = apart * np.minimum(largest, seen / np.maximum(left, np.finfo(float).tiny))
     spread = np.zeros((model.size + own.shape[2], count))
     where = np.concatenate((free, model.size + np.arange(own.shape[2])))
     spread[where] = moved * std
     return spread
+
+
+def _response(known: FloatArray, precision: FloatArray, unknown: FloatArray) -> FloatArray:
+    """Return how the parameters of the known columns move for a unit of each unknown one."""
+    gram = known.T @ known + precision
+    # In units of each parameter's own: those of rad and of m/s differ by ten decades.
+    unit = np.maximum(np.diag(gram), np.finfo(float).tiny) ** -0.5
+    scaled = gram * np.outer(unit, unit) + 1e-12 * np.eye(len(gram))
+    moved: FloatArray = -unit[:, None] * np.linalg.solve(scaled, unit[:, None] * known.T @ unknown)
+    return moved
 
 
 def _not_found(data: Residuals, solution: Solution) -> Iterator[Cell]:

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from discovery_scenes import at_joint, residuals_of, session_with
 
+from remaster_ros.calibration.fit import fit_session
 from remaster_ros.discovery.discover import Findings, discover_session, find_causes
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.step import moments_of
 from remaster_ros.discovery.evidence import solve
+from remaster_ros.discovery.undetected import undetected
 from remaster_ros.types import FloatArray, Session
 
 
@@ -190,3 +192,28 @@ def test_moments_lie_between_configurations():
         after = context.elapsed_s > moment
         configurations = context.measurements.configuration
         assert not set(configurations[after]) & set(configurations[~after])
+
+
+def test_causes_too_small_to_be_found_widen_the_offsets_and_nothing_else():
+    """They move zero-offsets, not the predictions; the more of them, the further."""
+    found = findings(session_with(39))
+    data, solution = found.residuals, found.selection.solution
+    spread = undetected(found.found, data, solution)
+    free = found.found.posterior.free
+    assert spread.shape[0] == found.found.model.size + len(solution.parameters)
+    held = np.setdiff1d(np.arange(found.found.model.size), free)
+    assert np.all(spread[held] == 0.0)
+    assert np.all(np.isfinite(spread))
+    plain = fit_session(session_with(39), rng=np.random.default_rng(1), precision=0.05)
+    wide = fit_session(
+        session_with(39), rng=np.random.default_rng(1), precision=0.05, unmodelled=spread
+    )
+    known = plain.identifiable
+    np.testing.assert_array_equal(known, wide.identifiable)
+    by_data, std = (fit.joint_offset_draws.std(axis=(0, 1)) for fit in (plain, wide))
+    assert 1.02 < np.max((std / by_data)[known]) < 3.0
+    np.testing.assert_allclose(wide.joint_offsets, plain.joint_offsets, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(wide.residuals_after, plain.residuals_after, atol=1e-12)
+    expected = np.hypot(by_data, np.linalg.norm(spread[: len(known)], axis=1))
+    # A standard deviation of 400 independent draws is known to 3.5 %.
+    np.testing.assert_allclose(std[known], expected[known], rtol=0.15)

@@ -1,0 +1,61 @@
+"""The moment of a step: dated as finely as the rows allow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.evidence import Solution
+
+
+def refine_moments(
+    solution: Solution,
+    tried: Sequence[Cell],
+    context: Context,
+    fit: Callable[[Sequence[Cell], Solution], Solution | None],
+) -> Solution:
+    """Move what happened at one moment to the best moment nearby.
+
+    Parameters
+    ----------
+    solution
+        The set found.
+    tried
+        All cells of the search: a better moment lies between those tried before and after.
+    context
+        Of the rows worked on.
+    fit
+        Fits a set, with a start.
+    """
+    for cell in solution.cells:
+        between = EFFECTS[cell.name].between
+        if between is None:
+            continue
+        moments = np.unique([other.moment for other in tried if other.name == cell.name])
+        low = np.max(moments[moments < cell.moment], initial=-np.inf)
+        high = np.min(moments[moments > cell.moment], initial=np.inf)
+        rest = tuple(other for other in solution.cells if other is not cell)
+        fits = [
+            moved
+            for other in between(context, float(low), float(high))
+            if other.parameters == cell.parameters
+            and (moved := fit((*rest, other), solution)) is not None
+        ]
+        solution = _dated(fits) if fits else solution
+    return solution
+
+
+def _dated(fits: Sequence[Solution]) -> Solution:
+    """Return the best of fits whose last cell differs in its moment, with the moment's std."""
+    evidence = np.array([fit.log_evidence for fit in fits])
+    best = fits[int(np.argmax(evidence))]
+    weight = np.exp(evidence - evidence.max())
+    moment = np.array([fit.cells[-1].moment for fit in fits])
+    spread = np.sqrt(np.average((moment - best.cells[-1].moment) ** 2, weights=weight))
+    dated = replace(best.cells[-1], moment_std=float(spread))
+    return replace(best, cells=(*best.cells[:-1], dated))
