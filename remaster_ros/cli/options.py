@@ -8,6 +8,8 @@ from collections.abc import Callable
 from typing import Any, NoReturn, TypeVar
 
 Number = TypeVar('Number', int, float)
+# Of the source paper.
+CANDIDATES = 60
 
 
 class Parser(argparse.ArgumentParser):
@@ -51,6 +53,18 @@ def _bounded(
         return value
 
     return convert
+
+
+def add_poses(parser: argparse.ArgumentParser) -> None:
+    """Add the numbers of candidate poses."""
+    for option, low, what in (('--poses', 1, 'to fit'), ('--validation', 0, 'held out')):
+        parser.add_argument(
+            option,
+            type=integer(low),
+            default=CANDIDATES,
+            metavar='N',
+            help=f'candidate poses {what} (default {CANDIDATES}; those out of reach are dropped)',
+        )
 
 
 def names(text: str) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ import json
 import numpy as np
 
 from remaster_ros.cli.console import progress_bar, show
-from remaster_ros.cli.options import integer, number
+from remaster_ros.cli.options import add_poses, integer, number
 from remaster_ros.kinematics.body_pairs import RESERVE_M
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.transforms import transform
@@ -26,20 +26,7 @@ TRIED_STARTS = 200
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``remaster plan``; their defaults are those of the nodes."""
     parser.add_argument('cell', metavar='CELL', help='cell file, or a shipped one (demo)')
-    parser.add_argument(
-        '--poses',
-        type=integer(1),
-        default=60,
-        metavar='N',
-        help='candidate poses to fit (default 60)',
-    )
-    parser.add_argument(
-        '--validation',
-        type=integer(0),
-        default=60,
-        metavar='N',
-        help='candidate poses held out (default 60)',
-    )
+    add_poses(parser)
     parser.add_argument(
         '--reference-every',
         type=integer(0),

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from remaster_ros.cli.console import progress_bar, show
-from remaster_ros.cli.options import integer, names, number
+from remaster_ros.cli.options import add_poses, names, number
 from remaster_ros.session.files import write_atomically
 from remaster_ros.session.reader import write_session
 from remaster_ros.session.workcell import read_cell
@@ -36,20 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--base-link', metavar='LINK', help='frame R (default: the root link)')
     parser.add_argument('--tip-link', metavar='LINK', help='frame T (default: the only end)')
-    parser.add_argument(
-        '--poses',
-        type=integer(1),
-        default=60,
-        metavar='N',
-        help='candidate poses to fit (default 60; those that cannot be reached are dropped)',
-    )
-    parser.add_argument(
-        '--validation',
-        type=integer(0),
-        default=60,
-        metavar='N',
-        help='candidate poses held out (default 60)',
-    )
+    add_poses(parser)
     parser.add_argument(
         '--sensors', type=names, metavar='NAME,…', help="of the cell's sensors (default: all)"
     )

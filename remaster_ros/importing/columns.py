@@ -246,16 +246,26 @@ def _joints(
     usable = [stem for stem in complete if not _OTHER_JOINTS & set(stem) and stem not in came_from]
     known = [stem for stem in usable if set(stem) <= _JOINT_WORDS | _REPORTED | {'*', '='}]
     best = [stem for stem in known if '=' in stem or _REPORTED & set(stem)] or known or usable
-    if len(best) > 1:
-        sets = '; '.join(', '.join(table.names[i] for i in complete[stem]) for stem in best[:4])
-        raise InputError(
-            f'{table.path}: these could all be the joint angles: {sets}; name them, base to tip, '
-            'with --joints'
-        )
-    if not best:
-        return ()
-    _take(found, complete[best[0]], taken)
-    return complete[best[0]]
+    sets = [complete[stem] for stem in best]
+    chosen = _only_one(table, sets, 'the joint angles', 'name them, base to tip, with --joints')
+    _take(found, chosen, taken)
+    return chosen
+
+
+def _only_one(
+    table: TextTable, sets: Sequence[tuple[int, ...]], what: str, remedy: str
+) -> tuple[int, ...]:
+    """Return the only set of columns; () where there is none.
+
+    Raises
+    ------
+    InputError
+        Several sets could be what is looked for.
+    """
+    if len(sets) > 1:
+        listed = '; '.join(', '.join(table.names[i] for i in columns) for columns in sets[:4])
+        raise InputError(f'{table.path}: these could all be {what}: {listed}; {remedy}')
+    return sets[0] if sets else ()
 
 
 def _joint_of(
@@ -300,16 +310,10 @@ def _point(
     usable = [stem for stem in complete if stem not in spreads]
     best = [stem for stem in usable if not _TOOL & set(stem)] or usable
     best = [stem for stem in best if _REPORTED & set(stem)] or best
-    if len(best) > 1:
-        sets = '; '.join(', '.join(table.names[i] for i in complete[stem]) for stem in best[:4])
-        raise InputError(
-            f'{table.path}: these could all be the measured points: {sets}; name the three '
-            'columns with --points'
-        )
-    if not best:
-        return ()
-    _take(found, complete[best[0]], taken)
-    return complete[best[0]]
+    sets = [complete[stem] for stem in best]
+    chosen = _only_one(table, sets, 'the measured points', 'name the three columns with --points')
+    _take(found, chosen, taken)
+    return chosen
 
 
 def _with_axis(words: Sequence[str]) -> tuple[str, ...]:

@@ -226,7 +226,7 @@ def _plain(values: Any) -> Any:
         return values.tolist()
     if isinstance(values, Mapping):
         return dict(values)
-    raise NotImplementedError(f'no JSON for {type(values)}')
+    raise TypeError(f'no JSON for {type(values)}')
 
 
 def encode(content: Struct) -> bytes:

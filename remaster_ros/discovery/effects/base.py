@@ -279,6 +279,14 @@ def displaced(*shifts: FloatArray) -> Design:
     return Design(None, np.stack(shifts, axis=-1))
 
 
+def along_axes(features: FloatArray, turns: FloatArray) -> list[FloatArray]:
+    """Return each feature (n, m) times each axis of rotations (n, 3, 3): 3 m shifts (n, 3).
+
+    The three axes of a feature stand next to each other.
+    """
+    return [features[:, [i]] * turns[:, :, a] for i in range(features.shape[1]) for a in range(3)]
+
+
 def turned(context: Context, axes: Sequence[FloatArray], about: FloatArray) -> Design:
     """Return columns that turn the marker about points (n, 3), m, by axes (n, 3), rad per unit."""
     return displaced(*(np.cross(axis, context.points - about) for axis in axes))

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 from scipy.spatial.distance import cdist
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced
+from remaster_ros.discovery.effects.base import Cell, Design, Effect, along_axes, displaced
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import up_to
 from remaster_ros.discovery.effects.splines import basis, knot_vector, mean_penalty, roughness
@@ -84,13 +84,7 @@ def _along_sight(context: Context, sensor: int, knots: FloatArray) -> Design:
 def _field(context: Context, sensor: int, centers: FloatArray, length: float) -> Design:
     mine = context.seen_by(sensor)[:, None]
     features = _kernel(context.in_sensor, centers, length) * mine
-    return displaced(
-        *(
-            features[:, [i]] * context.sensor_turn[:, :, axis]
-            for i in range(len(centers))
-            for axis in range(3)
-        )
-    )
+    return displaced(*along_axes(features, context.sensor_turn))
 
 
 EFFECT = Effect(

@@ -13,7 +13,14 @@ from functools import partial
 import numpy as np
 from scipy.interpolate import BSpline
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced, needs_time
+from remaster_ros.discovery.effects.base import (
+    Cell,
+    Design,
+    Effect,
+    along_axes,
+    displaced,
+    needs_time,
+)
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import up_to
 from remaster_ros.types import FloatArray
@@ -53,13 +60,7 @@ def _wandered(context: Context, sensor: int, knots: FloatArray) -> Design:
     padded = np.concatenate((knots[:1], knots, knots[-1:]))
     features = BSpline.design_matrix(context.progress, padded, 1).toarray()
     features = features * context.seen_by(sensor)[:, None]
-    return displaced(
-        *(
-            features[:, [i]] * context.sensor_turn[:, :, axis]
-            for i in range(len(knots))
-            for axis in range(3)
-        )
-    )
+    return displaced(*along_axes(features, context.sensor_turn))
 
 
 EFFECT = Effect(

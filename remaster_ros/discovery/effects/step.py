@@ -11,7 +11,14 @@ from functools import partial
 
 import numpy as np
 
-from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced, needs_time
+from remaster_ros.discovery.effects.base import (
+    Cell,
+    Design,
+    Effect,
+    along_axes,
+    displaced,
+    needs_time,
+)
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import angle, length
 from remaster_ros.types import FloatArray
@@ -103,7 +110,7 @@ def _slipped(context: Context, joint: int, moment: float) -> Design:
 
 def _marker_moved(context: Context, marker: int, moment: float) -> Design:
     mine = _after(context, moment) * (context.marker == marker)[:, None]
-    return displaced(*(context.tool[:, :3, axis] * mine for axis in range(3)))
+    return displaced(*along_axes(mine, context.tool[:, :3, :3]))
 
 
 def _sensor_moved(
@@ -112,12 +119,11 @@ def _sensor_moved(
     mine = _after(context, moment) * np.isin(context.sensor, sensors)[:, None]
     # Along the axes of the sensor, or of the base where all of them are concerned.
     turn = context.sensor_turn if len(sensors) == 1 else np.eye(3)[None]
-    axes = [np.broadcast_to(turn[:, :, axis], (len(context), 3)) for axis in range(3)]
-    shifts = [mine * axis for axis in axes]
+    shifts = along_axes(mine, turn)
     if turning:
         # A turn seen at one metre, which has the unit of the shifts.
         arms = context.points - np.mean(context.centers[list(sensors)], axis=0)
-        shifts += [mine * np.cross(axis, arms) for axis in axes]
+        shifts += [np.cross(shift, arms) for shift in shifts]
     return displaced(*shifts)
 
 

@@ -13,6 +13,7 @@ from remaster_ros.discovery.effects.base import (
     Design,
     Effect,
     Place,
+    along_axes,
     displaced,
     turned,
 )
@@ -166,21 +167,14 @@ def _at(context: Context, joint: int, form: _Form) -> Design:
     return Design(joint - 1, form.features(context))
 
 
-def _along_axes(context: Context, turn: Feature, form: _Form) -> list[FloatArray]:
-    """Return each feature times each axis of a rotation (n, 3, 3), (n, 3) each."""
-    features, axes = form.features(context), turn(context)
-    count = features.shape[1]
-    return [features[:, [i]] * axes[:, :, a] for i in range(count) for a in range(3)]
-
-
 def _shifted(context: Context, turn: Feature, form: _Form) -> Design:
     """Shift along the axes of a rotation (n, 3, 3), for each feature."""
-    return displaced(*_along_axes(context, turn, form))
+    return displaced(*along_axes(form.features(context), turn(context)))
 
 
 def _rotated(context: Context, turn: Feature, about: Feature, form: _Form) -> Design:
     """Turn about the axes of a rotation (n, 3, 3) through points (n, 3), for each feature."""
-    return turned(context, _along_axes(context, turn, form), about(context))
+    return turned(context, along_axes(form.features(context), turn(context)), about(context))
 
 
 def _bending(context: Context, link: int) -> Design:
