@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from remaster_ros.calibration.outliers import CERTAIN, gross_probability, robust_scale
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements
 
 # Errors that all solutions of a pose share belong to a sensor's noise as well: 0.5 mm beside
@@ -24,6 +25,10 @@ SCATTER = 5.0
 # The worst errors are left out of the comparison: single gross errors are named elsewhere.
 WORST_SHARE = 0.05
 LARGEST_SPREAD = 2.0
+# Gross errors spoil a mean that is so many times the one without the worst.
+SPOILT = 1.5
+# Observations that a sentence lists.
+LISTED = 5
 MEAN_LENGTH = float(np.sqrt(8.0 / np.pi))
 """Mean length of a vector of three independent standard normal numbers."""
 MEDIAN_LENGTH = 1.5382
@@ -50,6 +55,10 @@ class NoiseCheck:
     spread
         How many times larger noise makes the error on held-out rows, as few poses determine the
         parameters poorly; 1 on fitted rows.
+    gross
+        ``observation`` of every held-out row that is a gross error: no fit leaves those out.
+    mean_m
+        Mean 3-D error on all rows judged, gross ones too, m.
     """
 
     sensor: str
@@ -58,6 +67,22 @@ class NoiseCheck:
     within_m: float | None
     poses: int
     spread: float = 1.0
+    gross: tuple[int, ...] = ()
+    mean_m: float = 0.0
+
+    @property
+    def spoilt(self) -> str:
+        """What gross errors do to the held-out error, a sentence; '' where that is little."""
+        if not self.gross or self.mean_m <= SPOILT * self.error_m:
+            return ''
+        listed = ', '.join(map(str, self.gross[:LISTED]))
+        return (
+            f'{len(self.gross)} held-out readings of {self.sensor} are gross errors (observation '
+            f'{listed}{" …" if len(self.gross) > LISTED else ""}) and make up most of its mean '
+            f'error of {1e3 * self.mean_m:.3f} mm; without its worst twentieth it is '
+            f'{1e3 * self.error_m:.3f} mm. Run "remaster discover", which tests whether they '
+            'belong to another configuration.'
+        )
 
     @property
     def noise_m(self) -> float | None:
@@ -111,7 +136,8 @@ def check_noise(
             continue
         held_out = mine & measurements.is_validation
         judged = held_out if held_out.any() else mine
-        lengths = np.sort(np.linalg.norm(residuals[judged], axis=1))
+        errors = np.linalg.norm(residuals, axis=1)
+        lengths = np.sort(errors[judged])
         most = len(lengths) - int(WORST_SHARE * len(lengths))
         checks.append(
             NoiseCheck(
@@ -121,9 +147,19 @@ def check_noise(
                 _within(measurements, residuals, mine),
                 len(np.unique(measurements.pose[judged])),
                 spread if held_out.any() else 1.0,
+                _gross(measurements, errors, held_out),
+                float(lengths.mean()),
             )
         )
     return tuple(checks)
+
+
+def _gross(measurements: Measurements, errors: FloatArray, rows: BoolArray) -> tuple[int, ...]:
+    """Return the observations of the rows that are gross by the rule of the fit."""
+    if not rows.any():
+        return ()
+    gross = gross_probability(errors[rows] / robust_scale(errors[rows])) > CERTAIN
+    return tuple(measurements.observation[rows][gross].tolist())
 
 
 def _spread(fitted: Measurements, parameters: int) -> float:

@@ -200,17 +200,17 @@ def robust_noise(rows: Rows, errors: FloatArray, good: BoolArray) -> tuple[Float
     for index, span in rows.spans:
         paired = good[span] & (count[group[span]] > 1)
         poses = (rows.group_sensor == index) & (count > 0)
-        pose_total = _robust_scale(np.linalg.norm(mean[poses], axis=1))
+        pose_total = robust_scale(np.linalg.norm(mean[poses], axis=1))
         if not paired.any():
             sigma[index] = pose_total
             continue
-        sigma[index] = _robust_scale(deviation[span][paired])
+        sigma[index] = robust_scale(deviation[span][paired])
         own = sigma[index] ** 2 * np.mean(1.0 / count[poses])
         pose_sigma[index] = np.sqrt(max(pose_total**2 - own, 0.0))
     return sigma, pose_sigma
 
 
-def _robust_scale(lengths: FloatArray) -> float:
+def robust_scale(lengths: FloatArray) -> float:
     """Return the standard deviation per axis of three-dimensional errors of these lengths."""
     return float(np.max(np.quantile(lengths, _QUANTILES) / _EXPECTED)) + RESOLUTION_M
 

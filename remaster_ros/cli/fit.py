@@ -122,6 +122,7 @@ def summary(result: FitResult) -> str:
                 f'{check.sensor}: noise ({1e3 * check.noise_error_m:.3f} mm) does not explain the '
                 f'{left}: other errors dominate; run "remaster discover"'
             )
+    lines += [check.spoilt for check in result.noise_checks if check.spoilt]
     if result.structure is not None:
         lines += [f'{test.words} ({test.chance})' for test in result.structure.found]
         if result.structure.found and all(check.explained for check in result.noise_checks):

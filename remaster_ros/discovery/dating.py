@@ -19,7 +19,7 @@ def refine_moments(
     context: Context,
     fit: Callable[[Sequence[Cell], Solution], Solution | None],
 ) -> Solution:
-    """Move what happened at one moment to the best moment nearby.
+    """Move what happened at one moment to the best moment and variant nearby.
 
     Parameters
     ----------
@@ -43,7 +43,8 @@ def refine_moments(
         fits = [
             moved
             for other in between(context, float(low), float(high))
-            if other.parameters == cell.parameters
+            if (other.place, other.joints, other.subject)
+            == (cell.place, cell.joints, cell.subject)
             and (moved := fit((*rest, other), solution)) is not None
         ]
         solution = _dated(fits) if fits else solution
@@ -51,7 +52,7 @@ def refine_moments(
 
 
 def _dated(fits: Sequence[Solution]) -> Solution:
-    """Return the best of fits whose last cell differs in its moment, with the moment's std."""
+    """Return the best of fits that differ in the moment of their last cell, with its std."""
     evidence = np.array([fit.log_evidence for fit in fits])
     best = fits[int(np.argmax(evidence))]
     weight = np.exp(evidence - evidence.max())

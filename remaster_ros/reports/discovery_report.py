@@ -16,6 +16,12 @@ from remaster_ros.reports.pages import inlined, page, write_report
 
 # Long lists of spline coefficients are for other programs; the figure shows the curve.
 MOST_PARAMETERS = 8
+# Regions meant for 95 % of the held-out rows that hold clearly less than this are too small.
+FEWEST_INSIDE = 0.92
+TOO_SURE = (
+    ' Fewer held-out rows than should lie where they were predicted: something is left that the '
+    'model does not have.'
+)
 
 
 def write_discovery_report(
@@ -44,8 +50,10 @@ def write_discovery_report(
     html = page(
         'discovery.html.jinja',
         found=msgspec.to_builtins(content),
-        headline=headline(discovery, confirmation),
-        mood='good' if _is_proven(discovery, confirmation) else 'caution',
+        headline=headline(discovery, confirmation) + (TOO_SURE if too_sure(content) else ''),
+        mood='good'
+        if _is_proven(discovery, confirmation) and not too_sure(content)
+        else 'caution',
         equations={name: effect.equation for name, effect in EFFECTS.items()},
         sources={name: effect.source for name, effect in EFFECTS.items()},
         most_parameters=MOST_PARAMETERS,
@@ -53,6 +61,14 @@ def write_discovery_report(
         drawings={name: inlined(name, text) for name, text in drawings.items()},
     )
     return write_report(folder, drawings, html)
+
+
+def too_sure(content: Discovered) -> bool:
+    """Whether clearly fewer held-out rows lie in their 95 % regions than should."""
+    regions = content.predicted_regions95
+    if isinstance(regions, msgspec.UnsetType) or regions.held_out.interval95 is None:
+        return False
+    return regions.held_out.interval95[1] < FEWEST_INSIDE
 
 
 def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:

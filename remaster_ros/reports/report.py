@@ -97,7 +97,8 @@ def verdict(result: FitResult) -> Headline:
     change = f'{before:.3f} mm to {after:.3f} mm {where}'
     unexplained = [check for check in result.noise_checks if not check.explained]
     changes = _references(result)[1]
-    points = [_compared(check) for check in unexplained] + _structure(result) + changes
+    spoilt = [check.spoilt for check in result.noise_checks if check.spoilt]
+    points = [_compared(check) for check in unexplained] + _structure(result) + changes + spoilt
     doubtful = bool(unexplained) or result.other_errors
     mood = 'caution'
     if result.sampler.wandering and not result.sampler.converged:
@@ -118,7 +119,7 @@ def verdict(result: FitResult) -> Headline:
         headline = f'The mean position error falls from {change}: {times} smaller.'
         if doubtful:
             headline += f' {_dominated(result, unexplained)}'
-        elif validated and not changes and result.sampler.converged:
+        elif validated and not changes and not spoilt and result.sampler.converged:
             mood = 'good'
     elif gain > 1 / NOTICEABLE_GAIN:
         headline = (
