@@ -123,7 +123,12 @@ def real_nodes(
 
     # The recorder does not wait for a sensor whose node is not started.
     require = {'require': wanted[0]} if len(wanted) == 1 < len(known) else {}
-    values = {'pose_planner': own, 'robot_bridge': own, 'recorder': {**own, **require}}
+    values = {
+        'pose_planner': own,
+        'robot_bridge': own,
+        'recorder': {**own, **require},
+        'optimizer': own,
+    }
     for name, folders in FOLDERS.items():
         beside = _beside(params, sections[name], folders)
         values[name] = {**values.get(name, {}), **beside}

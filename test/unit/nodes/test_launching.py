@@ -65,6 +65,7 @@ def test_folders_are_beside_the_parameter_file_wherever_launch_was_started(tmp_p
     assert nodes['recorder'].parameters[1] == {'cell': CELL, **session}
     assert nodes['pose_planner'].parameters[1] == {'cell': CELL, **session}
     assert nodes['optimizer'].parameters[1] == {
+        'cell': CELL,
         **session,
         'out': str(tmp_path / 'results/fit'),
         'discovery': str(tmp_path / 'discovery'),
