@@ -29,6 +29,7 @@ from remaster_ros.session.cell_poses import RANGES, CellPoses
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.meshes import mesh_reader
 from remaster_ros.session.reader import URDF_LIMIT
+from remaster_ros.session.source_topics import source_problem
 from remaster_ros.session.yaml_places import with_line
 from remaster_ros.session.yaml_records import YAML_LIMIT, Bounds, Triple, read_yaml
 from remaster_ros.types import FARTHEST_M, FloatArray
@@ -70,6 +71,9 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     max_angle_deg
         Largest angle between the tool's z axis and the line to the sensor at which the marker
         is seen.
+    message_type
+        Where `topic` is of a node that is not of this package, the type of its messages, one of
+        `source_topics.MESSAGE_TYPES`.
     noise_m, pose_noise_m
         Standard deviations per axis that are expected: of a reading, and of the error that all
         readings at one pose share. Only plans depend on them; a fit estimates its own.
@@ -83,6 +87,14 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     max_angle_deg: Annotated[float, VIEW] = 60.0
     noise_m: Annotated[float, NOISE] = SIGMA_M
     pose_noise_m: Annotated[float, Bounds(0.0, 0.05, 'm')] = POSE_SIGMA_M
+    message_type: str = ''
+    # No key of the file: the topic of such a node, whose readings are published on `topic` anew.
+    source: str = ''
+
+    def publish_anew(self, name: str) -> None:
+        """Read the topic of a node that is not of this package; publish it as others are."""
+        if self.message_type:
+            self.source, self.topic = self.topic, f'{name}/marker'
 
 
 class CellBox(msgspec.Struct, forbid_unknown_fields=True):
@@ -168,7 +180,12 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         given = self.poses.given()
         plain['poses'] = {k: v for k, v in plain['poses'].items() if k in RANGES or k in given}
         for sensor in plain['sensors'].values():
-            for key, usual in (('noise_m', SIGMA_M), ('pose_noise_m', POSE_SIGMA_M)):
+            for key, usual in (
+                ('noise_m', SIGMA_M),
+                ('pose_noise_m', POSE_SIGMA_M),
+                ('message_type', ''),
+                ('source', ''),
+            ):
                 if sensor[key] == usual:
                     del sensor[key]
         return hashlib.sha256(msgspec.json.encode(plain)).hexdigest()
@@ -315,6 +332,8 @@ def parse_cell(data: bytes, path: Path) -> Workcell:
     cell = read_yaml(data, path, Workcell)
     urdf = path.parent / cell.robot.urdf
     cell.file = str(path)
+    for name, sensor in cell.sensors.items():
+        sensor.publish_anew(name)
     missing = (
         f'robot.urdf in {path} is {cell.robot.urdf!r}, which is relative to that file; copy the '
         'URDF there, or give its absolute path'
@@ -349,6 +368,10 @@ def _problem(cell: Workcell, chain: SerialChain) -> str:
             known = ', '.join(cell.markers)
             meant = did_you_mean(sensor.marker, cell.markers)
             return f'sensors.{name}.marker is {sensor.marker!r}; markers has {known}{meant}'
+        if problem := source_problem(
+            f'sensors.{name}', sensor.source, sensor.message_type, single_shot=sensor.single_shot
+        ):
+            return problem
     if cell.aim_at not in cell.sensors:
         meant = did_you_mean(cell.aim_at, cell.sensors)
         return f'aim_at {cell.aim_at!r} is none of the sensors {", ".join(cell.sensors)}{meant}'
