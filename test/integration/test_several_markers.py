@@ -39,25 +39,6 @@ def configurations():
     return q, np.repeat(np.arange(len(poses)), [len(pose.solutions[:3]) for pose in poses])
 
 
-def test_four_markers_go_through_files_fit_and_search(configurations, tmp_path):
-    print('seed', SEED)
-    rng = np.random.default_rng(SEED)
-    made, offsets = measured(CHAIN, CELL.urdf_text, configurations, bar('a', 'b', 'c', 'd'), rng)
-    held_out = np.isin(made.measurements.pose, np.unique(configurations[1])[::4])
-    made.measurements.is_validation[:] = held_out
-    write_session(tmp_path / 'session', made)
-    session = read_session(tmp_path / 'session')
-    assert session.marker_names == ('a', 'b', 'c', 'd')
-    assert len(session.measurements) == 4 * len(configurations[0])
-    found = fit_session(session, rng=np.random.default_rng(0))
-    inner = slice(1, 6)
-    z = ((found.joint_offsets - offsets) / found.joint_offsets_std)[inner]
-    assert np.max(np.abs(z)) < 4.0
-    assert found.accuracy['validation']['relative']['after']['mean_mm'] < 0.3
-    # Four markers, and nothing wrong with the arm.
-    assert discover_session(session, rng=np.random.default_rng(0)).verdict == 'none'
-
-
 def test_markers_of_a_frame_make_the_offsets_more_certain_and_the_intervals_hold(configurations):
     print('seed', SEED)
     rng = np.random.default_rng(SEED)
@@ -126,16 +107,18 @@ def test_without_the_frames_the_same_sessions_are_too_certain(configurations):
     assert np.sqrt(np.mean(np.square(z))) > 1.4
 
 
-def test_a_frame_goes_through_file_draws_and_search(configurations, tmp_path):
+def test_frames_of_four_markers_go_through_file_fit_and_search(configurations, tmp_path):
     print('seed', SEED)
     rng = np.random.default_rng(SEED)
-    sensors = bar('a', 'b', 'c', frame_sigma_m=0.2e-3)
+    sensors = bar(*BODY, frame_sigma_m=0.2e-3)
     made, offsets = measured(CHAIN, CELL.urdf_text, configurations, sensors, rng)
     made.measurements.is_validation[:] = made.measurements.pose % 4 == 3
-    made = replace(made, further_markers={'bar': ('b', 'c')})
+    made = replace(made, further_markers={'bar': ('b', 'c', 'd')})
     write_session(tmp_path / 'session', made)
     session = read_session(tmp_path / 'session')
-    assert session.further_markers == {'bar': ('b', 'c')}
+    assert session.marker_names == ('a', 'b', 'c', 'd')
+    assert len(session.measurements) == 4 * len(configurations[0])
+    assert session.further_markers == {'bar': ('b', 'c', 'd')}
     np.testing.assert_array_equal(session.measurements.frame, made.measurements.frame)
     found = fit_session(session, rng=np.random.default_rng(0))
     z = ((found.joint_offsets - offsets) / found.joint_offsets_std)[1:6]
@@ -146,5 +129,6 @@ def test_a_frame_goes_through_file_draws_and_search(configurations, tmp_path):
         assert noise[key] == pytest.approx(level, rel=0.4), key
     assert noise['frame_std_m'] < 0.5 * noise['frame_sigma_m']
     assert found.sampler.converged, found.sampler.message
-    # Errors that three rows share are no cause.
+    assert found.accuracy['validation']['relative']['after']['mean_mm'] < 0.6
+    # Nothing is wrong with the arm: errors that four rows share are no cause.
     assert discover_session(session, rng=np.random.default_rng(0)).verdict == 'none'

@@ -101,7 +101,7 @@ def test_markers_that_cannot_be_are_refused(markers, words):
         extra += '  near: [0.11, 0.0, 0.0]\n'
     if 'b-b' in markers:
         extra += '  b-b: [0.0, 0.11, 0.0]\n'
-    with pytest.raises(InputError, match='demo.yaml') as refused:
+    with pytest.raises(InputError, match='demo') as refused:
         cell(further, extra)
     assert words in str(refused.value)
     assert '\n' not in str(refused.value)
