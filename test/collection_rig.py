@@ -119,6 +119,9 @@ class Cell:
             assert np.all(np.linalg.norm(m.position[mine] - expected, axis=1) < 0.4e-3), name
         pairs = list(zip(m.configuration.tolist(), m.sensor.tolist()))
         assert len(set(pairs)) == len(pairs)
+        assert len(set(m.configuration.tolist())) == self.planned() > 3
+
+    def planned(self):
+        """Return how many configurations the last plan has."""
         tours = [r for r in read_journal(self.session / 'plan.jsonl').records if 'plans' in r]
-        planned = sum(len(p['solutions']) for s in tours[-1]['plans'].values() for p in s['poses'])
-        assert len(set(m.configuration.tolist())) == planned > 3
+        return sum(len(p['solutions']) for s in tours[-1]['plans'].values() for p in s['poses'])

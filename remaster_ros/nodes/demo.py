@@ -51,6 +51,15 @@ from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.setup import make_world
 from remaster_ros.simulation.truth import to_plain
 
+HAVE_CELL = (
+    'pose_planner',
+    'robot_bridge',
+    'recorder',
+    'optitrack_markers',
+    'laser_tracker_markers',
+)
+"""Nodes with the parameter ``cell``."""
+
 
 @dataclass(frozen=True)
 class Parameters:
@@ -60,6 +69,7 @@ class Parameters:
         '', 'folder of everything the demo writes: new, empty, or of a demo to go on with'
     )
     seed: int = parameter(0, 'seed of the hidden World and of all randomness', low=0)
+    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
     candidates: int = parameter(
         14, 'candidate poses for optimization and for validation, each', low=1, high=1000
     )
@@ -136,7 +146,7 @@ class Demo:
 
     def run(self) -> None:
         """Collect, fit, print."""
-        cell = read_cell('demo')
+        cell = read_cell(self.p.cell)
         world = make_world(
             self.hidden, cell, self.p.seed, self.p.rate, self.requests, self.p.candidates
         )
@@ -196,7 +206,10 @@ class Demo:
             'laser_tracker_markers': {'port': tracker_port},
         }
         for name in ALL_NODES:
-            self.processes.start(name, common, own.get(name, {}))
+            values = own.get(name, {})
+            if name in HAVE_CELL:
+                values['cell'] = self.p.cell
+            self.processes.start(name, common, values)
 
     def _spin(self) -> None:
         self._executor.spin_once(timeout_sec=0.1)

@@ -1,4 +1,4 @@
-"""The node of any sensor: one marker's readings out, and whether the sensor is ready.
+"""The node of any sensor: its markers' readings out, and whether the sensor is ready.
 
 What is particular to a device lies in its driver (`remaster_ros.sensors`). The node opens the
 driver, tries again while that fails, publishes readings with their time of capture, and publishes
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -32,7 +33,7 @@ RETRY_S = 0.5
 
 
 class SensorNode(RemasterNode):
-    """A node that publishes the marker which one of the cell's sensors follows.
+    """A node that publishes the markers which one of the cell's sensors measures.
 
     Parameters
     ----------
@@ -85,7 +86,18 @@ class SensorNode(RemasterNode):
                     'geometry_msgs/msg/PoseStamped'
                 )
             )
-        self._readings = self.create_publisher(PointStamped, described.topic, RELIABLE)
+        if described.further_markers and not driver.several_markers:
+            raise InputError(
+                f'{self.get_name()}: sensor {self.sensor} of {p.cell} has further_markers, but a '
+                f'{driver.device} measures one marker at a time; leave them out'
+            )
+        p = replace(p, further_markers=described.further_markers)
+        self._readings = {
+            '' if marker == described.marker else marker: self.create_publisher(
+                PointStamped, topic, RELIABLE
+            )
+            for marker, topic in described.topics.items()
+        }
         self.published = 0
         self.trouble = ''
         self.in_use = threading.Lock()
@@ -169,7 +181,7 @@ class SensorNode(RemasterNode):
         message.header.frame_id = self.sensor
         position = np.asarray(reading.position, float)
         message.point.x, message.point.y, message.point.z = map(float, position)
-        self._readings.publish(message)
+        self._readings[reading.marker].publish(message)
         self.published += 1
 
     def _summary(self) -> Summary:
