@@ -13,7 +13,6 @@ from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.options import add_poses, integer, number
 from remaster_ros.kinematics.body_pairs import RESERVE_M
 from remaster_ros.kinematics.collision import CollisionModel
-from remaster_ros.kinematics.transforms import transform
 from remaster_ros.planning.candidates import PlanningScene
 from remaster_ros.planning.collection_plan import CollectionPlan, plan_collection
 from remaster_ros.planning.tour_planner import TourPlanner
@@ -120,12 +119,7 @@ def planned(
         scene, counts, args.seed, args.reference_every, cell.design_settings(), travel
     )
     start = free_start(scene.model, args.seed)
-    return plan_collection(planner, rough_places(scene), start, progress)
-
-
-def rough_places(scene: PlanningScene) -> dict[str, FloatArray]:
-    """Return T_R_N of each sensor at its rough place, (4, 4)."""
-    return {name: transform(np.eye(3), origin) for name, origin in scene.rough_R.items()}
+    return plan_collection(planner, planner.rough_places, start, progress)
 
 
 def free_start(model: CollisionModel, seed: int) -> FloatArray:

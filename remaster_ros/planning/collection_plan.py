@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from remaster_ros.errors import InsufficientDataError
 from remaster_ros.motion.trajectory import Trajectory
 from remaster_ros.planning.candidates import PlannedPose
 from remaster_ros.planning.planned_design import Designed
@@ -60,6 +61,9 @@ class Expected(NamedTuple):
     tool_rms: float
 
 
+NOTHING_EXPECTED = Expected({}, np.nan, np.nan)
+
+
 @dataclass(frozen=True, eq=False)
 class CollectionPlan:
     """What a collection will do, and what its fit is expected to state.
@@ -86,6 +90,9 @@ class CollectionPlan:
         Root mean square of the 3-D error of the predicted markers, m.
     designed
         Of an optimal design; None without one.
+    undetermined
+        What these configurations do not determine at all, so that there are no standard
+        deviations (None and NaN above); ''.
     """
 
     tour: Tour
@@ -98,6 +105,7 @@ class CollectionPlan:
     joint_rms: float
     tool_rms: float
     designed: Designed | None
+    undetermined: str = ''
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -128,10 +136,14 @@ def plan_collection(
     Raises
     ------
     InsufficientDataError
-        No pose is left to fit on.
+        No pose is left to fit on, no configuration can be reached, or those that can do not
+        determine the offsets.
     """
     tour = planner.collection(T_R_N)
-    return look_ahead(planner, T_R_N, [tour], start, progress=progress)
+    plan = look_ahead(planner, T_R_N, [tour], start, progress=progress)
+    if plan.undetermined:
+        raise InsufficientDataError(plan.undetermined)
+    return plan
 
 
 def look_ahead(
@@ -152,6 +164,11 @@ def look_ahead(
         One after the other.
     stop
         What is left of the pose under way, visited first.
+
+    Raises
+    ------
+    InsufficientDataError
+        No configuration can be reached.
     """
     configurations = sum(sum(tour.configurations.values()) for tour in tours)
     steps = _Steps(start, planner.travel, lambda n: progress(min(n / configurations, 1.0)))
@@ -162,6 +179,11 @@ def look_ahead(
             stop = None
         while (following := left.next(steps.here)) is not None:
             steps.go(following)
+    if not steps.visits:
+        standing = planner.model.trouble(start) or 'no free way leads from there'
+        raise InsufficientDataError(
+            f'no configuration can be reached from where the arm stands: {standing}'
+        )
     fitted = tours[-1].plans[FITTED].poses
     lost = {(index, number) for split, index, number in steps.unreached if split == FITTED}
     reached = [
@@ -170,6 +192,13 @@ def look_ahead(
         )
         for at, pose in enumerate(fitted)
     ]
+    expected, undetermined = NOTHING_EXPECTED, ''
+    try:
+        reached = [pose for pose in reached if len(pose.solutions)]
+        expected = expected_precision(planner, T_R_N, reached)
+    except InsufficientDataError as error:
+        # What the arm does is known all the same.
+        undetermined = str(error)
     visits = tuple(steps.visits)
     measuring_s = planner.travel.measuring_s
     return CollectionPlan(
@@ -179,8 +208,9 @@ def look_ahead(
         measuring_s,
         sum(visit.trajectory.duration_s + measuring_s for visit in visits),
         max((visit.tool_speed_m_s for visit in visits), default=0.0),
-        *expected_precision(planner, T_R_N, [pose for pose in reached if len(pose.solutions)]),
+        *expected,
         planner.designed,
+        undetermined,
     )
 
 

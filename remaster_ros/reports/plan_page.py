@@ -68,7 +68,7 @@ def plan_page(
         cell=cell,
         registered=registered,
         confirm=confirm,
-        mood='caution' if missed_goal(plan) else 'good',
+        mood='caution' if missed_goal(plan) or plan.undetermined else 'good',
         headline=(
             f'{len(plan.visits)} configurations at {poses} poses in {minutes} of robot time; no '
             f'point of arm and tool faster than {plan.max_tool_speed_m_s:.2f} m/s.'
@@ -76,6 +76,7 @@ def plan_page(
         moving=minutes_text(moving_s),
         measuring_s=f'{plan.measuring_s:g}',
         fastest=fastest + 1,
+        undetermined=plan.undetermined,
         points=_points(plan),
         sensors=[
             (number, sight.sensor)
@@ -122,6 +123,8 @@ def write_plan_page(path: Path, html: str) -> None:
 def _points(plan: CollectionPlan) -> list[str]:
     """Return what asks for attention."""
     points = [missed_goal(plan)]
+    if plan.undetermined:
+        points.append(f'A fit of these configurations states nothing: {plan.undetermined}')
     if plan.unreached:
         points.append(f'No free way leads to {plan.unreached} configurations: they are left out')
     return [point for point in points if point]
@@ -159,7 +162,8 @@ def _joints(plan: CollectionPlan, chain: SerialChain) -> list[dict[str, Any]]:
             'high': float(q[:, joint].max()),
             'limits': _limits(chain.lower[joint], chain.upper[joint]),
         }
-        for joint, (name, std) in enumerate(plan.joint_std.items())
+        for joint, name in enumerate(chain.joint_names)
+        for std in (plan.joint_std.get(name),)
     ]
 
 

@@ -7,8 +7,8 @@ all of a link's can be read, else with what stands for that link in the collisio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -93,6 +93,14 @@ class RobotScene:
         frames = self.chain.frames(q)
         base = np.broadcast_to(np.eye(4), (*frames.shape[:-3], 1, 4, 4))
         return np.concatenate((base, frames), axis=-3)
+
+    def with_sensors(self, T_R_N: Mapping[str, FloatArray]) -> RobotScene:
+        """Return the scene with these sensors where they were measured to be, (4, 4) each."""
+        sights = [
+            replace(sight, sensor_R=T_R_N[sight.sensor][:3, 3]) if sight.sensor in T_R_N else sight
+            for sight in self.sights
+        ]
+        return replace(self, sights=sights)
 
     def sight_ends(self, q: FloatArray) -> FloatArray:
         """Return where the marker of each sight is at joint angles (..., k): m, (..., s, 3)."""
