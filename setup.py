@@ -59,7 +59,7 @@ setup(
     package_dir={f'{NAME}.config': 'config'},
     package_data={
         f'{NAME}.config': ['*.yaml', '*.rviz', 'robots/*', 'cells/*', 'sros2/*'],
-        f'{NAME}.reports': ['*.jinja'],
+        f'{NAME}.reports': ['*.jinja', '*.js'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
