@@ -59,7 +59,7 @@ setup(
     package_dir={f'{NAME}.config': 'config'},
     package_data={
         f'{NAME}.config': ['*.yaml', '*.rviz', 'robots/*', 'cells/*', 'sros2/*'],
-        f'{NAME}.reports': ['*.jinja'],
+        f'{NAME}.reports': ['*.jinja', 'live_page/*'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
@@ -90,6 +90,7 @@ setup(
         'mcap>=1.2',
         'python-dateutil>=2.8',
         'rosbags>=0.10',
+        'tornado>=6.4',
         'xacro>=2.0.8',
     ],
     extras_require={

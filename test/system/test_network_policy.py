@@ -15,10 +15,12 @@ NODES = (
     'laser_tracker_markers',
     'recorder',
     'optimizer',
+    'watch',
 )
 OWN = {
     'optitrack_markers': {'start_timeout_s': 600.0},
     'laser_tracker_markers': {'start_timeout_s': 600.0},
+    'watch': {'port': 0},
 }
 
 
