@@ -103,7 +103,10 @@ class Browser:
 
     def text(self, selector):
         """Return what of an element is seen; '' where it is hidden."""
-        return self.value(f'document.querySelector({json.dumps(selector)})?.innerText ?? ""')
+        return self.value(
+            f'(() => {{ const e = document.querySelector({json.dumps(selector)});'
+            ' return e && e.checkVisibility() ? e.innerText : ""; })()'
+        )
 
     def click(self, selector):
         """Click in the middle of an element, with the mouse."""
