@@ -21,6 +21,7 @@ JAZZY = [
         'trajectory-msgs',
         'diagnostic-msgs',
         'rosgraph-msgs',
+        'visualization-msgs',
     )
 ]
 
@@ -58,7 +59,7 @@ setup(
     packages=[*find_packages(include=[NAME, f'{NAME}.*']), f'{NAME}.config'],
     package_dir={f'{NAME}.config': 'config'},
     package_data={
-        f'{NAME}.config': ['*.yaml', '*.rviz', 'robots/*', 'cells/*', 'sros2/*'],
+        f'{NAME}.config': ['*.yaml', '*.rviz', '*.json', 'robots/*', 'cells/*', 'sros2/*'],
         f'{NAME}.reports': ['*.jinja', 'live_page/*'],
     },
     data_files=[

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
+from typing import Any
 
 FEWEST = 3
 """Configurations before a time is stated."""
@@ -56,6 +58,26 @@ class Pace:
         if len(self._took_s) < FEWEST:
             return None
         return left * sum(self._took_s) / len(self._took_s)
+
+
+def progress_text(counts: Mapping[str, Any], left_s: float | None) -> str:
+    """Return how far a collection is, in a line; '' before it is planned.
+
+    Parameters
+    ----------
+    counts
+        As of `TourProgress.counts`.
+    left_s
+        Time that is left, s; None where it is unknown.
+    """
+    done, of = counts['configurations_done'], counts['configurations']
+    if counts['phase'] != 'collection' or not of:
+        return ''
+    left = minutes_text(left_s)
+    return (
+        f'{done} of {of} configurations, {counts["poses_done"]} of {counts["poses"]} poses'
+        f'{f", {left}" if left else ""}'
+    )
 
 
 def minutes_text(left_s: float | None) -> str:

@@ -35,6 +35,7 @@ from remaster_ros.nodes.messages import JointOrder, solutions_of, transform_arra
 from remaster_ros.nodes.page_address import kept_token, opening_file, page_name
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.rviz_markers import RvizMarkers
 from remaster_ros.nodes.status import LATCHED, LEVELS, RELIABLE, TOPIC, NodeStatus, Summary, listen
 from remaster_ros.nodes.waypoints import waypoints_by_solution
 from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE, read_fit
@@ -69,6 +70,9 @@ class Parameters:
     names: str = parameter('', 'names of this computer by which browsers may ask, with commas')
     certificate: str = parameter('', 'PEM file of the certificate for https; empty for http')
     key: str = parameter('', 'PEM file of its key')
+    publish_tf: bool = parameter(
+        True, 'publish where the sensors stand to /tf_static, where tf2_msgs is installed'
+    )
 
 
 class Watch(RemasterNode):
@@ -95,6 +99,7 @@ class Watch(RemasterNode):
         self._callers = {n: self.create_client(Trigger, path) for n, path in services.items()}
         self._subscribe({name: sensor.topic for name, sensor in cell.sensors.items()})
         scene = robot_scene(cell, cell.collision_model(self.chain).bodies)
+        self._rviz = RvizMarkers(self, scene, publish_tf=self.p.publish_tf)
         self.page = self._open_page(msgspec.json.encode(live_scene(scene)))
         self.status = NodeStatus(self, self._summary)
         self.create_timer(EVERY_S, self._show, clock=self.status.steady)
@@ -169,6 +174,7 @@ class Watch(RemasterNode):
 
     def _on_registration(self, message: TransformStamped) -> None:
         self.view.take_registration(message.child_frame_id, transform_array(message))
+        self._rviz.place_sensors(self.view.registration)
 
     def _on_means(self, message: JointState) -> None:
         self._means = message
@@ -214,9 +220,13 @@ class Watch(RemasterNode):
     def _show(self) -> None:
         now = time.monotonic()
         self._expect(now)
-        if now - self._published_s >= (EVERY_S if self.page.watched else IDLE_EVERY_S) - 0.01:
+        watched = self.page.watched or self._rviz.wanted
+        if now - self._published_s >= (EVERY_S if watched else IDLE_EVERY_S) - 0.01:
             self._published_s = now
-            self.page.publish(self.view.view(now))
+            view = self.view.view(now)
+            self.page.publish(view)
+            if self._rviz.wanted:
+                self._rviz.publish(view['scene'])
 
     def _expect(self, now: float) -> None:
         """Have the expected standard deviations worked out when something new is recorded."""
@@ -226,7 +236,8 @@ class Watch(RemasterNode):
             return
         self._expecting, self._expected_of = True, count
         rough = {sensor.name: sensor.position_R for sensor in self._settings.sensors}
-        settings = self._settings.before({**rough, **self.view.places_R})
+        placed = {name: T[:3, 3] for name, T in self.view.registration.items()}
+        settings = self._settings.before({**rough, **placed})
         rng = np.random.default_rng(0)
         work = partial(expected_precision, self.chain, settings, measured, rng)
         self._background.submit(work, partial(self._on_precision, now))
@@ -282,7 +293,8 @@ def fit_facts(folder: Path, offsets: dict[str, float]) -> dict[str, str]:
         if errors:
             before, after = (errors[when]['mean_mm'] for when in ('before', 'after'))
             facts[f'mean error, {words}'] = f'{before:.3f} mm → {after:.3f} mm'
-    facts['report'] = str((folder / REPORT_FILE).resolve())
+    report = folder / REPORT_FILE
+    facts['files'] = str((report if report.exists() else folder).resolve())
     return facts
 
 

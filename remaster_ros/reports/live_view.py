@@ -52,6 +52,13 @@ class LiveView:
         The arm.
     markers
         Sensor -> the position of its marker in the tool frame, m, (3,).
+
+    Attributes
+    ----------
+    registration
+        Where registered sensors stand, sensor -> (4, 4).
+    residuals
+        Of the markers.
     """
 
     def __init__(self, chain: SerialChain, markers: Mapping[str, FloatArray]) -> None:
@@ -72,7 +79,7 @@ class LiveView:
         self._q: FloatArray | None = None
         self._target: FloatArray | None = None
         self._way: FloatArray = np.empty((0, 3))
-        self._registration: dict[str, FloatArray] = {}
+        self.registration: dict[str, FloatArray] = {}
         self._precision: list[tuple[float, Precision]] = []
         self._offsets: Mapping[str, tuple[float, float]] = {}
         self._fit: Mapping[str, Any] = {}
@@ -162,7 +169,7 @@ class LiveView:
     def take_registration(self, sensor: str, T_R_N: FloatArray) -> None:
         """Take where a sensor stands, (4, 4)."""
         if sensor in self._sensors and np.all(np.isfinite(T_R_N)):
-            self._registration[sensor] = T_R_N
+            self.registration[sensor] = T_R_N
 
     def take_offsets(self, means: Mapping[str, float], stds: Mapping[str, float]) -> None:
         """Take the zero-offsets of a fit and their standard deviations, joint -> rad."""
@@ -186,11 +193,6 @@ class LiveView:
     def measured(self) -> dict[int, list[FloatArray]]:
         """What is recorded and will be fitted: pose -> its configurations, rad."""
         return {pose: list(found.values()) for pose, found in self._measured.items()}
-
-    @property
-    def places_R(self) -> dict[str, FloatArray]:
-        """Where registered sensors stand in the robot base, m, (3,)."""
-        return {name: T[:3, 3] for name, T in self._registration.items()}
 
     def view(self, now_s: float) -> dict[str, Any]:
         """Return what the page shows now, of plain types."""
@@ -276,7 +278,7 @@ class LiveView:
             'hidden': bool(report and report.hidden),
             'message': _clip(report.trouble or report.message) if report else 'not seen yet',
             'read_age_s': ages.get(name),
-            'registered': name in self._registration,
+            'registered': name in self.registration,
             'residuals_mm': _rounded(norms[-MOST_POINTS:], 3),
             'median_mm': float(np.median(norms)) if len(norms) else None,
             'corrected': self.residuals.corrected,
@@ -339,7 +341,6 @@ class LiveView:
                 name: _rounded(self.residuals.points_R(name)[-MOST_POINTS:], 4)
                 for name in self._sensors
             },
-            'sensors': {name: _rounded(place, 3) for name, place in self.places_R.items()},
         }
 
 

@@ -15,6 +15,7 @@ from remaster_ros.reports.live_scene import live_scene
 from remaster_ros.reports.live_server import LiveServer, Place
 from remaster_ros.reports.robot_scene import robot_scene
 
+
 class Empty(BaseHTTPRequestHandler):
     """A page without a policy of its own."""
 
@@ -114,7 +115,9 @@ def test_from_begin_to_result(browser, played):
     assert browser.text('#offsets').count('joint_') == 7
     assert played.collection.commands == ['collect', 'pause', 'collect', 'fit']
     # The arm stands in the picture, and nothing went wrong on the way.
-    browser.until(lambda: browser.value('document.querySelectorAll("#scene canvas").length'), '3-D')
+    browser.until(
+        lambda: browser.value('document.querySelectorAll("#scene canvas").length'), '3-D'
+    )
     assert browser.text('#scene-note') == ''
     assert browser.errors == []
     own = f'http://127.0.0.1:{played.server.port}/'

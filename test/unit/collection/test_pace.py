@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from remaster_ros.collection.pace import Pace, minutes_text
+from remaster_ros.collection.pace import Pace, minutes_text, progress_text
 
 
 def run(pace, done, from_s, to_s, *, running=True):
@@ -54,3 +54,14 @@ def test_words():
     assert minutes_text(42.0) == 'about 40 s left'
     assert minutes_text(1.0) == 'about 10 s left'
     assert minutes_text(130.0) == 'about 2 min left'
+
+
+def test_a_line_says_how_far_it_is():
+    counts = {'phase': 'collection', 'configurations_done': 12, 'configurations': 97}
+    counts |= {'poses_done': 3, 'poses': 14}
+    assert progress_text(counts, 360.0) == (
+        '12 of 97 configurations, 3 of 14 poses, about 6 min left'
+    )
+    assert progress_text(counts, None) == '12 of 97 configurations, 3 of 14 poses'
+    assert progress_text(counts | {'phase': 'registration'}, 360.0) == ''
+    assert progress_text(counts | {'configurations': 0}, 360.0) == ''
