@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='IP address to listen on; one that other computers reach needs a certificate',
     )
     parser.add_argument(
-        '--port', type=integer(0), default=8765, help='0 for any free one (default 8765)'
+        '--port', type=integer(0), default=0, help='port to listen on (default: any free one)'
     )
     parser.add_argument(
         '--name',

@@ -203,8 +203,7 @@ class Demo:
         for name in ALL_NODES:
             self.processes.start(name, common, own.get(name, {}))
         if self.p.watch:
-            (port,) = free_ports(socket.SOCK_STREAM)
-            self.processes.start('watch', common, {'port': port, 'fit': str(self.fit)})
+            self.processes.start('watch', common, {'fit': str(self.fit)})
             name = page_name(self.node.context.get_domain_id(), '/watch')
             self.console.print(f'live page: open {opening_path(name)}', soft_wrap=True)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 import sys
 import time
 from collections.abc import Callable
@@ -32,7 +33,7 @@ from remaster_ros.errors import RemasterError
 from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.background import Background
 from remaster_ros.nodes.messages import JointOrder, solutions_of, transform_array
-from remaster_ros.nodes.page_address import kept_token, opening_file, page_name
+from remaster_ros.nodes.page_address import opening_file, page_name
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.rviz_markers import RvizMarkers
@@ -66,7 +67,13 @@ class Parameters:
         '127.0.0.1',
         'IP address to listen on; one that other computers reach needs certificate and key',
     )
-    port: int = parameter(8765, 'port to listen on; 0 for any free one', low=0, high=65535)
+    port: int = parameter(
+        0,
+        'port to listen on; 0 for any free one, another one with every start: no other program '
+        'can wait there for the page',
+        low=0,
+        high=65535,
+    )
     names: str = parameter('', 'names of this computer by which browsers may ask, with commas')
     certificate: str = parameter('', 'PEM file of the certificate for https; empty for http')
     key: str = parameter('', 'PEM file of its key')
@@ -108,7 +115,8 @@ class Watch(RemasterNode):
         names = tuple(name.strip() for name in self.p.names.split(',') if name.strip())
         place = Place(self.p.address, self.p.port, names, self.p.certificate, self.p.key)
         name = page_name(self.context.get_domain_id(), self.get_fully_qualified_name())
-        page = LiveServer(place, kept_token(name), scene, self._send)
+        # New with every start: an open page sends the old one to whoever has the port then.
+        page = LiveServer(place, secrets.token_urlsafe(32), scene, self._send)
         file = opening_file(name, page.url)
         # Not by the logger: that publishes, and the token is for this user alone.
         print(f'live page: {page.url if sys.stdout.isatty() else f"open {file}"}', flush=True)

@@ -125,7 +125,7 @@ class LiveServer:
         self.files = _files()
         self._seen, self._view = '', b'null'
         self._issued: deque[tuple[int, float]] = deque([(0, float('-inf'))], maxlen=100)
-        self._asked_s = float('-inf')
+        self._asked_s, self._used = float('-inf'), 0
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -159,10 +159,12 @@ class LiveServer:
     def refusal(self, seen: Seen) -> str:
         """Return why a person who has seen this must look again before the arm moves; ''."""
         issued = dict(self._issued).get(seen.view, float('-inf'))
-        if time.monotonic() - issued > FRESH_S:
+        if time.monotonic() - issued > FRESH_S or seen.view <= self._used:
             return 'the page was not up to date; look again'
         if not hmac.compare_digest(seen.seen.encode(), self._seen.encode()):
             return 'the collection has changed meanwhile; look again'
+        # A request that comes twice counts once.
+        self._used = seen.view
         return ''
 
     def close(self) -> None:
@@ -310,7 +312,7 @@ def _listen(place: Place) -> socket.socket:
         raise InputError(
             f'live page: {place.address} can be reached from other computers, and without https '
             'the token could be read on the way: give certificate and key, or leave the address '
-            'and use ssh -L 8765:127.0.0.1:8765 from there'
+            'and use ssh -L PORT:127.0.0.1:PORT from there'
         )
     try:
         family = socket.AF_INET6 if address.version == 6 else socket.AF_INET

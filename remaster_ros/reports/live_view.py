@@ -28,6 +28,10 @@ LONGEST_TEXT = 400
 MOST_NODES = 30
 MOST_MESSAGES = 40
 MOST_POINTS = 400
+MOST_FITTED = 2000
+"""Configurations that the expected precision is worked out for."""
+LONGEST_WAY = 200
+SHOWN_COUNTS = ('phase', 'poses_done', 'poses', 'configurations_done', 'configurations')
 PLANNER, BRIDGE, RECORDER, OPTIMIZER = 'pose_planner', 'robot_bridge', 'recorder', 'optimizer'
 NODES = (PLANNER, BRIDGE, RECORDER, OPTIMIZER)
 STOP_LABEL = 'Stop the collection'
@@ -66,7 +70,7 @@ class LiveView:
         self.residuals = LiveResiduals(chain, markers)
         self._pace = Pace()
         self._nodes = {name: _Node() for name in NODES}
-        self._values: dict[str, Mapping[str, str]] = {}
+        self._values: dict[str, str] = {}
         self._planner: events.PlannerState | None = None
         self._bridge: events.BridgeState | None = None
         self._recorder: events.RecorderState | None = None
@@ -80,7 +84,7 @@ class LiveView:
         self._target: FloatArray | None = None
         self._way: FloatArray = np.empty((0, 3))
         self.registration: dict[str, FloatArray] = {}
-        self._precision: list[tuple[float, Precision]] = []
+        self._precision: deque[tuple[float, Precision]] = deque(maxlen=MOST_POINTS)
         self._offsets: Mapping[str, tuple[float, float]] = {}
         self._fit: Mapping[str, Any] = {}
 
@@ -93,8 +97,8 @@ class LiveView:
         if node not in self._nodes and len(self._nodes) >= MOST_NODES:
             return
         self._nodes[node] = _Node(level, _clip(message), now_s)
-        self._values[node] = values
         if node == PLANNER:
+            self._values = {name: _clip(values.get(name, '')) for name in SHOWN_COUNTS}
             running = self._planner is not None and self._planner.state == 'running'
             self._pace.update(self._count('configurations_done'), now_s, running=running)
 
@@ -132,7 +136,9 @@ class LiveView:
         pose = self._announced
         if q is None or not recorded or pose is None or pose.stamp != end.stamp:
             return
-        if pose.split == 'optimization' and end.solution < len(pose.ids):
+        count = sum(map(len, self._measured.values()))
+        fitted = pose.split == 'optimization' and count < MOST_FITTED
+        if fitted and end.solution < len(pose.ids):
             self._measured.setdefault(pose.pose, {})[pose.ids[end.solution]] = q
 
     def _tell(self, body: events.State | events.Event, now_s: float) -> None:
@@ -164,7 +170,7 @@ class LiveView:
     def take_way(self, way: FloatArray) -> None:
         """Take the configurations that the arm goes through next, rad, (n, k)."""
         if np.all(np.isfinite(way)):
-            self._way = tool_path(self._chain, way)
+            self._way = tool_path(self._chain, way[:LONGEST_WAY])
 
     def take_registration(self, sensor: str, T_R_N: FloatArray) -> None:
         """Take where a sensor stands, (4, 4)."""
@@ -230,16 +236,16 @@ class LiveView:
 
     def _count(self, name: str) -> int:
         try:
-            return int(self._values.get(PLANNER, {}).get(name, '0'))
+            return int(self._values.get(name, '0'))
         except ValueError:
             return 0
 
     def _run(self, now_s: float) -> dict[str, Any]:
         done, of = self._count('configurations_done'), self._count('configurations')
-        phase = self._values.get(PLANNER, {}).get('phase', '')
+        phase = self._values.get('phase', '')
         collecting = phase == 'collection' and of > 0
         silent = self._silent(PLANNER, now_s)
-        state = self._planner.state if self._planner else ''
+        state = _clip(self._planner.state) if self._planner else ''
         message = self._nodes[PLANNER].message
         waiting = _clip(self._recorder.waiting_for) if self._recorder else ''
         left_s = self._pace.left_s(of - done) if collecting and state != 'complete' else None
@@ -314,7 +320,7 @@ class LiveView:
         if not why and halted:
             why = 'the arm is halted'
         if not why and state not in ('idle', 'paused', 'stopped'):
-            why = f'the collection is {state}'
+            why = _clip(f'the collection is {state}')
         begun = self._count('configurations_done') or self._count('poses_done')
         measured = bool(self._recorder and self._recorder.observations)
         idle = state not in ('running', 'held')

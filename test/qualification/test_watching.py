@@ -75,12 +75,14 @@ def test_collect_pause_reload_kill_stop_result(start, client, browser, tmp_path)
     browser.reload()
     until(lambda: state() == 'paused', 'the page after loading it again')
 
-    # Killed and started again, it serves the page that is open.
+    # Killed and started again it has another token.
     page.kill()
     page.wait()
     until(lambda: 'No connection' in browser.text('#link'), 'that the server is gone')
     page, again = watched(start, port, fit)
-    assert again == url
+    assert again != url
+    until(lambda: 'by the address' in browser.text('#link'), 'that the old token is refused')
+    browser.open(again)
     until(lambda: browser.text('#link') == '' and state() == 'paused', 'the page is back')
     assert cell.said['robot_bridge']['commanded'] == commanded, 'nothing has moved meanwhile'
 

@@ -244,6 +244,13 @@ def test_collect_of_another_state_or_of_an_old_view_is_refused(page, monkeypatch
     assert page.sent == []
 
 
+def test_collect_that_comes_twice_counts_once(page):
+    shown = page.view()
+    body = json.dumps({'view': shown['number'], 'seen': 'a'}).encode()
+    assert [page.ask('POST', '/command/collect', body)[0] for _ in range(2)] == [200, 409]
+    assert page.sent == ['collect']
+
+
 def test_a_large_body_is_refused(page):
     with pytest.raises((ConnectionError, http.client.HTTPException, AssertionError)):
         assert page.ask('POST', '/command/collect', b'x' * 100_000)[0] == 200

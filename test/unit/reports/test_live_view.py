@@ -170,9 +170,11 @@ def test_strangers_cannot_fill_the_memory_or_break_the_page(played):
     view.take_joints(np.full(7, np.nan))
     view.take_target(np.full((4, 4), np.inf))
     view.take_way(np.full((2, 7), np.nan))
+    view.take_way(np.zeros((10_000, 7)))
+    view.take(events.PlannerState(state=long, run=long), 1.0)
     shown = view.view(1.0)
     assert len(shown['nodes']) == MOST_NODES
     assert len(shown['halted']) == LONGEST_TEXT
     content = msgspec.json.encode(shown)
-    assert len(content) < 60_000
+    assert len(content) < 150_000
     json.loads(content, parse_constant=pytest.fail)
