@@ -20,13 +20,22 @@ class Cell:
     """A small collection of real nodes on fake devices, and what they publish."""
 
     def __init__(
-        self, start, client, folder, require, sensors, candidates=2, reference_every=0, cell='demo'
+        self,
+        start,
+        client,
+        folder,
+        require,
+        sensors,
+        candidates=2,
+        reference_every=0,
+        cell='demo',
+        rate=10.0,
     ):
         from remaster_ros.nodes.status import listen
 
         self.client, self.folder, self.session = client, folder, folder / 'session'
         print('seed', SEED)
-        self.world = make_world(folder / 'world', read_cell(cell), SEED, 10.0)
+        self.world = make_world(folder / 'world', read_cell(cell), SEED, rate)
         self.said, self.messages, self.results, self.events = {}, {}, [], []
         listen(client, self._record, self._summary)
         command, data, tracker = free_ports(

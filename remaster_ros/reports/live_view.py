@@ -31,6 +31,8 @@ MOST_POINTS = 400
 MOST_FITTED = 2000
 """Configurations that the expected precision is worked out for."""
 LONGEST_WAY = 200
+UNDETERMINED_RAD = 0.0873
+"""5 degrees: what the fit assumes of a zero-offset before it has seen anything."""
 SHOWN_COUNTS = ('phase', 'poses_done', 'poses', 'configurations_done', 'configurations')
 PLANNER, BRIDGE, RECORDER, OPTIMIZER = 'pose_planner', 'robot_bridge', 'recorder', 'optimizer'
 NODES = (PLANNER, BRIDGE, RECORDER, OPTIMIZER)
@@ -297,7 +299,7 @@ class LiveView:
             'configurations': [row.configurations for row in rows],
             'minutes': _rounded([since / 60.0 for since, _ in self._precision], 2),
             'std_deg': {
-                name: [_degrees(row.joint_std.get(name)) for row in rows]
+                name: [_determined(row.joint_std.get(name)) for row in rows]
                 for name in self._chain.joint_names
             },
         }
@@ -369,6 +371,11 @@ def tool_path(chain: SerialChain, way: FloatArray, steps: int = 12) -> FloatArra
 
 def _clip(text: str) -> str:
     return text if len(text) <= LONGEST_TEXT else f'{text[: LONGEST_TEXT - 1]}…'
+
+
+def _determined(std: float | None) -> float | None:
+    """Return a standard deviation in degrees; None as long as nearly nothing is known."""
+    return _degrees(std) if std is not None and std < UNDETERMINED_RAD else None
 
 
 def _degrees(radians: float | None) -> float | None:

@@ -43,7 +43,8 @@ def test_collect_pause_reload_kill_stop_result(start, client, browser, tmp_path)
     (port,) = free_ports(socket.SOCK_STREAM)
     fit = tmp_path / 'fit'
     page, url = watched(start, port, fit)
-    cell = Cell(start, client, tmp_path, 'mocap', ('mocap',), candidates=4)
+    # Slower than the other tests: a browser takes processors, and an arm that lags is halted.
+    cell = Cell(start, client, tmp_path, 'mocap', ('mocap',), candidates=4, rate=4.0)
     cell.nodes['optimizer'] = start(
         'remaster_ros.nodes.optimizer',
         *node_arguments(

@@ -92,7 +92,7 @@ async function drawScene(scene) {
           xaxis: axis('x (m)', { showbackground: false, range: [-fixed.reach_m, fixed.reach_m] }),
           yaxis: axis('y (m)', { showbackground: false, range: [-fixed.reach_m, fixed.reach_m] }),
           zaxis: axis('z (m)', { showbackground: false, range: [Math.min(fixed.lowest_m, 0), fixed.reach_m] }),
-          aspectmode: 'data', camera: { eye: { x: 0.95, y: 0.95, z: 0.5 }, center: { x: 0, y: 0, z: -0.1 } },
+          aspectmode: 'data', camera: { eye: { x: 1.05, y: 1.05, z: 0.45 }, center: { x: 0, y: 0, z: -0.05 } },
         },
         uirevision: 'kept', paper_bgcolor: 'rgba(0,0,0,0)', font: { color: INK }, margin: { l: 0, r: 0, t: 0, b: 0 },
         legend: { orientation: 'h', y: 0, yanchor: 'top' },
