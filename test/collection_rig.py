@@ -31,12 +31,13 @@ class Cell:
         cell='demo',
         held_out=1,
         collect=True,
+        rate=10.0,
     ):
         from remaster_ros.nodes.status import listen
 
         self.client, self.folder, self.session = client, folder, folder / 'session'
         print('seed', SEED)
-        self.world = make_world(folder / 'world', read_cell(cell), SEED, 10.0)
+        self.world = make_world(folder / 'world', read_cell(cell), SEED, rate)
         self.said, self.messages, self.results, self.events = {}, {}, [], []
         listen(client, self._record, self._summary)
         command, data, tracker = free_ports(

@@ -28,6 +28,7 @@ VERBS = {
     'discover': 'Find what the offsets leave, name the cause, extend the model, prove the gain.',
     'accuracy': 'Judge the zero-offsets of a fit on any session: the three metrics.',
     'recover': 'Finish the files of a session whose recorder was killed; print what was lost.',
+    'watch': 'Show a collection under way on a local web page.',
     'replay': 'Publish a recorded session again (as `ros2 bag play` does).',
 }
 SHELLS = ('bash', 'zsh', 'fish')

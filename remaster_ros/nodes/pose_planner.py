@@ -43,6 +43,7 @@ from remaster_ros.nodes.plan_preview import PlanPreview
 from remaster_ros.nodes.planner_parameters import Parameters
 from remaster_ros.nodes.planning_thread import PlanningThread
 from remaster_ros.nodes.pose_publisher import PosePublisher
+from remaster_ros.nodes.progress_lines import ProgressLines
 from remaster_ros.nodes.run_token import LivingRun, new_token, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import (
@@ -116,6 +117,7 @@ class PosePlanner(RemasterNode):
         self._cleared = self._described = False
         self._measure = MeasureCalls(self, self.cell)
         listen(self, self._on_record)
+        ProgressLines(self, self.status.steady, self.progress.counts, lambda: self.run.state)
         self.create_timer(0.05, self._step, clock=self.status.steady)
 
     def _resume(self) -> None:
