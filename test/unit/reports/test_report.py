@@ -20,7 +20,8 @@ from remaster_ros.cli.fit import summary
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.reports.fit_json import save_fit
-from remaster_ros.reports.report import report_html, verdict
+from remaster_ros.reports.judgement import verdict
+from remaster_ros.reports.report import report_html
 from remaster_ros.reports.view_3d import _round_factor, draw_view
 
 VOID = {'meta', 'br', 'img', 'link', 'hr', 'input'}
@@ -88,6 +89,7 @@ def test_all_files_are_there(folder):
         'figures/traces.svg',
         'fit.json',
         'report.html',
+        'residuals.csv',
     ]
 
 
@@ -171,7 +173,11 @@ def test_the_same_fit_gives_the_same_page(fit_result, folder, tmp_path):
 def test_without_figures_there_is_no_report_and_none_of_an_earlier_fit(fit_result, tmp_path):
     (tmp_path / 'report.html').write_text('of an earlier fit')
     assert save_fit(fit_result, tmp_path, figures=False) == tmp_path / 'fit.json'
-    assert sorted(path.name for path in tmp_path.iterdir()) == ['apply', 'fit.json']
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        'apply',
+        'fit.json',
+        'residuals.csv',
+    ]
 
 
 def test_drawing_libraries_are_imported_only_for_a_report():
