@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import textwrap
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -145,20 +144,17 @@ def _binned(ax: Axes, x: FloatArray, y: FloatArray, color: str) -> None:
     """Draw means with their standard errors in bins of equal counts."""
     if np.ptp(x) < 1e-3:
         return
-    groups = np.array_split(np.argsort(x), min(BINS, max(2, len(x) // 8)))
-    centers = np.array([x[g].mean() for g in groups])
-    means = np.array([y[g].mean() for g in groups])
-    spread = [float(y[g].std() / np.sqrt(len(g))) for g in groups]
-    # No line from bin to bin where nothing was measured in between.
-    edges = np.flatnonzero(
-        [
-            x[later].min() - x[earlier].max() > EMPTY * np.ptp(x)
-            for earlier, later in itertools.pairwise(groups)
-        ]
-    )
-    line = [np.insert(values, edges + 1, np.nan) for values in (centers, means)]
-    ax.plot(*line, color=color, linewidth=0.9)
-    ax.errorbar(centers, means, spread, color=color, ls='', elinewidth=0.6, marker='.', ms=3)
+    order = np.argsort(x)
+    # No bin, and no line from bin to bin, across what was not measured.
+    for part in np.split(order, np.flatnonzero(np.diff(x[order]) > EMPTY * np.ptp(x)) + 1):
+        bins = max(1, min(round(BINS * len(part) / len(x)), len(part) // 8))
+        groups = np.array_split(part, bins)
+        centers = [float(x[g].mean()) for g in groups]
+        means = [float(y[g].mean()) for g in groups]
+        spread = [float(y[g].std() / np.sqrt(len(g))) for g in groups]
+        ax.errorbar(
+            centers, means, spread, color=color, linewidth=0.9, elinewidth=0.6, marker='.', ms=3
+        )
 
 
 def causes(discovery: Discovery) -> Figure:
@@ -299,10 +295,16 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
             line = np.where(gap, np.nan, line)
         spread = 2.0 * (values @ draws.T).std(axis=1)
         middle = values @ mean
+        if cell.curve is None:
+            # Nor a straight band: a curve's own is known everywhere.
+            holes = np.flatnonzero(gap)
+            around = np.insert(at, holes, at[holes])
+            middle, spread = (np.insert(v, holes, np.nan) for v in (middle, spread))
+        else:
+            around = at
         ax.plot(x[far][shown] / per_shown, points, '.', color=BEFORE, markersize=2.5, alpha=0.6)
-        ax.fill_between(
-            at / per_shown, middle - spread, middle + spread, color=AFTER, alpha=0.25, linewidth=0
-        )
+        low, high = middle - spread, middle + spread
+        ax.fill_between(around / per_shown, low, high, color=AFTER, alpha=0.25, linewidth=0)
         # What jumps has no slope between two readings.
         drawn = 'default' if np.isnan(cell.moment) else 'steps-mid'
         ax.plot(at / per_shown, line, color=AFTER, linewidth=1.3, drawstyle=drawn)

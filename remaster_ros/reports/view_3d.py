@@ -146,7 +146,7 @@ def _direction(name: str, T_R_N: FloatArray, start: FloatArray, way: FloatArray)
     name = _plain(name)
     text = f'to {name}, {np.linalg.norm(T_R_N[:3, 3]):.1f} m from the base'
     line = {'color': SENSOR, 'width': 3}
-    points = start + np.array((0.75, 1.0))[:, None] * way
+    points = start + np.array((0.5, 0.65))[:, None] * way
     return _labelled(name, text, points, mode='lines+text', line=line)
 
 

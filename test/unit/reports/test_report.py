@@ -377,3 +377,26 @@ def test_what_changed_in_the_session_is_reported_first(fit_result):
     html = report_html(result, {})
     assert html.count('was moved between configurations') == 2
     assert 'off by up to 3.0' in html
+
+
+def test_a_far_sensor_leaves_the_arm_as_large_as_it_is(fit_result):
+    name, T = next(iter(fit_result.T_R_N.items()))
+    far = T.copy()
+    far[:3, 3] += (40.0, 0.0, 0.0)
+    # Measured points are carried to the base by the same frame: let them stay where they are.
+    m = fit_result.session.measurements
+    position = m.position.copy()
+    mine = m.sensor == list(fit_result.session.sensors).index(name)
+    position[mine] = apply(transforms.inverse(far) @ T, position[mine])
+    session = replace(fit_result.session, measurements=replace(m, position=position))
+    view = draw_view(replace(fit_result, session=session, T_R_N={**fit_result.T_R_N, name: far}))
+    assert name in view.far_sensors
+    largest = max(abs(x) for trace in view.data for x in trace['x'] if x is not None)
+    assert largest < 5.0
+    labels = [text for trace in view.data for text in trace.get('text', [])]
+    assert any('m from the base' in text for text in labels)
+
+
+def test_a_page_without_3d_says_what_is_missing(html):
+    assert 'needs WebGL, which this browser does not have' in html
+    assert '<noscript>The 3-D view needs JavaScript' in html
