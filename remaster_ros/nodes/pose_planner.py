@@ -46,14 +46,7 @@ from remaster_ros.nodes.pose_publisher import PosePublisher
 from remaster_ros.nodes.progress_lines import ProgressLines
 from remaster_ros.nodes.run_token import LivingRun, new_token, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import (
-    JOINT_STATES,
-    LATCHED,
-    RELIABLE,
-    NodeStatus,
-    Summary,
-    listen,
-)
+from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.planning.tour_order import REGISTRATION, PoseVisit
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanJournal

@@ -105,7 +105,7 @@ class Watch(RemasterNode):
         services = {name: f'remaster/{name}' for name in COMMANDS}
         self._callers = {n: self.create_client(Trigger, path) for n, path in services.items()}
         self._subscribe({name: sensor.topic for name, sensor in cell.sensors.items()})
-        scene = robot_scene(cell, cell.collision_model(self.chain).bodies)
+        scene = robot_scene(cell, cell.planning_scene(self.chain))
         self._rviz = RvizMarkers(self, scene, publish_tf=self.p.publish_tf)
         self.page = self._open_page(msgspec.json.encode(live_scene(scene)))
         self.status = NodeStatus(self, self._summary)

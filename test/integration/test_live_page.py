@@ -37,7 +37,7 @@ class Played:
 
     def __init__(self):
         self.collection = PlayedCollection(of=24)
-        scene = robot_scene(CELL, CELL.collision_model(CELL.chain()).bodies)
+        scene = robot_scene(CELL, CELL.planning_scene(CELL.chain()))
         content = msgspec.json.encode(live_scene(scene))
         self._lock, self._ending = threading.Lock(), threading.Event()
         self.server = LiveServer(Place(), 'T' * 43, content, self._send)
