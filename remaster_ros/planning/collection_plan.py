@@ -214,6 +214,21 @@ def look_ahead(
     )
 
 
+def outlook(planner: TourPlanner) -> tuple[Tour, Expected]:
+    """Return a collection with the sensors at their rough places, without its ways.
+
+    These take nearly all of the time that `plan_collection` takes; without them it is not known
+    which configurations no free way leads to, nor how long it all takes.
+
+    Raises
+    ------
+    InsufficientDataError
+        No pose is left to fit on, or the poses do not determine the offsets.
+    """
+    tour = planner.collection(planner.rough_places)
+    return tour, expected_precision(planner, planner.rough_places, tour.plans[FITTED].poses)
+
+
 class _Steps:
     """Go from stop to stop.
 
