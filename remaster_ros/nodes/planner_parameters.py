@@ -9,6 +9,7 @@ import numpy as np
 
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.nodes.parameters import parameter
+from remaster_ros.planning.separating_design import FoundCause
 from remaster_ros.planning.travel_time import SPEED_SHARE, TravelTime
 from remaster_ros.session.workcell import Workcell
 
@@ -37,6 +38,11 @@ class Parameters:
     )
     session: str = parameter(
         'session', "folder of the recorder's session, where the plan is kept (plan.jsonl)"
+    )
+    separate: str = parameter(
+        '',
+        'discovery.json: configurations that separate its causes from their look-alikes are '
+        'added; empty for none',
     )
     resume_within_s: float = parameter(
         30.0,
@@ -69,6 +75,15 @@ class Parameters:
             cell.acceleration_limits(model.chain),
         )
 
+    def causes(self) -> tuple[FoundCause, ...]:
+        """Return the causes that the plan is to separate; errors as of `read_causes`."""
+        if not self.separate:
+            return ()
+        # Imported when it is needed, as it takes a while.
+        from remaster_ros.reports.found_causes import read_causes
+
+        return read_causes(self.separate)
+
     def plan_settings(self, cell: Workcell) -> dict[str, Any]:
         """Return what the plan depends on."""
         design = cell.design_settings()
@@ -86,4 +101,5 @@ class Parameters:
             'limit_margin_deg': self.limit_margin_deg,
             # Other plans do not depend on them, and are those of older versions.
             **(speeds if design.optimal or design.fastest else {}),
+            **({'separate': repr(self.causes())} if self.separate else {}),
         }

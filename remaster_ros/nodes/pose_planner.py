@@ -80,6 +80,7 @@ class PosePlanner(RemasterNode):
             self.p.reference_every,
             self.cell.design_settings(),
             self.p.travel(self.cell, scene.model),
+            self.p.causes(),
         )
         folder = Path(self.p.session)
         self.journal = PlanJournal(

@@ -9,6 +9,7 @@ import numpy as np
 
 from remaster_ros.planning.collection_plan import FITTED, CollectionPlan
 from remaster_ros.planning.planned_design import DesignSettings
+from remaster_ros.planning.separating_design import DECIDED, SeparatingDesign
 
 HELD_OUT = 'validation'
 
@@ -46,6 +47,26 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
             'tool_share': design.goal.tool_share,
             'reached': design.reached,
         },
+        **({} if plan.separated is None else {'separate': _separated(plan.separated)}),
+    }
+
+
+def _separated(design: SeparatingDesign) -> dict[str, Any]:
+    return {
+        'configurations': sum(len(pose.solutions) for pose in design.poses),
+        'q_deg': [
+            np.degrees(q).round(4).tolist() for pose in design.poses for q in pose.solutions
+        ],
+        'pairs': [
+            {
+                'cause': pair.cause,
+                'look_alike': pair.look_alike,
+                'std_apart_before': round(pair.before, 2),
+                'std_apart': round(pair.after, 2),
+            }
+            for pair in design.pairs
+        ],
+        'otherwise': list(design.otherwise),
     }
 
 
@@ -74,9 +95,24 @@ def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
         lines.append(f'  {name:20s} {value}')
     lines.append(f'  {"root mean square":20s} {np.degrees(plan.joint_rms):.4f} deg')
     lines.append(f'expected error of the predicted markers: {plan.tool_rms * 1e3:.3f} mm (RMS)')
+    if plan.separated is not None:
+        lines += _separated_text(plan.separated)
     if missed := missed_goal(plan):
         lines.append(missed)
     return '\n'.join(lines)
+
+
+def _separated_text(design: SeparatingDesign) -> list[str]:
+    count = sum(len(pose.solutions) for pose in design.poses)
+    lines = [f'of these to separate causes: {count} configurations at {len(design.poses)} poses']
+    for pair in design.pairs:
+        verdict = 'decided' if pair.after >= DECIDED else 'may stay open'
+        lines.append(
+            f'  {pair.cause} or {pair.look_alike}: {pair.after:.1f} standard deviations apart '
+            f'({pair.before:.1f} without them), {verdict}'
+        )
+    lines += [f'  poses do not separate {words}' for words in design.otherwise]
+    return lines
 
 
 def minutes_text(seconds: float) -> str:
