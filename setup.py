@@ -60,7 +60,7 @@ setup(
     package_dir={f'{NAME}.config': 'config'},
     package_data={
         f'{NAME}.config': ['*.yaml', '*.rviz', '*.json', 'robots/*', 'cells/*', 'sros2/*'],
-        f'{NAME}.reports': ['*.jinja', 'live_page/*'],
+        f'{NAME}.reports': ['*.jinja', '*.js', 'live_page/*'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),

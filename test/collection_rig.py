@@ -30,6 +30,7 @@ class Cell:
         reference_every=0,
         cell='demo',
         rate=10.0,
+        collect=True,
     ):
         from remaster_ros.nodes.status import listen
 
@@ -72,8 +73,9 @@ class Cell:
         self._begin = begin
         self.nodes = {name: begin(name) for name in own}
         self.until(lambda: self.said.get('pose_planner', {}).get('robot') == 'heard', 'the robot')
-        response = call(client, '/remaster/collect')
-        assert response.success, response.message
+        if collect:
+            response = call(client, '/remaster/collect')
+            assert response.success, response.message
 
     def kill_and_start(self, name):
         self.nodes[name].kill()

@@ -40,10 +40,10 @@ from remaster_ros.nodes.rviz_markers import RvizMarkers
 from remaster_ros.nodes.status import LATCHED, LEVELS, RELIABLE, TOPIC, NodeStatus, Summary, listen
 from remaster_ros.nodes.waypoints import waypoints_by_solution
 from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE, read_fit
-from remaster_ros.reports.live_scene import live_scene
 from remaster_ros.reports.live_server import COMMANDS, Done, LiveServer, Place
 from remaster_ros.reports.live_view import LiveView
 from remaster_ros.reports.robot_scene import robot_scene
+from remaster_ros.reports.scene_view import scene_to_dict
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 
@@ -105,9 +105,9 @@ class Watch(RemasterNode):
         services = {name: f'remaster/{name}' for name in COMMANDS}
         self._callers = {n: self.create_client(Trigger, path) for n, path in services.items()}
         self._subscribe({name: sensor.topic for name, sensor in cell.sensors.items()})
-        scene = robot_scene(cell, cell.collision_model(self.chain).bodies)
+        scene = robot_scene(cell, cell.planning_scene(self.chain))
         self._rviz = RvizMarkers(self, scene, publish_tf=self.p.publish_tf)
-        self.page = self._open_page(msgspec.json.encode(live_scene(scene)))
+        self.page = self._open_page(msgspec.json.encode(scene_to_dict(scene)))
         self.status = NodeStatus(self, self._summary)
         self.create_timer(EVERY_S, self._show, clock=self.status.steady)
 

@@ -307,7 +307,11 @@ class LiveView:
     def _result(self) -> dict[str, Any]:
         return {
             'joints': [
-                {'joint': name, 'mean_deg': _degrees(mean), 'std_deg': _degrees(std)}
+                {
+                    'joint': name,
+                    'mean_deg': _degrees(mean),
+                    'std_deg': _determined(std),
+                }
                 for name, (mean, std) in self._offsets.items()
             ],
             'fit': dict(self._fit),
@@ -339,12 +343,12 @@ class LiveView:
 
     def _scene(self) -> dict[str, Any]:
         q, target = self._q, self._target
-        # The base's own frame first, as in `robot_scene.RobotScene.transforms`.
-        frames = [] if q is None else [_matrix(np.eye(4)), *map(_matrix, self._chain.frames(q))]
         return {
-            'frames': frames,
-            'target': None if target is None else _matrix(target),
+            'q': None if q is None else _rounded(q, 6),
+            # By rows.
+            'target': None if target is None else _rounded(target.ravel(), 5),
             'way': _rounded(self._way, 4),
+            'sensors': {name: _rounded(T[:3, 3], 3) for name, T in self.registration.items()},
             'points': {
                 name: _rounded(self.residuals.points_R(name)[-MOST_POINTS:], 4)
                 for name in self._sensors
@@ -384,8 +388,3 @@ def _degrees(radians: float | None) -> float | None:
 
 def _rounded(values: FloatArray | Sequence[float], digits: int) -> Any:
     return np.round(np.asarray(values, dtype=float), digits).tolist()
-
-
-def _matrix(T: FloatArray) -> list[float]:
-    """Return a transform by rows, 16 numbers."""
-    return [float(value) for value in np.round(T, 5).ravel()]

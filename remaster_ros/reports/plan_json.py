@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from remaster_ros.planning.collection_plan import CollectionPlan
+from remaster_ros.planning.collection_plan import FITTED, CollectionPlan
 from remaster_ros.planning.planned_design import DesignSettings
 
-FITTED, HELD_OUT = 'optimization', 'validation'
+HELD_OUT = 'validation'
 
 
 def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
@@ -52,7 +52,6 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
 def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
     """Return the same for people, one subject a line."""
     visits = Counter(visit.split for visit in plan.visits)
-    minutes = plan.robot_time_s / 60
     poses = plan.tour.poses
     lines = [
         f'to fit: {visits[FITTED]} configurations at {poses[FITTED]} poses'
@@ -66,7 +65,8 @@ def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
     lines += [
         f'dropped poses: {_counts(plan.tour.dropped)}',
         f'dropped configurations: {_counts(plan.dropped)}',
-        f'robot time: {minutes:.1f} min, fastest point at {plan.max_tool_speed_m_s:.2f} m/s',
+        f'robot time: {minutes_text(plan.robot_time_s)}, '
+        f'fastest point at {plan.max_tool_speed_m_s:.2f} m/s',
         'expected standard deviation of the offsets:',
     ]
     for name, std in plan.joint_std.items():
@@ -74,13 +74,20 @@ def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
         lines.append(f'  {name:20s} {value}')
     lines.append(f'  {"root mean square":20s} {np.degrees(plan.joint_rms):.4f} deg')
     lines.append(f'expected error of the predicted markers: {plan.tool_rms * 1e3:.3f} mm (RMS)')
-    if plan.designed is not None and not plan.designed.reached:
-        lines.append(_missed(plan))
+    if missed := missed_goal(plan):
+        lines.append(missed)
     return '\n'.join(lines)
 
 
-def _missed(plan: CollectionPlan) -> str:
-    assert plan.designed is not None
+def minutes_text(seconds: float) -> str:
+    """Return a time for people."""
+    return f'{seconds / 60:.1f} min'
+
+
+def missed_goal(plan: CollectionPlan) -> str:
+    """Return which goal an optimal design does not reach, and what would help; '' for none."""
+    if plan.designed is None or plan.designed.reached:
+        return ''
     goal = plan.designed.goal
     return (
         f'not reached: {np.degrees(goal.joint_std_rad):.4f} deg for the offsets or '

@@ -8,7 +8,7 @@ all of a link's can be read, else with what stands for that link in the collisio
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from remaster_ros.kinematics.bodies import Body, Shape, triangles
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.kinematics.urdf_geometry import Visual, chain_visuals
+from remaster_ros.planning.candidates import LineOfSight, PlanningScene
 from remaster_ros.session.meshes import MeshPart, find_mesh, read_mesh_parts
 from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import FloatArray, IntArray
@@ -70,10 +71,8 @@ class RobotScene:
         The arm.
     surfaces
         All that is drawn.
-    sensors
-        Rough place of each sensor in base_link, m, (3,).
-    markers
-        The marker that each sensor follows, in the tool frame, m, (3,).
+    sights
+        Where each sensor is, and which marker it follows.
     floor_z
         Height of the floor, m; None where there is none.
     notes
@@ -82,8 +81,7 @@ class RobotScene:
 
     chain: SerialChain
     surfaces: Sequence[Surface]
-    sensors: Mapping[str, FloatArray]
-    markers: Mapping[str, FloatArray]
+    sights: Sequence[LineOfSight]
     floor_z: float | None
     notes: Sequence[str]
 
@@ -96,33 +94,36 @@ class RobotScene:
         base = np.broadcast_to(np.eye(4), (*frames.shape[:-3], 1, 4, 4))
         return np.concatenate((base, frames), axis=-3)
 
-    def sight_ends(self, q: FloatArray) -> dict[str, FloatArray]:
-        """Return where the marker of each sensor is at joint angles (..., k): m, (..., 3)."""
-        return {name: self.chain.positions(q, at) for name, at in self.markers.items()}
+    def with_sensors(self, T_R_N: Mapping[str, FloatArray]) -> RobotScene:
+        """Return the scene with these sensors where they were measured to be, (4, 4) each."""
+        sights = [
+            replace(sight, sensor_R=T_R_N[sight.sensor][:3, 3]) if sight.sensor in T_R_N else sight
+            for sight in self.sights
+        ]
+        return replace(self, sights=sights)
+
+    def sight_ends(self, q: FloatArray) -> FloatArray:
+        """Return where the marker of each sight is at joint angles (..., k): m, (..., s, 3)."""
+        markers = np.array([sight.marker_T for sight in self.sights])
+        return self.chain.positions(np.asarray(q)[..., None, :], markers)
 
 
-def robot_scene(cell: Workcell, bodies: Sequence[Body]) -> RobotScene:
+def robot_scene(cell: Workcell, scene: PlanningScene) -> RobotScene:
     """Return the scene of a cell.
 
     Parameters
     ----------
     cell
         The cell.
-    bodies
-        As the collision checks have them (`CollisionModel.bodies`).
+    scene
+        Its planning scene: what the collision checks have, and the sensors.
     """
-    chain, folder = cell.chain(), Path(cell.file).parent
+    chain, folder = scene.model.chain, Path(cell.file).parent
     urdf, mesh_path = folder / cell.robot.urdf, [folder / path for path in cell.mesh_path]
     parts = cache(lambda name: read_mesh_parts(find_mesh(name, urdf, mesh_path)))
-    surfaces, notes = arm_surfaces(chain_visuals(cell.urdf_text, chain), bodies, parts)
-    return RobotScene(
-        chain,
-        surfaces,
-        {name: np.array(sensor.rough_position_m) for name, sensor in cell.sensors.items()},
-        {name: np.array(cell.markers[sensor.marker]) for name, sensor in cell.sensors.items()},
-        cell.floor_z_m,
-        notes,
-    )
+    visuals = chain_visuals(cell.urdf_text, chain)
+    surfaces, notes = arm_surfaces(visuals, scene.model.bodies, parts)
+    return RobotScene(chain, surfaces, scene.sights, scene.model.floor_z, notes)
 
 
 def arm_surfaces(

@@ -8,12 +8,12 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import msgspec
 import pytest
-from browser import Browser
-from played_collection import CELL, PlayedCollection
+from driven_browser import Browser
+from played_collection import CELL, CHAIN, PlayedCollection
 
-from remaster_ros.reports.live_scene import live_scene
 from remaster_ros.reports.live_server import LiveServer, Place
 from remaster_ros.reports.robot_scene import robot_scene
+from remaster_ros.reports.scene_view import scene_to_dict
 
 
 class Empty(BaseHTTPRequestHandler):
@@ -37,8 +37,8 @@ class Played:
 
     def __init__(self):
         self.collection = PlayedCollection(of=24)
-        scene = robot_scene(CELL, CELL.collision_model(CELL.chain()).bodies)
-        content = msgspec.json.encode(live_scene(scene))
+        scene = robot_scene(CELL, CELL.planning_scene(CHAIN))
+        content = msgspec.json.encode(scene_to_dict(scene))
         self._lock, self._ending = threading.Lock(), threading.Event()
         self.server = LiveServer(Place(), 'T' * 43, content, self._send)
         self._thread = threading.Thread(target=self._run)

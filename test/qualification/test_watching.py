@@ -7,8 +7,8 @@ import socket
 from pathlib import Path
 
 import pytest
-from browser import Browser
 from collection_rig import Cell
+from driven_browser import Browser
 from ros_rig import ROOT, call, node_arguments
 
 from remaster_ros.nodes.demo import free_ports

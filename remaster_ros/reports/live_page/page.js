@@ -131,7 +131,9 @@ function sensorState(sensor) {
 function showResult(result) {
   get('result').hidden = result.joints.length === 0;
   fill('offsets', result.joints.map((j) => [
-    j.joint, [number(j.mean_deg, 4, ''), 'n'], [number(j.std_deg, 4, ''), 'n'],
+    j.joint,
+    [j.std_deg === null ? 'not identifiable' : number(j.mean_deg, 4, ''), 'n'],
+    [number(j.std_deg, 4, ''), 'n'],
   ]));
   const key = JSON.stringify(result.fit);
   const list = get('fit-facts');
@@ -204,7 +206,7 @@ get('sure').addEventListener('close', () => {
 });
 
 if (token) {
-  request('scene').then(setScene).catch(() => {});
+  request('scene').then(setScene).catch(() => setText('scene-note', 'No 3-D picture: it did not arrive.'));
   look();
 } else {
   setText('state', 'no token');

@@ -41,7 +41,7 @@ class Node:
         return types.SimpleNamespace(now=lambda: types.SimpleNamespace(to_msg=Time))
 
 
-SCENE = robot_scene(CELL, CELL.collision_model(CHAIN).bodies)
+SCENE = robot_scene(CELL, CELL.planning_scene(CHAIN))
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import json
 import msgspec
 import numpy as np
 import pytest
-from played_collection import CHAIN, MARKERS, PER_POSE, PlayedCollection
+from played_collection import CHAIN, MARKERS, PER_POSE, T_R_N, PlayedCollection
 
 from remaster_ros.collection import events
 from remaster_ros.collection.live_precision import Precision
@@ -32,7 +32,7 @@ def test_before_any_node_is_heard_nothing_can_be_begun():
     assert not view['commands']['collect']['on']
     assert view['commands']['stop']['on']
     assert {row['message'] for row in view['nodes']} == {'not seen yet'}
-    assert view['scene']['frames'] == []
+    assert view['scene']['q'] is None
 
 
 def test_progress_and_time_left(played):
@@ -72,13 +72,12 @@ def test_a_rejected_configuration_is_told_and_leaves_no_residual(played):
     assert view['messages'][0]['text'].startswith('configuration rejected')
 
 
-def test_the_frames_are_those_of_the_links(played):
-    view = after(played, 3)
-    frames = np.array(view['scene']['frames']).reshape(-1, 4, 4)
-    assert np.allclose(frames[0], np.eye(4))
-    assert np.allclose(frames[1:], CHAIN.frames(played.q), atol=1e-5)
-    way = np.array(view['scene']['way'])
-    assert np.allclose(way[-1], CHAIN.positions(played.q, np.zeros(3)), atol=1e-4)
+def test_the_scene_has_the_arm_its_way_and_the_sensors(played):
+    scene = after(played, 3)['scene']
+    assert np.allclose(scene['q'], played.q, atol=1e-6)
+    assert np.allclose(np.reshape(scene['target'], (4, 4)), CHAIN.forward(played.q), atol=1e-5)
+    assert np.allclose(scene['way'][-1], CHAIN.positions(played.q, np.zeros(3)), atol=1e-4)
+    assert np.allclose(scene['sensors']['mocap'], T_R_N[:3, 3], atol=1e-3)
 
 
 def test_a_way_is_straight_in_the_joints():

@@ -38,7 +38,7 @@ def scene_with(folder, meshes):
             obstacles=TABLE,
         )
     )
-    return robot_scene(cell, cell.collision_model(cell.chain()).bodies)
+    return robot_scene(cell, cell.planning_scene(cell.chain()))
 
 
 def brick():
@@ -83,10 +83,12 @@ def test_obstacles_tool_markers_and_sensors_are_in_the_scene(tmp_path):
     assert (table.role, table.link) == ('obstacle', 0)
     np.testing.assert_allclose(table.vertices.max(axis=0), [1.0, 0.2, 0.4], atol=1e-9)
     assert roles['marker smr'].role == 'marker'
-    np.testing.assert_array_equal(scene.sensors['tracker'], [2.0, 0.5, 1.0])
+    (sight,) = scene.sights
+    np.testing.assert_array_equal(sight.sensor_R, [2.0, 0.5, 1.0])
     q = np.array([0.3, -0.2, 0.5, 1.0, -0.7, 0.4])
     there = scene.chain.positions(q, MARKERS['smr'])
-    np.testing.assert_allclose(scene.sight_ends(q)['tracker'], there)
+    np.testing.assert_allclose(scene.sight_ends(q), [there])
+    np.testing.assert_allclose(scene.sight_ends(np.array([q, 0 * q]))[0], [there])
     # The marker that is drawn is where the line of sight ends.
     marker = apply(scene.transforms(q)[6], roles['marker smr'].vertices)
     np.testing.assert_allclose((marker.min(axis=0) + marker.max(axis=0)) / 2, there, atol=1e-3)
