@@ -29,8 +29,9 @@ class Cell:
         candidates=2,
         reference_every=0,
         cell='demo',
-        rate=10.0,
+        held_out=1,
         collect=True,
+        rate=10.0,
     ):
         from remaster_ros.nodes.status import listen
 
@@ -47,7 +48,7 @@ class Cell:
             'pose_planner': {
                 'session': self.session,
                 'optimization_candidates': candidates,
-                'validation_candidates': 1,
+                'validation_candidates': held_out,
                 'registration_candidates': 6,
                 'reference_every': reference_every,
             },
@@ -121,6 +122,9 @@ class Cell:
             assert np.all(np.linalg.norm(m.position[mine] - expected, axis=1) < 0.4e-3), name
         pairs = list(zip(m.configuration.tolist(), m.sensor.tolist()))
         assert len(set(pairs)) == len(pairs)
+        assert len(set(m.configuration.tolist())) == self.planned() > 3
+
+    def planned(self):
+        """Return how many configurations the last plan has."""
         tours = [r for r in read_journal(self.session / 'plan.jsonl').records if 'plans' in r]
-        planned = sum(len(p['solutions']) for s in tours[-1]['plans'].values() for p in s['poses'])
-        assert len(set(m.configuration.tolist())) == planned > 3
+        return sum(len(p['solutions']) for s in tours[-1]['plans'].values() for p in s['poses'])

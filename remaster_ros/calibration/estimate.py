@@ -37,9 +37,9 @@ from remaster_ros.types import (
 # Fewer rows of a sensor do not determine its noise.
 FEWEST_ROWS = 4
 FEWEST_POSES = 3
-# Limits of chi-squared with 1 and 2 degrees of freedom at an error rate of 1 in 1,000: so often a
+# Limits of chi-squared with 1 to 3 degrees of freedom at an error rate of 1 in 1,000: so often a
 # sensor whose noise is the same in all directions gets one of its own along the line of sight.
-DIRECTION_LIMITS = {1: 10.828, 2: 13.816}
+DIRECTION_LIMITS = {1: 10.828, 2: 13.816, 3: 16.266}
 
 
 @dataclass(frozen=True, eq=False)

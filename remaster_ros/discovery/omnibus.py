@@ -89,7 +89,7 @@ class _Checks:
     def limit(self) -> FloatArray:
         """Length from which on the error of a row is gross, m, (n,)."""
         noise = self.data.noise_model.sensor_noise(self.solution.noise)
-        limit: FloatArray = GROSS * np.hypot(noise.sigma, noise.pose_sigma)
+        limit: FloatArray = GROSS * noise.total
         return limit[self.data.context.sensor]
 
     @cached_property

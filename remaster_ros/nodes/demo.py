@@ -53,6 +53,15 @@ from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.setup import make_world
 from remaster_ros.simulation.truth import to_plain
 
+HAVE_CELL = (
+    'pose_planner',
+    'robot_bridge',
+    'recorder',
+    'optitrack_markers',
+    'laser_tracker_markers',
+)
+"""Nodes with the parameter ``cell``."""
+
 
 @dataclass(frozen=True)
 class Parameters:
@@ -62,6 +71,7 @@ class Parameters:
         '', 'folder of everything the demo writes: new, empty, or of a demo to go on with'
     )
     seed: int = parameter(0, 'seed of the hidden World and of all randomness', low=0)
+    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
     candidates: int = parameter(
         14, 'candidate poses for optimization and for validation, each', low=1, high=1000
     )
@@ -139,7 +149,7 @@ class Demo:
 
     def run(self) -> None:
         """Collect, fit, print."""
-        cell = read_cell('demo')
+        cell = read_cell(self.p.cell)
         world = make_world(
             self.hidden, cell, self.p.seed, self.p.rate, self.requests, self.p.candidates
         )
@@ -201,9 +211,12 @@ class Demo:
             'laser_tracker_markers': {'port': tracker_port},
         }
         for name in ALL_NODES:
-            self.processes.start(name, common, own.get(name, {}))
+            values = own.get(name, {})
+            if name in HAVE_CELL:
+                values['cell'] = self.p.cell
+            self.processes.start(name, common, values)
         if self.p.watch:
-            self.processes.start('watch', common, {'fit': str(self.fit)})
+            self.processes.start('watch', common, {'cell': self.p.cell, 'fit': str(self.fit)})
             name = page_name(self.node.context.get_domain_id(), '/watch')
             self.console.print(f'live page: open {opening_path(name)}', soft_wrap=True)
 

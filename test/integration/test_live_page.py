@@ -8,7 +8,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import msgspec
 import pytest
-from driven_browser import Browser
+from browser import Browser
 from played_collection import CELL, CHAIN, PlayedCollection
 
 from remaster_ros.reports.live_server import LiveServer, Place

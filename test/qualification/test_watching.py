@@ -7,8 +7,8 @@ import socket
 from pathlib import Path
 
 import pytest
+from browser import Browser
 from collection_rig import Cell
-from driven_browser import Browser
 from ros_rig import ROOT, call, node_arguments
 
 from remaster_ros.nodes.demo import free_ports
@@ -66,7 +66,6 @@ def test_collect_pause_reload_kill_stop_result(start, client, browser, tmp_path)
     browser.open(url)
     until(lambda: state() == 'collecting', 'the collection')
     until(lambda: browser.text('#residuals-note').startswith('Distance'), 'residuals')
-    until(lambda: browser.value('document.querySelector("#precision").data?.length'), 'precision')
     until(lambda: ' left' in browser.text('#left'), 'the time that is left')
 
     browser.click('#pause')
@@ -115,6 +114,7 @@ def test_collect_pause_reload_kill_stop_result(start, client, browser, tmp_path)
     until(lambda: cell.recorder('exit_status') == 'stopped', 'the session is closed')
     go_on()
     cell.complete()
+    until(lambda: browser.value('document.querySelector("#precision").data?.length'), 'looks')
     until(lambda: state() == 'collection complete', 'the end')
     browser.click('#fit')
     until(lambda: str(fit) in browser.text('#result'), 'the result')

@@ -111,8 +111,8 @@ function drawResiduals(sensors) {
   const model = sensors.some((s) => s.corrected) ? 'the arm with the fitted zero-offsets' : 'the nominal arm';
   setText('residuals-note', made.length
     ? `Distance from each measured marker to where ${model} has it, registered by all configurations so far.`
-    : 'After five recorded configurations.');
-  flat('residuals', made, { xaxis: axis('configuration since this page was started'), yaxis: axis('mm', { rangemode: 'tozero' }), showlegend: true });
+    : 'After five measured points.');
+  flat('residuals', made, { xaxis: axis('measured point since this page was started'), yaxis: axis('mm', { rangemode: 'tozero' }), showlegend: true });
 }
 
 function drawPrecision(precision) {
@@ -123,7 +123,7 @@ function drawPrecision(precision) {
       hovertemplate: '%{y:.4f}° after %{x} configurations, %{customdata:.1f} min',
     }));
   setText('precision-note', made.length
-    ? 'Of each zero-offset, for what is recorded so far to be fitted, at the noise that the cell file expects.'
-    : 'As soon as a configuration to be fitted is recorded.');
+    ? `Of each zero-offset, by a fit of what is recorded so far. ${precision.message}`
+    : 'The optimizer fits what is recorded after every few configurations to fit.');
   flat('precision', made, { xaxis: axis('configurations to fit'), yaxis: axis('std (°)', { type: 'log' }), showlegend: true });
 }
