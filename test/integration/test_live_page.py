@@ -162,6 +162,7 @@ def test_without_the_token_the_page_is_empty(browser, played):
     browser.value('sessionStorage.clear()')
     browser.open(played.server.url.split('#')[0])
     browser.until(lambda: browser.text('#state') == 'no token', 'that the token is missing')
+    assert browser.value('document.querySelectorAll("button:disabled").length') == 4
     browser.open(played.server.url[:-1])
     browser.until(lambda: 'by the address that' in browser.text('#link'), 'that it is wrong')
     assert browser.value('sessionStorage.clear()') is None

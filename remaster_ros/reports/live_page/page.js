@@ -116,7 +116,7 @@ function show(view) {
   drawPrecision(view.precision);
   drawScene(view.scene);
   if (asked && view.seen !== asked.seen && get('sure').open) {
-    get('sure').close('no');
+    get('sure').close();
     banner('answer', 'The collection has changed meanwhile; look again.', 'caution');
   }
 }
@@ -155,7 +155,7 @@ function showLink() {
   document.body.classList.toggle('old', old);
   if (!old) return;
   for (const name of ['collect', 'pause', 'fit']) get(name).disabled = true;
-  if (get('sure').open) get('sure').close('no');
+  if (get('sure').open) get('sure').close();
   const since = Number.isFinite(age) ? ` What is shown is ${Math.round(age / 1000)} s old.` : '';
   banner('link', `${lastError || 'No answer from remaster watch.'}${since} Stop may not get through: use the red button.`);
 }
@@ -197,15 +197,16 @@ for (const name of ['pause', 'stop', 'fit']) get(name).addEventListener('click',
 get('collect').addEventListener('click', () => {
   asked = { seen: shown.view.seen };
   setText('sure-what', shown.view.commands.collect.label);
-  get('sure').returnValue = 'no';
   get('sure').showModal();
 });
-get('sure').addEventListener('close', () => {
-  if (get('sure').returnValue === 'yes' && asked) command('collect', { view: shown.number, seen: asked.seen });
+get('sure-yes').addEventListener('click', () => {
+  if (asked) command('collect', { view: shown.number, seen: asked.seen });
   asked = null;
 });
 
 if (token) {
+  // Until here a press would have done nothing.
+  get('stop').disabled = false;
   request('scene').then(setScene).catch(() => setText('scene-note', 'No 3-D picture: it did not arrive.'));
   look();
 } else {

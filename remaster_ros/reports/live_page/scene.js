@@ -123,7 +123,7 @@ function drawPrecision(precision) {
       hovertemplate: '%{y:.4f}° after %{x} configurations, %{customdata:.1f} min',
     }));
   setText('precision-note', made.length
-    ? `Of each zero-offset, by a fit of what is recorded so far. ${precision.message}`
+    ? `Of each zero-offset, by fits of what was recorded up to then; the last: ${precision.message}`
     : 'The optimizer fits what is recorded after every few configurations to fit.');
-  flat('precision', made, { xaxis: axis('configurations to fit'), yaxis: axis('std (°)', { type: 'log' }), showlegend: true });
+  flat('precision', made, { xaxis: axis('configurations to fit'), yaxis: axis('std (°)', { type: 'log', tickformat: '~g' }), showlegend: true });
 }
