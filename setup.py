@@ -96,6 +96,7 @@ setup(
     ],
     extras_require={
         'jazzy': JAZZY,
+        'pdf': ['weasyprint>=62'],
         'natnetclient': ['NatNetClient==0.8.3'],
         # colcon, with which a test builds the package, runs pytest only where it is in this list.
         'test': [
