@@ -16,6 +16,7 @@ from remaster_ros.reports.answer_inputs import Inputs
 from remaster_ros.reports.discovery_schema import Discovered, Effect
 from remaster_ros.reports.effect_words import STEP, is_held_by_model, is_of_measurement, title
 from remaster_ros.reports.judgement import NOTICEABLE_GAIN
+from remaster_ros.reports.remaining import Remaining, what_remains
 from remaster_ros.reports.schemas import JointOffset, Judgement
 from remaster_ros.types import BoolArray, FloatArray
 
@@ -67,14 +68,6 @@ class SensorNoise(NamedTuple):
     sensor: str
     reading_mm: float
     shared_mm: float | None
-
-
-class Remaining(NamedTuple):
-    """Something that the deed leaves: its name, its size in words, and what to do."""
-
-    what: str
-    size: str
-    remedy: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +150,7 @@ def answer_of(inputs: Inputs) -> Answer:
         brings=brings,
         held_out=held_out,
         noise=_noise(inputs),
-        remains=tuple(_remains(inputs, uses_causes, held_out)),
+        remains=tuple(what_remains(inputs, uses_causes, held_out, stages[brings].mean)),
         offsets=tuple(offsets),
     )
 
@@ -241,53 +234,6 @@ def _noise(inputs: Inputs) -> tuple[SensorNoise, ...]:
             if check.noise_m is not None:
                 rows.append(SensorNoise(sensor, 1e3 * check.noise_m, None))
     return tuple(rows)
-
-
-def _remains(inputs: Inputs, uses_causes: bool, held_out: bool) -> list[Remaining]:
-    found, judgement = inputs.found, inputs.judgement
-    rows: list[Remaining] = []
-    if found is not None:
-        for effect in found.effects:
-            if uses_causes and is_held_by_model(effect):
-                continue
-            sizes = effect.sizes if isinstance(effect.sizes, list) else []
-            remedy = effect.remedy if isinstance(effect.remedy, str) else ''
-            rows.append(Remaining(title(effect), '; '.join(sizes), remedy))
-        if found.verdict == 'undetermined':
-            rows.append(
-                Remaining(
-                    'Undecided',
-                    'another explanation fits as well',
-                    'Measure what the look-alikes below call for.',
-                )
-            )
-        if isinstance(found.unexplained, list):
-            rows += [
-                Remaining('Unexplained', f'{1e3 * left.size_m:.3f} mm RMS', left.next)
-                for left in found.unexplained
-            ]
-    elif judgement.doubts:
-        rows.append(
-            Remaining(
-                'More than noise',
-                judgement.doubts[0],
-                'Search for its cause: remaster discover SESSION --out DIR, then give DIR to '
-                'remaster report.',
-            )
-        )
-    rows += [Remaining('The data disagree', line, '') for line in judgement.disagreements]
-    if not held_out:
-        rows.append(
-            Remaining('Not proven', 'no poses were held out', 'Measure some more, and fit again.')
-        )
-    if not rows:
-        words = (
-            'every cause was tried, and none explains more of what is left than chance does'
-            if found is not None
-            else 'what is left is what noise explains'
-        )
-        rows.append(Remaining('Noise', words, ''))
-    return rows
 
 
 def _mood(inputs: Inputs, uses_causes: bool, may_be_good: bool) -> Mood:

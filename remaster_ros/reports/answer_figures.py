@@ -47,11 +47,10 @@ class Subject(NamedTuple):
 def draw_answer(subject: Subject) -> dict[str, str]:
     """Return every figure as SVG text, by file name without ending."""
     figures: dict[str, Callable[[Subject], Figure]] = {
-        'stages': stages,
         'session': over_session,
         'workspace': workspace,
     }
-    return as_svg(figures, subject)
+    return draw_stages(subject.answer) | as_svg(figures, subject)
 
 
 def final_errors(inputs: Inputs, answer: Answer) -> FloatArray:
@@ -61,9 +60,13 @@ def final_errors(inputs: Inputs, answer: Answer) -> FloatArray:
     return inputs.after_mm
 
 
-def stages(subject: Subject) -> Figure:
+def draw_stages(answer: Answer) -> dict[str, str]:
+    """Return the figure of the first screen as SVG text, by its name."""
+    return as_svg({'stages': stages}, answer)
+
+
+def stages(answer: Answer) -> Figure:
     """Draw the errors of the judged rows at each stage, with their mean and 95 %."""
-    answer = subject.answer
     shown = answer.stages
     figure = Figure(figsize=(NARROW_IN, 0.62 * len(shown) + 0.75), layout='constrained')
     ax = figure.subplots()

@@ -28,10 +28,8 @@ class Inputs:
     ----------
     session
         All rows.
-    fit, fit_folder
-        fit.json, and where it and the files beside it are.
-    found, found_folder
-        The same of a discovery; None without one.
+    fit, found
+        fit.json and discovery.json; None without the latter.
     before_mm, after_mm
         3-D error of every row with all offsets at zero and with those of the fit, (n,).
     causes_mm
@@ -40,9 +38,7 @@ class Inputs:
 
     session: Session
     fit: Fit
-    fit_folder: Path
     found: Discovered | None
-    found_folder: Path | None
     before_mm: FloatArray
     after_mm: FloatArray
     causes_mm: FloatArray | None
@@ -98,7 +94,7 @@ def read_inputs(session: Session, fit_path: Path, found_path: Path | None) -> In
     residuals = read_columns(fit_path.parent / RESIDUALS_FILE, session, BEFORE + AFTER, 'fit')
     before_mm, after_mm = _lengths_mm(residuals[:, :3]), _lengths_mm(residuals[:, 3:])
     if found_path is None:
-        return Inputs(session, fit, fit_path.parent, None, None, before_mm, after_mm, None)
+        return Inputs(session, fit, None, before_mm, after_mm, None)
     found = msgspec.convert(read_discovery(found_path), Discovered)
     _require_same(session, found, found_path, 'discover')
     causes_mm = None
@@ -106,16 +102,7 @@ def read_inputs(session: Session, fit_path: Path, found_path: Path | None) -> In
         path = found_path.parent / PREDICTIONS_FILE
         predicted = read_columns(path, session, PREDICTED, 'discover')
         causes_mm = _lengths_mm(session.measurements.position - predicted)
-    return Inputs(
-        session,
-        fit,
-        fit_path.parent,
-        found,
-        found_path.parent,
-        before_mm,
-        after_mm,
-        causes_mm,
-    )
+    return Inputs(session, fit, found, before_mm, after_mm, causes_mm)
 
 
 def _lengths_mm(errors: FloatArray) -> FloatArray:

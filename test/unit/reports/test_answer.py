@@ -77,7 +77,7 @@ def fit(fit_result) -> Fit:
 
 
 @pytest.fixture
-def inputs(fit_result, fit, tmp_path):
+def inputs(fit_result, fit):
     """Return a function: effects of a discovery (None without one) and changes -> inputs."""
 
     def made(effects=None, verdict='effects', mood='good', errors=(3.0, 0.5, 0.3)) -> Inputs:
@@ -87,9 +87,7 @@ def inputs(fit_result, fit, tmp_path):
         return Inputs(
             fit_result.session,
             fit,
-            tmp_path,
             found,
-            None,
             before,
             after,
             causes if effects else None,
@@ -132,6 +130,31 @@ def test_causes_that_stay_are_listed_with_their_remedy_and_the_others_are_not(in
     assert all(row.remedy == 'The remedy.' for row in remains)
     (left,) = answer_of(inputs([LENGTH])).remains
     assert left.what == 'Noise'
+
+
+def test_what_no_cause_explains_is_never_called_noise(inputs, fit):
+    assert [row.what for row in answer_of(inputs([])).remains] == ['Noise']
+    fit.judgement.doubts = ['tracker: the error after is 0.500 mm; noise makes 0.100 mm.']
+    (alone,) = answer_of(inputs()).remains
+    assert alone.size == fit.judgement.doubts[0]
+    assert 'remaster discover' in alone.sentence
+    assert '..' not in alone.sentence
+    (searched,) = answer_of(inputs([])).remains
+    assert searched.what == 'More than noise'
+    assert '0.500 mm, and no cause' in searched.size
+
+
+def test_many_gross_errors_say_when_and_of_which_sensor(inputs):
+    made = inputs([])
+    m = made.session.measurements
+    rows = np.flatnonzero(m.sensor == m.sensor[-1])[-4:]
+    made.found.noise.outliers = m.observation[rows].tolist()
+    (gross,) = answer_of(made).remains
+    first, last = m.configuration[rows[[0, -1]]]
+    minutes = (m.stamp_s[rows[0]] - m.stamp_s[0]) / 60.0
+    name = made.session.sensor_names[m.sensor[-1]]
+    assert gross.size.startswith(f'4 of {len(m)} readings, of {name}: ')
+    assert f'configurations {first} to {last}, {minutes:.1f} to ' in gross.size
 
 
 def test_an_error_of_the_measurement_is_no_gain_of_the_arm(inputs):
