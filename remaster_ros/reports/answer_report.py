@@ -19,7 +19,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.reports.answer import ALL_FILES, Answer, answer_of, registrations
-from remaster_ros.reports.answer_figures import Subject, draw_answer, final_errors
+from remaster_ros.reports.answer_figures import Subject, draw_answer
 from remaster_ros.reports.answer_inputs import Inputs
 from remaster_ros.reports.fit_json import APPLY_FOLDER, REPORT_FILE
 from remaster_ros.reports.fit_tables import accuracy_rows, marker_rows
@@ -173,7 +173,7 @@ def measured_when(inputs: Inputs) -> str:
 def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
     """Return the rows with the largest errors after the deed, the largest first."""
     session, m = inputs.session, inputs.session.measurements
-    final = final_errors(inputs, answer)
+    final = answer.final_mm
     frames = registrations(inputs)
     first = float(m.stamp_s.min())
     gross = inputs.found.noise.outliers if inputs.found is not None else ()

@@ -14,7 +14,9 @@ from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.effect_words import is_held_by_model, title
 
 # Fewer gross errors are in the table of left-out rows alone.
-FEWEST_GROSS = 3
+FEWEST_GROSS, LEAST_SHARE = 3, 0.01
+# The first screen names so many causes, with so many sizes each; all of them stand below.
+MOST_NAMED, MOST_SIZES = 4, 2
 
 
 class Remaining(NamedTuple):
@@ -75,12 +77,19 @@ def what_remains(
 def _of_discovery(found: Discovered, uses_causes: bool) -> list[Remaining]:
     """Return the causes that stay, and what has none."""
     rows: list[Remaining] = []
-    for effect in found.effects:
-        if uses_causes and is_held_by_model(effect):
-            continue
+    stay = [e for e in found.effects if not (uses_causes and is_held_by_model(e))]
+    for effect in stay[:MOST_NAMED]:
         sizes = effect.sizes if isinstance(effect.sizes, list) else []
+        size = '; '.join(sizes)
+        if len(sizes) > MOST_SIZES and isinstance(effect.size_m, float):
+            size = f'{1e3 * effect.size_m:.3f} mm RMS at the marker'
         remedy = effect.remedy if isinstance(effect.remedy, str) else ''
-        rows.append(Remaining(title(effect), '; '.join(sizes), remedy))
+        rows.append(Remaining(title(effect), size, remedy))
+    if more := stay[MOST_NAMED:]:
+        largest = max(e.size_m for e in more if isinstance(e.size_m, float))
+        size = f'up to {1e3 * largest:.3f} mm RMS at the marker'
+        name = f'{len(more)} smaller cause{"s" if len(more) > 1 else ""}'
+        rows.append(Remaining(name, size, 'See below.'))
     if found.verdict == 'undetermined':
         remedy = 'Measure what the look-alikes below call for.'
         rows.append(Remaining('Undecided', 'another explanation fits as well', remedy))
@@ -98,7 +107,7 @@ def _gross(inputs: Inputs) -> Remaining | None:
     # With the causes some of those that the fit left out are none.
     gross = inputs.fit_left_out if inputs.found is None else inputs.found.noise.outliers
     rows = np.isin(m.observation, list(gross))
-    if rows.sum() < FEWEST_GROSS:
+    if rows.sum() < max(FEWEST_GROSS, LEAST_SHARE * len(m)):
         return None
     sensors = listed([session.sensor_names[i] for i in np.unique(m.sensor[rows])])
     first, last = m.stamp_s[rows].min(), m.stamp_s[rows].max()

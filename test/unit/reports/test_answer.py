@@ -9,9 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from remaster_ros.compensation.export import exports
 from remaster_ros.errors import InputError
 from remaster_ros.reports.answer import answer_of
-from remaster_ros.reports.answer_inputs import Inputs, parts, read_inputs
+from remaster_ros.reports.answer_inputs import Inputs, errors_with_model_mm, parts, read_inputs
 from remaster_ros.reports.answer_report import checked_svg, require_ready, worst_rows
 from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.effect_words import law, title
@@ -80,7 +81,9 @@ def fit(fit_result) -> Fit:
 def inputs(fit_result, fit):
     """Return a function: effects of a discovery (None without one) and changes -> inputs."""
 
-    def made(effects=None, verdict='effects', mood='good', errors=(3.0, 0.5, 0.3)) -> Inputs:
+    def made(
+        effects=None, verdict='effects', mood='good', errors=(3.0, 0.5, 0.3), model=None
+    ) -> Inputs:
         rows = np.ones(len(fit_result.session.measurements))
         found = None if effects is None else discovery(fit, effects, verdict, mood)
         before, after, causes = (rows * error for error in errors)
@@ -91,6 +94,7 @@ def inputs(fit_result, fit):
             before,
             after,
             causes if effects else None,
+            None if model is None else rows * model,
         )
 
     return made
@@ -130,6 +134,38 @@ def test_causes_that_stay_are_listed_with_their_remedy_and_the_others_are_not(in
     assert all(row.remedy == 'The remedy.' for row in remains)
     (left,) = answer_of(inputs([LENGTH])).remains
     assert left.what == 'Noise'
+
+
+@pytest.mark.parametrize(('model', 'uses_causes'), [(0.4, True), (0.49, False)])
+def test_a_robot_model_that_holds_a_part_is_used_where_that_helps(inputs, model, uses_causes):
+    answer = answer_of(inputs([LENGTH, SOFT], model=model))
+    assert answer.uses_causes == uses_causes
+    assert [stage.mean for stage in answer.stages] == pytest.approx([3.0, 0.5, model, 0.3])
+    assert answer.brings == (2 if uses_causes else 1)
+    assert answer.final_mm[0] == (model if uses_causes else 0.5)
+    assert answer.mood == 'caution'
+    named = [row.what for row in answer.remains]
+    assert ('Link length of joint 2' in named) != uses_causes
+    assert 'Joint compliance of joint 2' in named
+
+
+def test_the_first_screen_names_the_largest_causes_alone(inputs):
+    names = [row.what for row in answer_of(inputs(7 * [SOFT])).remains]
+    assert names == [*4 * ['Joint compliance of joint 2'], '3 smaller causes']
+
+
+def test_a_robot_model_is_judged_as_it_is(fit_result):
+    """The calibrated model leaves what the offsets leave, the nominal one what there is today."""
+    session = fit_result.session
+    calibrated = errors_with_model_mm(session, exports(fit_result)['robot_calibrated.urdf'])
+    nominal = errors_with_model_mm(session, session.urdf)
+    held_out = session.measurements.is_validation
+    for found, residuals in (
+        (nominal, fit_result.residuals_before),
+        (calibrated, fit_result.residuals_after),
+    ):
+        expected = 1e3 * np.linalg.norm(residuals, axis=1)[held_out].mean()
+        assert found[held_out].mean() == pytest.approx(expected, rel=0.03)
 
 
 def test_what_no_cause_explains_is_never_called_noise(inputs, fit):
