@@ -167,7 +167,7 @@ class PaperModel:
 def product_mode(session: Session) -> Mode:
     """Return the product's posterior of the same model: no common part, the marker as known."""
     found = estimate(Problem.of(replace(session, marker_std_m=KNOWN_MARKER_M)))
-    return find_mode(found.posterior.without_pose_sigma())
+    return find_mode(found.posterior.with_independent_rows())
 
 
 def product_states(model: PaperModel, mode: Mode, points: FloatArray) -> FloatArray:

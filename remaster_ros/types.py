@@ -33,11 +33,15 @@ class MarkerReading:
         Marker position in N, m, shape (3,).
     temperature_c
         Of the air, by the sensor's own thermometer; NaN where it has none.
+    marker
+        Name of the marker, where the sensor measures several; '' for the one it follows. Those
+        of one frame have equal stamps.
     """
 
     stamp_s: float
     position: FloatArray
     temperature_c: float = nan
+    marker: str = ''
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,9 @@ class Observation:
         (None for a single shot), m, (3,).
     samples
         How many samples the mean has; None where unknown.
+    frame
+        Observations of one sensor with the same number come from one frame of it and share its
+        error; None where this one shares none.
     """
 
     observation: int
@@ -68,6 +75,7 @@ class Observation:
     std: FloatArray | None = None
     samples: int | None = None
     temperature_c: float | None = None
+    frame: int | None = None
 
 
 @dataclass(frozen=True)
@@ -135,6 +143,9 @@ class Measurements:
         Measured joint torques, N m, (n, k), NaN where unknown; None if the file has no column.
     is_reference
         True where ``split`` is ``reference``, (n,); None where none is, as in every session.
+    frame
+        Rows of one sensor with the same number come from one frame of it and share its error,
+        (n,); -1 where a row shares none. None where the file has no such column.
     """
 
     observation: IntArray
@@ -152,6 +163,7 @@ class Measurements:
     temperature_c: FloatArray
     effort: FloatArray | None = None
     is_reference: BoolArray | None = None
+    frame: IntArray | None = None
 
     def __len__(self) -> int:
         """Return the number of observations."""
@@ -199,6 +211,8 @@ class Session:
         How well the nominal marker positions are known, per axis, m.
     sensors
         Sensor name -> the marker it follows while collecting.
+    further_markers
+        Sensor name -> further markers that it measures in the same frame, where it does.
     measurements
         What is fitted and what is held out: no row of them is a reference.
     references
@@ -237,6 +251,7 @@ class Session:
     created: str = ''
     extra: Mapping[str, Any] = field(default_factory=dict)
     references: Measurements | None = None
+    further_markers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     observations_sha256: str = ''
 
     @property

@@ -20,13 +20,24 @@ class Cell:
     """A small collection of real nodes on fake devices, and what they publish."""
 
     def __init__(
-        self, start, client, folder, require, sensors, candidates=2, reference_every=0, cell='demo'
+        self,
+        start,
+        client,
+        folder,
+        require,
+        sensors,
+        candidates=2,
+        reference_every=0,
+        cell='demo',
+        held_out=1,
+        collect=True,
+        rate=10.0,
     ):
         from remaster_ros.nodes.status import listen
 
         self.client, self.folder, self.session = client, folder, folder / 'session'
         print('seed', SEED)
-        self.world = make_world(folder / 'world', read_cell(cell), SEED, 10.0)
+        self.world = make_world(folder / 'world', read_cell(cell), SEED, rate)
         self.said, self.messages, self.results, self.events = {}, {}, [], []
         listen(client, self._record, self._summary)
         command, data, tracker = free_ports(
@@ -37,7 +48,7 @@ class Cell:
             'pose_planner': {
                 'session': self.session,
                 'optimization_candidates': candidates,
-                'validation_candidates': 1,
+                'validation_candidates': held_out,
                 'registration_candidates': 6,
                 'reference_every': reference_every,
             },
@@ -63,8 +74,9 @@ class Cell:
         self._begin = begin
         self.nodes = {name: begin(name) for name in own}
         self.until(lambda: self.said.get('pose_planner', {}).get('robot') == 'heard', 'the robot')
-        response = call(client, '/remaster/collect')
-        assert response.success, response.message
+        if collect:
+            response = call(client, '/remaster/collect')
+            assert response.success, response.message
 
     def kill_and_start(self, name):
         self.nodes[name].kill()
@@ -110,6 +122,9 @@ class Cell:
             assert np.all(np.linalg.norm(m.position[mine] - expected, axis=1) < 0.4e-3), name
         pairs = list(zip(m.configuration.tolist(), m.sensor.tolist()))
         assert len(set(pairs)) == len(pairs)
+        assert len(set(m.configuration.tolist())) == self.planned() > 3
+
+    def planned(self):
+        """Return how many configurations the last plan has."""
         tours = [r for r in read_journal(self.session / 'plan.jsonl').records if 'plans' in r]
-        planned = sum(len(p['solutions']) for s in tours[-1]['plans'].values() for p in s['poses'])
-        assert len(set(m.configuration.tolist())) == planned > 3
+        return sum(len(p['solutions']) for s in tours[-1]['plans'].values() for p in s['poses'])

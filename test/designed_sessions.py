@@ -53,6 +53,7 @@ def measured(
         points[mine] += of_pose[rows.pose[mine]]
         points[mine] += sensor.sigma_m * rng.standard_normal((len(mine), 3))
         if sensor.frame_sigma_m > 0.0:
+            rows = replace(rows, frame=rows.configuration)
             of_frame = sensor.frame_sigma_m * rng.standard_normal((len(q), 3))
             points[mine] += of_frame[rows.configuration[mine]]
     session = Session(

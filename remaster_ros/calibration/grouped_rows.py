@@ -1,9 +1,10 @@
-"""Observations sorted for the estimators: by sensor, then by pose."""
+"""Observations sorted for the estimators: by sensor, then by pose, then by frame."""
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from remaster_ros.types import FloatArray, IntArray, Measurements
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Observations sorted by sensor, then by pose.
+    """Observations sorted by sensor, then by pose, then by frame.
 
     Attributes
     ----------
@@ -30,6 +31,9 @@ class Rows:
     group_start, group_size, group_sensor
         The rows of one sensor at one pose share an error: where each group starts, how many rows
         and which sensor it has, (groups,).
+    frame
+        Number of each row's frame, ascending from 0, (n,): the markers of one frame share an
+        error, too. None where every row is a frame by itself.
     """
 
     source: IntArray
@@ -40,15 +44,24 @@ class Rows:
     group_start: IntArray
     group_size: IntArray
     group_sensor: IntArray
+    frame: IntArray | None = None
 
     @classmethod
     def of(cls, measurements: Measurements, rows: IntArray, reference: FloatArray) -> Rows:
         """Sort the given rows of the measurements; `reference` is T_R_N, (sensors, 4, 4)."""
-        order = np.lexsort((rows, measurements.pose[rows], measurements.sensor[rows]))
-        source = rows[order]
+        keys = [rows, measurements.pose[rows], measurements.sensor[rows]]
+        if measurements.frame is not None:
+            keys.insert(1, measurements.frame[rows])
+        source = rows[np.lexsort(keys)]
         sensor, pose = measurements.sensor[source], measurements.pose[source]
-        change = np.flatnonzero((np.diff(sensor) != 0) | (np.diff(pose) != 0)) + 1
-        group_start = np.concatenate(([0], change)).astype(np.int64)
+        new_group = (np.diff(sensor) != 0) | (np.diff(pose) != 0)
+        group_start = np.concatenate(([0], np.flatnonzero(new_group) + 1)).astype(np.int64)
+        frame = None
+        if measurements.frame is not None:
+            number = measurements.frame[source]
+            new_frame = new_group | (np.diff(number) != 0) | (number[1:] < 0)
+            if not new_frame.all():
+                frame = np.concatenate(([0], np.cumsum(new_frame)))
         edges = np.searchsorted(sensor, np.arange(len(reference) + 1))
         return cls(
             source=source,
@@ -63,6 +76,7 @@ class Rows:
             group_start=group_start,
             group_size=np.diff(np.append(group_start, len(source))),
             group_sensor=sensor[group_start],
+            frame=frame,
         )
 
     def __len__(self) -> int:
@@ -99,9 +113,54 @@ class Rows:
             group_start=self.group_start[first:last] - start,
             group_size=self.group_size[first:last],
             group_sensor=self.group_sensor[first:last],
+            frame=None if self.frame is None else self.frame[start:stop] - self.frame[start],
         )
 
     @property
     def group_of_row(self) -> IntArray:
         """Index of each row's group, (n,)."""
         return np.repeat(np.arange(len(self.group_start)), self.group_size)
+
+    @cached_property
+    def frame_start(self) -> IntArray:
+        """Where each frame starts, (frames,)."""
+        if self.frame is None:
+            return np.arange(len(self))
+        return np.flatnonzero(np.diff(self.frame, prepend=-1))
+
+    @cached_property
+    def frame_size(self) -> IntArray:
+        """Rows of each frame, (frames,)."""
+        return np.diff(np.append(self.frame_start, len(self)))
+
+    @cached_property
+    def first_frame(self) -> IntArray:
+        """The first frame of each group, (groups,)."""
+        return np.searchsorted(self.frame_start, self.group_start)
+
+    @cached_property
+    def group_frames(self) -> IntArray:
+        """Frames of each group, (groups,)."""
+        return np.diff(np.append(self.first_frame, len(self.frame_start)))
+
+    @cached_property
+    def group_of_frame(self) -> IntArray:
+        """Index of each frame's group, (frames,)."""
+        return np.repeat(np.arange(len(self.group_start)), self.group_frames)
+
+    @cached_property
+    def mean_frame_size(self) -> FloatArray:
+        """Harmonic mean of the frames' rows in each group, (groups,)."""
+        inverse = np.add.reduceat(1.0 / self.frame_size, self.first_frame)
+        # Groups alike have the same number to the last digit.
+        return np.round(self.group_frames / inverse, 9)
+
+    def frame_sum(self, values: FloatArray, axis: int) -> FloatArray:
+        """Sum over the rows of each frame; `axis` (the rows) becomes the frames."""
+        if self.frame is None:
+            return values
+        return np.add.reduceat(values, self.frame_start, axis=axis)
+
+    def sum_of_frames(self, values: FloatArray, axis: int) -> FloatArray:
+        """Sum over the frames of each group; `axis` (the frames) becomes the groups."""
+        return np.add.reduceat(values, self.first_frame, axis=axis)

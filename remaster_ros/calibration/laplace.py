@@ -17,7 +17,7 @@ from remaster_ros.calibration.noise import RESOLUTION_M
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.priors import prior_rows
 from remaster_ros.errors import InsufficientDataError
-from remaster_ros.types import FloatArray
+from remaster_ros.types import BoolArray, FloatArray
 
 # Steps to the mode end when they are shorter than this, in standard deviations. Where the
 # predictions bend along a badly known direction they shorten slowly: then this is near enough for
@@ -257,18 +257,28 @@ def _noise_guess(posterior: Posterior) -> FloatArray:
     errors = posterior.rows.target - posterior.model.predict(posterior.reference, posterior.rows)
     noise = posterior.noise_model
     sums = noise.sums_of_squares(errors)
-    sigmas, ratios = [], []
+    sigmas, ratios, ratios_of_frames = [], [], []
+    kind = np.array([group.kind for group in noise.error_groups])
+
+    def ratio(larger: BoolArray, size: FloatArray, variance: float, sigma: float) -> float:
+        share = np.average(size[larger], weights=noise.freedom[larger])
+        more = sums[larger].sum() / noise.freedom[larger].sum() - variance
+        return float(np.arcsinh(np.sqrt(max(more, 0.0) / share) / sigma))
+
     for index in range(len(noise.channels)):
         mine = noise.channel_of == index
-        inner, outer = mine & (noise.size_of == 0), mine & (noise.size_of > 0)
-        common = sums[outer].sum() / noise.freedom[outer].sum()
-        variance = sums[inner].sum() / noise.freedom[inner].sum() if inner.any() else common
+        rows, frames, poses = (mine & (kind == name) for name in ('rows', 'frames', 'poses'))
+        smallest = next(part for part in (rows, frames, poses) if part.any())
+        below = frames if frames.any() else poses
+        variance = sums[smallest].sum() / noise.freedom[smallest].sum()
         sigma = np.sqrt(variance + RESOLUTION_M**2)
         sigmas.append(np.log(sigma))
+        if index in noise.framed:
+            ratios_of_frames.append(ratio(below, noise.frame_size_of, variance, sigma))
+            variance = sums[below].sum() / noise.freedom[below].sum()
         if index in noise.separable:
-            share = np.average(noise.size_of[outer], weights=noise.freedom[outer])
-            ratios.append(np.arcsinh(np.sqrt(max(common - variance, 0.0) / share) / sigma))
-    return np.array(sigmas + ratios)
+            ratios.append(ratio(poses, noise.size_of, variance, sigma))
+    return np.array(sigmas + ratios + ratios_of_frames)
 
 
 def _noise_peak(linearisation: Linearisation, start: FloatArray, shortest: float) -> FloatArray:
@@ -298,7 +308,7 @@ def _noise_peak(linearisation: Linearisation, start: FloatArray, shortest: float
 
 
 def _noise_covariance(linearisation: Linearisation, peak: FloatArray) -> FloatArray:
-    """Return the noise's covariance by its curvature; of a pose_sigma near zero by its spread."""
+    """Return the noise's covariance by its curvature; of a shared part near zero by its spread."""
     precision = _noise_curvature(linearisation, peak)[2]
     count = len(linearisation.posterior.noise_model.channels)
     std = 1.0 / np.sqrt(np.maximum(np.diag(precision), 0.45))

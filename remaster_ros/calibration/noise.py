@@ -13,11 +13,26 @@ of 3.
 
 Where a sensor has one row at every pose the two parts cannot be distinguished: sigma is then their
 sum, and there is no pose_sigma.
+
+*Several markers.* The markers that a sensor has in one frame share a further part, with standard
+deviation frame_sigma per axis: of the sensor, and of how well the arm repeats itself. With M
+markers in a frame its mean has the variance sigma^2 / M + frame_sigma^2, and a pose with m frames
+enters by three kinds of errors, whose variances are::
+
+    deviations from the frames' means           sigma^2
+    those of the frames' means, times sqrt(M)   sigma^2 + M frame_sigma^2
+    the pose's mean, times sqrt(m M)            sigma^2 + M frame_sigma^2 + m M pose_sigma^2
+
+This is exact where the frames of a pose have equally many markers. Where some were hidden in some
+of them, M is the harmonic mean of their numbers and every frame has the same weight (the analysis
+of unweighted means, Burdick and Graybill 1992, Confidence Intervals on Variance Components): the
+sums then have these variances on average. Without frames of several markers M is 1, and nothing is
+said of frame_sigma. Where every pose has one frame only, frame_sigma contains pose_sigma.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -25,6 +40,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from remaster_ros.calibration.error_groups import Channel, ErrorGroup, error_groups
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.types import FloatArray, IntArray
 
@@ -44,57 +60,19 @@ class Noise:
         Of the part that is independent between rows.
     pose_sigma
         Of the part that the rows of one sensor at one pose share; 0 where the channel has none.
+    frame_sigma
+        Of the part that the markers of one frame share; 0 where the channel has none.
     """
 
     sigma: FloatArray
     pose_sigma: FloatArray
-
-
-@dataclass(frozen=True)
-class Channel:
-    """Errors of one sensor that have one noise.
-
-    Attributes
-    ----------
-    sensor
-        Its index.
-    direction
-        'along' the line of sight, 'across' it, or '' for all axes alike.
-    axes
-        Which axes of the rows' frames these are: first and behind the last.
-    """
-
-    sensor: int
-    direction: str
-    axes: tuple[int, int]
+    frame_sigma: FloatArray
 
     @property
-    def dimension(self) -> int:
-        """Number of axes."""
-        return self.axes[1] - self.axes[0]
-
-
-@dataclass(frozen=True, eq=False)
-class ErrorGroup:
-    """Errors of one channel that have one variance.
-
-    Attributes
-    ----------
-    channel
-        Its index.
-    size
-        Size n of the groups whose means these are, variance sigma² + n pose_sigma² (of √n times
-        the mean); 0 for the deviations from the means of groups of any size, variance sigma².
-    groups
-        The groups, (g,).
-    freedom
-        Number of independent errors.
-    """
-
-    channel: int
-    size: int
-    groups: IntArray
-    freedom: int
+    def total(self) -> FloatArray:
+        """Standard deviation of all parts together, m, (..., channels)."""
+        total: FloatArray = np.sqrt(self.sigma**2 + self.pose_sigma**2 + self.frame_sigma**2)
+        return total
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +87,8 @@ class NoiseModel:
         Number of sensors, those without rows included.
     channels
         Those of sensor 0, of sensor 1, …
-    separable
-        Indices of the channels with a pose_sigma of their own, ascending.
+    separable, framed
+        Indices of the channels with a pose_sigma, and with a frame_sigma of their own, ascending.
     error_groups
         What the data enter by.
     frames
@@ -122,6 +100,7 @@ class NoiseModel:
     sensors: int
     channels: tuple[Channel, ...]
     separable: tuple[int, ...]
+    framed: tuple[int, ...]
     error_groups: tuple[ErrorGroup, ...]
     frames: FloatArray | None
 
@@ -144,13 +123,15 @@ class NoiseModel:
                 channels += [Channel(sensor, 'along', (0, 1)), Channel(sensor, 'across', (1, 3))]
             else:
                 channels.append(Channel(sensor, '', (0, 3)))
-        several = set(rows.group_sensor[rows.group_size > 1].tolist())
+        several = set(rows.group_sensor[rows.group_frames > 1].tolist())
+        shared = set(rows.group_sensor[rows.group_size > rows.group_frames].tolist())
         return cls(
             rows,
             len(reference),
             tuple(channels),
             tuple(index for index, c in enumerate(channels) if c.sensor in several),
-            _error_groups(channels, rows),
+            tuple(index for index, c in enumerate(channels) if c.sensor in shared),
+            error_groups(channels, rows),
             _frames(rows, reference) if len(split) > 0 else None,
         )
 
@@ -165,9 +146,14 @@ class NoiseModel:
         return np.array([group.channel for group in self.error_groups])
 
     @cached_property
-    def size_of(self) -> IntArray:
-        """Size of each error group, (error groups,)."""
+    def size_of(self) -> FloatArray:
+        """Share of pose_sigma² in the variance of each error group, (error groups,)."""
         return np.array([group.size for group in self.error_groups])
+
+    @cached_property
+    def frame_size_of(self) -> FloatArray:
+        """Share of frame_sigma² in the variance of each error group, (error groups,)."""
+        return np.array([group.frame_size for group in self.error_groups])
 
     @cached_property
     def freedom(self) -> FloatArray:
@@ -177,26 +163,47 @@ class NoiseModel:
     def variances(self, noise: Noise) -> FloatArray:
         """Return the variance of each error group, m², (..., error groups)."""
         of = self.channel_of
-        return noise.sigma[..., of] ** 2 + self.size_of * noise.pose_sigma[..., of] ** 2
+        own = noise.sigma[..., of] ** 2 + self.frame_size_of * noise.frame_sigma[..., of] ** 2
+        variances: FloatArray = own + self.size_of * noise.pose_sigma[..., of] ** 2
+        return variances
+
+    @property
+    def shares(self) -> list[int]:
+        """Channels of the parts that rows share: those `separable`, then those `framed`."""
+        return [*self.separable, *self.framed]
+
+    def noise(self, sigma: FloatArray, shared: FloatArray) -> Noise:
+        """Return the noise with sigma of the channels and the parts `shares`, m, (..., s)."""
+        pose_sigma, frame_sigma = np.zeros_like(sigma), np.zeros_like(sigma)
+        count = len(self.separable)
+        pose_sigma[..., list(self.separable)] = shared[..., :count]
+        frame_sigma[..., list(self.framed)] = shared[..., count:]
+        return Noise(sigma, pose_sigma, frame_sigma)
+
+    def shared(self, noise: Noise) -> FloatArray:
+        """Return the parts `shares` of a noise, m, (..., s)."""
+        parts = noise.pose_sigma[..., self.separable], noise.frame_sigma[..., self.framed]
+        return np.concatenate(parts, axis=-1)
 
     def of_sensors(self, sigma: FloatArray, pose_sigma: FloatArray) -> Noise:
         """Return the noise with one sigma and pose_sigma for each sensor, m, (sensors,) each."""
         sensor = [channel.sensor for channel in self.channels]
-        return Noise(sigma[..., sensor], pose_sigma[..., sensor])
+        return Noise(sigma[..., sensor], pose_sigma[..., sensor], np.zeros(len(sensor)))
 
     def sensor_noise(self, noise: Noise) -> Noise:
         """Return the noise of each sensor, root mean square over the axes, m, (..., sensors)."""
         share = np.zeros((len(self.channels), self.sensors))
         for index, channel in enumerate(self.channels):
             share[index, channel.sensor] = channel.dimension / 3.0
-        return Noise(np.sqrt(noise.sigma**2 @ share), np.sqrt(noise.pose_sigma**2 @ share))
+        parts = noise.sigma, noise.pose_sigma, noise.frame_sigma
+        return Noise(*(np.sqrt(part**2 @ share) for part in parts))
 
     def total_noise(self, noise: Noise) -> FloatArray:
-        """Return the noise of each sensor, both its parts together, m, (..., sensors, 2).
+        """Return the noise of each sensor, all its parts together, m, (..., sensors, 2).
 
         Along the line of sight, and per axis across it: equal where the sensor has one channel.
         """
-        total = np.hypot(noise.sigma, noise.pose_sigma)
+        total = noise.total
         result = np.empty((*total.shape[:-1], self.sensors, 2))
         for index, channel in enumerate(self.channels):
             sides = {'along': [0], 'across': [1]}.get(channel.direction, [0, 1])
@@ -207,24 +214,14 @@ class NoiseModel:
         """Return the sum of squares in each error group, m², of errors (..., n, 3)."""
         if self.frames is not None:
             errors = np.einsum('nij,...nj->...ni', self.frames, errors)
-        means = self.rows.group_sum(errors, axis=-2)
-        means = means**2 / self.rows.group_size[:, None]
-        spans = dict(self.rows.spans)
-        total = np.zeros((*errors.shape[:-2], len(self.channels)))
+        values = np.moveaxis(errors, (-2, -1), (0, 1))
         sums = np.zeros((*errors.shape[:-2], len(self.error_groups)))
-        for index, channel in enumerate(self.channels):
-            part = errors[..., spans.get(channel.sensor, slice(0, 0)), slice(*channel.axes)]
-            total[..., index] = np.einsum('...ni,...ni->...', part, part)
-        for index, group in enumerate(self.error_groups):
-            if group.size > 0:
-                axes = slice(*self.channels[group.channel].axes)
-                sums[..., index] = means[..., group.groups, axes].sum(axis=(-1, -2))
-                total[..., group.channel] -= sums[..., index]
-        for index, group in enumerate(self.error_groups):
-            if group.size == 0:
-                # Cancellation may leave a value just below zero.
-                sums[..., index] = np.maximum(total[..., group.channel], 0.0)
-        return sums
+        for index, part in self._parts(self.rows, values, 0):
+            sums[..., index] = np.einsum('ni...,ni...->...', part, part)
+        for index, parts in self._contained.items():
+            sums[..., index] -= sums[..., parts].sum(axis=-1)
+        # Cancellation may leave a value just below zero.
+        return np.maximum(sums, 0.0)
 
     def gram(self, features: Callable[[Rows, slice], FloatArray], width: int) -> FloatArray:
         """Return the Gram matrix of features in each error group, (error groups, width, width).
@@ -239,7 +236,6 @@ class NoiseModel:
             Number of features.
         """
         result = np.zeros((len(self.error_groups), width, width))
-        total = np.zeros((len(self.channels), width, width))
         for first, last in self.rows.blocks(GRAM_ROWS):
             rows = self.rows.of_groups(first, last)
             start = int(self.rows.group_start[first])
@@ -247,25 +243,62 @@ class NoiseModel:
             values = features(rows, where)
             if self.frames is not None:
                 values = self.frames[where] @ values
-            sums = rows.group_sum(values.reshape(len(rows), -1), axis=0).reshape(-1, 3, width)
-            means = sums / np.sqrt(rows.group_size)[:, None, None]
-            spans = dict(rows.spans)
-            for index, channel in enumerate(self.channels):
-                part = values[spans.get(channel.sensor, slice(0, 0)), slice(*channel.axes)]
-                total[index] += _gram(part)
-            for index, group in enumerate(self.error_groups):
-                if group.size > 0:
-                    inside = group.groups[(group.groups >= first) & (group.groups < last)] - first
-                    result[index] += _gram(
-                        means[inside, slice(*self.channels[group.channel].axes)]
-                    )
-        for index, group in enumerate(self.error_groups):
-            if group.size > 0:
-                total[group.channel] -= result[index]
-        for index, group in enumerate(self.error_groups):
-            if group.size == 0:
-                result[index] = total[group.channel]
+            for index, part in self._parts(rows, values, first):
+                flat = part.reshape(-1, width)
+                result[index] += flat.T @ flat
+        for index, parts in self._contained.items():
+            result[index] -= result[parts].sum(axis=0)
         return result
+
+    def _parts(
+        self, rows: Rows, values: FloatArray, first: int
+    ) -> Iterator[tuple[int, FloatArray]]:
+        """Return of each error group the vectors whose squares its sum is made of.
+
+        Of 'frames' those of the means themselves, which contain the poses' means (`_contained`).
+
+        Parameters
+        ----------
+        rows
+            n of the rows, whole groups from the one with index ``first`` on.
+        values
+            Vectors in the axes of the channels, (n, 3, ...).
+        """
+        shape = (-1, *(1,) * (values.ndim - 1))
+        means = frames = values
+        if rows.frame is not None:
+            means = rows.frame_sum(values, axis=0) / rows.frame_size.reshape(shape)
+            frames = means * np.sqrt(rows.mean_frame_size[rows.group_of_frame]).reshape(shape)
+        poses = rows.sum_of_frames(frames, axis=0) / np.sqrt(rows.group_frames).reshape(shape)
+        spans = dict(rows.spans)
+        for index, group in enumerate(self.error_groups):
+            channel = self.channels[group.channel]
+            axes, span = slice(*channel.axes), spans.get(channel.sensor, slice(0, 0))
+            groups = group.groups[(group.groups >= first) & (group.groups < first + len(poses))]
+            if group.kind == 'poses':
+                yield index, poses[groups - first, axes]
+            elif rows.frame is None:
+                # Every row is a frame: those of a sensor are of one size.
+                yield index, (values[span, axes] if group.kind == 'frames' else values[:0, axes])
+            elif group.kind == 'frames':
+                yield index, frames[np.isin(rows.group_of_frame, groups - first), axes]
+            else:
+                mean = np.repeat(means[:, axes], rows.frame_size, axis=0)
+                yield index, values[span, axes] - mean[span]
+
+    @cached_property
+    def _contained(self) -> dict[int, list[int]]:
+        """Error groups of kind 'frames' -> those whose sums theirs contains at first."""
+        return {
+            index: [
+                other
+                for other, poses in enumerate(self.error_groups)
+                if poses.kind == 'poses'
+                and (poses.channel, poses.frame_size) == (group.channel, group.frame_size)
+            ]
+            for index, group in enumerate(self.error_groups)
+            if group.kind == 'frames'
+        }
 
     def whitened(self, values: NDArray[Any], noise: Noise) -> NDArray[Any]:
         """Return vectors (n, 3, ...) in units of the noise: independent, variance 1 in all rows.
@@ -276,40 +309,35 @@ class NoiseModel:
         flat = values.reshape(len(rows), 3, -1)
         if self.frames is not None:
             flat = self.frames.astype(kind) @ flat
-        sigma, pose_sigma = np.ones((2, len(rows.group_size), 3))
+        sigma, pose_sigma, frame_sigma = np.ones((3, len(rows.group_size), 3))
         for index, channel in enumerate(self.channels):
-            mine = rows.group_sensor == channel.sensor
-            sigma[mine, slice(*channel.axes)] = noise.sigma[index]
-            pose_sigma[mine, slice(*channel.axes)] = noise.pose_sigma[index]
-        size = rows.group_size[:, None]
-        root = np.sqrt(sigma**2 + size * pose_sigma**2)
-        # deviations / sigma + mean / root = values / sigma - mean (1 / sigma - 1 / root)
-        less = ((1.0 / sigma - 1.0 / root) / size)[:, :, None].astype(kind)
-        sums = rows.group_sum(flat.reshape(len(rows), -1), axis=0).reshape(len(less), 3, -1)
-        common = sums * less
-        scale = (1.0 / sigma)[rows.group_of_row][:, :, None].astype(kind)
-        white = flat * scale - common[rows.group_of_row]
+            mine, axes = rows.group_sensor == channel.sensor, slice(*channel.axes)
+            sigma[mine, axes] = noise.sigma[index]
+            pose_sigma[mine, axes] = noise.pose_sigma[index]
+            frame_sigma[mine, axes] = noise.frame_sigma[index]
+        size, count = rows.mean_frame_size[:, None], rows.group_frames[:, None]
+        inner = np.sqrt(sigma**2 + size * frame_sigma**2)
+        outer = np.sqrt(inner**2 + count * size * pose_sigma**2)
+        # With M the size of a frame, w = sqrt(harmonic mean / M), means f of frames, p of poses:
+        # (value - f) / sigma + w (f - p) / inner + w p / outer. A frame of one row is its value.
+        of_frame = rows.group_of_frame
+        ratio = np.sqrt(size[of_frame] / rows.frame_size[:, None])
+        means = flat
+        if rows.frame is not None:
+            means = rows.frame_sum(flat, axis=0) / rows.frame_size[:, None, None].astype(kind)
+        of_poses = rows.sum_of_frames(means.reshape(len(of_frame), -1), axis=0)
+        of_poses = of_poses.reshape(len(size), 3, -1) / count[:, :, None].astype(kind)
+        of_poses *= (1.0 / inner - 1.0 / outer)[:, :, None].astype(kind)
+        white = flat * (1.0 / sigma)[rows.group_of_row][:, :, None].astype(kind)
+        if rows.frame is None:
+            white -= of_poses[of_frame]
+        else:
+            less = (1.0 / sigma[of_frame] - ratio / inner[of_frame])[:, :, None].astype(
+                kind
+            ) * means
+            less += of_poses[of_frame] * ratio[:, :, None].astype(kind)
+            white -= np.repeat(less, rows.frame_size, axis=0)
         return white.reshape(values.shape)
-
-
-def _gram(vectors: FloatArray) -> FloatArray:
-    flat = vectors.reshape(-1, vectors.shape[-1])
-    return flat.T @ flat
-
-
-def _error_groups(channels: Sequence[Channel], rows: Rows) -> tuple[ErrorGroup, ...]:
-    """Sort the groups of each channel by size; groups of one row have no deviations."""
-    found = []
-    for index, channel in enumerate(channels):
-        mine = np.flatnonzero(rows.group_sensor == channel.sensor)
-        size = rows.group_size[mine]
-        spare = int(np.sum(size - 1))
-        if spare > 0:
-            found.append(ErrorGroup(index, 0, mine, channel.dimension * spare))
-        for value in np.unique(size):
-            groups = mine[size == value]
-            found.append(ErrorGroup(index, int(value), groups, channel.dimension * len(groups)))
-    return tuple(found)
 
 
 def _frames(rows: Rows, reference: FloatArray) -> FloatArray:

@@ -165,10 +165,11 @@ def _gross(measurements: Measurements, errors: FloatArray, rows: BoolArray) -> t
 def _spread(fitted: Measurements, parameters: int) -> float:
     """Return how many times the noise the error is where the parameters were not fitted.
 
-    That of a linear model with the noise of poses: three numbers for each pose of each sensor.
+    That of a linear model with the noise of poses: three numbers for each pose of each sensor and
+    of each of its markers.
     """
-    poses = np.unique(np.stack((fitted.pose, fitted.sensor)), axis=1).shape[1]
-    free = max(3 * poses - parameters - 1, 1)
+    readings = np.unique(np.stack((fitted.pose, fitted.sensor, fitted.marker)), axis=1).shape[1]
+    free = max(3 * readings - parameters - 1, 1)
     return float(np.sqrt(1.0 + min(parameters / free, LARGEST_SPREAD**2 - 1.0)))
 
 

@@ -7,13 +7,16 @@ from dataclasses import dataclass, field, replace
 
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.calibration.posterior import Posterior
+from remaster_ros.types import FloatArray
 
 
 @dataclass(frozen=True)
 class NoiseEstimate:
     """The noise of one sensor per axis, m: posterior means, and the std of ``sigma_m``.
 
-    ``pose_sigma_m`` is None where no pose has two rows: ``sigma_m`` then holds both parts. Where
+    ``pose_sigma_m`` is None where no pose has two frames: ``sigma_m`` then holds both parts, or
+    ``frame_sigma_m`` does, the noise that the markers of a frame share; it is None where no frame
+    has two. Where
     the noise along the line of sight differs, these are root mean squares over the three axes, and
     ``directions`` has the noise 'along' and 'across'; otherwise it is empty.
     """
@@ -22,6 +25,8 @@ class NoiseEstimate:
     std_m: float
     pose_sigma_m: float | None
     pose_std_m: float | None
+    frame_sigma_m: float | None = None
+    frame_std_m: float | None = None
     directions: Mapping[str, NoiseEstimate] = field(default_factory=dict)
 
 
@@ -30,15 +35,18 @@ def noise_estimates(posterior: Posterior, by_channel: Noise) -> dict[str, NoiseE
     noise_model = posterior.noise_model
     by_sensor = noise_model.sensor_noise(by_channel)
     separate = {noise_model.channels[index].sensor for index in noise_model.separable}
+    framed = {noise_model.channels[index].sensor for index in noise_model.framed}
+
+    def of_draws(draws: FloatArray, known: bool) -> tuple[float, float] | tuple[None, None]:
+        return (float(draws.mean()), float(draws.std(ddof=1))) if known else (None, None)
 
     def estimate(noise: Noise, at: int, sensor: int) -> NoiseEstimate:
-        sigma, pose_sigma = noise.sigma[..., at], noise.pose_sigma[..., at]
-        known = sensor in separate
+        sigma = noise.sigma[..., at]
         return NoiseEstimate(
-            sigma_m=float(sigma.mean()),
-            std_m=float(sigma.std(ddof=1)),
-            pose_sigma_m=float(pose_sigma.mean()) if known else None,
-            pose_std_m=float(pose_sigma.std(ddof=1)) if known else None,
+            float(sigma.mean()),
+            float(sigma.std(ddof=1)),
+            *of_draws(noise.pose_sigma[..., at], sensor in separate),
+            *of_draws(noise.frame_sigma[..., at], sensor in framed),
         )
 
     result = {}

@@ -170,7 +170,7 @@ def fit_paper(
     moved = np.arange(model.joints + 6 * len(model.sensor_names))
     nominal = model.vector(np.zeros(model.joints), problem.markers)
     free = moved[model.joints :]
-    posterior = Posterior.of(model, rows, (), free, nominal).without_pose_sigma()
+    posterior = Posterior.of(model, rows, (), free, nominal).with_independent_rows()
 
     def columns(states: FloatArray) -> FloatArray:
         x, sigma = _paper_natural(target, model, states)

@@ -2,7 +2,8 @@
 
 The noise is that of `noise`. Priors: flat in log sigma, which is the paper's p(sigma^2) ∝ sigma^-2
 d(sigma^2) (eq. 14), down to the resolution no sensor passes (`RESOLUTION_M`); pose_sigma / sigma
-half-Cauchy with scale 1, proper at zero and without a unit (Gelman 2006); registrations flat in
+half-Cauchy with scale 1, proper at zero and without a unit (Gelman 2006), and frame_sigma / sigma
+alike; registrations flat in
 the turn and shift of the pinned coordinates of `model`; inner joint offsets Gaussian about 0 with
 `priors.OFFSET_STD`, where nothing else is known; markers and base
 frames Gaussian where something is known of them.
@@ -31,8 +32,9 @@ class Posterior:
 
     A point is a flat vector (d,): the free pinned parameters, then the noise coordinates eta:
     log sigma of every channel, and asinh(pose_sigma / sigma) >= 0 of the channels that have
-    one. The latter is as good as linear near zero and as a logarithm far from it, so the
-    posterior looks alike whether pose_sigma is nothing or nearly all; its prior is sech.
+    one, then asinh(frame_sigma / sigma) likewise. These are as good as linear near zero and as a
+    logarithm far from it, so the posterior looks alike whether pose_sigma is nothing or nearly
+    all; their prior is sech.
 
     Attributes
     ----------
@@ -64,7 +66,8 @@ class Posterior:
     ) -> Posterior:
         """Assemble; ``split`` are the sensors with a noise along and another across their sight.
 
-        A channel of a sensor with several rows at some pose has a pose_sigma of its own.
+        A channel of a sensor with several frames at some pose has a pose_sigma of its own, one
+        with several markers in some frame a frame_sigma.
         """
         noise_model = NoiseModel.of(rows, model.reference, split)
         return cls(model, tuple(priors), free, reference, noise_model)
@@ -79,15 +82,15 @@ class Posterior:
         """Names of the free parameters, f."""
         return tuple(self.model.names[index] for index in self.free)
 
-    def without_pose_sigma(self) -> Posterior:
+    def with_independent_rows(self) -> Posterior:
         """Return the posterior under noise that is independent between all rows."""
-        return replace(self, noise_model=replace(self.noise_model, separable=()))
+        return replace(self, noise_model=replace(self.noise_model, separable=(), framed=()))
 
     @property
     def size(self) -> int:
         """Length of a point."""
         noise = self.noise_model
-        return len(self.free) + len(noise.channels) + len(noise.separable)
+        return len(self.free) + len(noise.channels) + len(noise.shares)
 
     def parameters(self, points: FloatArray) -> FloatArray:
         """Return the full pinned parameters (..., size of the model) of points (..., d)."""
@@ -96,13 +99,11 @@ class Posterior:
         return z
 
     def noise(self, eta: FloatArray) -> Noise:
-        """Return sigma and pose_sigma of each channel, m, of noise coordinates (..., e)."""
+        """Return the noise of each channel, m, of noise coordinates (..., e)."""
         count = len(self.noise_model.channels)
         sigma = np.exp(eta[..., :count])
-        pose_sigma = np.zeros_like(sigma)
-        separable = list(self.noise_model.separable)
-        pose_sigma[..., separable] = sigma[..., separable] * np.sinh(np.abs(eta[..., count:]))
-        return Noise(sigma, pose_sigma)
+        shared = sigma[..., self.noise_model.shares] * np.sinh(np.abs(eta[..., count:]))
+        return self.noise_model.noise(sigma, shared)
 
     def variances(self, eta: FloatArray) -> FloatArray:
         """Return the variance of each error group, m², (..., error groups)."""
@@ -113,12 +114,12 @@ class Posterior:
         count = len(self.noise_model.channels)
         # A half-normal wall at the resolution instead of a jump: as good as one pseudo-reading.
         wall = 0.5 * np.sum((RESOLUTION_M * np.exp(-eta[..., :count])) ** 2, axis=-1)
-        # The half-Cauchy of the ratio, times the derivative of the ratio by its coordinate.
+        # The half-Cauchy of each ratio, times the derivative of the ratio by its coordinate.
         ratio = eta[..., count:]
         return -wall - np.sum(np.logaddexp(ratio, -ratio), axis=-1)
 
     def inside(self, points: FloatArray) -> BoolArray:
-        """Tell where no pose_sigma is negative, (...), of points (..., d)."""
+        """Tell where no pose_sigma or frame_sigma is negative, (...), of points (..., d)."""
         ratios = points[..., len(self.free) + len(self.noise_model.channels) :]
         return np.all(ratios >= 0.0, axis=-1)
 

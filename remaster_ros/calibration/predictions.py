@@ -144,8 +144,9 @@ class _Part:
         Predicted, m, (n, 3).
     spread
         A root of the covariance by the parameters, m, (n, 3, size).
-    own_noise, pose_noise
-        Covariance of the noise of one row, and of what rows of a pose share, m², (n, 3, 3).
+    own_noise, pose_noise, frame_noise
+        Covariance of the noise of one row, of what rows of a pose share, and of what rows of a
+        frame share, m², (n, 3, 3).
     """
 
     rows: Rows
@@ -154,6 +155,7 @@ class _Part:
     spread: FloatArray
     own_noise: FloatArray
     pose_noise: FloatArray
+    frame_noise: FloatArray
 
     @classmethod
     def of(cls, fit: FitResult, rows: Rows, triangle: FloatArray) -> _Part:
@@ -171,19 +173,30 @@ class _Part:
             total: FloatArray = across[:, None, None] * np.eye(3)
             return total + (along - across)[:, None, None] * squares
 
-        own, shared = _variances(fit)
-        return cls(rows, sensor, place, spread, covariance(own), covariance(shared))
+        parts = [covariance(variances) for variances in _variances(fit)]
+        return cls(rows, sensor, place, spread, *parts)
 
 
-def _variances(fit: FitResult) -> tuple[FloatArray, FloatArray]:
-    """Return the noise of one row and that shared by a pose, m², (sensors, 2): along, across."""
-    own, shared = [], []
+def _variances(fit: FitResult) -> FloatArray:
+    """Return the noise of a row, shared by a pose and by a frame, m², (3, sensors, 2).
+
+    The last axis is along and across the line of sight.
+    """
+    variances = []
     for name in fit.predictive.model.sensor_names:
         noise = fit.noise[name]
         sides = [noise.directions.get(side, noise) for side in ('along', 'across')]
-        own.append([side.sigma_m**2 for side in sides])
-        shared.append([(side.pose_sigma_m or 0.0) ** 2 for side in sides])
-    return np.array(own), np.array(shared)
+        variances.append(
+            [
+                (
+                    side.sigma_m**2,
+                    (side.pose_sigma_m or 0.0) ** 2,
+                    (side.frame_sigma_m or 0.0) ** 2,
+                )
+                for side in sides
+            ]
+        )
+    return np.moveaxis(np.array(variances), -1, 0)
 
 
 def _left_out_distances(
@@ -202,6 +215,9 @@ def _left_out_distances(
         same = rows.group_of_row[:, None] == rows.group_of_row
         # Rows of a pose share an error: their noise is one matrix of n × n blocks.
         noise = np.einsum('nm,nij->nimj', same.astype(float), part.pose_noise)
+        if rows.frame is not None:
+            same = rows.frame[:, None] == rows.frame
+            noise += np.einsum('nm,nij->nimj', same.astype(float), part.frame_noise)
         noise[np.arange(n), :, np.arange(n)] += part.own_noise
         R = noise.reshape(3 * n, 3 * n)
         root = part.spread.reshape(3 * n, -1)

@@ -53,7 +53,8 @@ class FitResult:
     parameter_names
         p names: joints, ``registration.<sensor>.x`` … ``rz`` (corrections about the centroid of
         the sensor's data to a registration near the result, see `model`), ``marker.<name>.x``,
-        ``noise.<sensor>.sigma`` and ``.pose_sigma``. What is held fixed is not among them.
+        ``noise.<sensor>.sigma`` and ``.pose_sigma`` and
+        ``.frame_sigma`` where it has them. What is held fixed is not among them.
     draws
         (chains, draws, p); rad and m.
     trace
@@ -220,11 +221,11 @@ def sampled_columns(
 ) -> FloatArray:
     """Return natural parameters x (..., size) and noise eta (..., e) as chains of a fit, (..., p).
 
-    The moved parameters, every channel's sigma, and the pose_sigma of those that have one.
+    The moved parameters, every channel's sigma, and what their rows share where that is known.
     """
     noise = posterior.noise(eta)
-    separate = noise.pose_sigma[..., list(posterior.noise_model.separable)]
-    return np.concatenate((x[..., moved], noise.sigma, separate), axis=-1)
+    shared = posterior.noise_model.shared(noise)
+    return np.concatenate((x[..., moved], noise.sigma, shared), axis=-1)
 
 
 def _sampled_names(posterior: Posterior, moved: IntArray) -> tuple[str, ...]:
@@ -238,6 +239,7 @@ def _sampled_names(posterior: Posterior, moved: IntArray) -> tuple[str, ...]:
         *(model.names[index] for index in moved),
         *(f'{noise}.sigma' for noise in noises),
         *(f'{noises[index]}.pose_sigma' for index in noise_model.separable),
+        *(f'{noises[index]}.frame_sigma' for index in noise_model.framed),
     )
 
 

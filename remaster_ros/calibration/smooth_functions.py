@@ -42,6 +42,7 @@ def spread_poses(rows: Rows) -> Rows:
         group_start=np.cumsum(size) - size,
         group_size=size,
         group_sensor=rows.group_sensor[first],
+        frame=None if rows.frame is None else rows.frame[kept],
     )
 
 

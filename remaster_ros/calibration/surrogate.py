@@ -145,12 +145,13 @@ def _data_parts(mode: Mode, width: FloatArray) -> list[_Part]:
     variances = posterior.variances(mode.eta)
     parts = []
     for sensor in range(len(model.sensor_names)):
-        # Without a part common to a pose the error groups of a channel have one variance.
-        alike: dict[tuple[int, int], list[int]] = {}
-        for group, (channel, size) in enumerate(zip(noise.channel_of, noise.size_of)):
-            if noise.channels[channel].sensor == sensor:
-                key = channel, size if channel in noise.separable else 0
-                alike.setdefault(key, []).append(group)
+        # Without a part that rows share the error groups of a channel have one variance.
+        alike: dict[tuple[int, float, float], list[int]] = {}
+        for index, group in enumerate(noise.error_groups):
+            if noise.channels[group.channel].sensor == sensor:
+                frame_size = group.frame_size if group.channel in noise.framed else 0.0
+                size = group.size if group.channel in noise.separable else 0.0
+                alike.setdefault((group.channel, frame_size, size), []).append(index)
         merged = np.array([grams[groups].sum(axis=0) for groups in alike.values()])
         chief = np.array([groups[0] for groups in alike.values()])
         channels = noise.channel_of[chief].tolist()

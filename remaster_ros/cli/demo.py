@@ -18,6 +18,12 @@ WITHOUT_ROS = (
 )
 
 
+DESIGNED_FROM = 30
+"""Candidate poses to choose from, and to hold out from, where the poses are designed."""
+WITH_CAUSES = 14
+"""Candidate poses, each, where causes are looked for."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``remaster demo``."""
     parser.add_argument('--out', metavar='DIR', help='new folder (default: remaster_demo_N)')
@@ -25,16 +31,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     size.add_argument(
         '--candidates',
         type=integer(1),
-        default=14,
         metavar='N',
-        help='candidate poses for optimization and for validation, each (default 14)',
+        help='visit every pose of a Latin hypercube that can be reached, of N candidates for '
+        'optimization and N for validation, with one marker for each sensor (default: three '
+        f'markers, and the poses that tell the most; with --hide {WITH_CAUSES} candidates)',
     )
     size.add_argument(
         '--full',
         dest='candidates',
         action='store_const',
         const=60,
-        help="the paper's size: 60 candidate poses each",
+        help="the paper's collection: one marker for each sensor, 60 candidate poses each",
     )
     parser.add_argument(
         '--hide',
@@ -50,6 +57,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=10.0,
         help='world time over wall time (1 to 20; default 10)',
     )
+    parser.add_argument(
+        '--watch', action='store_true', help='show it on the live page, until Ctrl-C'
+    )
 
 
 def run(args: argparse.Namespace) -> NoReturn:
@@ -60,13 +70,25 @@ def run(args: argparse.Namespace) -> NoReturn:
         {
             'out': str(out),
             'seed': args.seed,
-            'candidates': args.candidates,
+            **_collection(args.candidates, bool(args.hide)),
             'rate': args.rate,
             'figures': not args.no_figures,
             'quiet': args.quiet,
             'hide': ','.join(args.hide),
+            'watch': args.watch,
         },
     )
+
+
+def _collection(candidates: int | None, hidden: bool) -> dict[str, object]:
+    """Return the cell and the number of candidates.
+
+    Poses that are chosen for the offsets keep the fewest that a search for causes needs; one that
+    is to show causes has all solutions of its poses.
+    """
+    if candidates is None and not hidden:
+        return {'cell': 'quick', 'candidates': DESIGNED_FROM}
+    return {'cell': 'demo', 'candidates': candidates or WITH_CAUSES}
 
 
 def free_folder() -> Path:

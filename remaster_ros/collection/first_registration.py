@@ -12,11 +12,12 @@ from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray
 
+# Poses: the markers of one frame lie too close to each other to register a sensor by.
 POINTS = 3
 
 
 class FirstRegistration:
-    """Collect points of each sensor; from the third on they give T_R_N.
+    """Collect points of each sensor; from the third pose on they give T_R_N.
 
     Parameters
     ----------
@@ -46,20 +47,25 @@ class FirstRegistration:
     ) -> None:
         self._chain, self._markers, self._allowed_m = chain, markers, allowed_m
         self._points: dict[str, list[tuple[FloatArray, FloatArray]]] = {n: [] for n in sensors}
+        # Where the arm stood: the same for the markers of a frame.
+        self._stops: dict[str, set[bytes]] = {name: set() for name in self._points}
         self.T_R_N: dict[str, FloatArray] = {}
         self.troubles: dict[str, str] = {}
 
     def add(self, readings: Iterable[PairedReading]) -> list[str]:
-        """Take the readings of one pose; return the sensors that are registered anew by them."""
-        registered = []
+        """Take readings at registration poses; return the sensors registered anew by them."""
+        registered: list[str] = []
+        taken: dict[str, None] = {}
         for reading in readings:
             name = reading.sensor
             marker_R = self._chain.positions(reading.q, self._markers[reading.marker])
-            points = self._points[name]
-            points.append((marker_R, reading.position))
-            if len(points) < POINTS:
+            self._points[name].append((marker_R, reading.position))
+            self._stops[name].add(np.asarray(reading.q, float).tobytes())
+            taken[name] = None
+        for name in taken:
+            if len(self._stops[name]) < POINTS:
                 continue
-            robot, measured = (np.array(side) for side in zip(*points))
+            robot, measured = (np.array(side) for side in zip(*self._points[name]))
             try:
                 self.T_R_N[name], _ = register_ransac(robot, measured, self._allowed_m)
             except InsufficientDataError as error:
@@ -71,7 +77,5 @@ class FirstRegistration:
 
     def describe(self) -> str:
         """Return how far the registration is, as text."""
-        parts = [
-            f'{name}: point {len(points)} of {POINTS}' for name, points in self._points.items()
-        ]
+        parts = [f'{name}: point {len(stops)} of {POINTS}' for name, stops in self._stops.items()]
         return '; '.join([*parts, *self.troubles.values()])

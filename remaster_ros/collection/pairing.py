@@ -34,6 +34,8 @@ class SensorRules:
         A larger standard deviation on any axis over the dwell is no still marker, m (streams).
     timeout_s
         How long after the dwell (stream) or settling (single shot) a reading may stay out, s.
+    further
+        Further markers that come in the same frames (streams).
     """
 
     sensor: str
@@ -43,11 +45,12 @@ class SensorRules:
     min_samples: int = 5
     max_std_m: float = 0.5e-3
     timeout_s: float = 2.0
+    further: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class PairedReading:
-    """One sensor's accepted reading at one configuration.
+    """One sensor's accepted reading of a marker at one configuration.
 
     Attributes
     ----------
@@ -72,13 +75,14 @@ class PairedReading:
 
 @dataclass(frozen=True)
 class Rejection:
-    """Why a sensor has no observation at a configuration.
+    """Why a sensor, or one of its markers, has no observation at a configuration.
 
     Attributes
     ----------
     reason
         A name to count by: ``moving``, ``unseen``, ``clock``, ``stale``, ``too_few``,
-        ``unsteady``, ``frozen``, ``swapped``, ``device``, ``absent`` or ``not_waited``.
+        ``unsteady``, ``frozen``, ``swapped``, ``device``, ``absent`` or ``not_waited``; of a
+        single marker also ``hidden``.
     detail
         One line with the numbers.
     """
@@ -87,6 +91,10 @@ class Rejection:
     reason: str
     detail: str
 
+
+HIDDEN_S = 0.3
+"""So long after the dwell a marker of which nothing comes counts as hidden, where others of its
+frames were seen: messages of several topics come in no common order, s."""
 
 LONGEST_GAP_S = 5.0
 """Without a report of the joints for so long it is unknown whether the arm stood still, s."""
@@ -111,6 +119,16 @@ class Pairing:
     require
         What the arm waits for: ``all`` sensors, ``any`` of them, or one by its name. A sensor
         that is not required and has no reading by then is left out.
+
+    Attributes
+    ----------
+    decided
+        What was decided of each sensor. One reading is enough: a marker that is hidden costs
+        nothing while another one of the same frames is seen.
+    further
+        Readings of further markers in the same frames, of sensors that have a reading.
+    left_out
+        Markers without a reading, of sensors that have one.
     """
 
     def __init__(
@@ -127,6 +145,8 @@ class Pairing:
         self.motion_tolerance = motion_tolerance
         self.require = require
         self.decided: dict[str, PairedReading | Rejection] = {}
+        self.further: dict[str, list[PairedReading]] = {}
+        self.left_out: list[Rejection] = []
         self._decided_s: dict[str, float] = {}
         self._now_s = self._looked_s = settled_stamp_s
         self._excused_s = dict.fromkeys(self.rules, 0.0)
@@ -251,7 +271,7 @@ class Pairing:
         return dwell_s + rules.timeout_s + self._excused_s[rules.sensor]
 
     def _late(self, rules: SensorRules, allowed: float) -> Rejection:
-        count = len(self._readings[rules.sensor])
+        count = max(map(len, self._by_marker(rules).values()))
         if 0 < count < rules.min_samples and not rules.single_shot:
             detail = f'{count} usable samples in {allowed:.1f} s (at least {rules.min_samples})'
             return Rejection(rules.sensor, 'too_few', detail)
@@ -265,29 +285,79 @@ class Pairing:
             used = None if name in self.decided else self._used(rules)
             # Only a joint state after the end shows that the arm stood still to the end.
             if used and self._joints and self._joints[-1][0] >= used[0]:
-                self._set(self._judge(rules, *used))
+                self._settle(rules, *used)
 
-    def _used(self, rules: SensorRules) -> tuple[float, list[MarkerReading]] | None:
-        """Return the end of a measurement and the readings in it; None while it lasts."""
+    def _settle(
+        self, rules: SensorRules, end: float, used: Mapping[str, list[MarkerReading]]
+    ) -> None:
+        """Decide on a sensor by the readings of its markers up to the end of the measurement."""
+        judged = [self._judge(rules, end, marker, part) for marker, part in used.items()]
+        accepted = [item for item in judged if isinstance(item, PairedReading)]
+        if not accepted:
+            self._set(judged[0])
+            return
+        self._set(accepted[0])
+        self.further[rules.sensor] = accepted[1:]
+        self.left_out += [item for item in judged if isinstance(item, Rejection)]
+        self.left_out += [
+            Rejection(rules.sensor, 'hidden', f'{marker} was not seen')
+            for marker in (rules.marker, *rules.further)
+            if marker not in used
+        ]
+
+    def _by_marker(self, rules: SensorRules) -> dict[str, list[MarkerReading]]:
+        """Return the readings of each of a sensor's markers."""
         readings = self._readings[rules.sensor]
-        if not readings:
+        if not rules.further:
+            return {rules.marker: readings}
+        return {
+            name: [reading for reading in readings if (reading.marker or rules.marker) == name]
+            for name in (rules.marker, *rules.further)
+        }
+
+    def _used(self, rules: SensorRules) -> tuple[float, dict[str, list[MarkerReading]]] | None:
+        """Return the end of a measurement and each marker's readings in it; None while it lasts.
+
+        Markers with too few readings up to the end are left out, unless all are.
+        """
+        if not self._readings[rules.sensor]:
             return None
+        parts = self._by_marker(rules)
         if rules.single_shot:
-            return readings[0].stamp_s, readings[:1]
+            readings = parts[rules.marker]
+            return readings[0].stamp_s, {rules.marker: readings[:1]}
+
+        def within(end: float) -> dict[str, list[MarkerReading]]:
+            used = {
+                name: [reading for reading in part if reading.stamp_s <= end]
+                for name, part in parts.items()
+            }
+            return {name: part for name, part in used.items() if len(part) >= rules.min_samples}
+
         end = self.settled_stamp_s + rules.dwell_s
-        # The dwell is over for this sensor once it has sent something later than its end.
-        if readings[-1].stamp_s <= end:
+        # The dwell is over for a marker once something later than its end has come of it.
+        over = [bool(part) and part[-1].stamp_s > end for part in parts.values()]
+        if not any(over) or not (all(over) or self._hidden_since(rules, end)):
             return None
-        used = [reading for reading in readings if reading.stamp_s <= end]
-        if len(used) >= rules.min_samples:
+        if used := within(end):
             return end, used
-        used = readings[: rules.min_samples]
-        end = used[-1].stamp_s
-        late = end > self.settled_stamp_s + self._allowed_s(rules)
-        return None if late or len(used) < rules.min_samples else (end, used)
+        enough = [
+            part[rules.min_samples - 1].stamp_s
+            for part in parts.values()
+            if len(part) >= rules.min_samples
+        ]
+        end = min(enough, default=np.inf)
+        if end > self.settled_stamp_s + self._allowed_s(rules):
+            return None
+        complete = all(part and part[-1].stamp_s >= end for part in parts.values())
+        return (end, within(end)) if complete or self._hidden_since(rules, end) else None
+
+    def _hidden_since(self, rules: SensorRules, end: float) -> bool:
+        """Whether what has not come of a marker up to a time will not come any more."""
+        return self._now_s > end + min(HIDDEN_S, 0.5 * rules.timeout_s)
 
     def _judge(
-        self, rules: SensorRules, end: float, used: list[MarkerReading]
+        self, rules: SensorRules, end: float, marker: str, used: list[MarkerReading]
     ) -> PairedReading | Rejection:
         stamps = np.array([stamp for stamp, _ in self._joints])
         q = np.array([joints for _, joints in self._joints])
@@ -315,5 +385,5 @@ class Pairing:
                 detail = f'{len(used)} readings are the same to the last bit'
                 return Rejection(rules.sensor, 'frozen', detail)
         return PairedReading(
-            rules.sensor, rules.marker, end, q_mean, positions.mean(axis=0), std, len(used)
+            rules.sensor, marker, end, q_mean, positions.mean(axis=0), std, len(used)
         )

@@ -7,7 +7,8 @@ arm goes. Neither can be recognised by the reading alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -22,6 +23,10 @@ UNUSUAL = 6.0
 """So many times the usual deviation is another marker."""
 SMALLEST_M = 0.01
 """No smaller deviation counts as another marker, m: offsets bend the field of deviations."""
+DISTANCE_M = 5e-3
+"""No smaller difference of two markers' distance counts as another marker, m."""
+UNUSUAL_PLACES = 8.0
+"""Nor one below so many times what the markers' places are known to."""
 MOVED_M = 1e-3
 """A marker that should have moved further than this cannot have the same reading, m."""
 
@@ -41,15 +46,46 @@ class Plausibility:
         Nominal marker positions in the tool frame, m, (3,) each.
     max_deviation_m
         Beyond this no marker is what it should be, m.
+    marker_std_m
+        How well the markers' positions are known, per axis, m.
     """
 
     def __init__(
-        self, chain: SerialChain, markers: Mapping[str, FloatArray], max_deviation_m: float = 0.05
+        self,
+        chain: SerialChain,
+        markers: Mapping[str, FloatArray],
+        max_deviation_m: float = 0.05,
+        marker_std_m: float = 0.5e-3,
     ) -> None:
         self._chain, self._markers = chain, markers
         self._max_deviation_m = max_deviation_m
+        self._distance_m = max(DISTANCE_M, UNUSUAL_PLACES * marker_std_m)
         self._usual: dict[str, list[float]] = {}
-        self._last: dict[str, PairedReading] = {}
+        self._last: dict[tuple[str, str], PairedReading] = {}
+
+    def judge_frame(
+        self,
+        readings: Sequence[PairedReading],
+        T_R_N: FloatArray | None,
+        *,
+        anywhere: bool = False,
+    ) -> list[PairedReading | Rejection]:
+        """Judge the markers of one frame, each as `judge` does, and their distances.
+
+        Those are known wherever arm and sensor stand. Where one of them is wrong, markers were
+        taken for others or a stray for one of them; which, the distances cannot tell (of two that
+        were exchanged, their own distance is right). So none of the frame is taken.
+        """
+        for one, other in itertools.combinations(readings, 2):
+            nominal = np.subtract(self._markers[one.marker], self._markers[other.marker])
+            wanted, found = map(np.linalg.norm, (nominal, one.position - other.position))
+            if not abs(found - wanted) <= self._distance_m:
+                detail = (
+                    f'{one.marker} and {other.marker} are {1e3 * found:.0f} mm apart, by the cell '
+                    f'file {1e3 * wanted:.0f} mm: are their numbers in the rigid body right?'
+                )
+                return [Rejection(one.sensor, 'swapped', detail)]
+        return [self.judge(reading, T_R_N, anywhere=anywhere) for reading in readings]
 
     def judge(
         self, reading: PairedReading, T_R_N: FloatArray | None, *, anywhere: bool = False
@@ -68,7 +104,7 @@ class Plausibility:
         """
         name = reading.sensor
         marker_R = self._place(reading)
-        last = self._last.get(name)
+        last = self._last.get((name, reading.marker))
         if last is not None and np.array_equal(last.position, reading.position):
             moved = float(np.linalg.norm(marker_R - self._place(last)))
             if moved > MOVED_M:
@@ -86,7 +122,7 @@ class Plausibility:
                 return Rejection(name, 'swapped', detail)
             if not anywhere:
                 self._usual.setdefault(name, []).append(deviation)
-        self._last[name] = reading
+        self._last[name, reading.marker] = reading
         return reading
 
     def _place(self, reading: PairedReading) -> FloatArray:

@@ -62,7 +62,9 @@ class EndedReading:
     from_q
         Where the arm came from, rad, (k,); None where that is not known.
     accepted, rejected
-        What each sensor gave, or why not.
+        What each sensor gave, a reading of each of its markers that was seen, or why nothing.
+    left_out
+        Markers without a reading, of sensors that gave others.
     waited_s
         How long the arm stood for each sensor, s.
     last_s
@@ -75,6 +77,7 @@ class EndedReading:
     from_q: FloatArray | None
     accepted: Sequence[PairedReading]
     rejected: Sequence[Rejection]
+    left_out: Sequence[Rejection]
     waited_s: Mapping[str, float]
     last_s: float
     temperature_c: float | None
@@ -147,7 +150,8 @@ class Recording:
         self._due: deque[SettledArm] = deque(maxlen=100)
         # Topics come in no common order: what belongs to a dwell may come before the settling.
         self._joints: deque[tuple[float, FloatArray]] = deque(maxlen=4000)
-        self._readings: deque[tuple[str, MarkerReading]] = deque(maxlen=4000)
+        most = max(1 + len(one.further) for one in rules)
+        self._readings: deque[tuple[str, MarkerReading]] = deque(maxlen=4000 * most)
         self._temperatures: deque[tuple[float, float]] = deque(maxlen=500)
         self.q: FloatArray | None = None
         self.now_s = 0.0
@@ -282,18 +286,29 @@ class Recording:
         self.pairing = self._settled = None
         pairing.finish()
         at_reference = settled.pose.split == REFERENCE
-        decided = [
-            item
-            if isinstance(item, Rejection)
-            else self._plausibility.judge(item, T_R_N.get(item.sensor), anywhere=at_reference)
-            for item in pairing.decided.values()
-        ]
-        accepted = [item for item in decided if isinstance(item, PairedReading)]
+        accepted: list[PairedReading] = []
+        rejected, left_out = [], list(pairing.left_out)
+        for item in pairing.decided.values():
+            if isinstance(item, Rejection):
+                rejected.append(item)
+                continue
+            frame = [item, *pairing.further.get(item.sensor, ())]
+            judged = self._plausibility.judge_frame(
+                frame, T_R_N.get(item.sensor), anywhere=at_reference
+            )
+            good = [reading for reading in judged if isinstance(reading, PairedReading)]
+            bad = [reading for reading in judged if isinstance(reading, Rejection)]
+            accepted += good
+            if good:
+                left_out += bad
+            else:
+                rejected.append(bad[0])
         return EndedReading(
             settled,
             self._came_from,
             accepted,
-            [item for item in decided if isinstance(item, Rejection)],
+            rejected,
+            left_out,
             pairing.waited_s(),
             max((reading.stamp_s for reading in accepted), default=self.now_s),
             self._temperature_c(settled.stamp_s),

@@ -76,6 +76,9 @@ class ReferenceWatch:
         self._chain, self._stop_m, self._false_alarm = chain, stop_m, false_alarm
         self._markers = {name: np.asarray(place, float) for name, place in markers.items()}
         self._references: list[FloatArray] = []
+        # One marker of each sensor: those of a frame share their errors, and each is off by what
+        # is unknown of its place.
+        self._followed: dict[str, str] = {}
         self._rounds: list[ReferenceRound] = []
         self._open = False
         self._begin = 0
@@ -89,7 +92,12 @@ class ReferenceWatch:
         return len(self._rounds)
 
     def add(self, reading: ReferenceReading) -> None:
-        """Take a reading; one at a reference that this round has already begins the next round."""
+        """Take a reading; one at a reference that this round has already begins the next round.
+
+        Only the marker that a sensor has measured first counts.
+        """
+        if self._followed.setdefault(reading.sensor, reading.marker) != reading.marker:
+            return
         if self.begins_round(reading):
             self._rounds.append(ReferenceRound())
             self._open = True
@@ -100,6 +108,8 @@ class ReferenceWatch:
 
     def begins_round(self, reading: ReferenceReading) -> bool:
         """Return whether `add` would take a reading for the first of another round."""
+        if self._followed.get(reading.sensor, reading.marker) != reading.marker:
+            return False
         return not self._open or self._key(reading) in self._rounds[-1].rows
 
     def _key(self, reading: ReferenceReading) -> tuple[int, str]:

@@ -189,7 +189,7 @@ class _System:
         # Base first, then unpenalised, then penalised: one Cholesky holds all determinants.
         self.order = np.concatenate((np.flatnonzero(free), np.flatnonzero(~free)))
         self.unpenalised = int(free.sum())
-        self.separable = list(self.model.separable)
+        self.shares = self.model.shares
         # Each group's matrix as one row: sums and traces over groups are then products.
         self.flat = self.grams.reshape(len(self.grams), -1)
 
@@ -205,13 +205,10 @@ class _System:
 
     def noise(self, eta: FloatArray) -> Noise:
         count = len(self.model.channels)
-        sigma = np.exp(eta[:count])
-        pose_sigma = np.zeros(count)
-        pose_sigma[self.separable] = np.exp(eta[count : count + len(self.separable)])
-        return Noise(sigma, pose_sigma)
+        return self.model.noise(np.exp(eta[:count]), np.exp(eta[count : count + len(self.shares)]))
 
     def evaluate(self, eta: FloatArray) -> tuple[float, FloatArray]:
-        """Return −L and its gradient by eta: log sigmas, log pose sigmas, log smoothness."""
+        """Return −L and its gradient by eta: log sigmas, what rows share, smoothness."""
         noise = self.noise(eta)
         weights = 1.0 / self.model.variances(noise)
         factors = np.exp(eta[len(eta) - len(self.penalised) :])
@@ -225,16 +222,21 @@ class _System:
         value = 0.5 * n @ np.log(weights) - np.sum(np.log(np.diag(root))) - 0.5 * weights @ rss
         value -= 0.5 * self.ridge @ beta**2
         by_log_weight = 0.5 * (n - weights * trace - weights * rss)
-        # d log w / d log sigma = -2 sigma² w, and the same with g pose_sigma².
+        # d log w / d log sigma = -2 sigma² w, and the same with g pose_sigma², M frame_sigma².
         slope = np.zeros(len(eta))
         channel, count = self.model.channel_of, len(self.model.channels)
         by_variance = -2.0 * weights * by_log_weight
-        by_sigma = np.bincount(channel, by_variance, count)
+        by_sigma = np.bincount(channel, by_variance, count).astype(float)
         by_pose_sigma = np.bincount(channel, self.model.size_of * by_variance, count)
+        by_frame_sigma = np.bincount(channel, self.model.frame_size_of * by_variance, count)
         slope[:count] = noise.sigma**2 * by_sigma
-        slope[count : count + len(self.separable)] = (noise.pose_sigma**2 * by_pose_sigma)[
-            self.separable
-        ]
+        slope[count : count + len(self.shares)] = self.model.shared(
+            Noise(
+                by_sigma,
+                noise.pose_sigma**2 * by_pose_sigma,
+                noise.frame_sigma**2 * by_frame_sigma,
+            )
+        )
         for i, (index, penalty, factor) in enumerate(
             zip(self.penalised, self.penalties, factors, strict=True)
         ):
@@ -330,16 +332,26 @@ class _System:
     def _curvature(self) -> FloatArray:
         """Return about what the second derivatives of −L by eta are."""
         channel, count = self.model.channel_of, len(self.model.channels)
-        means = self.model.freedom * (self.model.size_of > 0)
-        rows = 2.0 * np.bincount(channel, self.model.freedom, count)
-        poses = 0.5 * np.bincount(channel, means, count)[self.separable]
+        freedom = self.model.freedom
+        own, poses, frames = (
+            np.bincount(channel, freedom * entering, count).astype(float)
+            for entering in (1.0, self.model.size_of > 0, self.model.frame_size_of > 0)
+        )
+        shared = self.model.shared(Noise(own, poses, frames))
         smooth = [len(penalty) / 6.0 for penalty in self.penalties]
-        return np.array([*rows, *poses, *smooth])
+        return np.array([*(2.0 * own), *(0.5 * shared), *smooth])
 
     def _start(self, start: Solution | None) -> tuple[FloatArray, list[tuple[float, float]]]:
         noise = self.guess if start is None else start.noise
         sigma = np.log(np.maximum(noise.sigma, RESOLUTION_M))
-        pose = np.maximum(noise.pose_sigma, 0.1 * noise.sigma)[self.separable]
+        least = 0.1 * noise.sigma
+        shared = self.model.shared(
+            Noise(
+                noise.sigma,
+                np.maximum(noise.pose_sigma, least),
+                np.maximum(noise.frame_sigma, least),
+            )
+        )
         known: dict[object, float] = {}
         if start is not None:
             known = {
@@ -351,9 +363,9 @@ class _System:
             np.log(known.get(self.cells[i].key, self._typical(penalty, self.where[i], noise)))
             for i, penalty in zip(self.penalised, self.penalties, strict=True)
         ]
-        eta = np.concatenate((sigma, np.log(pose), smooth))
+        eta = np.concatenate((sigma, np.log(shared), smooth))
         floor, ceiling = np.log(RESOLUTION_M), np.log(0.1)
-        bounds = [(floor, ceiling)] * (len(sigma) + len(pose))
+        bounds = [(floor, ceiling)] * (len(sigma) + len(shared))
         bounds += [(value - _LARGE, value + _LARGE) for value in smooth]
         return eta, bounds
 

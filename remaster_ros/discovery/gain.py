@@ -51,7 +51,7 @@ def gain_of(
     measurements = found.problem.measurements
     held_out = measurements.is_validation
     noise = data.noise_model.sensor_noise(solution.noise)
-    variance = 3.0 * (noise.sigma**2 + noise.pose_sigma**2)
+    variance = 3.0 * noise.total**2
     rows = held_out if held_out.any() else ~held_out
     floor = float(np.sqrt(np.mean(variance[measurements.sensor[rows]])))
     if not held_out.any():
@@ -107,7 +107,7 @@ def pose_common_fraction(data: Residuals, solution: Solution) -> float:
     """Return the share of the noise's variance that rows of one pose have in common."""
     noise = data.noise_model.sensor_noise(solution.noise)
     common = np.sum(noise.pose_sigma**2)
-    return float(common / (common + np.sum(noise.sigma**2)))
+    return float(common / np.sum(noise.total**2))
 
 
 def noise_by_range(data: Residuals, solution: Solution) -> dict[str, dict[str, float]]:

@@ -79,7 +79,8 @@ class CellSensors:
     def subscribe(self, bag: BagRecorder) -> None:
         """Subscribe to the readings, through the bag."""
         for name, sensor in self._sensors.items():
-            bag.subscribe(PointStamped, sensor.topic, self._on_point(name))
+            for marker, topic in sensor.topics.items():
+                bag.subscribe(PointStamped, topic, self._on_point(name, marker))
             bag.subscribe(Temperature, temperature_topic(sensor.topic), self._on_temperature)
 
     def take(self, record: EventRecord, report: SensorReport) -> None:
@@ -115,7 +116,7 @@ class CellSensors:
     def _absent(self) -> dict[str, str]:
         return self._liveness.absent(time.monotonic(), self.required.names)
 
-    def _on_point(self, sensor: str) -> Callable[[PointStamped], None]:
+    def _on_point(self, sensor: str, marker: str) -> Callable[[PointStamped], None]:
         def receive(message: PointStamped) -> None:
             point = message.point
             position = np.array([point.x, point.y, point.z])
@@ -123,7 +124,7 @@ class CellSensors:
                 self.not_finite[sensor] += 1
                 return
             self._liveness.reads(sensor, time.monotonic())
-            reading = MarkerReading(seconds(message.header.stamp), position)
+            reading = MarkerReading(seconds(message.header.stamp), position, marker=marker)
             self._recording.take_reading(sensor, reading)
             self._on_reading()
 

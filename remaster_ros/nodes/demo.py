@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,7 @@ from remaster_ros.nodes.demo_summary import (
     print_times,
 )
 from remaster_ros.nodes.launching import ALL_NODES, CORE, SENSORS
+from remaster_ros.nodes.page_address import opening_path, page_name
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.processes import NodeProcesses
 from remaster_ros.nodes.running import report
@@ -51,6 +53,15 @@ from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.setup import make_world
 from remaster_ros.simulation.truth import to_plain
 
+HAVE_CELL = (
+    'pose_planner',
+    'robot_bridge',
+    'recorder',
+    'optitrack_markers',
+    'laser_tracker_markers',
+)
+"""Nodes with the parameter ``cell``."""
+
 
 @dataclass(frozen=True)
 class Parameters:
@@ -60,6 +71,7 @@ class Parameters:
         '', 'folder of everything the demo writes: new, empty, or of a demo to go on with'
     )
     seed: int = parameter(0, 'seed of the hidden World and of all randomness', low=0)
+    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
     candidates: int = parameter(
         14, 'candidate poses for optimization and for validation, each', low=1, high=1000
     )
@@ -70,6 +82,7 @@ class Parameters:
         '', 'what else is wrong with the hidden arm: NAME[@JOINT][:SIZE_MM],…, or random'
     )
     figures: bool = parameter(True, 'write figures and the report')
+    watch: bool = parameter(False, 'serve the live page, and end with a signal')
     quiet: bool = parameter(False, 'print nothing but errors')
 
 
@@ -136,7 +149,7 @@ class Demo:
 
     def run(self) -> None:
         """Collect, fit, print."""
-        cell = read_cell('demo')
+        cell = read_cell(self.p.cell)
         world = make_world(
             self.hidden, cell, self.p.seed, self.p.rate, self.requests, self.p.candidates
         )
@@ -155,6 +168,8 @@ class Demo:
             self.console.print('looking for causes')
             self._trigger('remaster/discover', 'optimizer', timeout_s=300.0)
             results.append(('causes', self.discovery, 'discovery.json'))
+        if self.p.watch:
+            self._stay()
         self.processes.stop()
         print_times(self.console, self.node.times)
         # Only here, after everything that estimates has ended, is the truth opened.
@@ -196,7 +211,14 @@ class Demo:
             'laser_tracker_markers': {'port': tracker_port},
         }
         for name in ALL_NODES:
-            self.processes.start(name, common, own.get(name, {}))
+            values = own.get(name, {})
+            if name in HAVE_CELL:
+                values['cell'] = self.p.cell
+            self.processes.start(name, common, values)
+        if self.p.watch:
+            self.processes.start('watch', common, {'cell': self.p.cell, 'fit': str(self.fit)})
+            name = page_name(self.node.context.get_domain_id(), '/watch')
+            self.console.print(f'live page: open {opening_path(name)}', soft_wrap=True)
 
     def _spin(self) -> None:
         self._executor.spin_once(timeout_sec=0.1)
@@ -206,6 +228,14 @@ class Demo:
             # The last summary of the killed process no longer holds.
             self.node.summaries.pop(name, None)
             self.console.print(f'{name} was killed, and is started again')
+
+    def _stay(self) -> None:
+        """Leave the nodes to the live page until a signal."""
+        self.console.print('the live page stays until Ctrl-C')
+        with suppress(KeyboardInterrupt):
+            while True:
+                self._spin()
+        self._stopping.clear()
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
         deadline = time.monotonic() + timeout_s

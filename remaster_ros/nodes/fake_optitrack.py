@@ -50,7 +50,10 @@ class FakeOptiTrackNode(RemasterNode):
             host=p.host,
             command_port=p.command_port,
             data_port=p.data_port,
-            behaviour=OptiTrackBehaviour(occlusions_per_s=p.occlusions_per_s),
+            behaviour=OptiTrackBehaviour(
+                occlusions_per_s=p.occlusions_per_s,
+                further=world.truth.sensors[p.sensor].further,
+            ),
         )
         self.server.start()
 

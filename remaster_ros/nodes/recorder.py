@@ -75,7 +75,7 @@ class Recorder(RemasterNode):
             sensor_rules(self.cell, self.p),
             self.p.motion_tolerance,
             self.p.require,
-            Plausibility(self.chain, markers, self.p.max_deviation_m),
+            Plausibility(self.chain, markers, self.p.max_deviation_m, self.cell.marker_std_m),
         )
         self.sensors = CellSensors(self, self.p, self.cell, self.recording, self._end_reading)
         self.registration = FirstRegistration(
@@ -226,8 +226,9 @@ class Recorder(RemasterNode):
             return
         for name, waited_s in ended.waited_s.items():
             self._waited_s[name] += waited_s
-        self.counts.update(f'{item.sensor}_{item.reason}' for item in ended.rejected)
-        self.counts.update(f'{item.sensor}_accepted' for item in ended.accepted)
+        refused = (*ended.rejected, *ended.left_out)
+        self.counts.update(f'{item.sensor}_{item.reason}' for item in refused)
+        self.counts.update(f'{name}_accepted' for name in {item.sensor for item in ended.accepted})
         self.keeper.write(partial(self._write_down, ended))
 
     def _write_down(self, ended: EndedReading) -> None:

@@ -71,6 +71,7 @@ def sensor_rules(cell: Workcell, p: Parameters) -> tuple[SensorRules, ...]:
         SensorRules(
             sensor=name,
             marker=sensor.marker,
+            further=tuple(sensor.further_markers),
             single_shot=sensor.single_shot,
             dwell_s=p.dwell_s,
             min_samples=p.min_samples,
@@ -90,6 +91,11 @@ def session_header(cell: Workcell, settle_s: float) -> Session:
         tip_link=chain.tip_link,
         markers={name: np.array(position) for name, position in cell.markers.items()},
         sensors={name: sensor.marker for name, sensor in cell.sensors.items()},
+        further_markers={
+            name: tuple(sensor.further_markers)
+            for name, sensor in cell.sensors.items()
+            if sensor.further_markers
+        },
         measurements=Measurements.empty(len(chain)),
         marker_std_m=cell.marker_std_m,
         settle_s=settle_s,

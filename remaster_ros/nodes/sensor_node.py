@@ -1,4 +1,4 @@
-"""The node of any sensor: one marker's readings out, and whether the sensor is ready.
+"""The node of any sensor: its markers' readings out, and whether the sensor is ready.
 
 What is particular to a device lies in its driver (`remaster_ros.sensors`). The node opens the
 driver, tries again while that fails, publishes readings with their time of capture, and publishes
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -21,8 +22,10 @@ from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.running import RemasterNode, fault_of_this_program, run
 from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary
+from remaster_ros.nodes.topic_source import subscribe_to_source
 from remaster_ros.sensors.driver import SensorClock, StreamDriver, TriggeredDriver
-from remaster_ros.sensors.registry import kind_of, load_driver
+from remaster_ros.sensors.registry import TOPIC, kind_of, load_driver
+from remaster_ros.sensors.topic.driver import TopicDriver
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import MarkerReading
 
@@ -30,7 +33,7 @@ RETRY_S = 0.5
 
 
 class SensorNode(RemasterNode):
-    """A node that publishes the marker which one of the cell's sensors follows.
+    """A node that publishes the markers which one of the cell's sensors measures.
 
     Parameters
     ----------
@@ -73,7 +76,28 @@ class SensorNode(RemasterNode):
                 f'{str(described.single_shot).lower()}, but a {driver.device} '
                 f'{"measures on request" if triggered else "streams"}; correct single_shot'
             )
-        self._readings = self.create_publisher(PointStamped, described.topic, RELIABLE)
+        if bool(described.source) != issubclass(driver, TopicDriver):
+            raise InputError(
+                f'{self.get_name()}: sensor {self.sensor} of {p.cell} '
+                + (
+                    f'has a message_type; its node is a {TOPIC}'
+                    if described.source
+                    else 'has no message_type; give that of its topic, such as '
+                    'geometry_msgs/msg/PoseStamped'
+                )
+            )
+        if described.further_markers and not driver.several_markers:
+            raise InputError(
+                f'{self.get_name()}: sensor {self.sensor} of {p.cell} has further_markers, but a '
+                f'{driver.device} measures one marker at a time; leave them out'
+            )
+        p = replace(p, further_markers=described.further_markers)
+        self._readings = {
+            '' if marker == described.marker else marker: self.create_publisher(
+                PointStamped, topic, RELIABLE
+            )
+            for marker, topic in described.topics.items()
+        }
         self.published = 0
         self.trouble = ''
         self.in_use = threading.Lock()
@@ -82,6 +106,8 @@ class SensorNode(RemasterNode):
         self._started = False
         simulated = bool(self.get_parameter('use_sim_time').value)
         self.driver = driver(p, SensorClock(self.now_s, self._sleep, simulated))
+        if isinstance(self.driver, TopicDriver):
+            subscribe_to_source(self, self.driver, described)
         if isinstance(self.driver, TriggeredDriver):
             self._step = MeasureService(self, self.driver, cell, self._ending).step
         elif isinstance(self.driver, StreamDriver):
@@ -155,7 +181,7 @@ class SensorNode(RemasterNode):
         message.header.frame_id = self.sensor
         position = np.asarray(reading.position, float)
         message.point.x, message.point.y, message.point.z = map(float, position)
-        self._readings.publish(message)
+        self._readings[reading.marker].publish(message)
         self.published += 1
 
     def _summary(self) -> Summary:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from remaster_ros.errors import InsufficientDataError
+from remaster_ros.kinematics.transforms import transform
 from remaster_ros.planning.candidates import Plan, PlannedPose, PlanningScene, order_solutions
 from remaster_ros.planning.free_order import free_way
 from remaster_ros.planning.planned_design import (
@@ -16,11 +17,11 @@ from remaster_ros.planning.planned_design import (
     visit_order,
 )
 from remaster_ros.planning.reference_choice import choose_references
+from remaster_ros.planning.registration_tour import registration_tour
 from remaster_ros.planning.tour_order import (
     REFERENCE,
     REGISTRATION,
     Tour,
-    registration_tour,
 )
 from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.types import FloatArray
@@ -72,6 +73,11 @@ class TourPlanner:
         self.design = design or DesignSettings()
         self.travel = travel or TravelTime.of(scene.model)
         self.designed: Designed | None = None
+
+    @property
+    def rough_places(self) -> dict[str, FloatArray]:
+        """T_R_N of each sensor at its rough place, (4, 4)."""
+        return {name: transform(np.eye(3), at) for name, at in self.scene.rough_R.items()}
 
     def registration(self) -> Tour:
         """Plan poses for the three-point registration, before sensors at their rough places."""

@@ -70,7 +70,9 @@ def gain(discovery: Discovery) -> Figure:
     fits = selection.empty, selection.solution
     noises = [data.noise_model.sensor_noise(fit.noise) for fit in fits]
     # By sensor, before or after, and part: shared by a pose, or within.
-    values = 1e3 * np.array([(noise.pose_sigma, noise.sigma) for noise in noises])
+    values = 1e3 * np.array(
+        [(noise.pose_sigma, np.hypot(noise.sigma, noise.frame_sigma)) for noise in noises]
+    )
     values = values.transpose(2, 1, 0).reshape(-1, 2)
     y = np.arange(len(values))
     for column, (color, label) in enumerate(((BEFORE, 'before'), (AFTER, 'after'))):

@@ -133,7 +133,12 @@ def _noise(noise: NoiseEstimate) -> dict[str, Any]:
         for direction, part in noise.directions.items()
         for key, value in vars(part).items()
     }
-    return vars(noise) | directions
+    return {
+        key: value
+        for key, value in (vars(noise) | directions).items()
+        # A sensor with one marker in a frame has no such noise.
+        if value is not None or 'frame' not in key
+    }
 
 
 def _describe(session: Session) -> dict[str, Any]:

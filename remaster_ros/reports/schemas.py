@@ -93,21 +93,28 @@ class Marker(Struct):
 class Noise(Struct):
     """A sensor's noise per axis: of one row, and common to a pose (None: not separable).
 
-    Where it differs along and across the line of sight, both stand there as well.
+    Where it has several markers in a frame, also what these share. Where it differs along and
+    across the line of sight, both stand there as well.
     """
 
     sigma_m: float
     std_m: float
     pose_sigma_m: float | None
     pose_std_m: float | UnsetType | None = UNSET
+    frame_sigma_m: float | UnsetType = UNSET
+    frame_std_m: float | UnsetType = UNSET
     along_sigma_m: float | UnsetType = UNSET
     along_std_m: float | UnsetType = UNSET
     along_pose_sigma_m: float | UnsetType | None = UNSET
     along_pose_std_m: float | UnsetType | None = UNSET
+    along_frame_sigma_m: float | UnsetType = UNSET
+    along_frame_std_m: float | UnsetType = UNSET
     across_sigma_m: float | UnsetType = UNSET
     across_std_m: float | UnsetType = UNSET
     across_pose_sigma_m: float | UnsetType | None = UNSET
     across_pose_std_m: float | UnsetType | None = UNSET
+    across_frame_sigma_m: float | UnsetType = UNSET
+    across_frame_std_m: float | UnsetType = UNSET
 
 
 class Sampler(Struct):

@@ -30,6 +30,9 @@ class SensorParameters:
         low=0.1,
         high=3600.0,
     )
+    further_markers: Mapping[str, int] = field(default_factory=dict)
+    """Of the cell file, no parameter of the node: further markers, and what the device knows each
+    by. Only for drivers that are `several_markers`."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +93,8 @@ class Driver(ABC):
     """The driver's frozen dataclass of parameters."""
     device: ClassVar[str]
     """What it is, for messages."""
+    several_markers: ClassVar[bool] = False
+    """Whether it measures several markers in one frame."""
     phase: str = 'connecting'
     """``connecting`` until `open` has returned, then ``ready``; set by the node. `open` may set
     another text while it takes long."""
@@ -122,6 +127,7 @@ class StreamDriver(Driver):
     def read(self) -> MarkerReading | None:
         """Return the next reading, stamped with its time of capture.
 
+        Of several markers in one frame one after the other, with the same stamp.
         Only measured positions: nothing occluded, predicted, filled in or held over. Waits some
         tenths of a second at most, then returns None.
 

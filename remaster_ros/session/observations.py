@@ -26,6 +26,8 @@ from remaster_ros.types import FARTHEST_M, FloatArray, Measurements, Observation
 log = logging.getLogger('remaster_ros')
 
 LIMIT_TOLERANCE_RAD = math.radians(1.0)
+FRAME = 'frame'
+"""The column that names the rows of one sensor which come from one frame."""
 
 
 class ColumnNames:
@@ -36,7 +38,7 @@ class ColumnNames:
     q, from_q
         Reported joint positions, and those that the arm came from.
     effort
-        Measured joint torques; these columns are optional.
+        Measured joint torques; these columns are optional, and so is `FRAME`.
     """
 
     position = ('x_m', 'y_m', 'z_m')
@@ -54,11 +56,12 @@ class ColumnNames:
         """Columns that a file may leave out where every field of them would be empty."""
         return (*self.from_q, *self.std, 'samples', 'temperature_c')
 
-    def names(self, with_effort: bool = False) -> list[str]:
+    def names(self, with_effort: bool = False, with_frame: bool = False) -> list[str]:
         """Return every column's name."""
         return [
             *('observation', 'pose', 'configuration', 'split', 'stamp_s', 'sensor', 'marker'),
             *(*self.q, *self.from_q, *self.position, *self.std, 'samples', 'temperature_c'),
+            *([FRAME] if with_frame else ()),
             *(self.effort if with_effort else ()),
         ]
 
@@ -74,13 +77,20 @@ class RowFormat:
         The robot, for the number of joints and their limits.
     sensors, markers
         The names in session.yaml, in their order.
+    with_frame
+        Whether the rows that are to be written have the column `FRAME`.
     """
 
     def __init__(
-        self, path: Path, chain: SerialChain, sensors: Sequence[str], markers: Sequence[str]
+        self,
+        path: Path,
+        chain: SerialChain,
+        sensors: Sequence[str],
+        markers: Sequence[str],
+        with_frame: bool = False,
     ) -> None:
         self._path, self._chain = path, chain
-        self._sensors, self._markers = sensors, markers
+        self._sensors, self._markers, self._with_frame = sensors, markers, with_frame
         self._columns = ColumnNames(len(chain))
 
     def parse(self, data: bytes) -> Measurements:
@@ -97,7 +107,7 @@ class RowFormat:
         path = self._path
         # Before its zeros are taken for those that a power cut leaves.
         refuse_utf16(data, path)
-        end = _whole_lines(data, most=len(self._sensors))
+        end = _whole_lines(data, most=len(self._sensors) * len(self._markers))
         if end < len(data):
             torn = data.count(b'\n', 0, end) + 1
             log.warning('%s, line %d: cut off while being written, and dropped', path, torn)
@@ -137,7 +147,8 @@ class RowFormat:
         """
         if not rows:
             return []
-        table = Table(self._path, self._columns.names(), list(rows), first_line)
+        names = self._columns.names(with_frame=self._with_frame)
+        table = Table(self._path, names, list(rows), first_line)
         return self._accept(self._convert(table), first_line, rules)
 
     def _accept(self, m: Measurements, first_line: int, rules: SequenceRules) -> list[RowKeys]:
@@ -170,6 +181,7 @@ class RowFormat:
             temperature_c=table.numbers(['temperature_c'], optional=True)[:, 0],
             effort=table.numbers(columns.effort, optional=True) if with_effort else None,
             is_reference=is_reference if is_reference.any() else None,
+            frame=table.integers(FRAME, least=0) if FRAME in table.cells else None,
         )
         table.refuse(measurements.std < 0, dict.fromkeys(columns.std, 'is negative; correct it'))
         problems = [
@@ -201,8 +213,8 @@ def _refuse_other_separators(header: str, path: Path) -> None:
 def _whole_lines(data: bytes, most: int) -> int:
     """Return how many bytes at the beginning are whole lines.
 
-    The rows of one configuration are written in one piece, a row for each of the (`most`) sensors:
-    zeros further up are no crash's work, and left for the reader to refuse.
+    The rows of one configuration are written in one piece, `most` at most, a row for each marker
+    of each sensor: zeros further up are no crash's work, and left for the reader to refuse.
     """
     end = data.rfind(b'\n') + 1
     zero = data.find(b'\0')
@@ -211,12 +223,12 @@ def _whole_lines(data: bytes, most: int) -> int:
     return data.rfind(b'\n', 0, zero) + 1
 
 
-def format_header(joints: int, with_effort: bool = False) -> str:
+def format_header(joints: int, with_effort: bool = False, with_frame: bool = False) -> str:
     """Return the header line of observations.csv."""
-    return ','.join(ColumnNames(joints).names(with_effort)) + '\n'
+    return ','.join(ColumnNames(joints).names(with_effort, with_frame)) + '\n'
 
 
-def format_observation(observation: Observation) -> str:
+def format_observation(observation: Observation, with_frame: bool = False) -> str:
     """Return one observation as a line without its end; numbers survive the round trip exactly."""
     o = observation
     unknown = [''] * len(o.q)
@@ -229,6 +241,7 @@ def format_observation(observation: Observation) -> str:
         *([''] * 3 if o.std is None else map(_text, o.std)),
         '' if o.samples is None else str(int(o.samples)),
         '' if o.temperature_c is None else _text(o.temperature_c),
+        *(['' if o.frame is None else str(int(o.frame))] if with_frame else ()),
     ]
     return ','.join(cells)
 
@@ -251,10 +264,16 @@ def format_measurements(m: Measurements, sensors: Sequence[str], markers: Sequen
         *(column for values in (m.q, m.from_q, m.position, m.std) for column in numbers(values)),
         [str(samples) if samples >= 0 else '' for samples in m.samples.tolist()],
         *numbers(m.temperature_c[:, None]),
+        *(
+            [[str(number) if number >= 0 else '' for number in m.frame.tolist()]]
+            if m.frame is not None
+            else ()
+        ),
         *(numbers(m.effort) if m.effort is not None else ()),
     ]
     lines = map(','.join, zip(*cells, strict=True))
-    return format_header(m.q.shape[1], m.effort is not None) + ''.join(f'{row}\n' for row in lines)
+    header = format_header(m.q.shape[1], m.effort is not None, m.frame is not None)
+    return header + ''.join(f'{row}\n' for row in lines)
 
 
 def _check_names(names: list[str], columns: ColumnNames, path: Path) -> None:
@@ -279,7 +298,7 @@ def _check_names(names: list[str], columns: ColumnNames, path: Path) -> None:
             f'{where}: column {", ".join(missing)} is missing; add it (docs/session-format.md), '
             'or let "remaster import" make a session of this table'
         )
-    unknown = [name for name in names if name not in columns.names(with_effort=True)]
+    unknown = [name for name in names if name not in columns.names(True, True)]
     if unknown:
         log.warning('%s: unknown columns are not used: %s', where, ', '.join(map(repr, unknown)))
 

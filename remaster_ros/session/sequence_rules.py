@@ -22,13 +22,17 @@ class RowKeys(NamedTuple):
     configuration: int
     split: int
     stamp_s: float
+    sensor: int
+    marker: int
+    frame: int
 
 
 class SequenceRules:
     """What must hold between rows, given in their order.
 
     Observation numbers are unique and grow with time, time never runs backwards, a pose belongs
-    to one split and a configuration to one pose.
+    to one split and a configuration to one pose. The rows of a frame are of one configuration and
+    of different markers.
     """
 
     def __init__(self) -> None:
@@ -36,6 +40,8 @@ class SequenceRules:
         self._of_observation: MutableMapping[int, RowKeys] = {}
         self._of_pose: MutableMapping[int, RowKeys] = {}
         self._of_configuration: MutableMapping[int, RowKeys] = {}
+        self._of_frame: MutableMapping[tuple[int, int], RowKeys] = {}
+        self._in_frame: MutableMapping[tuple[int, int, int], RowKeys] = {}
 
     def branch(self) -> SequenceRules:
         """Return rules after the same rows; rows that they accept change nothing here."""
@@ -44,6 +50,8 @@ class SequenceRules:
         rules._of_observation = ChainMap({}, self._of_observation)
         rules._of_pose = ChainMap({}, self._of_pose)
         rules._of_configuration = ChainMap({}, self._of_configuration)
+        rules._of_frame = ChainMap({}, self._of_frame)
+        rules._in_frame = ChainMap({}, self._in_frame)
         return rules
 
     def problem(self, row: RowKeys) -> str:
@@ -77,6 +85,18 @@ class SequenceRules:
                 f'column configuration: {row.configuration} belongs to pose {same.pose} on line '
                 f'{same.line} and to pose {row.pose} here; give a configuration one pose'
             )
+        same = self._of_frame.get((row.sensor, row.frame))
+        if row.frame >= 0 and same is not None and same.configuration != row.configuration:
+            return (
+                f'column frame: {row.frame} belongs to configuration {same.configuration} on line '
+                f'{same.line} and to {row.configuration} here; give every frame its own number'
+            )
+        same = self._in_frame.get((row.sensor, row.frame, row.marker))
+        if row.frame >= 0 and same is not None:
+            return (
+                f'column marker: frame {row.frame} of this sensor has this marker on line '
+                f'{same.line} already; a frame has each marker once'
+            )
         return ''
 
     def accept(self, row: RowKeys) -> None:
@@ -85,6 +105,9 @@ class SequenceRules:
         self._of_observation[row.observation] = row
         self._of_pose.setdefault(row.pose, row)
         self._of_configuration.setdefault(row.configuration, row)
+        if row.frame >= 0:
+            self._of_frame.setdefault((row.sensor, row.frame), row)
+            self._in_frame[row.sensor, row.frame, row.marker] = row
 
 
 def split_indices(m: Measurements) -> IntArray:
@@ -98,6 +121,10 @@ def split_indices(m: Measurements) -> IntArray:
 def row_keys(m: Measurements, first_line: int) -> Iterator[RowKeys]:
     """Yield the keys of every row, the first being on `first_line` of its file."""
     lines = range(first_line, first_line + len(m))
-    columns = (m.observation, m.pose, m.configuration, split_indices(m), m.stamp_s)
+    frame = np.full(len(m), -1) if m.frame is None else m.frame
+    columns = (
+        *(m.observation, m.pose, m.configuration, split_indices(m), m.stamp_s),
+        *(m.sensor, m.marker, frame),
+    )
     # Plain Python numbers: dictionaries of NumPy scalars are slow.
     return map(RowKeys, lines, *(column.tolist() for column in columns))

@@ -6,6 +6,7 @@ twice, and the points that its sensors were registered by.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -220,6 +221,7 @@ class SessionJournal:
             return []
         pairs = sorted(zip(readings, temperatures_c), key=lambda pair: pair[0].stamp_s)
         self._keep_time(pairs[0][0].stamp_s)
+        markers = Counter(reading.sensor for reading in readings)
         return [
             Observation(
                 observation=writer.observations + number,
@@ -228,6 +230,8 @@ class SessionJournal:
                 split=_split(split),
                 from_q=from_q,
                 temperature_c=temperature_c,
+                # Every sensor has one frame in a configuration.
+                frame=writer.configurations if markers[reading.sensor] > 1 else None,
                 **vars(replace(reading, stamp_s=reading.stamp_s + self._shift_s)),
             )
             for number, (reading, temperature_c) in enumerate(pairs)

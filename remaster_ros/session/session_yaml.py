@@ -33,6 +33,7 @@ class _Robot(msgspec.Struct):
 
 class _Sensor(msgspec.Struct):
     marker: str
+    further_markers: tuple[str, ...] = ()
 
 
 class SessionHeader(msgspec.Struct):
@@ -66,6 +67,11 @@ class SessionHeader(msgspec.Struct):
             tip_link=self.robot.tip_link,
             markers={name: np.array(position) for name, position in self.markers.items()},
             sensors={name: sensor.marker for name, sensor in self.sensors.items()},
+            further_markers={
+                name: sensor.further_markers
+                for name, sensor in self.sensors.items()
+                if sensor.further_markers
+            },
             measurements=measurements,
             marker_std_m=self.marker_std_m,
             settle_s=self.settle_s,
@@ -123,7 +129,10 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
             'tip_link': session.tip_link,
         },
         'markers': session.markers,
-        'sensors': {name: {'marker': marker} for name, marker in session.sensors.items()},
+        'sensors': {
+            name: {'marker': marker, 'further_markers': session.further_markers.get(name, ())}
+            for name, marker in session.sensors.items()
+        },
         'settle_s': session.settle_s,
         'times': '' if session.timed else 'none',
         'marker_std_m': session.marker_std_m,
@@ -136,6 +145,9 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
     }
     header = _checked(to_plain(content), 'session to be written: ')
     given = {key: value for key, value in to_plain(header).items() if value not in ('', {}, None)}
+    for sensor in given['sensors'].values():
+        if not sensor['further_markers']:
+            del sensor['further_markers']
     return dump_yaml(_merge(given, session.extra))
 
 
@@ -171,11 +183,14 @@ def _problem(header: SessionHeader) -> str:
             if not name or name != name.strip() or any(c in name for c in ',"\r\n\0'):
                 return f'{kind}: {name!r} is no usable name; leave out commas, quotes and blanks'
     for sensor, entry in header.sensors.items():
-        if entry.marker not in header.markers:
-            return (
-                f'sensors.{sensor}.marker: {entry.marker!r} is not among the markers '
-                f'({", ".join(header.markers)}); correct the name'
-            )
+        named = [('marker', entry.marker)]
+        named += [('further_markers', name) for name in entry.further_markers]
+        for key, marker in named:
+            if marker not in header.markers:
+                return (
+                    f'sensors.{sensor}.{key}: {marker!r} is not among the markers '
+                    f'({", ".join(header.markers)}); correct the name'
+                )
     for sensor, base in header.base_prior.items():
         if sensor not in header.sensors:
             known = ', '.join(header.sensors)

@@ -26,20 +26,17 @@ from remaster_ros.planning.candidates import (
 from remaster_ros.planning.expected_sensors import POSE_SIGMA_M, SIGMA_M, ExpectedSensor
 from remaster_ros.planning.planned_design import DesignSettings
 from remaster_ros.session.cell_poses import RANGES, CellPoses
+from remaster_ros.session.cell_sensor import CellSensor
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.meshes import mesh_reader
 from remaster_ros.session.reader import URDF_LIMIT
 from remaster_ros.session.yaml_places import with_line
 from remaster_ros.session.yaml_records import YAML_LIMIT, Bounds, Triple, read_yaml
-from remaster_ros.types import FARTHEST_M, FloatArray
+from remaster_ros.types import FloatArray
 
 ON_TOOL = Bounds(-3.0, 3.0, 'm')
 # A marker is placed better than this; a session file may give more, where nothing is known.
 MARKER_STD = Bounds(0.0, 0.02, 'm', above=True)
-# From the resolution of an interferometer to a depth camera's noise.
-NOISE = Bounds(1e-7, 0.05, 'm')
-# A retroreflector or sphere is seen from further round than this.
-VIEW = Bounds(3.5, 180.0, 'degrees')
 CLEARANCE = Bounds(HALF_STEP_M, 1.0, 'm', remedy='; half the step of a path check is the least')
 
 
@@ -49,40 +46,6 @@ class CellRobot(msgspec.Struct, forbid_unknown_fields=True):
     urdf: str
     base_link: str | None = None
     tip_link: str | None = None
-
-
-class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
-    """A sensor of a cell.
-
-    Attributes
-    ----------
-    marker
-        The marker it follows.
-    topic
-        Where its readings are published (geometry_msgs/PointStamped, sensor frame); relative to
-        the nodes' namespace, unless it begins with ``/``.
-    rough_position_m
-        Where it stands in the robot base, roughly.
-    single_shot
-        True for an instrument that measures on request.
-    measure_service
-        The service (std_srvs/Trigger) that makes it measure.
-    max_angle_deg
-        Largest angle between the tool's z axis and the line to the sensor at which the marker
-        is seen.
-    noise_m, pose_noise_m
-        Standard deviations per axis that are expected: of a reading, and of the error that all
-        readings at one pose share. Only plans depend on them; a fit estimates its own.
-    """
-
-    marker: str
-    topic: str
-    rough_position_m: Annotated[Triple, Bounds(-FARTHEST_M, FARTHEST_M, 'm')]
-    single_shot: bool = False
-    measure_service: str = ''
-    max_angle_deg: Annotated[float, VIEW] = 60.0
-    noise_m: Annotated[float, NOISE] = SIGMA_M
-    pose_noise_m: Annotated[float, Bounds(0.0, 0.05, 'm')] = POSE_SIGMA_M
 
 
 class CellBox(msgspec.Struct, forbid_unknown_fields=True):
@@ -152,6 +115,8 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         float | list[float], Bounds(0.0, unit='rad/s²', above=True)
     ] = 5.0
     mesh_path: list[str] = []
+    # Whether the nodes show their plan and wait for /remaster/confirm before the arm moves.
+    confirm: bool = False
     urdf_text: str = ''
     # Where it was read from; nothing a plan depends on.
     file: str = ''
@@ -163,12 +128,20 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     def fingerprint(self) -> str:
         """Return a checksum of all that a plan depends on."""
         plain = msgspec.to_builtins(msgspec.structs.replace(self, file=''))
+        del plain['confirm']
         # Keys that files of older versions have not count where they are not as by default: plans
         # of those versions go on.
         given = self.poses.given()
         plain['poses'] = {k: v for k, v in plain['poses'].items() if k in RANGES or k in given}
         for sensor in plain['sensors'].values():
-            for key, usual in (('noise_m', SIGMA_M), ('pose_noise_m', POSE_SIGMA_M)):
+            for key, usual in (
+                ('noise_m', SIGMA_M),
+                ('pose_noise_m', POSE_SIGMA_M),
+                ('message_type', ''),
+                ('source', ''),
+                ('frame_noise_m', 0.0),
+                ('further_markers', {}),
+            ):
                 if sensor[key] == usual:
                     del sensor[key]
         return hashlib.sha256(msgspec.json.encode(plain)).hexdigest()
@@ -264,9 +237,10 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
             ExpectedSensor(
                 name,
                 np.array(sensor.rough_position_m),
-                {sensor.marker: np.array(self.markers[sensor.marker])},
+                {marker: np.array(self.markers[marker]) for marker in sensor.markers},
                 sensor.noise_m,
                 sensor.pose_noise_m,
+                sensor.frame_noise_m,
             )
             for name, sensor in self.sensors.items()
         ]
@@ -315,6 +289,8 @@ def parse_cell(data: bytes, path: Path) -> Workcell:
     cell = read_yaml(data, path, Workcell)
     urdf = path.parent / cell.robot.urdf
     cell.file = str(path)
+    for name, sensor in cell.sensors.items():
+        sensor.publish_anew(name)
     missing = (
         f'robot.urdf in {path} is {cell.robot.urdf!r}, which is relative to that file; copy the '
         'URDF there, or give its absolute path'
@@ -345,10 +321,8 @@ def _problem(cell: Workcell, chain: SerialChain) -> str:
     if not cell.sensors:
         return 'sensors is empty; name at least one'
     for name, sensor in cell.sensors.items():
-        if sensor.marker not in cell.markers:
-            known = ', '.join(cell.markers)
-            meant = did_you_mean(sensor.marker, cell.markers)
-            return f'sensors.{name}.marker is {sensor.marker!r}; markers has {known}{meant}'
+        if problem := sensor.problem(f'sensors.{name}', cell.markers):
+            return problem
     if cell.aim_at not in cell.sensors:
         meant = did_you_mean(cell.aim_at, cell.sensors)
         return f'aim_at {cell.aim_at!r} is none of the sensors {", ".join(cell.sensors)}{meant}'

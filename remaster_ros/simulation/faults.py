@@ -37,6 +37,8 @@ An OptiTrack server:
 ``swapped``        labels a stray as the marker
 ``jumping``        shows the marker half a metre off in every fourth frame
 ``occluded``       does not see the marker
+``hidden``         does not see the marker of this number in the rigid body
+``exchanged``      takes the marker of this number for the first one, and the other way round
 ``filled``         guesses where the marker is
 ``slow``           streams every n-th frame
 ``late``           streams frames so many seconds late

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,9 +56,12 @@ class OptiTrackBehaviour:
     ----------
     rigid_body, body_id
         The tool's rigid body. Its member 1 is the calibration marker.
+    further
+        Further markers of the world's sensor, by name, with their numbers in the body.
     companions
-        Members 2, 3, …: offsets from the calibration marker along the sensor's axes, m. They
-        move with it and do not turn with the tool: no program here uses the body's rotation.
+        Members 2, 3, … where there are no further markers: offsets from the calibration marker
+        along the sensor's axes, m. They move with it and do not turn with the tool: no program
+        here uses the body's rotation.
     strays
         Reflections at fixed places in the sensor frame, m.
     noise_across_m, noise_along_m
@@ -65,14 +69,15 @@ class OptiTrackBehaviour:
     mid_exposure_clock
         Whether frames carry the time of exposure; USB cameras send 0.
     occlusions_per_s, occlusion_s
-        How often the calibration marker is hidden, and for how long on average (exponential
-        distributions), in world time.
+        How often one of the markers that are followed is hidden, and for how long on average
+        (exponential distributions), in world time.
     guess_error_m
         Standard deviation per axis of the model's guess at a hidden marker.
     """
 
     rigid_body: str = 'tool'
     body_id: int = 1
+    further: Mapping[str, int] = field(default_factory=dict)
     companions: tuple[Vec3, ...] = ((0.06, 0.0, 0.0), (0.0, 0.05, 0.0), (0.04, 0.03, 0.02))
     strays: tuple[Vec3, ...] = ((0.8, -0.5, 2.4), (-0.7, 0.4, 2.9))
     noise_across_m: float = 25e-6
@@ -110,9 +115,14 @@ class OptiTrackScene:
         self._rng = rng
         self._behaviour = behaviour
         self._start_s = world.now()
-        self._offsets = np.array([(0.0, 0.0, 0.0), *behaviour.companions])
+        self._further = behaviour.further
+        first = world.marker_in_sensor(sensor, self._start_s)
+        further = [
+            world.marker_in_sensor(sensor, self._start_s, name) - first for name in self._further
+        ]
+        self._offsets = np.array([(0.0, 0.0, 0.0), *(further or behaviour.companions)])
         self._strays = np.reshape(np.array(behaviour.strays, dtype=float), (-1, 3))
-        members = range(1, len(self._offsets) + 1)
+        members = [1, *(self._further.values() or range(2, len(self._offsets) + 1))]
         stray_labels = range(_FIRST_STRAY_ID, _FIRST_STRAY_ID + len(self._strays))
         self._labels = (*(behaviour.body_id << 16 | m for m in members), *stray_labels)
         across, along = behaviour.noise_across_m, behaviour.noise_along_m
@@ -120,6 +130,8 @@ class OptiTrackScene:
         self._occlusion = (self._start_s, self._start_s)
         self._plan_occlusion(self._start_s)
         self._hidden_params: int | None = None
+        # Which of the markers that are followed is hidden, where not all are.
+        self._hidden_place = 0
         self._guess_error = np.zeros(3)
         self._last_seen = np.zeros_like(self._offsets)
 
@@ -162,13 +174,23 @@ class OptiTrackScene:
         points[size:] += self._strays
         seen = points[:size]
         truth = self._offsets + self._world.marker_in_sensor(self._sensor, t)
+        for place, name in enumerate(self._further, 1):
+            truth[place] = self._world.marker_in_sensor(self._sensor, t, name)
         seen += truth
         params = [MEASURED | HAS_MODEL] * size + [MEASURED | UNLABELED] * len(self._strays)
         if hidden_params is not None:
-            hidden = 1 if tracked else size
+            hidden = [self._hidden_place] if tracked else list(range(size))
             guessed = bool(hidden_params & MODEL_FILLED)
-            seen[:hidden] = (truth + self._guess_error if guessed else self._last_seen)[:hidden]
-            params[:hidden] = [hidden_params] * hidden
+            seen[hidden] = (truth + self._guess_error if guessed else self._last_seen)[hidden]
+            for place in hidden:
+                params[place] = hidden_params
+        faults = self._world.faults(self._sensor)
+        if 'hidden' in faults:
+            place = self._place_of(faults['hidden'])
+            seen[place], params[place] = self._last_seen[place], OCCLUDED | HAS_MODEL
+        if 'exchanged' in faults:
+            pair = [0, self._place_of(faults['exchanged'])]
+            seen[pair] = seen[pair[::-1]]
         self._last_seen = seen
 
         old = version < (3, 0)
@@ -210,7 +232,7 @@ class OptiTrackScene:
         return round((t - self._start_s + 1000.0) * CLOCK_HZ)
 
     def _hidden(self, t: float, tracked: bool) -> int | None:
-        """Return the flags of the hidden calibration marker; None while it is seen."""
+        """Return the flags of the hidden marker; None while all are seen."""
         start, end = self._occlusion
         if t >= end:
             self._plan_occlusion(end)
@@ -224,8 +246,14 @@ class OptiTrackScene:
             self._hidden_params = None
         elif self._hidden_params is None:
             self._hidden_params = int(self._rng.choice(_HIDDEN))
+            if self._further:
+                self._hidden_place = int(self._rng.integers(len(self._offsets)))
             self._guess_error = self._rng.normal(0.0, self._behaviour.guess_error_m, 3)
         return self._hidden_params
+
+    def _place_of(self, number: float) -> int:
+        """Return where the marker of this number in the body is among the labels."""
+        return self._labels.index(self._behaviour.body_id << 16 | int(number))
 
     def _plan_occlusion(self, after_s: float) -> None:
         rate = self._behaviour.occlusions_per_s

@@ -51,7 +51,8 @@ def simulate_session(
     poses, validation_poses
         For each pose its joint solutions in the order visited, rad, (m, k).
     sensors
-        By name; at every configuration each gives one observation.
+        By name; at every configuration each gives an observation of each of its markers, from one
+        frame.
     markers
         Nominal positions in the tool frame, m, (3,); the true ones lie ``marker_std_m`` away.
     joint_offsets
@@ -75,8 +76,9 @@ def simulate_session(
         effect that this arm cannot show.
     """
     for name, sensor in sensors.items():
-        if sensor.marker not in markers:
-            raise InputError(f"sensor '{name}' follows marker '{sensor.marker}', which is none")
+        for marker in sensor.markers:
+            if marker not in markers:
+                raise InputError(f"sensor '{name}' follows marker '{marker}', which is none")
     solutions = [np.atleast_2d(np.asarray(q, dtype=float)) for q in (*poses, *validation_poses)]
     if not sensors or not solutions or any(q.shape[-1] != len(chain) for q in solutions):
         raise InputError(
@@ -95,20 +97,26 @@ def simulate_session(
     q = np.concatenate(solutions)
     model = model_of_tour(chain, truth, q)
     truth = with_effects(truth, model, effects, effect_rng or rng)
-    points = model.seen(truth.effects).reshape(len(q), len(sensors), 3)
+    seen_by = [s for s, sensor in enumerate(sensors.values()) for _ in sensor.markers]
+    points = model.seen(truth.effects).reshape(len(q), len(seen_by), 3)
 
     pose = np.repeat(np.arange(len(solutions)), [len(part) for part in solutions])
     for s, sensor in enumerate(sensors.values()):
         common = sensor.pose_sigma_m * rng.standard_normal((len(solutions), 3))
-        points[:, s] += common[pose] + sensor.sigma_m * rng.standard_normal((len(q), 3))
-    # Row order as recorded: configuration by configuration, sensor by sensor.
+        for place in np.flatnonzero(np.equal(seen_by, s)):
+            points[:, place] += common[pose] + sensor.sigma_m * rng.standard_normal((len(q), 3))
+        if sensor.further:
+            shared = sensor.frame_sigma_m * rng.standard_normal((len(q), 1, 3))
+            points[:, np.equal(seen_by, s)] += shared
+    # Row order as recorded: configuration by configuration, sensor by sensor, marker by marker.
     position = points.reshape(-1, 3)
     gross = np.flatnonzero(rng.random(len(position)) < outlier_share)
     direction = rng.standard_normal((len(gross), 3))
     position[gross] += outlier_m * direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
     n, names = len(position), list(markers)
-    row = np.repeat(np.arange(len(q)), len(sensors))
+    row = np.repeat(np.arange(len(q)), len(seen_by))
+    several = len(seen_by) > len(sensors)
     came_from = np.concatenate((np.full((1, len(chain)), np.nan), q[:-1]))
     measurements = Measurements(
         observation=np.arange(n),
@@ -116,8 +124,11 @@ def simulate_session(
         configuration=row,
         is_validation=pose[row] >= len(poses),
         stamp_s=np.asarray(SECONDS_PER_CONFIGURATION * (1.0 + row), dtype=float),
-        sensor=np.tile(np.arange(len(sensors)), len(q)),
-        marker=np.tile([names.index(sensor.marker) for sensor in sensors.values()], len(q)),
+        sensor=np.tile(seen_by, len(q)),
+        marker=np.tile(
+            [names.index(marker) for sensor in sensors.values() for marker in sensor.markers],
+            len(q),
+        ),
         q=q[row],
         from_q=came_from[row],
         position=position,
@@ -127,6 +138,7 @@ def simulate_session(
         temperature_c=(
             np.full(n, np.nan) if warming is None else AMBIENT_C + model.visited.warming_k[row]
         ),
+        frame=row if several else None,
     )
     session = Session(
         urdf=urdf,
@@ -134,6 +146,9 @@ def simulate_session(
         tip_link=chain.tip_link,
         markers=nominal,
         sensors={name: sensor.marker for name, sensor in sensors.items()},
+        further_markers={
+            name: tuple(sensor.further) for name, sensor in sensors.items() if sensor.further
+        },
         measurements=measurements,
         marker_std_m=marker_std_m,
         exit_status='complete',

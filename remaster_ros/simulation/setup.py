@@ -122,11 +122,14 @@ def make_world(
     for name, sensor in cell.sensors.items():
         place = settings['sensors'][name]
         T_R_N = place_sensor(place['position_m'], place['look_at_m'], PLACEMENT_STD_M, rng)
-        if sensor.marker not in markers:
-            nominal = np.array(cell.markers[sensor.marker])
-            markers[sensor.marker] = nominal + rng.normal(0, cell.marker_std_m, 3)
+        for marker in sensor.markers:
+            if marker not in markers:
+                nominal = np.array(cell.markers[marker])
+                markers[marker] = nominal + rng.normal(0, cell.marker_std_m, 3)
         acceptance = np.deg2rad(place['acceptance_deg'])
-        sensors[name] = SimulatedSensor(sensor.marker, T_R_N, acceptance_rad=acceptance)
+        sensors[name] = SimulatedSensor(
+            sensor.marker, T_R_N, acceptance_rad=acceptance, further=sensor.further_markers
+        )
     joint_offsets = rng.normal(0, np.deg2rad(settings['offset_std_deg']), len(chain))
     warming = Warming(rng.uniform(2.0, 6.0), rng.uniform(300.0, 1500.0), START_S)
     truth = SessionTruth(joint_offsets, markers, sensors, warming)

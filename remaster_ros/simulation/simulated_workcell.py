@@ -85,6 +85,8 @@ def simulate_workcell(
             place_sensor(sensor.rough_position_m, middle, PLACEMENT_STD_M, placement),
             sigma_m,
             pose_sigma_m,
+            further=sensor.further_markers,
+            frame_sigma_m=sensor.frame_noise_m,
         )
         for name, sensor in cell.sensors.items()
     }

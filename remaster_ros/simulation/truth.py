@@ -6,7 +6,7 @@ No module that estimates or moves an arm may import it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import msgspec
@@ -46,11 +46,14 @@ class SimulatedSensor:
     ----------
     marker
         Name of the marker that it measures.
+    further
+        Further markers that it measures in the same frame, with their numbers in the rigid body.
     T_R_N
         Its true frame in the robot base, (4, 4).
-    sigma_m, pose_sigma_m
-        Error of every point, and error that all points at one pose share, m per axis. They hold
-        for the offline simulation; a fake device has the errors of its own data sheet.
+    sigma_m, pose_sigma_m, frame_sigma_m
+        Error of every point, error that all points at one pose share, and error that the markers
+        of one frame share, m per axis. They hold for the offline simulation; a fake device has
+        the errors of its own data sheet.
     acceptance_rad
         Largest angle between the tool's z axis and the line to the sensor at which a fake device
         sees the marker (a retroreflector takes about 30 degrees, a sphere more).
@@ -61,6 +64,13 @@ class SimulatedSensor:
     sigma_m: float = 0.1e-3
     pose_sigma_m: float = 0.2e-3
     acceptance_rad: float = np.pi
+    further: Mapping[str, int] = field(default_factory=dict)
+    frame_sigma_m: float = 0.0
+
+    @property
+    def markers(self) -> tuple[str, ...]:
+        """Every marker that it measures, `marker` first."""
+        return (self.marker, *self.further)
 
     def in_sensor(self, points_R: FloatArray) -> FloatArray:
         """Map points (..., 3) of the robot base to the sensor's frame N, m."""
@@ -98,8 +108,10 @@ class SessionTruth:
     effect_sizes_m: tuple[float, ...] = ()
     outliers: tuple[int, ...] = ()
 
-    def without_noise(self, chain: SerialChain, sensor: str, q: FloatArray) -> FloatArray:
-        """Where a sensor measures its marker without noise and effects, m, (..., 3).
+    def without_noise(
+        self, chain: SerialChain, sensor: str, q: FloatArray, marker: str = ''
+    ) -> FloatArray:
+        """Where a sensor measures a marker without noise and effects, m, (..., 3).
 
         Parameters
         ----------
@@ -109,9 +121,11 @@ class SessionTruth:
             Name of the sensor, in whose frame N the positions are.
         q
             Reported joint angles, rad, (..., k).
+        marker
+            One of its markers; '' for the first.
         """
         placed = self.sensors[sensor]
-        points_R = chain.positions(q, self.markers[placed.marker], self.joint_offsets)
+        points_R = chain.positions(q, self.markers[marker or placed.marker], self.joint_offsets)
         return placed.in_sensor(points_R)
 
 

@@ -183,18 +183,22 @@ class World:
 
     # What sensors see
 
-    def marker_in_sensor(self, sensor: str, t: float) -> FloatArray:
-        """True position of the sensor's marker in the sensor's frame at time t, m, (3,)."""
+    def marker_in_sensor(self, sensor: str, t: float, marker: str = '') -> FloatArray:
+        """True position of a marker, '' for the first, in the sensor's frame at time t, m, (3,).
+
+        The fault ``swapped`` is one of the first marker alone.
+        """
         self._sensor(sensor)
         q = self.reported(t)[0]
         if self.truth.effects:
             with self._lock:
-                marker_N = self._wrong.marker_in_sensor(sensor, t, q)
+                marker_N = self._wrong.marker_in_sensor(sensor, t, q, marker)
         else:
             # The same, several times as fast.
-            marker_N = self.truth.without_noise(self.chain, sensor, q)
+            marker_N = self.truth.without_noise(self.chain, sensor, q, marker)
         faults = self.faults(sensor)
-        marker_N[0] += faults.get('swapped', 0.0)
+        if not marker:
+            marker_N[0] += faults.get('swapped', 0.0)
         marker_N[1] += faults.get('bumped', 0.0)
         return marker_N
 

@@ -153,13 +153,17 @@ def measured(
     state: ArmState,
     name: str,
     sensor: SimulatedSensor,
-    marker: FloatArray,
+    marker: str,
+    position: FloatArray,
     wrong: Deviation | None,
 ) -> FloatArray:
-    """What the named sensor measures of a marker of the tool frame (3,), in N, m, (n, 3)."""
+    """What the named sensor measures of a marker at a position of the tool frame (3,), m, (n, 3).
+
+    In the sensor's frame N.
+    """
     if wrong is None:
-        return sensor.in_sensor(placed(state, marker, None))
-    moved = marker + wrong.marker[:, wrong.markers.index(sensor.marker)]
+        return sensor.in_sensor(placed(state, position, None))
+    moved = position + wrong.marker[:, wrong.markers.index(marker)]
     return wrong.measured(name, sensor.in_sensor(placed(state, moved, wrong)))
 
 
@@ -195,7 +199,7 @@ class WorldModel:
     def seen(self, effects: Sequence[HiddenEffect] = ()) -> FloatArray:
         """What the sensors see without noise, each in its own frame N, m, (n, 3).
 
-        Rows as they are recorded: at every configuration one of each sensor.
+        Rows as they are recorded: at every configuration one of each marker of each sensor.
         """
         q, wrong = self.visited.q + self.joint_offsets, None
         if effects:
@@ -204,16 +208,22 @@ class WorldModel:
             q = q + wrong.angle
         state = self.arm.state(q)
         points = [
-            measured(state, name, sensor, self.markers[sensor.marker], wrong)
+            measured(state, name, sensor, marker, self.markers[marker], wrong)
             for name, sensor in self.sensors.items()
+            for marker in sensor.markers
         ]
         return np.stack(points, axis=1).reshape(-1, 3)
 
     @cached_property
     def distance_m(self) -> dict[str, float]:
         """Mean distance of what each sensor measures, m."""
-        points = self._as_drawn.reshape(-1, len(self.sensors), 3)
-        return dict(zip(self.sensors, np.linalg.norm(points, axis=2).mean(axis=0).tolist()))
+        seen_by = [name for name, sensor in self.sensors.items() for _ in sensor.markers]
+        points = self._as_drawn.reshape(-1, len(seen_by), 3)
+        length = np.linalg.norm(points, axis=2).mean(axis=0)
+        return {
+            name: float(np.mean(length[[name == other for other in seen_by]]))
+            for name in self.sensors
+        }
 
     def response(self, effect: HiddenEffect) -> FloatArray:
         """How far an effect moves what the sensors see, m, (n, 3)."""
@@ -231,9 +241,9 @@ class WorldModel:
         """
         state = self.arm.state(self.visited.q + self.joint_offsets)
         blocks = []
-        for s, sensor in enumerate(self.sensors.values()):
-            marker = self.markers[sensor.marker]
-            point = placed(state, marker, None)
+        seen = [(s, marker) for s, x in enumerate(self.sensors.values()) for marker in x.markers]
+        for s, marker in seen:
+            point = placed(state, self.markers[marker], None)
             turns = np.cross(state.axis, point[:, None] - state.origin)
             offsets = np.swapaxes(turns, 1, 2)
             centered = point - point.mean(axis=0)
@@ -242,10 +252,11 @@ class WorldModel:
             frames = np.zeros((len(point), 3, 6 * len(self.sensors)))
             frames[:, :, 6 * s : 6 * s + 6] = np.concatenate((shifted, turned), axis=2)
             places = np.zeros((len(point), 3, 3 * len(self.markers)))
-            first = 3 * list(self.markers).index(sensor.marker)
+            first = 3 * list(self.markers).index(marker)
             places[:, :, first : first + 3] = state.tool
             block = np.concatenate((offsets, frames, places), axis=2)
-            blocks.append(np.einsum('ji,njp->nip', sensor.T_R_N[:3, :3], block))
+            R_R_N = list(self.sensors.values())[s].T_R_N[:3, :3]
+            blocks.append(np.einsum('ji,njp->nip', R_R_N, block))
         return np.stack(blocks, axis=1).reshape(-1, 3, blocks[0].shape[2])
 
     def left(self, response: FloatArray, *, fit_markers: bool = True) -> FloatArray:

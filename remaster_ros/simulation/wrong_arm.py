@@ -64,11 +64,12 @@ class WrongArm:
         smooth = share * share * (3.0 - 2.0 * share)
         return before.map(lambda a, b: a + smooth * (b - a), after)
 
-    def marker_in_sensor(self, name: str, t: float, q: FloatArray) -> FloatArray:
+    def marker_in_sensor(self, name: str, t: float, q: FloatArray, marker: str = '') -> FloatArray:
         """What a sensor would measure without noise, in its frame N, m, (3,), for reported q."""
         sensor, wrong = self._truth.sensors[name], self.deviation(t)
+        marker = marker or sensor.marker
         state = self._arm.state(q + self._truth.joint_offsets + wrong.angle)
-        return measured(state, name, sensor, self._truth.markers[sensor.marker], wrong)[0]
+        return measured(state, name, sensor, marker, self._truth.markers[marker], wrong)[0]
 
     def _deviation(self) -> Deviation:
         """Work out what is wrong at the last stop, with all that went before."""

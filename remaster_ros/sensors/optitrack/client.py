@@ -241,7 +241,7 @@ class NatNetClient(MarkerFollower):
             self._take_answer(message)
 
     def _take_frame(self, frame: Frame, received_s: float, sender: Source) -> None:
-        sample = self._take_whole_frame(frame, received_s, sender)
+        samples = self._take_whole_frame(frame, received_s, sender)
         if sender != self._lock.source:
             return
         self._malformed_in_a_row = 0
@@ -251,7 +251,7 @@ class NatNetClient(MarkerFollower):
         self._bitstream_changed = bitstream_changed
         if frame.params & MODEL_LIST_CHANGED:
             self._model_wanted = True
-        if sample is not None:
+        for sample in samples:
             self._hand_on(sample)
 
     def _take_answer(self, message: Message) -> None:
@@ -260,7 +260,7 @@ class NatNetClient(MarkerFollower):
             self._take_server(message)
         elif isinstance(message, ModelDefinition):
             self._model_wanted = False
-            self._gate.name_assets(message.labelled_assets)
+            self._name_assets(message.labelled_assets)
         elif isinstance(message, natnet.Response):
             self._take_bitstream(message)
         elif isinstance(message, natnet.Notice):

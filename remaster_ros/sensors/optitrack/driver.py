@@ -1,4 +1,4 @@
-"""An OptiTrack bar as the sensor of a node: the measured positions of one marker.
+"""An OptiTrack bar as the sensor of a node: the measured positions of the markers of a body.
 
 Occluded, model-filled and otherwise unmeasured frames never become a reading; they are counted
 with their reason in the state, which also states what is wrong when nothing comes.
@@ -33,7 +33,11 @@ class Parameters(NatNetSettings, SensorParameters):
     )
     rigid_body: str = parameter('', 'name of the rigid body in Motive; empty for the only one')
     member: int = parameter(
-        1, 'number of the marker in that body; 0 for a lone marker without a body', low=0, high=999
+        1,
+        'number in that body of the marker that the cell file names first; 0 for a lone marker '
+        'without a body',
+        low=0,
+        high=999,
     )
     marker_id: int = parameter(
         0, 'id of the marker on the wire instead of body and member; 0 for these', low=0
@@ -45,6 +49,7 @@ class OptiTrackDriver(StreamDriver):
 
     parameters_type = Parameters
     device = 'OptiTrack'
+    several_markers = True
 
     def __init__(self, parameters: Parameters, clock: SensorClock) -> None:
         p = parameters
@@ -56,6 +61,9 @@ class OptiTrackDriver(StreamDriver):
         )
         self._samples: queue.SimpleQueue[MarkerSample] = queue.SimpleQueue()
         self._mapping = ClockMapping(simulated=clock.simulated)
+        # The markers of a frame have one time of capture.
+        self._frame: tuple[int, float, float] | None = None
+        self._captured_s = 0.0
         kind = NatNetClientBackend if p.client == 'natnetclient' else NatNetClient
         self.client = kind(replace(p, marker=marker), self._samples.put, clock=clock.now)
         self.client.start()
@@ -72,10 +80,13 @@ class OptiTrackDriver(StreamDriver):
         if sample.received_s <= 0.0:
             # By a simulated clock that has not begun, no time of capture can be given.
             return None
-        captured_s = self._mapping.capture_time(
-            sample.timestamp_s, sample.age_s, sample.received_s
-        )
-        return MarkerReading(captured_s, sample.position)
+        frame = (sample.frame_number, sample.timestamp_s, sample.received_s)
+        if frame != self._frame:
+            self._frame = frame
+            self._captured_s = self._mapping.capture_time(
+                sample.timestamp_s, sample.age_s, sample.received_s
+            )
+        return MarkerReading(self._captured_s, sample.position, marker=sample.marker)
 
     def state(self) -> SensorState:
         """Return what the frames, and those that do not come, show."""
@@ -90,6 +101,9 @@ class OptiTrackDriver(StreamDriver):
             'refused_sources': ', '.join([*status.rivals, *status.contestants, *status.foreign]),
             **{f'dropped_{reason}': count for reason, count in status.dropped.items()},
         }
+        for name, counts in self.client.further_counts().items():
+            values[f'accepted_{name}'] = counts.accepted
+            values[f'not_seen_{name}'] = str(counts.last_reason or '')
         odd = warning(status)
         return SensorState(
             ready=diagnosis.fault in ('none', 'marker'),

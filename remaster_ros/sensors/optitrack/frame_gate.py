@@ -124,6 +124,8 @@ class MarkerSample:
         How well the cameras' rays meet, m per ray; NaN before NatNet 3.
     received_s
         When the datagram arrived here, by the clock given to the client, s.
+    marker
+        Name of a further marker; '' for the calibration marker itself.
     """
 
     frame_number: int
@@ -133,6 +135,7 @@ class MarkerSample:
     position: FloatArray
     residual_m: float
     received_s: float
+    marker: str = ''
 
 
 @dataclass(kw_only=True)

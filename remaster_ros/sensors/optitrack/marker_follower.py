@@ -1,4 +1,4 @@
-"""What both OptiTrack clients have in common: the thread, the marker, counts and diagnosis."""
+"""What both OptiTrack clients have in common: the thread, the markers, counts and diagnosis."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from remaster_ros.errors import DeviceError
@@ -15,7 +15,12 @@ from remaster_ros.sensors.optitrack.diagnosis import (
     StreamStatus,
     diagnose,
 )
-from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerGate, MarkerSample
+from remaster_ros.sensors.optitrack.frame_gate import (
+    Dropped,
+    GateCounts,
+    MarkerGate,
+    MarkerSample,
+)
 from remaster_ros.sensors.optitrack.frame_source import Source, SourceLock, SourceVerdict, describe
 from remaster_ros.sensors.optitrack.protocol.frames import Frame
 from remaster_ros.sensors.optitrack.protocol.natnet import encode_echo_request
@@ -28,14 +33,18 @@ _log = logging.getLogger('remaster_ros')
 
 
 class MarkerFollower(ABC):
-    """Follows one marker of an OptiTrack server in a thread of its own.
+    """Follows the markers of one rigid body of an OptiTrack server in a thread of its own.
+
+    Each marker is judged by itself: one that is hidden, filled in by the model or that jumps gives
+    no reading, and the others of the frame do.
 
     Parameters
     ----------
     settings
-        How to reach the server, and which marker to follow.
+        How to reach the server, and which markers to follow.
     on_sample
-        Called in the thread with every reading. What it raises is logged.
+        Called in the thread with every reading, those of a frame one after the other. What it
+        raises is logged.
     clock
         Gives the time at which a datagram arrived, s.
     """
@@ -51,6 +60,11 @@ class MarkerFollower(ABC):
         self._clock = clock
         self._status = StreamStatus()
         self._gate = MarkerGate(settings.marker, self._status)
+        self._further = {
+            name: MarkerGate(choice, GateCounts())
+            for name, choice in settings.choices().items()
+            if name
+        }
         self._lock = SourceLock(settings.silence_s)
         self._believed_before: Source | None = None
         self._thread: threading.Thread | None = None
@@ -121,6 +135,10 @@ class MarkerFollower(ABC):
             contestants=tuple(map(describe, self._lock.contestants(now)[:FOREIGN_REMEMBERED])),
         )
 
+    def further_counts(self) -> dict[str, GateCounts]:
+        """Return the counts of each further marker, by name."""
+        return {name: gate.counts for name, gate in self._further.items()}
+
     def diagnosis(self) -> Diagnosis:
         """Return what is wrong when readings are missing, and the remedy."""
         return diagnose(self.status(), self._settings)
@@ -175,19 +193,24 @@ class MarkerFollower(ABC):
         self._gate.drop(Dropped.MALFORMED)
         self._status.last_malformed = str(what)
 
+    def _name_assets(self, assets: Mapping[str, int]) -> None:
+        """Find the markers' ids among the rigid bodies that the server streams, by name."""
+        for gate in (self._gate, *self._further.values()):
+            gate.name_assets(assets)
+
     def _take_whole_frame(
         self, frame: Frame, received_s: float, source: Source
-    ) -> MarkerSample | None:
-        """Account for a frame that decoded to its end, and find its reading."""
+    ) -> list[MarkerSample]:
+        """Account for a frame that decoded to its end, and find its readings."""
         now = time.monotonic()
         before = self._lock.source
         verdict = self._lock.judge(source, now)
         if verdict is SourceVerdict.FOREIGN:
             self._gate.drop(Dropped.FOREIGN)
-            return None
+            return []
         if verdict is SourceVerdict.PROBATION:
             self._gate.pass_over(Dropped.PROBATION)
-            return None
+            return []
         if before is None:
             self._begin_source(source)
         self._status.last_malformed = ''
@@ -195,15 +218,20 @@ class MarkerFollower(ABC):
         connection = self._status.server.connection if self._status.server is not None else None
         ticks_per_s = connection.clock_frequency if connection is not None else 0
         sample = self._gate.admit(frame, received_s, ticks_per_s)
+        samples = [] if sample is None else [sample]
+        for name, gate in self._further.items():
+            if (sample := gate.admit(frame, received_s, ticks_per_s)) is not None:
+                samples.append(replace(sample, marker=name))
         if self._gate.resolved:
             self._ready.set()
-        return sample
+        return samples
 
     def _begin_source(self, source: Source) -> None:
         """Report whose frames are believed from now on."""
         before, self._believed_before = self._believed_before, source
         if before is not None and before != source:
-            self._gate.begin_source()
+            for gate in (self._gate, *self._further.values()):
+                gate.begin_source()
             _log.warning(
                 'OptiTrack: frames of %s are believed from now on, before it was %s',
                 describe(source),

@@ -66,6 +66,11 @@ class NatNetClientBackend(MarkerFollower):
                 'client: natnetclient receives unicast only and cannot choose the bitstream: set '
                 'transport to unicast and bitstream to "", or client to builtin'
             )
+        if settings.further_markers:
+            raise InputError(
+                'client: natnetclient is compared by one marker, but the cell file has '
+                'further_markers: set client to builtin'
+            )
         # It puts underscores for the blanks of a name.
         name = settings.marker.rigid_body.replace(' ', '_')
         marker = dataclasses.replace(settings.marker, rigid_body=name)
@@ -144,7 +149,7 @@ class NatNetClientBackend(MarkerFollower):
 
     def _follow(self, client: Any) -> None:
         """Read frames until the stream falls silent or natnetclient no longer understands it."""
-        self._gate.name_assets({name: body.id for name, body in client.rigid_bodies.items()})
+        self._name_assets({name: body.id for name, body in client.rigid_bodies.items()})
         source = client.data_sock._sock
         source.settimeout(POLL_S)
         failures = 0
@@ -169,12 +174,12 @@ class NatNetClientBackend(MarkerFollower):
                 self._note_malformed(error)
                 continue
             last_frame_s = time.monotonic()
-            sample = self._take_whole_frame(frame, received_s, sender)
+            samples = self._take_whole_frame(frame, received_s, sender)
             if sender != self._lock.source:
                 continue
             theirs = _read(client, datagram)
             failures = failures + 1 if theirs is None else 0
-            if sample is not None:
+            for sample in samples:
                 self._compare(sample, theirs)
 
     def _compare(self, sample: MarkerSample, theirs: tuple[LabeledMarker, ...] | None) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from ipaddress import AddressValueError, IPv4Address
 from typing import Literal
 
@@ -28,6 +29,8 @@ class NatNetSettings:
     ----------
     marker
         Which marker to follow.
+    further_markers
+        Further markers of the same rigid body to follow: their numbers in it by name.
     silence_s
         Without a frame for this long the stream counts as stopped, s (wall clock).
 
@@ -51,6 +54,7 @@ class NatNetSettings:
     data_port: int = parameter(natnet.DEFAULT_DATA_PORT, 'as set in Motive', low=1, high=65535)
     bitstream: str = parameter('', "NatNet version to ask for; empty takes the server's own")
     marker: MarkerChoice = field(default_factory=MarkerChoice)
+    further_markers: Mapping[str, int] = field(default_factory=dict)
     silence_s: float = 1.0
 
     def __post_init__(self) -> None:
@@ -68,6 +72,36 @@ class NatNetSettings:
                 require_supported(natnet.parse_version(self.bitstream))
             except (ValueError, ProtocolError) as error:
                 raise InputError(f'bitstream: {error}') from error
+
+    def choices(self) -> dict[str, MarkerChoice]:
+        """Return which markers to follow: that of `marker` as '', and the further ones by name.
+
+        Raises
+        ------
+        InputError
+            Two of them are the same marker, or a lone marker has none beside it.
+        """
+        first = self.marker
+        found = {'': first}
+        used = {
+            first.member if first.marker_id is None else first.marker_id & 0xFFFF: 'its marker'
+        }
+        for name, member in self.further_markers.items():
+            if first.lone_marker:
+                raise InputError(
+                    f'member: a lone marker belongs to no rigid body, but the cell file has '
+                    f'{name} beside it; set member to its number in the body'
+                )
+            if member in used:
+                raise InputError(
+                    f'member: {name} of further_markers in the cell file has the number {member}, '
+                    f'which is that of {used[member]}; give every marker its own'
+                )
+            used[member] = name
+            asset = None if first.marker_id is None else first.marker_id >> 16 << 16
+            marker_id = None if asset is None else asset | member
+            found[name] = replace(first, member=member, marker_id=marker_id)
+        return found
 
     @property
     def wanted_version(self) -> Version | None:

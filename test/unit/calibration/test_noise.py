@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -21,6 +22,23 @@ def rows_of_two_sensors() -> tuple[Rows, np.ndarray]:
     return found.posterior.rows, found.model.reference
 
 
+@cache
+def rows_of_frames() -> tuple[Rows, np.ndarray]:
+    """Three markers in each frame of the first sensor, hidden from some poses' frames alike."""
+    found = estimate(Problem.of(scene(61, poses=15, sensor_count=2)[0]))
+    measurements = found.problem.measurements
+    several = (measurements.sensor == 0) & (measurements.pose > 1)
+    hidden = several & (measurements.pose % 4 == 0)
+    source = np.concatenate((np.arange(len(measurements)), *[np.flatnonzero(several)] * 2))
+    kept = np.ones(len(source), bool)
+    kept[-int(several.sum()) :] = ~hidden[several]
+    source = source[kept]
+    frame = np.where(measurements.sensor == 0, measurements.configuration, -1)
+    many = replace(measurements, frame=frame).select(source)
+    rows = Rows.of(many, np.arange(len(many)), found.model.reference)
+    return rows, found.model.reference
+
+
 def a_noise(model: NoiseModel) -> Noise:
     """Every channel's own, so that a mistaken channel shows."""
     count = len(model.channels)
@@ -28,12 +46,14 @@ def a_noise(model: NoiseModel) -> Noise:
     pose_sigma = np.where(
         np.isin(np.arange(count), model.separable), 3e-4 / (1 + np.arange(count)), 0
     )
-    return Noise(sigma, pose_sigma)
+    framed = np.where(np.isin(np.arange(count), model.framed), 2e-4 / (1 + np.arange(count)), 0)
+    return Noise(sigma, pose_sigma, framed)
 
 
 @pytest.mark.parametrize('split', SPLITS)
-def test_whitening_makes_noise_of_the_model_white(split):
-    rows, reference = rows_of_two_sensors()
+@pytest.mark.parametrize('given', [rows_of_two_sensors, rows_of_frames])
+def test_whitening_makes_noise_of_the_model_white(given, split):
+    rows, reference = given()
     model = NoiseModel.of(rows, reference, split)
     noise = a_noise(model)
     seed = 3
@@ -45,6 +65,8 @@ def test_whitening_makes_noise_of_the_model_white(split):
         shape = (len(rows), channel.dimension, 400)
         common = rng.standard_normal((len(rows.group_start), *shape[1:]))[rows.group_of_row]
         drawn = noise.pose_sigma[index] * common + noise.sigma[index] * rng.standard_normal(shape)
+        of_frames = rng.standard_normal((len(rows.frame_start), *shape[1:]))
+        drawn += noise.frame_sigma[index] * np.repeat(of_frames, rows.frame_size, axis=0)
         mine = dict(rows.spans)[channel.sensor]
         values[mine, axes] = drawn[mine]
     if model.frames is not None:
@@ -58,8 +80,9 @@ def test_whitening_makes_noise_of_the_model_white(split):
 
 
 @pytest.mark.parametrize('split', SPLITS)
-def test_sums_grams_and_whitening_are_of_one_likelihood(split):
-    rows, reference = rows_of_two_sensors()
+@pytest.mark.parametrize('given', [rows_of_two_sensors, rows_of_frames])
+def test_sums_grams_and_whitening_are_of_one_likelihood(given, split):
+    rows, reference = given()
     model = NoiseModel.of(rows, reference, split)
     noise = a_noise(model)
     vectors = np.random.default_rng(4).standard_normal((len(rows), 3, 5))

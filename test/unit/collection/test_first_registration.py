@@ -48,3 +48,17 @@ def test_points_that_do_not_agree_register_nothing_until_enough_do():
     assert registration.add([reading(PLACES[3])]) == ['mocap']
     assert not registration.troubles
     np.testing.assert_allclose(registration.T_R_N['mocap'], T_R_N, atol=1e-6)
+
+
+def test_the_markers_of_one_frame_are_one_place():
+    """Three points of a tool lie too close together to register a sensor by."""
+    body = {'sir': MARKERS['sir'], 'b': np.array([0.0, 0.09, 0.0]), 'c': np.zeros(3)}
+    registration = FirstRegistration(CHAIN, body, ['mocap'], 0.025)
+
+    def frame(q):
+        seen = {name: apply(inverse(T_R_N), CHAIN.positions(q, at)) for name, at in body.items()}
+        return [PairedReading('mocap', name, 1.0, q, at, None, 1) for name, at in seen.items()]
+
+    assert [registration.add(frame(q)) for q in PLACES[:3]] == [[], [], ['mocap']]
+    np.testing.assert_allclose(registration.T_R_N['mocap'], T_R_N, atol=1e-9)
+    assert registration.describe() == 'mocap: point 3 of 3'

@@ -1,5 +1,7 @@
 """Pairing: only what was captured after settling, while the arm stood, is ever an observation."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -301,3 +303,88 @@ def test_who_was_waited_for():
     waited = pairing.waited_s()
     assert waited['mocap'] == pytest.approx(0.5, abs=0.05)
     assert sum(waited.values()) == pytest.approx(4.0, abs=0.05)
+
+
+THREE = replace(STREAM, further=('b', 'c'))
+
+
+def frames(pairing, seen, *, until=1.0, start=10.0, joints_until=None, order=1):
+    """Feed joint states at 50 Hz and frames at 100 Hz; `seen` tells which markers one shows."""
+    stamps = start + np.arange(-0.1, until, 0.01)
+    for name in ('', 'b', 'c')[::order]:
+        for stamp in stamps:
+            if seen(name or 'sir', stamp - start):
+                position = np.array([stamp, 'bc'.find(name), 0.0]) * 1e-6
+                pairing.add_reading('mocap', MarkerReading(stamp, position, marker=name))
+    for t in np.arange(-0.1, joints_until or until, 0.02):
+        pairing.add_joint_state(start + t, Q)
+    return pairing
+
+
+def taken(pairing):
+    """Return the samples of each marker of the bar."""
+    first = pairing.decided['mocap']
+    readings = [first, *pairing.further.get('mocap', [])]
+    assert all(isinstance(one, PairedReading) for one in readings), readings
+    assert len({(one.stamp_s, one.q.tobytes()) for one in readings}) == 1
+    return {one.marker: one.samples for one in readings}
+
+
+@pytest.mark.parametrize('order', [1, -1])
+def test_the_markers_of_a_frame_are_taken_together(order):
+    pairing = frames(Pairing(10.0, Q, (THREE,)), lambda name, t: True, order=order)
+    assert taken(pairing) == {'sir': 50, 'b': 50, 'c': 50}
+    assert not pairing.left_out
+
+
+def test_nothing_is_decided_while_a_marker_may_still_come():
+    """Its messages are late: the joint states are 0.2 s ahead of them."""
+    late = frames(Pairing(10.0, Q, (THREE,)), lambda name, t: name != 'c', joints_until=0.72)
+    assert not late.decided
+    late = frames(late, lambda name, t: name == 'c')
+    assert taken(late) == {'sir': 50, 'b': 50, 'c': 50}
+
+
+@pytest.mark.parametrize('hidden', ['sir', 'b'])
+def test_a_hidden_marker_is_left_out_and_the_others_count(hidden):
+    """Also the one that the sensor follows; the arm waits 0.3 s beyond the dwell and no more."""
+    pairing = Pairing(10.0, Q, (THREE,))
+    frames(pairing, lambda name, t: name != hidden, until=0.84)
+    assert set(taken(pairing)) == {'sir', 'b', 'c'} - {hidden}
+    assert [(item.reason, item.detail) for item in pairing.left_out] == [
+        ('hidden', f'{hidden} was not seen')
+    ]
+
+
+def test_a_marker_that_was_seen_too_seldom_is_left_out():
+    rules = Pairing(10.0, Q, (THREE,))
+    pairing = frames(rules, lambda name, t: name != 'c' or t < 0.025 or t > 0.485)
+    assert taken(pairing) == {'sir': 50, 'b': 50}
+
+
+def test_where_all_are_hidden_the_first_that_comes_back_ends_the_dwell():
+    pairing = frames(
+        Pairing(10.0, Q, (THREE,)),
+        lambda name, t: t > (0.995 if name == 'b' else 1.295),
+        until=2.0,
+    )
+    assert taken(pairing) == {'b': 5}
+    assert pairing.decided['mocap'].stamp_s == pytest.approx(11.04)
+
+
+def test_a_marker_that_moves_by_itself_is_left_out():
+    pairing = Pairing(10.0, Q, (THREE,))
+    for stamp in 10.0 + np.arange(0.0, 1.0, 0.01):
+        for name in ('', 'b', 'c'):
+            swing = 2e-3 * np.sin(40.0 * stamp) if name == '' else 1e-6 * stamp
+            place = np.array([swing, 0.0, 0.0])
+            pairing.add_reading('mocap', MarkerReading(stamp, place, marker=name))
+    run(pairing, skip_stream=True)
+    assert set(taken(pairing)) == {'b', 'c'}
+    assert [item.reason for item in pairing.left_out] == ['unsteady']
+
+
+def test_markers_that_never_come_are_a_sensor_without_reading():
+    pairing = frames(Pairing(10.0, Q, (THREE,)), lambda name, t: False, until=3.0)
+    pairing.give_up(13.0)
+    assert pairing.decided['mocap'].reason == 'stale'

@@ -21,11 +21,15 @@ class Judge:
     def __init__(self, refused=''):
         self.refused, self.asked = refused, []
 
-    def judge(self, reading, T_R_N, *, anywhere):
-        self.asked.append((reading.sensor, T_R_N, anywhere))
-        if reading.sensor == self.refused:
-            return Rejection(reading.sensor, 'swapped', 'far off')
-        return reading
+    def judge_frame(self, readings, T_R_N, *, anywhere):
+        name = readings[0].sensor
+        self.asked.append((name, T_R_N, anywhere))
+        return [
+            Rejection(name, 'swapped', 'far off')
+            if self.refused in (name, reading.marker)
+            else reading
+            for reading in readings
+        ]
 
 
 class Bench:
@@ -263,3 +267,28 @@ def test_what_was_recorded_before_is_not_read_again():
     assert (event.stamp, event.solution, event.result) == (POSE.stamp, 1, 'partial')
     assert event.reason == 'recorded before'
     assert event.measuring_s is None
+
+
+def test_markers_of_a_frame_end_together_and_one_that_is_none_costs_no_other():
+    """One good marker makes the configuration recorded; without any the sensor is refused."""
+    rules = SensorRules('mocap', 'sir', min_samples=5, further=('b', 'c'))
+    for refused, left, result in (
+        ('', 3, 'recorded'),
+        ('b', 2, 'recorded'),
+        ('mocap', 0, 'rejected'),
+    ):
+        bench = Bench(rules, refused=refused)
+        bench.announce()
+        bench.settle(Q)
+        ended = []
+        for i in range(40):
+            bench.t += 0.02
+            for name in ('', 'b', 'c'):
+                place = np.array([1.0, 1e-6 * (i % 3), 0.0])
+                bench.recording.take_reading('mocap', MarkerReading(bench.t, place, marker=name))
+            bench.recording.take_joints(bench.t, Q)
+            ended.append(bench.recording.end({}))
+        (end,) = [item for item in ended if item is not None]
+        assert (len(end.accepted), end.result) == (left, result)
+        assert [item.reason for item in end.left_out] == ['swapped'] * (refused == 'b')
+        assert len(end.rejected) == (refused == 'mocap')

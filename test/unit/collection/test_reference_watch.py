@@ -1,5 +1,7 @@
 """References: few are enough, every change is named and measured, nothing is found in nothing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -308,3 +310,21 @@ def test_too_few_or_flat_candidates_are_weak():
     weak = choose_references(CHAIN, planar, still)
     assert weak.smallest < 1.0
     assert choose_references(CHAIN, np.empty((0, len(CHAIN))), SEEN).indices == ()
+
+
+def test_further_markers_of_a_sensor_begin_no_round_and_change_nothing():
+    """They share the errors of the first one: counted as well, noise would look like a change."""
+    scene = Scene(3, only=('mocap',))
+    watches = [ReferenceWatch(CHAIN, {**MARKERS, 'b': MARKERS['sir']}) for _ in range(2)]
+    for _ in range(4):
+        scene.readings.clear()
+        scene.round()
+        for row in scene.readings:
+            for watch in watches:
+                watch.add(row)
+            further = replace(row, marker='b', position=row.position + 1e-3)
+            assert not watches[1].begins_round(further)
+            watches[1].add(further)
+        found = [watch.judge(scene.registered) for watch in watches]
+        assert found[0] == found[1]
+    assert watches[0].rounds == watches[1].rounds == 4

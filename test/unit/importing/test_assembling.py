@@ -184,6 +184,21 @@ def test_two_markers_at_one_stop_are_one_configuration(do):
         '--unchecked',
     ).measurements
     assert made.configuration.tolist() == [i // 2 for i in range(48)]
+    assert made.frame is None
+
+
+def test_two_markers_at_one_moment_are_one_frame(do):
+    """Measured one after the other, as the last two are, they share no error."""
+    arm, run = do
+    q = np.repeat(arm.q[:24], 2, axis=0)
+    time = np.repeat(10.0 * np.arange(24), 2)
+    time[-1] += 2.0
+    made = run(
+        ['marker', 'time', *HEADER],
+        [['a', 'b'] * 24, time, *np.rad2deg(q).T, *(1e3 * arm.points.T)],
+        '--unchecked',
+    ).measurements
+    assert made.frame.tolist() == [*np.repeat(np.arange(23), 2).tolist(), -1, -1]
 
 
 def test_joints_outside_their_limits_name_the_row_and_the_remedies(do):

@@ -65,6 +65,7 @@ def test_folders_are_beside_the_parameter_file_wherever_launch_was_started(tmp_p
     assert nodes['recorder'].parameters[1] == {'cell': CELL, **session}
     assert nodes['pose_planner'].parameters[1] == {'cell': CELL, **session}
     assert nodes['optimizer'].parameters[1] == {
+        'cell': CELL,
         **session,
         'out': str(tmp_path / 'results/fit'),
         'discovery': str(tmp_path / 'discovery'),
@@ -101,6 +102,20 @@ def test_sensors_by_the_names_of_the_cell(tmp_path, monkeypatch):
     lost = edited(tmp_path, lambda data: data.pop('/**/laser_tracker_markers'))
     with pytest.raises(InputError, match="no node for the sensor 'tracker'"):
         real_nodes(CELL, lost)
+
+
+def test_a_topic_of_another_package_needs_no_section(tmp_path):
+    text = Path(CELL).read_text(encoding='utf-8')
+    text = text.replace('../robots', str(Path(CELL).parents[1] / 'robots')).replace(
+        'topic: optitrack/marker',
+        'topic: /vrpn/tool\n    message_type: geometry_msgs/msg/PoseStamped',
+    )
+    cell = tmp_path / 'cell.yaml'
+    cell.write_text(text, encoding='utf-8')
+    params = edited(tmp_path, lambda data: data.pop('/**/optitrack_markers'))
+    (node,) = real_nodes(str(cell), params, 'mocap')[len(CORE) :]
+    assert (node.executable, node.name) == ('sensor_markers', 'topic_markers_mocap')
+    assert node.parameters[1] == {'cell': str(cell), 'sensor': 'mocap'}
 
 
 def test_the_names_of_the_arm_are_remapped_within_the_namespace():
@@ -153,14 +168,27 @@ def test_fakes_have_the_clock_of_their_namespace():
 
 
 def test_a_wrong_configuration_is_not_started_again():
-    assert exit_ends_launch(2)
-    assert not any(exit_ends_launch(code) for code in (0, 1, -9, -11, None))
+    assert exit_ends_launch('recorder-3', 2)
+    assert not any(exit_ends_launch('recorder-3', code) for code in (0, 1, -9, -11, None))
+    assert not exit_ends_launch('watch-9', 2), 'the arm does not need the live page'
+
+
+def test_the_live_page_is_started_where_it_is_asked_for():
+    for nodes in (real_nodes(CELL, REAL), fake_nodes(REAL)):
+        assert 'watch' not in [node.name for node in nodes]
+    assert fake_nodes(REAL, dashboard='True')[-1].name == 'watch'
+    nodes = {node.name: node for node in real_nodes(CELL, REAL, dashboard='true')}
+    fit = nodes['optimizer'].parameters[1]['out']
+    assert nodes['watch'].parameters == (REAL, {'cell': CELL, 'fit': fit})
+    with pytest.raises(InputError, match='true or false'):
+        real_nodes(CELL, REAL, dashboard='yes')
 
 
 @pytest.mark.parametrize('name', ['real', 'fake'])
 def test_the_launch_files(name, monkeypatch):
     """Run with stand-ins for launch, which is not on every machine that runs this."""
     given = {'cell': CELL, 'params': REAL, 'sensors': 'all', 'namespace': '/left'}
+    given['dashboard'] = 'false'
     if name == 'fake':
         given['params'] = str(ROOT / 'config' / 'fake.yaml')
 

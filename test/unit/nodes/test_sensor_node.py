@@ -172,13 +172,38 @@ def rig(monkeypatch, tmp_path):
 def test_a_stream_is_published_under_its_time_of_capture(rig):
     r = rig(Stream, scale=1.5)
     assert r.driver.p.scale == 1.5
-    r.wait(lambda: r.node._readings.get_subscription_count(), 'the match')
+    r.wait(lambda: r.node._readings[''].get_subscription_count(), 'the match')
     r.driver.readings.append(MarkerReading(7.25, PLACE))
     r.wait(lambda: r.points, 'the point')
     (point,) = r.points
     assert (seconds(point.header.stamp), point.header.frame_id) == (7.25, 'mocap')
     assert (point.point.x, point.point.y, point.point.z) == tuple(PLACE)
     assert {'sensor': 'mocap', 'ready': 'yes', 'published': 1}.items() <= r.values().items()
+
+
+class Body(Stream):
+    """The same, of several markers."""
+
+    several_markers = True
+
+
+def test_markers_of_a_frame_have_topics_of_their_own_and_one_stamp(rig):
+    r = rig(Body, cell='quick')
+    assert dict(r.driver.p.further_markers) == {'sir_2': 2, 'sir_3': 3}
+    further = []
+    r.peer.create_subscription(PointStamped, 'optitrack/marker/sir_3', further.append, 10)
+    r.wait(
+        lambda: all(r.node._readings[name].get_subscription_count() for name in ('', 'sir_3')),
+        'the match',
+    )
+    r.driver.readings += [
+        MarkerReading(7.25, PLACE),
+        MarkerReading(7.25, PLACE + 0.05, marker='sir_3'),
+    ]
+    r.wait(lambda: r.points and further, 'both points')
+    assert r.points[0].header == further[0].header
+    assert further[0].point.x == PLACE[0] + 0.05
+    assert len(r.points) == len(further) == 1
 
 
 def test_a_stream_that_is_lost_is_opened_again(rig):
@@ -292,3 +317,8 @@ def test_a_node_that_hears_commands_is_named_so_that_the_bridge_can_tell(rig):
 def test_a_sensor_that_is_not_so_in_the_cell_is_refused(rig, driver, sensor, words):
     with pytest.raises(InputError, match=words):
         rig(driver, name=f'gauge_{driver.__name__}_{sensor}', sensor=sensor)
+
+
+def test_a_device_of_one_marker_refuses_a_cell_with_several(rig):
+    with pytest.raises(InputError, match='has further_markers, but a gauge measures one marker'):
+        rig(Stream, name='gauge_of_one', cell='quick')

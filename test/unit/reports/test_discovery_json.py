@@ -165,7 +165,7 @@ def test_noise_along_the_line_of_sight_is_drawn_by_sensor(saved):
     found, _ = saved
     data = found.residuals
     noise_model = NoiseModel.of(data.rows, np.eye(4)[None], (0,))
-    noise = Noise(np.array([0.3e-3, 0.0]), np.array([0.0, 0.6e-3]))
+    noise = Noise(np.array([0.3e-3, 0.0]), np.array([0.0, 0.6e-3]), np.zeros(2))
     selection = replace(
         found.selection,
         empty=replace(found.selection.empty, noise=noise),

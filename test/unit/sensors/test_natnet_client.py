@@ -7,6 +7,7 @@ import socket
 import struct
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from fuzz_messages import full_frame
 from fuzzing import DatagramSource
 from optitrack_world import RATE, SENSOR, MarkerWorld, eventually, free_port, open_descriptors
 
-from remaster_ros.errors import DeviceError
+from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.sensors.optitrack import client as natnet_client
 from remaster_ros.sensors.optitrack.client import NatNetClient, _is_of_no_use
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
@@ -486,3 +487,86 @@ def test_stopping_leaves_nothing_behind(data_port):
             pass
         client.stop()  # a second time
     assert (threading.active_count(), open_descriptors()) == before
+
+
+class BodyWorld(MarkerWorld):
+    """A body of three markers that keeps its orientation."""
+
+    def __init__(self):
+        super().__init__()
+        self.current = {}
+        self.places = {'': np.zeros(3), 'b': np.array([0.1, 0, 0]), 'c': np.array([0, 0.07, 0])}
+
+    def marker_in_sensor(self, sensor, t, marker=''):
+        return super().marker_in_sensor(sensor, t) + self.places[marker]
+
+    def faults(self, device):
+        return self.current
+
+
+@pytest.mark.parametrize('version', [(2, 10), (3, 1), (4, 1)])
+def test_all_markers_of_a_frame_are_read_and_a_hidden_one_hides_no_other(version, data_port):
+    """Any of them may be hidden, also the one that is followed; the others are where they were."""
+    samples, world = [], BodyWorld()
+    # The numbers in the body leave one out.
+    further = {'b': 2, 'c': 4}
+    behaviour = replace(NOISELESS, further=further)
+    options = {'version': version, 'world': world, 'behaviour': behaviour}
+
+    def names_seen():
+        count = len(samples)
+        assert eventually(lambda: len(samples) > count + 12)
+        return {sample.marker for sample in samples[count + 6 :]}
+
+    with (
+        fake_server(data_port, **options) as server,
+        client_of(
+            server.command_port,
+            data_port,
+            samples.append,
+            clock=world.now,
+            further_markers=further,
+        ) as client,
+    ):
+        assert names_seen() == {'', 'b', 'c'}
+        for number, others in ((1, {'b', 'c'}), (4, {'', 'b'})):
+            world.current = {'hidden': number}
+            assert names_seen() == others
+            assert client.diagnosis().fault == 'none', client.diagnosis()
+        counts = client.further_counts()
+    assert counts['c'].dropped[Dropped.OCCLUDED] > 0
+    assert not any(counts['b'].dropped.values())
+    frames = {}
+    for sample in samples:
+        frame = frames.setdefault(sample.frame_number, {})
+        assert sample.marker not in frame
+        frame[sample.marker] = sample
+    for frame in frames.values():
+        assert len({(s.timestamp_s, s.age_s, s.received_s) for s in frame.values()}) == 1
+        if '' in frame:
+            for name, sample in frame.items():
+                apart = sample.position - frame[''].position
+                # The wire has 32-bit numbers.
+                np.testing.assert_allclose(apart, world.places[name], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('options', 'words'),
+    [
+        ({'further_markers': {'b': 1}}, 'has the number 1, which is that of its marker'),
+        ({'further_markers': {'b': 2, 'c': 2}}, 'has the number 2, which is that of b'),
+        (
+            {'further_markers': {'b': 2}, 'marker': MarkerChoice(lone_marker=True)},
+            'a lone marker belongs to no rigid body',
+        ),
+    ],
+)
+def test_markers_that_cannot_be_told_apart_are_refused(options, words):
+    with pytest.raises(InputError, match=words):
+        NatNetClient(NatNetSettings(**options), lambda sample: None)
+
+
+def test_an_id_on_the_wire_gives_the_body_of_the_further_markers():
+    choice = MarkerChoice(marker_id=7 << 16 | 3)
+    choices = NatNetSettings(marker=choice, further_markers={'b': 5}).choices()
+    assert [found.marker_id for found in choices.values()] == [7 << 16 | 3, 7 << 16 | 5]

@@ -1,0 +1,58 @@
+"""Three markers of the bar through the nodes: one is hidden, the recorder is killed."""
+
+import numpy as np
+import pytest
+from collection_rig import Cell
+
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.bag import BagReader
+from remaster_ros.session.workcell import config_path
+from remaster_ros.simulation.faults import inject
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
+
+
+def test_markers_of_a_frame_are_recorded_together_and_a_hidden_one_costs_nothing(
+    start, client, tmp_path
+):
+    text = config_path('cells/quick.yaml').read_text(encoding='utf-8')
+    text = text.replace('../robots', str(config_path('robots')))
+    path = tmp_path / 'cell.yaml'
+    kept = [line for line in text.splitlines() if not line.startswith(('  design', '  joint_std'))]
+    path.write_text('\n'.join(kept), encoding='utf-8')
+    cell = Cell(start, client, tmp_path, 'mocap', ['mocap'], cell=path)
+    cell.until(lambda: cell.results.count('recorded') > 4, 'the first configurations')
+    inject(tmp_path / 'world', {'mocap': {'hidden': 1}})
+    hidden_from = len(cell.results)
+    cell.until(lambda: len(cell.results) > hidden_from + 2, 'some with a hidden marker')
+    inject(tmp_path / 'world', {})
+    cell.kill_and_start('recorder')
+    session = cell.complete()
+
+    m, truth = session.measurements, cell.world.truth
+    assert session.further_markers == {'mocap': ('sir_2', 'sir_3')}
+    names = np.array(session.marker_names)[m.marker]
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    for name in ('sir', 'sir_2', 'sir_3'):
+        mine = names == name
+        expected = truth.without_noise(chain, 'mocap', m.q[mine], name)
+        assert np.all(np.linalg.norm(m.position[mine] - expected, axis=1) < 0.4e-3), name
+    # Each marker once in a configuration, all of one frame, and where it was hidden the others.
+    of = [sorted(names[m.configuration == number]) for number in np.unique(m.configuration)]
+    assert all(found in (['sir', 'sir_2', 'sir_3'], ['sir_2', 'sir_3']) for found in of), of
+    assert 2 <= of.count(['sir_2', 'sir_3']) < len(of) - 4
+    np.testing.assert_array_equal(m.frame, m.configuration)
+    assert len(of) == cell.planned() > 3
+
+    stamps: dict[str, set[int]] = {}
+    from geometry_msgs.msg import PointStamped
+    from rclpy.serialization import deserialize_message
+
+    for message in BagReader(cell.session / 'bag'):
+        if message.topic.startswith('/optitrack/marker'):
+            stamp = deserialize_message(message.cdr, PointStamped).header.stamp
+            stamps.setdefault(message.topic, set()).add(stamp.sec * 10**9 + stamp.nanosec)
+    second, third = stamps['/optitrack/marker/sir_2'], stamps['/optitrack/marker/sir_3']
+    # Equal stamps in a frame; single frames may have one of them hidden.
+    assert len(second & third) > 0.9 * len(second | third)
+    assert len(stamps['/optitrack/marker'] & second) < len(second)

@@ -1,0 +1,180 @@
+"""The state of the live page: events in, a view out."""
+
+from __future__ import annotations
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+from played_collection import CHAIN, MARKERS, PER_POSE, PlayedCollection
+
+from remaster_ros.collection import events
+from remaster_ros.collection.live_precision import Precision
+from remaster_ros.reports.live_view import LONGEST_TEXT, MOST_NODES, SILENT_S, LiveView, tool_path
+
+
+@pytest.fixture
+def played():
+    return PlayedCollection()
+
+
+def after(played, configurations, every_s=5.0, **step):
+    played.state = 'running'
+    for i in range(configurations):
+        played.step(now=every_s * i, **step)
+    return played.view.view(every_s * (configurations - 1))
+
+
+def test_before_any_node_is_heard_nothing_can_be_begun():
+    view = LiveView(CHAIN, MARKERS).view(0.0)
+    assert view['run']['state'] == 'silent'
+    assert not view['commands']['collect']['on']
+    assert view['commands']['stop']['on']
+    assert {row['message'] for row in view['nodes']} == {'not seen yet'}
+    assert view['scene']['frames'] == []
+
+
+def test_progress_and_time_left(played):
+    view = after(played, 21)
+    run = view['run']
+    assert (run['done'], run['of'], run['poses_done'], run['poses']) == (21, 40, 5, 10)
+    assert run['left'] == 'about 2 min left'
+    assert view['commands']['pause']['on']
+    assert not view['commands']['collect']['on']
+
+
+def test_residuals_points_and_what_will_be_fitted(played):
+    view = after(played, 12)
+    mocap, tracker = view['sensors']
+    assert len(mocap['residuals_mm']) == 12
+    assert mocap['median_mm'] < 0.4
+    assert mocap['registered']
+    assert not tracker['registered']
+    assert (tracker['ready'], tracker['message']) == (False, 'the beam is broken')
+    assert tracker['median_mm'] is None
+    assert len(view['scene']['points']['mocap']) == 12
+    assert sum(map(len, played.view.measured.values())) == 12
+    assert len(played.view.measured) == 12 // PER_POSE
+
+
+@pytest.mark.parametrize(
+    'step', [{'split': 'validation'}, {'split': 'reference'}, {'result': 'rejected'}]
+)
+def test_what_is_not_fitted_adds_nothing_to_the_expected_precision(played, step):
+    after(played, 8, **step)
+    assert played.view.measured == {}
+
+
+def test_a_rejected_configuration_is_told_and_leaves_no_residual(played):
+    view = after(played, 8, result='rejected')
+    assert view['sensors'][0]['residuals_mm'] == []
+    assert view['messages'][0]['text'].startswith('configuration rejected')
+
+
+def test_the_frames_are_those_of_the_links(played):
+    view = after(played, 3)
+    frames = np.array(view['scene']['frames']).reshape(-1, 4, 4)
+    assert np.allclose(frames[0], np.eye(4))
+    assert np.allclose(frames[1:], CHAIN.frames(played.q), atol=1e-5)
+    way = np.array(view['scene']['way'])
+    assert np.allclose(way[-1], CHAIN.positions(played.q, np.zeros(3)), atol=1e-4)
+
+
+def test_a_way_is_straight_in_the_joints():
+    way = np.array([[0.0] * 7, [0.4] * 7, [0.4] * 7])
+    path = tool_path(CHAIN, way, steps=3)
+    middle = CHAIN.positions(np.full(7, 0.2), np.zeros(3))
+    assert path.shape == (6, 3)
+    assert np.allclose(path[1], middle)
+    assert tool_path(CHAIN, way[:1]).shape == (0, 3)
+
+
+def test_a_silent_planner_is_named_and_takes_the_buttons_away(played):
+    after(played, 3)
+    view = played.view.view(10.0 + SILENT_S + 1.0)
+    assert view['run']['message'] == 'no sign of pose_planner'
+    assert not view['commands']['collect']['on']
+    assert not view['commands']['pause']['on']
+    assert view['commands']['stop']['on']
+    assert all('silent for' in row['message'] for row in view['nodes'])
+
+
+@pytest.mark.parametrize('state', ['idle', 'paused', 'stopped'])
+def test_a_halt_is_shown_and_nothing_goes_on(played, state):
+    played.state = state
+    played.beat(1.0)
+    assert played.view.view(1.0)['commands']['collect']['on']
+    played.halted = 'the emergency stop was pressed'
+    played.beat(2.0)
+    view = played.view.view(2.0)
+    assert view['halted'] == 'the emergency stop was pressed'
+    assert not view['commands']['collect']['on']
+    assert set(view['commands']) == {'collect', 'pause', 'stop', 'fit'}, 'none clears a halt'
+
+
+def test_stop_is_labelled_as_no_emergency_stop(played):
+    stop = played.view.view(0.0)['commands']['stop']
+    assert stop['note'].startswith('No emergency stop')
+
+
+@pytest.mark.parametrize(
+    'change',
+    [{'state': 'paused'}, {'halted': 'silence'}, {'changed': 'the tracker was moved'}],
+)
+def test_the_mark_of_what_was_seen_changes_with_what_a_person_decides_by(played, change):
+    played.beat(1.0)
+    before = played.view.seen(1.0)
+    played.beat(2.0)
+    assert played.view.seen(2.0) == before
+    vars(played).update(change)
+    played.beat(3.0)
+    assert played.view.seen(3.0) != before
+    assert played.view.seen(3.0) != played.view.seen(3.0 + SILENT_S + 1.0)
+
+
+def test_expected_standard_deviations_by_configurations_and_minutes(played):
+    after(played, 5)
+    for count, std in ((4, 1e-3), (8, 5e-4)):
+        joints = dict.fromkeys(CHAIN.joint_names, std) | {'joint_1': None}
+        played.view.take_precision(Precision(count, joints))
+    table = played.view.view(20.0)['precision']
+    assert table['configurations'] == [4, 8]
+    assert table['std_deg']['joint_1'] == [None, None]
+    assert table['std_deg']['joint_2'] == [pytest.approx(0.0573, abs=1e-4), 0.028648]
+    assert table['minutes'][-1] > 0.0
+
+
+def test_a_result_needs_every_joint_as_a_number(played):
+    names = CHAIN.joint_names
+    means = dict.fromkeys(names, 0.01)
+    played.view.take_offsets(means, dict.fromkeys(names[:-1], 0.001))
+    played.view.take_offsets(means | {'joint_3': float('nan')}, dict.fromkeys(names, 0.001))
+    assert played.view.view(0.0)['result']['joints'] == []
+    played.view.take_offsets(means | {'joint_9': 0.0}, dict.fromkeys(names, 0.001))
+    joints = played.view.view(0.0)['result']['joints']
+    assert [row['joint'] for row in joints] == list(names)
+    assert joints[0]['mean_deg'] == pytest.approx(np.degrees(0.01), abs=1e-6)
+
+
+def test_strangers_cannot_fill_the_memory_or_break_the_page(played):
+    view, long = played.view, 'x' * 100_000
+    for i in range(1000):
+        view.take_summary(f'stranger_{i}', 'ok', long, {'configurations': long}, 1.0)
+        view.take(events.SensorReport(sensor=f'sensor_{i}', ready=True, message=long), 1.0)
+        view.take(events.ArmStopped(stamp='', reason=long), 1.0)
+        view.take_registration(f'sensor_{i}', np.eye(4))
+    view.take_summary('pose_planner', 'ok', long, {'configurations': 'many'}, 1.0)
+    view.take(events.TourPlanned(long), 1.0)
+    view.take(events.BridgeState(halted=long), 1.0)
+    view.take_joints(np.full(7, np.nan))
+    view.take_target(np.full((4, 4), np.inf))
+    view.take_way(np.full((2, 7), np.nan))
+    view.take_way(np.zeros((10_000, 7)))
+    view.take(events.PlannerState(state=long, run=long), 1.0)
+    shown = view.view(1.0)
+    assert len(shown['nodes']) == MOST_NODES
+    assert len(shown['halted']) == LONGEST_TEXT
+    content = msgspec.json.encode(shown)
+    assert len(content) < 150_000
+    json.loads(content, parse_constant=pytest.fail)
