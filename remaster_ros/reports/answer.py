@@ -224,14 +224,11 @@ def _noise(inputs: Inputs) -> tuple[SensorNoise, ...]:
     rows: list[SensorNoise] = []
     if inputs.found is not None and isinstance(inputs.found.noise.sensors, dict):
         for sensor, noise in inputs.found.noise.sensors.items():
-            shared = noise.pose_sigma_m
-            both = None if shared is None else float(np.hypot(noise.sigma_m, shared))
-            factor = 1e3 * MEAN_LENGTH
-            rows.append(
-                SensorNoise(
-                    sensor, factor * noise.sigma_m, None if both is None else factor * both
-                )
-            )
+            # What the markers of a frame share is in each of its readings.
+            frame = noise.frame_sigma_m if isinstance(noise.frame_sigma_m, float) else 0.0
+            reading, pose = float(np.hypot(noise.sigma_m, frame)), noise.pose_sigma_m
+            both = None if pose is None else 1e3 * MEAN_LENGTH * float(np.hypot(reading, pose))
+            rows.append(SensorNoise(sensor, 1e3 * MEAN_LENGTH * reading, both))
     elif isinstance(inputs.fit.explained_by_noise, dict):
         for sensor, check in inputs.fit.explained_by_noise.items():
             if check.noise_m is not None:

@@ -183,3 +183,9 @@ def test_a_session_alone_is_fitted_first(made: Path, tmp_path: Path) -> None:
     html = (tmp_path / 'out/report.html').read_text(encoding='utf-8')
     assert '<svg' not in html
     assert 'More than noise' in html
+
+
+def test_a_session_in_which_something_moved_is_green_on_no_page(made: Path) -> None:
+    for page in ('fit/report.html', 'found/report.html', 'report/report.html'):
+        html = (made / page).read_text(encoding='utf-8')
+        assert re.findall(r'class="verdict (\w+)"', html) == ['caution'], page

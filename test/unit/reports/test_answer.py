@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+import builtins
 from dataclasses import replace
 
 import msgspec
@@ -346,7 +346,22 @@ def test_the_page_of_another_command_is_not_replaced(tmp_path):
         require_ready(tmp_path, pdf=False)
 
 
-def test_without_the_library_for_pdf_one_line_says_how_to_get_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'weasyprint', None)
-    with pytest.raises(InputError, match=r"pip install 'remaster_ros\[pdf\]'"):
+@pytest.mark.parametrize(
+    ('error', 'words'),
+    [
+        (ImportError('no'), r"pip install 'remaster_ros\[pdf\]'"),
+        (OSError("cannot load library 'pango'\nmore"), r"library 'pango'\): apt install libpango"),
+    ],
+)
+def test_without_what_makes_pdf_one_line_says_how_to_get_it(tmp_path, monkeypatch, error, words):
+    usual = builtins.__import__
+
+    def importing(name, *args, **kwargs):
+        if name == 'weasyprint':
+            raise error
+        return usual(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, '__import__', importing)
+    with pytest.raises(InputError, match=words) as found:
         require_ready(tmp_path, pdf=True)
+    assert '\n' not in str(found.value)
