@@ -9,9 +9,8 @@ import time
 import urllib.request
 
 import pytest
+from page_probe import NAMES, WEBGL
 from tornado.websocket import websocket_connect
-
-NAMES = ('chromium', 'chromium-browser', 'google-chrome', 'chrome')
 
 
 class Browser:
@@ -25,7 +24,7 @@ class Browser:
             [
                 program,
                 *('--headless', '--no-sandbox', '--no-first-run', '--disable-extensions'),
-                *('--remote-debugging-port=0', '--enable-unsafe-swiftshader'),
+                *('--remote-debugging-port=0', *WEBGL),
                 *(f'--user-data-dir={profile}', '--window-size=1200,1500', 'about:blank'),
             ],
             stdout=subprocess.DEVNULL,

@@ -11,7 +11,10 @@ from remaster_ros.session.workcell import read_cell
 
 CELL = read_cell('demo')
 CHAIN = CELL.chain()
-MARKERS = {name: np.array(CELL.markers[s.marker]) for name, s in CELL.sensors.items()}
+MARKERS = {
+    name: {marker: np.array(CELL.markers[marker]) for marker in sensor.markers}
+    for name, sensor in CELL.sensors.items()
+}
 T_R_N = transform(matrix_from_rpy(np.array([0.0, 0.1, 2.5])), np.array([1.9, 0.0, 1.2]))
 PER_POSE = 4
 
@@ -72,27 +75,20 @@ class PlayedCollection:
         report = events.SensorReport(sensor='tracker', ready=False, trouble='the beam is broken')
         self.view.take(report, now)
 
-    def step(self, now=None, result='recorded', split='optimization'):
+    def step(self, now=None, result='recorded'):
         """Visit one configuration, where the collection runs; then the nodes report."""
         now = time.monotonic() if now is None else now
         if self.state == 'running' and self.done < self.of:
             index = self.done % PER_POSE
-            if index == 0:
-                self.stamp = f'{self.done}.0'
-                self.view.take(
-                    events.PoseAnnounced(
-                        stamp=self.stamp, pose=self.done, split=split, ids=tuple(range(PER_POSE))
-                    ),
-                    now,
-                )
+            self.stamp = f'{self.done - index}.0'
             before, self.q = self.q, self.rng.uniform(-1.5, 1.5, len(CHAIN))
             self.view.take_target(CHAIN.forward(self.q))
             self.view.take_way(np.array([before, self.q]))
             self.view.take_joints(self.q)
             self.view.take_registration('mocap', T_R_N)
             self.view.take(events.SolutionSettled(stamp=self.stamp, solution=index), now)
-            read = apply(inverse(T_R_N), CHAIN.positions(self.q, MARKERS['mocap']))
-            self.view.residuals.reading('mocap', read + self.rng.normal(0.0, 1e-4, 3))
+            read = apply(inverse(T_R_N), CHAIN.positions(self.q, MARKERS['mocap']['sir']))
+            self.view.residuals.reading('mocap', 'sir', read + self.rng.normal(0.0, 1e-4, 3))
             ended = events.ConfigurationEnded(stamp=self.stamp, solution=index, result=result)
             self.view.take(ended, now)
             self.done += 1

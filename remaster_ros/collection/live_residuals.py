@@ -18,9 +18,9 @@ from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import FloatArray
 
 FEWEST = 5
-"""Configurations before residuals are stated: three points fit any registration well."""
+"""Points before residuals are stated: three of them fit any registration well."""
 MOST = 2000
-"""Configurations kept; the first ones are dropped beyond."""
+"""Points of a sensor that are kept; the first ones are dropped beyond."""
 
 
 class LiveResiduals:
@@ -31,15 +31,19 @@ class LiveResiduals:
     chain
         The arm.
     markers
-        Sensor -> the position of its marker in the tool frame, m, (3,).
+        Sensor -> its markers -> their positions in the tool frame, m, (3,).
     """
 
-    def __init__(self, chain: SerialChain, markers: Mapping[str, FloatArray]) -> None:
+    def __init__(
+        self, chain: SerialChain, markers: Mapping[str, Mapping[str, FloatArray]]
+    ) -> None:
         self._chain, self._markers = chain, markers
         self._offsets: FloatArray | None = None
         self._q: FloatArray | None = None
-        self._sums = {name: np.zeros(4) for name in markers}
-        self._pairs: dict[str, list[tuple[FloatArray, FloatArray]]] = {
+        # Of each sensor and marker the sum of the readings, and their number.
+        self._sums = {(name, marker): np.zeros(4) for name in markers for marker in markers[name]}
+        # Configuration, marker in the tool frame, marker as read.
+        self._pairs: dict[str, list[tuple[FloatArray, FloatArray, FloatArray]]] = {
             name: [] for name in markers
         }
         self._found: dict[str, tuple[FloatArray, FloatArray]] = {}
@@ -50,17 +54,18 @@ class LiveResiduals:
         for total in self._sums.values():
             total[:] = 0.0
 
-    def reading(self, sensor: str, position_N: FloatArray) -> None:
-        """Take a reading in the sensor's frame, m, (3,)."""
+    def reading(self, sensor: str, marker: str, position_N: FloatArray) -> None:
+        """Take a reading of a marker in the sensor's frame, m, (3,)."""
         if self._q is not None and np.all(np.isfinite(position_N)):
-            self._sums[sensor] += [*position_N, 1.0]
+            self._sums[sensor, marker] += [*position_N, 1.0]
 
     def ended(self, *, recorded: bool) -> None:
         """End a configuration; its readings count where it was recorded."""
         if self._q is not None and recorded:
-            for name, total in self._sums.items():
+            for (name, marker), total in self._sums.items():
                 if total[3]:
-                    self._pairs[name].append((self._q, total[:3] / total[3]))
+                    place = self._markers[name][marker]
+                    self._pairs[name].append((self._q, place, total[:3] / total[3]))
                     del self._pairs[name][:-MOST]
                     self._found.pop(name, None)
         self._q = None
@@ -76,7 +81,7 @@ class LiveResiduals:
         return self._offsets is not None
 
     def norms_m(self, sensor: str) -> FloatArray:
-        """Return the length of each configuration's residual, m, (n,); n = 0 for too few."""
+        """Return the length of each residual, m, (n,); n = 0 for too few."""
         return self._fitted(sensor)[0]
 
     def points_R(self, sensor: str) -> FloatArray:
@@ -93,8 +98,8 @@ class LiveResiduals:
         nothing = np.empty(0), np.empty((0, 3))
         if len(pairs) < FEWEST:
             return nothing
-        q, read = (np.array(column) for column in zip(*pairs, strict=True))
-        expected = self._chain.positions(q, self._markers[sensor], self._offsets)
+        q, places, read = (np.array(column) for column in zip(*pairs, strict=True))
+        expected = self._chain.positions(q, places, self._offsets)
         try:
             T_R_N, _ = register_points(expected, read)
         except RemasterError:

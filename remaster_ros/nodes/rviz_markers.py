@@ -20,14 +20,14 @@ from visualization_msgs.msg import Marker, MarkerArray
 from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.messages import transform_message
 from remaster_ros.nodes.status import LATCHED, RELIABLE
-from remaster_ros.reports.live_scene import color_of
-from remaster_ros.reports.robot_scene import RobotScene, coarser
+from remaster_ros.reports.robot_scene import RobotScene, Surface, coarser
 from remaster_ros.types import FloatArray
 
 TOPIC = 'remaster/markers'
 TF_STATIC = '/tf_static'
 MOST_TRIANGLES = 300
 """Of each surface: every message holds them all."""
+COLORS = {'link': '#9aa7b5', 'tool': '#d98e32', 'marker': '#2f9e78', 'obstacle': '#b06a5a'}
 SENSOR_COLORS = ('#3b82c4', '#e07b39', '#2f9e78', '#a86bc0')
 
 
@@ -45,18 +45,19 @@ class RvizMarkers:
     """
 
     def __init__(self, node: Node, scene: RobotScene, *, publish_tf: bool) -> None:
-        self._node, self._base = node, scene.chain.base_link
+        self._node, self._scene, self._base = node, scene, scene.chain.base_link
         self._publisher = node.create_publisher(MarkerArray, TOPIC, RELIABLE)
         self._surfaces = [self._surface(i, s) for i, s in enumerate(scene.surfaces)]
-        self._links = [surface.link for surface in scene.surfaces]
         self._tf = None
         if publish_tf and util.find_spec('tf2_msgs') is not None:
             message = import_module('tf2_msgs.msg').TFMessage
             self._tf = message, node.create_publisher(message, TF_STATIC, LATCHED)
 
-    def _surface(self, number: int, surface: Any) -> Marker:
+    def _surface(self, number: int, surface: Surface) -> Marker:
         points, faces = coarser(surface.vertices, surface.faces, MOST_TRIANGLES)
-        marker = self._marker('arm', number, Marker.TRIANGLE_LIST, color_of(surface), 1.0)
+        marker = self._marker('arm', number, Marker.TRIANGLE_LIST, COLORS[surface.role], 1.0)
+        if surface.color is not None:
+            marker.color = _color(*surface.color)
         marker.points = _points(points[faces].reshape(-1, 3))
         return marker
 
@@ -65,8 +66,7 @@ class RvizMarkers:
         marker.header.frame_id = self._base
         marker.pose.orientation.w = 1.0
         marker.scale.x = marker.scale.y = marker.scale.z = size
-        red, green, blue = (int(color[i : i + 2], 16) / 255.0 for i in (1, 3, 5))
-        marker.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
+        marker.color = _color(*(int(color[i : i + 2], 16) / 255.0 for i in (1, 3, 5)))
         return marker
 
     @property
@@ -77,10 +77,10 @@ class RvizMarkers:
     def publish(self, scene: Mapping[str, Any]) -> None:
         """Publish the markers of a `LiveView.view(…)['scene']`."""
         markers = []
-        frames = np.reshape(scene['frames'], (-1, 4, 4))
-        for marker, link in zip(self._surfaces, self._links, strict=True):
-            if len(frames):
-                _place(marker, frames[link])
+        if scene['q'] is not None:
+            frames = self._scene.transforms(np.array(scene['q']))
+            for marker, surface in zip(self._surfaces, self._scene.surfaces, strict=True):
+                _place(marker, frames[surface.link])
                 markers.append(marker)
         way = self._marker('way', 0, Marker.LINE_STRIP, '#e0a83c', 0.006)
         way.points = _points(np.reshape(scene['way'], (-1, 3)))
@@ -120,6 +120,10 @@ class RvizMarkers:
             found.append(transform_message(self._base, name, T))
             found[-1].header.stamp = stamp
         publisher.publish(kind(transforms=found))
+
+
+def _color(red: float, green: float, blue: float) -> ColorRGBA:
+    return ColorRGBA(r=float(red), g=float(green), b=float(blue), a=1.0)
 
 
 def _place(marker: Marker, T: FloatArray) -> None:

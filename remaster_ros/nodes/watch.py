@@ -12,7 +12,7 @@ import os
 import secrets
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,26 +24,27 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.collection.events import EventRecord
-from remaster_ros.collection.live_precision import Precision, expected_precision
 from remaster_ros.errors import RemasterError
 from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.background import Background
 from remaster_ros.nodes.messages import JointOrder, solutions_of, transform_array
 from remaster_ros.nodes.page_address import opening_file, page_name
 from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.precision_watch import TOPIC as PRECISION
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.rviz_markers import RvizMarkers
 from remaster_ros.nodes.status import LATCHED, LEVELS, RELIABLE, TOPIC, NodeStatus, Summary, listen
 from remaster_ros.nodes.waypoints import waypoints_by_solution
 from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE, read_fit
-from remaster_ros.reports.live_scene import live_scene
 from remaster_ros.reports.live_server import COMMANDS, Done, LiveServer, Place
 from remaster_ros.reports.live_view import LiveView
 from remaster_ros.reports.robot_scene import robot_scene
+from remaster_ros.reports.scene_view import scene_to_dict
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 
@@ -51,8 +52,6 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 EVERY_S = 0.2
 IDLE_EVERY_S = 1.0
 """How often the view is renewed while somebody looks, and while nobody does."""
-PRECISION_PAUSE = 10.0
-"""The expected precision is worked out in a tenth of the time at most."""
 NICENESS = 5
 """The page gives way to what moves the arm."""
 
@@ -92,22 +91,24 @@ class Watch(RemasterNode):
         super().__init__('watch')
         self.p = declare(self, Parameters)
         cell = read_cell(self.p.cell)
-        self.chain, self._settings = cell.chain(), cell.design_settings()
+        self.chain = cell.chain()
         self._order = JointOrder(self.chain.joint_names)
-        markers = {name: np.array(cell.markers[s.marker]) for name, s in cell.sensors.items()}
+        markers = {
+            name: {marker: np.array(cell.markers[marker]) for marker in sensor.markers}
+            for name, sensor in cell.sensors.items()
+        }
         self.view = LiveView(self.chain, markers)
         self._waypoints, self._stds = JointTrajectory(), JointState()
         self._means: JointState | None = None
         self._background = Background(self)
-        self._expecting, self._expected_of, self._expect_after_s = False, 0, 0.0
         self._published_s = float('-inf')
         self._q: FloatArray | None = None
         services = {name: f'remaster/{name}' for name in COMMANDS}
         self._callers = {n: self.create_client(Trigger, path) for n, path in services.items()}
-        self._subscribe({name: sensor.topic for name, sensor in cell.sensors.items()})
+        self._subscribe({name: sensor.topics for name, sensor in cell.sensors.items()})
         scene = robot_scene(cell, cell.planning_scene(self.chain))
         self._rviz = RvizMarkers(self, scene, publish_tf=self.p.publish_tf)
-        self.page = self._open_page(msgspec.json.encode(live_scene(scene)))
+        self.page = self._open_page(msgspec.json.encode(scene_to_dict(scene)))
         self.status = NodeStatus(self, self._summary)
         self.create_timer(EVERY_S, self._show, clock=self.status.steady)
 
@@ -122,7 +123,7 @@ class Watch(RemasterNode):
         print(f'live page: {page.url if sys.stdout.isatty() else f"open {file}"}', flush=True)
         return page
 
-    def _subscribe(self, sensors: dict[str, str]) -> None:
+    def _subscribe(self, sensors: Mapping[str, Mapping[str, str]]) -> None:
         def take(kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
             self.create_subscription(kind, topic, _tolerant(callback), qos)
 
@@ -134,8 +135,10 @@ class Watch(RemasterNode):
         take(JointState, 'remaster/joint_offsets', self._on_means, LATCHED)
         take(JointState, 'remaster/joint_offsets_std', self._on_stds, LATCHED)
         take(DiagnosticArray, TOPIC, self._on_status, RELIABLE)
-        for name, topic in sensors.items():
-            take(PointStamped, topic, partial(self._on_point, name), NEWEST)
+        take(String, PRECISION, lambda message: self.view.take_precision(message.data), LATCHED)
+        for name, topics in sensors.items():
+            for marker, topic in topics.items():
+                take(PointStamped, topic, partial(self._on_point, name, marker), NEWEST)
         listen(self, self._on_record)
 
     # What comes in
@@ -154,9 +157,9 @@ class Watch(RemasterNode):
         self._q = self._order.positions(message)
         self.view.take_joints(self._q)
 
-    def _on_point(self, sensor: str, message: PointStamped) -> None:
+    def _on_point(self, sensor: str, marker: str, message: PointStamped) -> None:
         point = message.point
-        self.view.residuals.reading(sensor, np.array([point.x, point.y, point.z]))
+        self.view.residuals.reading(sensor, marker, np.array([point.x, point.y, point.z]))
 
     def _on_target(self, message: PoseStamped) -> None:
         place, turn = message.pose.position, message.pose.orientation
@@ -227,7 +230,6 @@ class Watch(RemasterNode):
 
     def _show(self) -> None:
         now = time.monotonic()
-        self._expect(now)
         watched = self.page.watched or self._rviz.wanted
         if now - self._published_s >= (EVERY_S if watched else IDLE_EVERY_S) - 0.01:
             self._published_s = now
@@ -235,28 +237,6 @@ class Watch(RemasterNode):
             self.page.publish(view)
             if self._rviz.wanted:
                 self._rviz.publish(view['scene'])
-
-    def _expect(self, now: float) -> None:
-        """Have the expected standard deviations worked out when something new is recorded."""
-        measured = self.view.measured
-        count = sum(map(len, measured.values()))
-        if self._expecting or count == self._expected_of or now < self._expect_after_s:
-            return
-        self._expecting, self._expected_of = True, count
-        rough = {sensor.name: sensor.position_R for sensor in self._settings.sensors}
-        placed = {name: T[:3, 3] for name, T in self.view.registration.items()}
-        settings = self._settings.before({**rough, **placed})
-        rng = np.random.default_rng(0)
-        work = partial(expected_precision, self.chain, settings, measured, rng)
-        self._background.submit(work, partial(self._on_precision, now))
-
-    def _on_precision(self, asked_s: float, found: Precision | Exception) -> None:
-        now, self._expecting = time.monotonic(), False
-        self._expect_after_s = now + PRECISION_PAUSE * (now - asked_s)
-        if isinstance(found, Exception):
-            self.get_logger().warning(f'expected precision: {found}')
-        else:
-            self.view.take_precision(found)
 
     def _summary(self) -> Summary:
         state = 'watched' if self.page.watched else 'serving'
@@ -272,7 +252,7 @@ def _tolerant(callback: Callable[[Any], None]) -> Callable[[Any], None]:
     """Return a callback that leaves out a message which makes no sense; the nodes report those."""
 
     def receive(message: Any) -> None:
-        with contextlib.suppress(RemasterError, ValueError):
+        with contextlib.suppress(RemasterError, ValueError, msgspec.MsgspecError):
             callback(message)
 
     return receive

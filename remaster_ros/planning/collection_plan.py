@@ -12,6 +12,7 @@ from remaster_ros.errors import InsufficientDataError
 from remaster_ros.motion.trajectory import Trajectory
 from remaster_ros.planning.candidates import PlannedPose
 from remaster_ros.planning.planned_design import Designed
+from remaster_ros.planning.separating_design import SeparatingDesign
 from remaster_ros.planning.tour_order import PoseVisit, Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.planning.travel_time import TravelTime
@@ -93,6 +94,8 @@ class CollectionPlan:
     undetermined
         What these configurations do not determine at all, so that there are no standard
         deviations (None and NaN above); ''.
+    separated
+        What was added to separate causes; None without causes.
     """
 
     tour: Tour
@@ -106,6 +109,7 @@ class CollectionPlan:
     tool_rms: float
     designed: Designed | None
     undetermined: str = ''
+    separated: SeparatingDesign | None = None
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -211,6 +215,7 @@ def look_ahead(
         *expected,
         planner.designed,
         undetermined,
+        planner.separated,
     )
 
 

@@ -39,6 +39,7 @@ from tornado.httpserver import HTTPServer
 from tornado.web import Application, HTTPError, RequestHandler
 
 from remaster_ros.errors import InputError
+from remaster_ros.reports.scene_view import view_script
 
 COMMANDS = ('collect', 'pause', 'stop', 'fit')
 FRESH_S = 3.0
@@ -354,13 +355,14 @@ def _files() -> dict[str, tuple[bytes, str]]:
     """Return the page's files by name, compressed, with their types."""
     folder = importlib.resources.files(__package__).joinpath('live_page')
     plotly = importlib.resources.files('plotly').joinpath('package_data', 'plotly.min.js')
+    script = 'text/javascript; charset=utf-8'
     found = {
         '': (folder.joinpath('index.html'), 'text/html; charset=utf-8'),
-        'page.js': (folder.joinpath('page.js'), 'text/javascript; charset=utf-8'),
-        'scene.js': (folder.joinpath('scene.js'), 'text/javascript; charset=utf-8'),
+        'page.js': (folder.joinpath('page.js'), script),
+        'scene.js': (folder.joinpath('scene.js'), script),
         'page.css': (folder.joinpath('page.css'), 'text/css; charset=utf-8'),
-        'plotly.js': (plotly, 'text/javascript; charset=utf-8'),
+        'plotly.js': (plotly, script),
     }
-    return {
-        name: (gzip.compress(path.read_bytes(), 6), kind) for name, (path, kind) in found.items()
-    }
+    texts = {name: (path.read_bytes(), kind) for name, (path, kind) in found.items()}
+    texts['robot_view.js'] = view_script().encode(), script
+    return {name: (gzip.compress(text, 6), kind) for name, (text, kind) in texts.items()}

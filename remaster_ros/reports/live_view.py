@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from remaster_ros.collection import events
-from remaster_ros.collection.live_precision import Precision
 from remaster_ros.collection.live_residuals import LiveResiduals
 from remaster_ros.collection.pace import Pace, minutes_text
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -28,8 +28,6 @@ LONGEST_TEXT = 400
 MOST_NODES = 30
 MOST_MESSAGES = 40
 MOST_POINTS = 400
-MOST_FITTED = 2000
-"""Configurations that the expected precision is worked out for."""
 LONGEST_WAY = 200
 UNDETERMINED_RAD = 0.0873
 """5 degrees: what the fit assumes of a zero-offset before it has seen anything."""
@@ -40,6 +38,21 @@ STOP_LABEL = 'Stop the collection'
 STOP_NOTE = (
     'No emergency stop: it asks the planner over the network. In danger use the red button.'
 )
+
+
+class Look(msgspec.Struct, frozen=True):
+    """Of `precision_json`: what was known after so many configurations."""
+
+    configurations: int
+    minutes: float | None
+    joint_std_deg: dict[str, float | None]
+
+
+class Precision(msgspec.Struct, frozen=True):
+    """What the page shows of `precision_json`."""
+
+    message: str = ''
+    looks: list[Look] = []
 
 
 @dataclass
@@ -57,7 +70,7 @@ class LiveView:
     chain
         The arm.
     markers
-        Sensor -> the position of its marker in the tool frame, m, (3,).
+        Sensor -> its markers -> their positions in the tool frame, m, (3,).
 
     Attributes
     ----------
@@ -67,7 +80,9 @@ class LiveView:
         Of the markers.
     """
 
-    def __init__(self, chain: SerialChain, markers: Mapping[str, FloatArray]) -> None:
+    def __init__(
+        self, chain: SerialChain, markers: Mapping[str, Mapping[str, FloatArray]]
+    ) -> None:
         self._chain, self._sensors = chain, tuple(markers)
         self.residuals = LiveResiduals(chain, markers)
         self._pace = Pace()
@@ -80,13 +95,11 @@ class LiveView:
         self._messages: deque[tuple[float, str]] = deque(maxlen=MOST_MESSAGES)
         self._plan = ''
         self._open: dict[tuple[str, int], FloatArray] = {}
-        self._announced: events.PoseAnnounced | None = None
-        self._measured: dict[int, dict[int, FloatArray]] = {}
         self._q: FloatArray | None = None
         self._target: FloatArray | None = None
         self._way: FloatArray = np.empty((0, 3))
         self.registration: dict[str, FloatArray] = {}
-        self._precision: deque[tuple[float, Precision]] = deque(maxlen=MOST_POINTS)
+        self._precision = Precision()
         self._offsets: Mapping[str, tuple[float, float]] = {}
         self._fit: Mapping[str, Any] = {}
 
@@ -117,10 +130,6 @@ class LiveView:
                 self._reports[sensor] = body
             case events.TourPlanned(description):
                 self._plan = _clip(description)
-                self._measured.clear()
-                self._precision.clear()
-            case events.PoseAnnounced():
-                self._announced = body
             case events.SolutionSettled(stamp=stamp, solution=solution) if self._q is not None:
                 self._open = {(stamp, solution): self._q}
                 self.residuals.settled(self._q)
@@ -135,13 +144,6 @@ class LiveView:
         self.residuals.ended(recorded=recorded and q is not None)
         if end.result != 'recorded':
             self._messages.append((now_s, _clip(f'configuration {end.result}: {end.reason}')))
-        pose = self._announced
-        if q is None or not recorded or pose is None or pose.stamp != end.stamp:
-            return
-        count = sum(map(len, self._measured.values()))
-        fitted = pose.split == 'optimization' and count < MOST_FITTED
-        if fitted and end.solution < len(pose.ids):
-            self._measured.setdefault(pose.pose, {})[pose.ids[end.solution]] = q
 
     def _tell(self, body: events.State | events.Event, now_s: float) -> None:
         match body:
@@ -191,16 +193,11 @@ class LiveView:
         """Take what else is to be shown of a fit: label -> text."""
         self._fit = fit
 
-    def take_precision(self, precision: Precision) -> None:
-        """Take what is expected of a fit of the configurations so far."""
-        self._precision.append((self._pace.running_s, precision))
+    def take_precision(self, text: str) -> None:
+        """Take what is known so far (JSON of /remaster/precision); errors as of msgspec."""
+        self._precision = msgspec.json.decode(text, type=Precision)
 
     # What goes out
-
-    @property
-    def measured(self) -> dict[int, list[FloatArray]]:
-        """What is recorded and will be fitted: pose -> its configurations, rad."""
-        return {pose: list(found.values()) for pose, found in self._measured.items()}
 
     def view(self, now_s: float) -> dict[str, Any]:
         """Return what the page shows now, of plain types."""
@@ -293,13 +290,14 @@ class LiveView:
         }
 
     def _precision_table(self) -> dict[str, Any]:
-        """Return the expected standard deviations by configurations and minutes."""
-        rows = [row for _, row in self._precision]
+        """Return the standard deviations by configurations and minutes."""
+        looks = self._precision.looks[-MOST_POINTS:]
         return {
-            'configurations': [row.configurations for row in rows],
-            'minutes': _rounded([since / 60.0 for since, _ in self._precision], 2),
+            'message': _clip(self._precision.message),
+            'configurations': [look.configurations for look in looks],
+            'minutes': [look.minutes for look in looks],
             'std_deg': {
-                name: [_determined(row.joint_std.get(name)) for row in rows]
+                name: [look.joint_std_deg.get(name) for look in looks]
                 for name in self._chain.joint_names
             },
         }
@@ -307,7 +305,11 @@ class LiveView:
     def _result(self) -> dict[str, Any]:
         return {
             'joints': [
-                {'joint': name, 'mean_deg': _degrees(mean), 'std_deg': _degrees(std)}
+                {
+                    'joint': name,
+                    'mean_deg': _degrees(mean),
+                    'std_deg': _determined(std),
+                }
                 for name, (mean, std) in self._offsets.items()
             ],
             'fit': dict(self._fit),
@@ -339,12 +341,12 @@ class LiveView:
 
     def _scene(self) -> dict[str, Any]:
         q, target = self._q, self._target
-        # The base's own frame first, as in `robot_scene.RobotScene.transforms`.
-        frames = [] if q is None else [_matrix(np.eye(4)), *map(_matrix, self._chain.frames(q))]
         return {
-            'frames': frames,
-            'target': None if target is None else _matrix(target),
+            'q': None if q is None else _rounded(q, 6),
+            # By rows.
+            'target': None if target is None else _rounded(target.ravel(), 5),
             'way': _rounded(self._way, 4),
+            'sensors': {name: _rounded(T[:3, 3], 3) for name, T in self.registration.items()},
             'points': {
                 name: _rounded(self.residuals.points_R(name)[-MOST_POINTS:], 4)
                 for name in self._sensors
@@ -384,8 +386,3 @@ def _degrees(radians: float | None) -> float | None:
 
 def _rounded(values: FloatArray | Sequence[float], digits: int) -> Any:
     return np.round(np.asarray(values, dtype=float), digits).tolist()
-
-
-def _matrix(T: FloatArray) -> list[float]:
-    """Return a transform by rows, 16 numbers."""
-    return [float(value) for value in np.round(T, 5).ravel()]

@@ -10,6 +10,7 @@ import numpy as np
 
 from remaster_ros.planning.collection_plan import FITTED, CollectionPlan, Expected
 from remaster_ros.planning.planned_design import DesignSettings
+from remaster_ros.planning.separating_design import DECIDED, SeparatingDesign
 from remaster_ros.planning.tour_order import Tour
 
 HELD_OUT = 'validation'
@@ -45,6 +46,26 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
             'tool_share': design.goal.tool_share,
             'reached': design.reached,
         },
+        **({} if plan.separated is None else {'separate': _separated(plan.separated)}),
+    }
+
+
+def _separated(design: SeparatingDesign) -> dict[str, Any]:
+    return {
+        'configurations': sum(len(pose.solutions) for pose in design.poses),
+        'q_deg': [
+            np.degrees(q).round(4).tolist() for pose in design.poses for q in pose.solutions
+        ],
+        'pairs': [
+            {
+                'cause': pair.cause,
+                'look_alike': pair.look_alike,
+                'std_apart_before': round(pair.before, 2),
+                'std_apart': round(pair.after, 2),
+            }
+            for pair in design.pairs
+        ],
+        'otherwise': list(design.otherwise),
     }
 
 
@@ -68,6 +89,8 @@ def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
         f'fastest point at {plan.max_tool_speed_m_s:.2f} m/s',
     ]
     lines += _expected_lines(plan.joint_std, plan.joint_rms, plan.tool_rms)
+    if plan.separated is not None:
+        lines += _separated_text(plan.separated)
     if missed := missed_goal(plan):
         lines.append(missed)
     return '\n'.join(lines)
@@ -119,6 +142,19 @@ def _degrees(joint_std: Mapping[str, float | None]) -> dict[str, float | None]:
     return {
         name: None if std is None else float(np.degrees(std)) for name, std in joint_std.items()
     }
+
+
+def _separated_text(design: SeparatingDesign) -> list[str]:
+    count = sum(len(pose.solutions) for pose in design.poses)
+    lines = [f'of these to separate causes: {count} configurations at {len(design.poses)} poses']
+    for pair in design.pairs:
+        verdict = 'decided' if pair.after >= DECIDED else 'may stay open'
+        lines.append(
+            f'  {pair.cause} or {pair.look_alike}: {pair.after:.1f} standard deviations apart '
+            f'({pair.before:.1f} without them), {verdict}'
+        )
+    lines += [f'  poses do not separate {words}' for words in design.otherwise]
+    return lines
 
 
 def minutes_text(seconds: float) -> str:

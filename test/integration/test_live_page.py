@@ -9,11 +9,11 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 import msgspec
 import pytest
 from browser import Browser
-from played_collection import CELL, PlayedCollection
+from played_collection import CELL, CHAIN, PlayedCollection
 
-from remaster_ros.reports.live_scene import live_scene
 from remaster_ros.reports.live_server import LiveServer, Place
 from remaster_ros.reports.robot_scene import robot_scene
+from remaster_ros.reports.scene_view import scene_to_dict
 
 
 class Empty(BaseHTTPRequestHandler):
@@ -37,8 +37,8 @@ class Played:
 
     def __init__(self):
         self.collection = PlayedCollection(of=24)
-        scene = robot_scene(CELL, CELL.planning_scene(CELL.chain()))
-        content = msgspec.json.encode(live_scene(scene))
+        scene = robot_scene(CELL, CELL.planning_scene(CHAIN))
+        content = msgspec.json.encode(scene_to_dict(scene))
         self._lock, self._ending = threading.Lock(), threading.Event()
         self.server = LiveServer(Place(), 'T' * 43, content, self._send)
         self._thread = threading.Thread(target=self._run)
@@ -162,6 +162,7 @@ def test_without_the_token_the_page_is_empty(browser, played):
     browser.value('sessionStorage.clear()')
     browser.open(played.server.url.split('#')[0])
     browser.until(lambda: browser.text('#state') == 'no token', 'that the token is missing')
+    assert browser.value('document.querySelectorAll("button:disabled").length') == 4
     browser.open(played.server.url[:-1])
     browser.until(lambda: 'by the address that' in browser.text('#link'), 'that it is wrong')
     assert browser.value('sessionStorage.clear()') is None

@@ -93,7 +93,7 @@ def test_what_is_published_is_shown_and_nonsense_is_left_out(page, client):
         view = page.view()
         if not view:
             return False
-        done = view['scene']['frames'] and view['scene']['way'] and view['result']['joints']
+        done = view['scene']['q'] and view['scene']['way'] and view['result']['joints']
         return done and view['sensors'][0]['registered'] and markers
 
     wait_until(shown, 30.0, 'the view')

@@ -116,7 +116,7 @@ function show(view) {
   drawPrecision(view.precision);
   drawScene(view.scene);
   if (asked && view.seen !== asked.seen && get('sure').open) {
-    get('sure').close('no');
+    get('sure').close();
     banner('answer', 'The collection has changed meanwhile; look again.', 'caution');
   }
 }
@@ -131,7 +131,9 @@ function sensorState(sensor) {
 function showResult(result) {
   get('result').hidden = result.joints.length === 0;
   fill('offsets', result.joints.map((j) => [
-    j.joint, [number(j.mean_deg, 4, ''), 'n'], [number(j.std_deg, 4, ''), 'n'],
+    j.joint,
+    [j.std_deg === null ? 'not identifiable' : number(j.mean_deg, 4, ''), 'n'],
+    [number(j.std_deg, 4, ''), 'n'],
   ]));
   const key = JSON.stringify(result.fit);
   const list = get('fit-facts');
@@ -153,7 +155,7 @@ function showLink() {
   document.body.classList.toggle('old', old);
   if (!old) return;
   for (const name of ['collect', 'pause', 'fit']) get(name).disabled = true;
-  if (get('sure').open) get('sure').close('no');
+  if (get('sure').open) get('sure').close();
   const since = Number.isFinite(age) ? ` What is shown is ${Math.round(age / 1000)} s old.` : '';
   banner('link', `${lastError || 'No answer from remaster watch.'}${since} Stop may not get through: use the red button.`);
 }
@@ -195,16 +197,17 @@ for (const name of ['pause', 'stop', 'fit']) get(name).addEventListener('click',
 get('collect').addEventListener('click', () => {
   asked = { seen: shown.view.seen };
   setText('sure-what', shown.view.commands.collect.label);
-  get('sure').returnValue = 'no';
   get('sure').showModal();
 });
-get('sure').addEventListener('close', () => {
-  if (get('sure').returnValue === 'yes' && asked) command('collect', { view: shown.number, seen: asked.seen });
+get('sure-yes').addEventListener('click', () => {
+  if (asked) command('collect', { view: shown.number, seen: asked.seen });
   asked = null;
 });
 
 if (token) {
-  request('scene').then(setScene).catch(() => {});
+  // Until here a press would have done nothing.
+  get('stop').disabled = false;
+  request('scene').then(setScene).catch(() => setText('scene-note', 'No 3-D picture: it did not arrive.'));
   look();
 } else {
   setText('state', 'no token');

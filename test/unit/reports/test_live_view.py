@@ -7,11 +7,13 @@ import json
 import msgspec
 import numpy as np
 import pytest
-from played_collection import CHAIN, MARKERS, PER_POSE, PlayedCollection
+from played_collection import CHAIN, MARKERS, T_R_N, PlayedCollection
 
+from remaster_ros import simulate
 from remaster_ros.collection import events
-from remaster_ros.collection.live_precision import Precision
+from remaster_ros.collection.stopping_rule import StoppingGoal, StoppingRule
 from remaster_ros.reports.live_view import LONGEST_TEXT, MOST_NODES, SILENT_S, LiveView, tool_path
+from remaster_ros.reports.precision_json import precision_json
 
 
 @pytest.fixture
@@ -32,7 +34,7 @@ def test_before_any_node_is_heard_nothing_can_be_begun():
     assert not view['commands']['collect']['on']
     assert view['commands']['stop']['on']
     assert {row['message'] for row in view['nodes']} == {'not seen yet'}
-    assert view['scene']['frames'] == []
+    assert view['scene']['q'] is None
 
 
 def test_progress_and_time_left(played):
@@ -44,7 +46,7 @@ def test_progress_and_time_left(played):
     assert not view['commands']['collect']['on']
 
 
-def test_residuals_points_and_what_will_be_fitted(played):
+def test_residuals_and_points(played):
     view = after(played, 12)
     mocap, tracker = view['sensors']
     assert len(mocap['residuals_mm']) == 12
@@ -54,16 +56,6 @@ def test_residuals_points_and_what_will_be_fitted(played):
     assert (tracker['ready'], tracker['message']) == (False, 'the beam is broken')
     assert tracker['median_mm'] is None
     assert len(view['scene']['points']['mocap']) == 12
-    assert sum(map(len, played.view.measured.values())) == 12
-    assert len(played.view.measured) == 12 // PER_POSE
-
-
-@pytest.mark.parametrize(
-    'step', [{'split': 'validation'}, {'split': 'reference'}, {'result': 'rejected'}]
-)
-def test_what_is_not_fitted_adds_nothing_to_the_expected_precision(played, step):
-    after(played, 8, **step)
-    assert played.view.measured == {}
 
 
 def test_a_rejected_configuration_is_told_and_leaves_no_residual(played):
@@ -72,13 +64,12 @@ def test_a_rejected_configuration_is_told_and_leaves_no_residual(played):
     assert view['messages'][0]['text'].startswith('configuration rejected')
 
 
-def test_the_frames_are_those_of_the_links(played):
-    view = after(played, 3)
-    frames = np.array(view['scene']['frames']).reshape(-1, 4, 4)
-    assert np.allclose(frames[0], np.eye(4))
-    assert np.allclose(frames[1:], CHAIN.frames(played.q), atol=1e-5)
-    way = np.array(view['scene']['way'])
-    assert np.allclose(way[-1], CHAIN.positions(played.q, np.zeros(3)), atol=1e-4)
+def test_the_scene_has_the_arm_its_way_and_the_sensors(played):
+    scene = after(played, 3)['scene']
+    assert np.allclose(scene['q'], played.q, atol=1e-6)
+    assert np.allclose(np.reshape(scene['target'], (4, 4)), CHAIN.forward(played.q), atol=1e-5)
+    assert np.allclose(scene['way'][-1], CHAIN.positions(played.q, np.zeros(3)), atol=1e-4)
+    assert np.allclose(scene['sensors']['mocap'], T_R_N[:3, 3], atol=1e-3)
 
 
 def test_a_way_is_straight_in_the_joints():
@@ -133,16 +124,41 @@ def test_the_mark_of_what_was_seen_changes_with_what_a_person_decides_by(played,
     assert played.view.seen(3.0) != played.view.seen(3.0 + SILENT_S + 1.0)
 
 
-def test_expected_standard_deviations_by_configurations_and_minutes(played):
-    after(played, 5)
-    for count, std in ((4, 1e-3), (8, 5e-4)):
-        joints = dict.fromkeys(CHAIN.joint_names, std) | {'joint_1': None}
-        played.view.take_precision(Precision(count, joints))
+def looks(*stds):
+    names = CHAIN.joint_names
+    return [
+        {
+            'configurations': 5 * i + 5,
+            'minutes': 1.5 * i,
+            'joint_std_deg': dict.fromkeys(names, std) | {'joint_1': None},
+            'joint_rms_deg': std,
+        }
+        for i, std in enumerate(stds)
+    ]
+
+
+def test_what_is_known_by_configurations_and_minutes(played):
+    message = {'format': 'remaster-precision/1', 'message': '5 more', 'looks': looks(0.1, 0.02)}
+    played.view.take_precision(json.dumps(message))
     table = played.view.view(20.0)['precision']
-    assert table['configurations'] == [4, 8]
+    assert table['message'] == '5 more'
+    assert (table['configurations'], table['minutes']) == ([5, 10], [0.0, 1.5])
     assert table['std_deg']['joint_1'] == [None, None]
-    assert table['std_deg']['joint_2'] == [pytest.approx(0.0573, abs=1e-4), 0.028648]
-    assert table['minutes'][-1] > 0.0
+    assert table['std_deg']['joint_2'] == [0.1, 0.02]
+    for nonsense in ('', '[]', '{"looks": [{}]}', '{"looks": 1}'):
+        with pytest.raises(msgspec.MsgspecError):
+            played.view.take_precision(nonsense)
+    assert played.view.view(20.0)['precision'] == table
+
+
+def test_what_the_optimizer_publishes_is_understood(played):
+    rule = StoppingRule(StoppingGoal(joint_std_rad=1e-4), planned=20, every=5)
+    session = simulate(robot='iiwa7', seed=1).session
+    look = rule.look(session, 5, None, np.random.default_rng(0))
+    played.view.take_precision(precision_json(rule, [look]))
+    table = played.view.view(0.0)['precision']
+    assert table['configurations'] == [look.configurations]
+    assert table['message'] == rule.describe(look)
 
 
 def test_a_result_needs_every_joint_as_a_number(played):
@@ -166,6 +182,7 @@ def test_strangers_cannot_fill_the_memory_or_break_the_page(played):
         view.take_registration(f'sensor_{i}', np.eye(4))
     view.take_summary('pose_planner', 'ok', long, {'configurations': 'many'}, 1.0)
     view.take(events.TourPlanned(long), 1.0)
+    view.take_precision(json.dumps({'message': long, 'looks': looks(*[0.1] * 5000)}))
     view.take(events.BridgeState(halted=long), 1.0)
     view.take_joints(np.full(7, np.nan))
     view.take_target(np.full((4, 4), np.inf))
