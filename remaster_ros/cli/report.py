@@ -63,7 +63,10 @@ def run(args: argparse.Namespace) -> int:
             save_fit(result, fit_path.parent, figures=not args.no_figures)
         progress('writing', 0.0)
         inputs = read_inputs(session, fit_path, found_path)
-        answer = write_answer(inputs, out, not args.no_figures, args.pdf)
+        found_folder = None if found_path is None else found_path.parent
+        answer = write_answer(
+            inputs, fit_path.parent, found_folder, out, not args.no_figures, args.pdf
+        )
     if args.json:
         print(json.dumps(as_dict(answer, out)))
     else:
@@ -74,12 +77,8 @@ def run(args: argparse.Namespace) -> int:
 
 def summary(answer: Answer) -> str:
     """Return the answer in a few lines."""
-    lines = [answer.headline]
-    for row in answer.remains:
-        lines.append(
-            f'remains: {row.what}{f": {row.size}" if row.size else ""}. {row.remedy}'.strip()
-        )
-    return '\n'.join(lines)
+    remains = [f'remains: {row.sentence}' for row in answer.remains]
+    return '\n'.join([answer.headline, *remains])
 
 
 def as_dict(answer: Answer, out: Path) -> dict[str, Any]:

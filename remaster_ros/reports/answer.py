@@ -12,10 +12,11 @@ from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.noise_check import MEAN_LENGTH
 from remaster_ros.compensation.export import GEOMETRY_FILE, LAYER_FILE, REMASTER_FILE, URDF_FILE
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, transform
-from remaster_ros.reports.answer_inputs import Inputs
-from remaster_ros.reports.discovery_schema import Discovered, Effect
+from remaster_ros.reports.answer_inputs import Inputs, all_taken_out
+from remaster_ros.reports.discovery_schema import Effect
 from remaster_ros.reports.effect_words import STEP, is_held_by_model, is_of_measurement, title
 from remaster_ros.reports.judgement import NOTICEABLE_GAIN
+from remaster_ros.reports.remaining import Remaining, what_remains
 from remaster_ros.reports.schemas import JointOffset, Judgement
 from remaster_ros.types import BoolArray, FloatArray
 
@@ -69,14 +70,6 @@ class SensorNoise(NamedTuple):
     shared_mm: float | None
 
 
-class Remaining(NamedTuple):
-    """Something that the deed leaves: its name, its size in words, and what to do."""
-
-    what: str
-    size: str
-    remedy: str
-
-
 @dataclass(frozen=True, eq=False)
 class Answer:
     """The first screen.
@@ -95,6 +88,8 @@ class Answer:
         From today on, each with more corrected.
     brings
         Index of the stage that the deed reaches.
+    final_mm
+        The error of every row there, (n,).
     held_out
         The stages are judged by poses that were never fitted.
     noise
@@ -110,6 +105,7 @@ class Answer:
     has_geometry: bool
     stages: tuple[Stage, ...]
     brings: int
+    final_mm: FloatArray
     held_out: bool
     noise: tuple[SensorNoise, ...]
     remains: tuple[Remaining, ...]
@@ -138,26 +134,29 @@ def answer_of(inputs: Inputs) -> Answer:
     fit, found = inputs.fit, inputs.found
     effects = found.effects if found is not None else []
     judged, held_out = judged_rows(inputs)
-    uses_causes = bool(effects) and _all_taken_out(found)
-    stages = _stages(inputs, judged, uses_causes)
-    brings = len(stages) - 1 if uses_causes else 1
+    rows, brings = _stages(inputs)
+    stages = tuple(Stage(text, errors[judged]) for text, errors in rows)
+    uses_causes = brings > 1
     offsets = found.joint_offsets_after if uses_causes and found else fit.joint_offsets
     action, reason = _action(
         inputs.judgement, effects, stages[0].mean, stages[brings].mean, offsets
     )
     known = sum(row.identifiable for row in offsets)
-    measured = [title(e) for e in effects if uses_causes and is_of_measurement(e)]
+    geometry = uses_causes and any(map(is_held_by_model, effects))
+    taken_out = uses_causes and brings == len(rows) - 1
+    measured = [title(e) for e in effects if taken_out and is_of_measurement(e)]
     return Answer(
         mood=_mood(inputs, uses_causes, held_out and action != 'wait'),
-        headline=reason or _headline(known, stages, brings, held_out, measured),
+        headline=reason or _headline(known, stages, brings, held_out, measured, geometry),
         action=action,
         uses_causes=uses_causes,
-        has_geometry=uses_causes and any(map(is_held_by_model, effects)),
+        has_geometry=geometry,
         stages=stages,
         brings=brings,
+        final_mm=rows[brings][1],
         held_out=held_out,
         noise=_noise(inputs),
-        remains=tuple(_remains(inputs, uses_causes, held_out)),
+        remains=tuple(what_remains(inputs, uses_causes, held_out, stages[brings].mean)),
         offsets=tuple(offsets),
     )
 
@@ -170,30 +169,27 @@ def judged_rows(inputs: Inputs) -> tuple[BoolArray, bool]:
     return ~np.isin(m.observation, list(inputs.fit_left_out)), False
 
 
-def _all_taken_out(found: Discovered | None) -> bool:
-    """Whether all causes are in the corrected robot model, or in how the arm was measured."""
-    return (
-        found is not None
-        and found.verdict != 'undetermined'
-        and all(is_held_by_model(effect) or is_of_measurement(effect) for effect in found.effects)
-    )
-
-
-def _stages(inputs: Inputs, judged: BoolArray, uses_causes: bool) -> tuple[Stage, ...]:
-    stages = [
-        Stage('today', inputs.before_mm[judged]),
-        Stage('with the zero-offsets', inputs.after_mm[judged]),
-    ]
-    if inputs.causes_mm is not None and inputs.found is not None:
+def _stages(inputs: Inputs) -> tuple[list[tuple[str, FloatArray]], int]:
+    """Return title and errors of all rows, mm, at each stage, and the one that a deed reaches."""
+    rows = [('today', inputs.before_mm), ('with the zero-offsets', inputs.after_mm)]
+    if inputs.causes_mm is None or inputs.found is None:
+        return rows, 1
+    if all_taken_out(inputs.found):
         effects = inputs.found.effects
-        text = 'with every cause corrected too'
-        if uses_causes:
-            measured = any(map(is_of_measurement, effects))
-            model = any(map(is_held_by_model, effects))
-            text = 'with zero-offsets' + (' and lengths' if model else '')
-            text += ', measuring errors taken out' if measured else ''
-        stages.append(Stage(text, inputs.causes_mm[judged]))
-    return tuple(stages)
+        text = 'with zero-offsets' + (
+            ' and lengths' if any(map(is_held_by_model, effects)) else ''
+        )
+        text += ', measuring errors taken out' if any(map(is_of_measurement, effects)) else ''
+        return [*rows, (text, inputs.causes_mm)], 2
+    brings = 1
+    if inputs.model_mm is not None:
+        rows.append(('with the corrected robot model', inputs.model_mm))
+        # Chosen by the fitted rows; those held out only show what it brings.
+        fitted = ~inputs.session.measurements.is_validation
+        means = [float(errors[fitted].mean()) for _, errors in rows]
+        brings = 2 if means[1] > NOTICEABLE_GAIN * means[2] else 1
+    rows.append(('with every cause corrected too', inputs.causes_mm))
+    return rows, brings
 
 
 def _action(
@@ -228,66 +224,16 @@ def _noise(inputs: Inputs) -> tuple[SensorNoise, ...]:
     rows: list[SensorNoise] = []
     if inputs.found is not None and isinstance(inputs.found.noise.sensors, dict):
         for sensor, noise in inputs.found.noise.sensors.items():
-            shared = noise.pose_sigma_m
-            both = None if shared is None else float(np.hypot(noise.sigma_m, shared))
-            factor = 1e3 * MEAN_LENGTH
-            rows.append(
-                SensorNoise(
-                    sensor, factor * noise.sigma_m, None if both is None else factor * both
-                )
-            )
+            # What the markers of a frame share is in each of its readings.
+            frame = noise.frame_sigma_m if isinstance(noise.frame_sigma_m, float) else 0.0
+            reading, pose = float(np.hypot(noise.sigma_m, frame)), noise.pose_sigma_m
+            both = None if pose is None else 1e3 * MEAN_LENGTH * float(np.hypot(reading, pose))
+            rows.append(SensorNoise(sensor, 1e3 * MEAN_LENGTH * reading, both))
     elif isinstance(inputs.fit.explained_by_noise, dict):
         for sensor, check in inputs.fit.explained_by_noise.items():
             if check.noise_m is not None:
                 rows.append(SensorNoise(sensor, 1e3 * check.noise_m, None))
     return tuple(rows)
-
-
-def _remains(inputs: Inputs, uses_causes: bool, held_out: bool) -> list[Remaining]:
-    found, judgement = inputs.found, inputs.judgement
-    rows: list[Remaining] = []
-    if found is not None:
-        for effect in found.effects:
-            if uses_causes and is_held_by_model(effect):
-                continue
-            sizes = effect.sizes if isinstance(effect.sizes, list) else []
-            remedy = effect.remedy if isinstance(effect.remedy, str) else ''
-            rows.append(Remaining(title(effect), '; '.join(sizes), remedy))
-        if found.verdict == 'undetermined':
-            rows.append(
-                Remaining(
-                    'Undecided',
-                    'another explanation fits as well',
-                    'Measure what the look-alikes below call for.',
-                )
-            )
-        if isinstance(found.unexplained, list):
-            rows += [
-                Remaining('Unexplained', f'{1e3 * left.size_m:.3f} mm RMS', left.next)
-                for left in found.unexplained
-            ]
-    elif judgement.doubts:
-        rows.append(
-            Remaining(
-                'More than noise',
-                judgement.doubts[0],
-                'Search for its cause: remaster discover SESSION --out DIR, then give DIR to '
-                'remaster report.',
-            )
-        )
-    rows += [Remaining('The data disagree', line, '') for line in judgement.disagreements]
-    if not held_out:
-        rows.append(
-            Remaining('Not proven', 'no poses were held out', 'Measure some more, and fit again.')
-        )
-    if not rows:
-        words = (
-            'every cause was tried, and none explains more of what is left than chance does'
-            if found is not None
-            else 'what is left is what noise explains'
-        )
-        rows.append(Remaining('Noise', words, ''))
-    return rows
 
 
 def _mood(inputs: Inputs, uses_causes: bool, may_be_good: bool) -> Mood:
@@ -314,10 +260,12 @@ def _headline(
     brings: int,
     held_out: bool,
     measured: Sequence[str],
+    corrects_model: bool,
 ) -> str:
     """Return the deed and its gain; ``measured`` is what was found of the measurement."""
     before, after = stages[0], stages[brings]
     deed = f'Set the zero-offsets of {joints} joint{"s" if joints > 1 else ""}'
+    deed += ' and correct the robot model' if corrects_model else ''
     where = 'poses that were never fitted' if held_out else 'the fitted poses'
     if measured:
         # That part of the errors was never the arm's.

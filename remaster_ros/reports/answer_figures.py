@@ -28,7 +28,7 @@ from remaster_ros.types import FloatArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-ALL_CAUSES, FAINT = '#2f9e78', '#808a96'
+MODEL, ALL_CAUSES, FAINT = '#8a6fc4', '#2f9e78', '#808a96'
 # Narrower than the figures of many panels: to be read on a phone.
 NARROW_IN, WIDE_IN = 5.2, 8.4
 MOST_POINTS = 1500
@@ -47,27 +47,23 @@ class Subject(NamedTuple):
 def draw_answer(subject: Subject) -> dict[str, str]:
     """Return every figure as SVG text, by file name without ending."""
     figures: dict[str, Callable[[Subject], Figure]] = {
-        'stages': stages,
         'session': over_session,
         'workspace': workspace,
     }
-    return as_svg(figures, subject)
+    return draw_stages(subject.answer) | as_svg(figures, subject)
 
 
-def final_errors(inputs: Inputs, answer: Answer) -> FloatArray:
-    """Return the error of every row at the stage that the deed reaches, mm, (n,)."""
-    if answer.brings == 2 and inputs.causes_mm is not None:
-        return inputs.causes_mm
-    return inputs.after_mm
+def draw_stages(answer: Answer) -> dict[str, str]:
+    """Return the figure of the first screen as SVG text, by its name."""
+    return as_svg({'stages': stages}, answer)
 
 
-def stages(subject: Subject) -> Figure:
+def stages(answer: Answer) -> Figure:
     """Draw the errors of the judged rows at each stage, with their mean and 95 %."""
-    answer = subject.answer
     shown = answer.stages
     figure = Figure(figsize=(NARROW_IN, 0.62 * len(shown) + 0.75), layout='constrained')
     ax = figure.subplots()
-    colors = (BEFORE, AFTER, ALL_CAUSES)
+    colors = (BEFORE, AFTER, *((MODEL,) if len(shown) > 3 else ()), ALL_CAUSES)
     for row, (stage, color) in enumerate(zip(shown, colors, strict=False)):
         errors = np.maximum(np.sort(stage.errors), 1e-4)
         if len(errors) > MOST_POINTS:
@@ -115,7 +111,7 @@ def over_session(subject: Subject) -> Figure:
         if not len(mine):
             continue
         marker = SENSOR_MARKERS[sensor % len(SENSOR_MARKERS)]
-        for errors, color in ((inputs.before_mm, BEFORE), (final_errors(inputs, answer), AFTER)):
+        for errors, color in ((inputs.before_mm, BEFORE), (answer.final_mm, AFTER)):
             for held_out in (False, True):
                 rows = mine[m.is_validation[mine] == held_out]
                 ax.plot(
@@ -167,7 +163,7 @@ def workspace(subject: Subject) -> Figure:
     T_R_N = np.array([frames[name] for name in inputs.session.sensor_names])
     shown = np.linspace(0, len(m) - 1, min(len(m), MOST_POINTS)).round().astype(int)
     points = apply(T_R_N[m.sensor[shown]], m.position[shown])
-    errors = final_errors(inputs, subject.answer)[shown]
+    errors = subject.answer.final_mm[shown]
     order = np.argsort(errors)
     rows = inputs.fit.joint_offsets
     offsets = np.radians([row.mean_deg if row.identifiable else 0.0 for row in rows])

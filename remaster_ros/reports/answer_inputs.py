@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
+from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.result import predicted_rows
+from remaster_ros.compensation.export import URDF_FILE
 from remaster_ros.errors import InputError
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.discovery_schema import Discovered
-from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, read_fit
+from remaster_ros.reports.effect_words import is_held_by_model, is_of_measurement
+from remaster_ros.reports.fit_json import (
+    APPLY_FOLDER,
+    DISCOVERY_FILE,
+    FIT_FILE,
+    FIT_LIMIT,
+    read_fit,
+)
 from remaster_ros.reports.predictions_csv import PREDICTED, PREDICTIONS_FILE
 from remaster_ros.reports.rows_csv import AFTER, BEFORE, RESIDUALS_FILE, read_columns
 from remaster_ros.reports.schemas import Fit, Judgement
+from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.types import FloatArray, Session
 
 
@@ -28,24 +39,24 @@ class Inputs:
     ----------
     session
         All rows.
-    fit, fit_folder
-        fit.json, and where it and the files beside it are.
-    found, found_folder
-        The same of a discovery; None without one.
+    fit, found
+        fit.json and discovery.json; None without the latter.
     before_mm, after_mm
         3-D error of every row with all offsets at zero and with those of the fit, (n,).
     causes_mm
         With the causes as well, (n,); None where there are none.
+    model_mm
+        With the corrected robot model of the discovery and nothing else, (n,); None where it has
+        all causes or none.
     """
 
     session: Session
     fit: Fit
-    fit_folder: Path
     found: Discovered | None
-    found_folder: Path | None
     before_mm: FloatArray
     after_mm: FloatArray
     causes_mm: FloatArray | None
+    model_mm: FloatArray | None = None
 
     @property
     def judgement(self) -> Judgement:
@@ -98,24 +109,36 @@ def read_inputs(session: Session, fit_path: Path, found_path: Path | None) -> In
     residuals = read_columns(fit_path.parent / RESIDUALS_FILE, session, BEFORE + AFTER, 'fit')
     before_mm, after_mm = _lengths_mm(residuals[:, :3]), _lengths_mm(residuals[:, 3:])
     if found_path is None:
-        return Inputs(session, fit, fit_path.parent, None, None, before_mm, after_mm, None)
+        return Inputs(session, fit, None, before_mm, after_mm, None)
     found = msgspec.convert(read_discovery(found_path), Discovered)
     _require_same(session, found, found_path, 'discover')
-    causes_mm = None
+    causes_mm = model_mm = None
     if found.effects:
         path = found_path.parent / PREDICTIONS_FILE
         predicted = read_columns(path, session, PREDICTED, 'discover')
         causes_mm = _lengths_mm(session.measurements.position - predicted)
-    return Inputs(
-        session,
-        fit,
-        fit_path.parent,
-        found,
-        found_path.parent,
-        before_mm,
-        after_mm,
-        causes_mm,
+    if any(map(is_held_by_model, found.effects)) and not all_taken_out(found):
+        path = found_path.parent / APPLY_FOLDER / URDF_FILE
+        data = read_limited(path, FIT_LIMIT, 'discover again, which writes it')
+        model_mm = errors_with_model_mm(session, decode_text(data, path))
+    return Inputs(session, fit, found, before_mm, after_mm, causes_mm, model_mm)
+
+
+def all_taken_out(found: Discovered) -> bool:
+    """Whether all causes are in the corrected robot model, or in how the arm was measured."""
+    return found.verdict != 'undetermined' and all(
+        is_held_by_model(effect) or is_of_measurement(effect) for effect in found.effects
     )
+
+
+def errors_with_model_mm(session: Session, urdf: str) -> FloatArray:
+    """Return the 3-D error of every row with another robot model, as it is, mm, (n,).
+
+    Registrations and markers are fitted to the optimization rows, as for the error of today.
+    """
+    found = estimate(Problem.of(replace(session, urdf=urdf)))
+    predicted = predicted_rows(found.problem, found.model, found.before.z)
+    return _lengths_mm(session.measurements.position - predicted)
 
 
 def _lengths_mm(errors: FloatArray) -> FloatArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import logging
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -18,7 +19,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.reports.answer import ALL_FILES, Answer, answer_of, registrations
-from remaster_ros.reports.answer_figures import Subject, draw_answer, final_errors
+from remaster_ros.reports.answer_figures import Subject, draw_answer
 from remaster_ros.reports.answer_inputs import Inputs
 from remaster_ros.reports.fit_json import APPLY_FOLDER, REPORT_FILE
 from remaster_ros.reports.fit_tables import accuracy_rows, marker_rows
@@ -50,8 +51,26 @@ class WorstRow(NamedTuple):
     remark: str
 
 
-def write_answer(inputs: Inputs, folder: Path, figures: bool = True, pdf: bool = False) -> Answer:
+def write_answer(
+    inputs: Inputs,
+    fit_folder: Path,
+    found_folder: Path | None,
+    folder: Path,
+    figures: bool = True,
+    pdf: bool = False,
+) -> Answer:
     """Write report.html, the files to apply and, if asked for, report.pdf; return the answer.
+
+    Parameters
+    ----------
+    inputs
+        What was read.
+    fit_folder, found_folder
+        Of the fit and of the discovery, which hold figures and files to apply.
+    folder
+        Where to; made if missing.
+    figures, pdf
+        Whether to have figures, and report.pdf.
 
     Raises
     ------
@@ -61,10 +80,15 @@ def write_answer(inputs: Inputs, folder: Path, figures: bool = True, pdf: bool =
     printer = require_ready(folder, pdf)
     answer = answer_of(inputs)
     subject = Subject(inputs, answer, _chain(inputs))
-    drawings = draw_answer(subject) | _figures_of(inputs) if figures else {}
+    drawings: dict[str, str] = {}
+    if figures:
+        drawings = draw_answer(subject) | _figures_of(fit_folder, FIT_FIGURES)
+        if found_folder is not None:
+            drawings |= _figures_of(found_folder, FOUND_FIGURES)
     make_folder(folder)
     html = answer_html(subject, {name: inlined(name, svg) for name, svg in drawings.items()})
-    _copy_apply(inputs, answer, folder)
+    source = found_folder if answer.uses_causes and found_folder else fit_folder
+    _copy_apply(source / APPLY_FOLDER, answer, folder)
     write_atomically(folder / REPORT_FILE, html)
     if printer is not None:
         printed = {name: as_image(svg) for name, svg in drawings.items()}
@@ -149,10 +173,11 @@ def measured_when(inputs: Inputs) -> str:
 def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
     """Return the rows with the largest errors after the deed, the largest first."""
     session, m = inputs.session, inputs.session.measurements
-    final = final_errors(inputs, answer)
+    final = answer.final_mm
     frames = registrations(inputs)
     first = float(m.stamp_s.min())
     gross = inputs.found.noise.outliers if inputs.found is not None else ()
+    left_out = {} if answer.uses_causes else inputs.fit_left_out
     rows = []
     for i in np.argsort(-final, kind='stable')[:WORST_ROWS]:
         number, sensor = int(m.observation[i]), session.sensor_names[m.sensor[i]]
@@ -160,7 +185,7 @@ def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
         if session.timed:
             clock = clock_time(float(m.stamp_s[i]))[:8]
             when = clock or f'{(m.stamp_s[i] - first) / 60.0:.1f} min'
-        remark = inputs.fit_left_out.get(number, 'gross error' if number in gross else '')
+        remark = left_out.get(number, 'gross error' if number in gross else '')
         rows.append(
             WorstRow(
                 number,
@@ -178,28 +203,21 @@ def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
     return rows
 
 
-def _copy_apply(inputs: Inputs, answer: Answer, folder: Path) -> None:
+def _copy_apply(source: Path, answer: Answer, folder: Path) -> None:
     """Copy the files of the deed, so that the page can be handed on with them."""
-    source = inputs.found_folder if answer.uses_causes else inputs.fit_folder
-    assert source is not None
     make_folder(folder / APPLY_FOLDER)
     for name in ALL_FILES:
         # One of an earlier page would contradict this one.
         (folder / APPLY_FOLDER / name).unlink(missing_ok=True)
     for name in answer.files:
-        data = read_limited(
-            source / APPLY_FOLDER / name, FILE_LIMIT, 'fit or discover again, which write it'
-        )
+        data = read_limited(source / name, FILE_LIMIT, 'fit or discover again, which write it')
         write_atomically(folder / APPLY_FOLDER / name, data)
 
 
-def _figures_of(inputs: Inputs) -> dict[str, str]:
-    """Return those figures of the fit and the discovery that are there."""
-    wanted = [(inputs.fit_folder, name) for name in FIT_FIGURES]
-    if inputs.found_folder is not None:
-        wanted += [(inputs.found_folder, name) for name in FOUND_FIGURES]
+def _figures_of(folder: Path, names: Sequence[str]) -> dict[str, str]:
+    """Return those figures of a fit or a discovery that are there."""
     texts = {}
-    for folder, name in wanted:
+    for name in names:
         path = folder / 'figures' / f'{name}.svg'
         if path.exists():
             data = read_limited(path, FILE_LIMIT, 'it was there')

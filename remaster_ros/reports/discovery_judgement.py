@@ -8,6 +8,7 @@ from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.reports.discovery_schema import Discovered
+from remaster_ros.reports.effect_words import STEP
 from remaster_ros.reports.schemas import Judgement
 
 # Regions meant for 95 % of the held-out rows that hold clearly less than this are too small.
@@ -51,6 +52,9 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
     if discovery.verdict in ('undetermined', 'unexplained') or discovery.unexplained:
         return False
     if not discovery.fit.sampler.converged:
+        return False
+    if any(effect.form == STEP for effect in discovery.effects):
+        # What was measured before and after it does not agree.
         return False
     if confirmation is not None and not confirmation.same_offsets:
         return False

@@ -44,6 +44,7 @@ def write_discovery_report(
     html = page(
         'discovery.html.jinja',
         found=msgspec.to_builtins(content),
+        session=discovery.fit.session,
         equations={name: effect.equation for name, effect in EFFECTS.items()},
         sources={name: effect.source for name, effect in EFFECTS.items()},
         most_parameters=MOST_PARAMETERS,

@@ -10,8 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+import numpy as np
 from markupsafe import Markup
 
+from remaster_ros.reports.answer import answer_of
+from remaster_ros.reports.answer_figures import draw_stages
+from remaster_ros.reports.answer_inputs import Inputs
 from remaster_ros.reports.figures import draw_figures
 from remaster_ros.reports.fit_json import fit_content
 from remaster_ros.reports.fit_tables import accuracy_rows, marker_rows
@@ -31,8 +35,18 @@ def write_fit_report(result: FitResult, folder: Path) -> Path:
     InputError
         The folder cannot be written to.
     """
-    drawings = draw_figures(result)
+    drawings = draw_figures(result) | draw_stages(answer_of(inputs_of(result)))
     return write_report(folder, drawings, report_html(result, drawings))
+
+
+def inputs_of(result: FitResult) -> Inputs:
+    """Return a fit as the first screen takes it."""
+    lengths = (
+        1e3 * np.linalg.norm(residuals, axis=1)
+        for residuals in (result.residuals_before, result.residuals_after)
+    )
+    before_mm, after_mm = lengths
+    return Inputs(result.session, fit_content(result), None, before_mm, after_mm, None)
 
 
 def report_html(result: FitResult, drawings: dict[str, str]) -> str:
@@ -42,12 +56,13 @@ def report_html(result: FitResult, drawings: dict[str, str]) -> str:
         from remaster_ros.reports.view_3d import draw_view
 
         scene = draw_view(result)
-    content = fit_content(result)
-    fit = msgspec.to_builtins(content)
+    inputs = inputs_of(result)
+    fit = msgspec.to_builtins(inputs.fit)
     return page(
         'report.html.jinja',
         fit=fit,
-        accuracy=accuracy_rows(content.accuracy),
+        answer=answer_of(inputs),
+        accuracy=accuracy_rows(inputs.fit.accuracy),
         markers=marker_rows(fit, result.session),
         references=references(result),
         session=result.session,

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import sys
+import builtins
 from dataclasses import replace
 
 import msgspec
 import numpy as np
 import pytest
 
+from remaster_ros.compensation.export import exports
 from remaster_ros.errors import InputError
 from remaster_ros.reports.answer import answer_of
-from remaster_ros.reports.answer_inputs import Inputs, parts, read_inputs
+from remaster_ros.reports.answer_inputs import Inputs, errors_with_model_mm, parts, read_inputs
 from remaster_ros.reports.answer_report import checked_svg, require_ready, worst_rows
 from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.effect_words import law, title
@@ -77,22 +78,23 @@ def fit(fit_result) -> Fit:
 
 
 @pytest.fixture
-def inputs(fit_result, fit, tmp_path):
+def inputs(fit_result, fit):
     """Return a function: effects of a discovery (None without one) and changes -> inputs."""
 
-    def made(effects=None, verdict='effects', mood='good', errors=(3.0, 0.5, 0.3)) -> Inputs:
+    def made(
+        effects=None, verdict='effects', mood='good', errors=(3.0, 0.5, 0.3), model=None
+    ) -> Inputs:
         rows = np.ones(len(fit_result.session.measurements))
         found = None if effects is None else discovery(fit, effects, verdict, mood)
         before, after, causes = (rows * error for error in errors)
         return Inputs(
             fit_result.session,
             fit,
-            tmp_path,
             found,
-            None,
             before,
             after,
             causes if effects else None,
+            None if model is None else rows * model,
         )
 
     return made
@@ -132,6 +134,63 @@ def test_causes_that_stay_are_listed_with_their_remedy_and_the_others_are_not(in
     assert all(row.remedy == 'The remedy.' for row in remains)
     (left,) = answer_of(inputs([LENGTH])).remains
     assert left.what == 'Noise'
+
+
+@pytest.mark.parametrize(('model', 'uses_causes'), [(0.4, True), (0.49, False)])
+def test_a_robot_model_that_holds_a_part_is_used_where_that_helps(inputs, model, uses_causes):
+    answer = answer_of(inputs([LENGTH, SOFT], model=model))
+    assert answer.uses_causes == uses_causes
+    assert [stage.mean for stage in answer.stages] == pytest.approx([3.0, 0.5, model, 0.3])
+    assert answer.brings == (2 if uses_causes else 1)
+    assert answer.final_mm[0] == (model if uses_causes else 0.5)
+    assert answer.mood == 'caution'
+    named = [row.what for row in answer.remains]
+    assert ('Link length of joint 2' in named) != uses_causes
+    assert 'Joint compliance of joint 2' in named
+
+
+def test_the_first_screen_names_the_largest_causes_alone(inputs):
+    names = [row.what for row in answer_of(inputs(7 * [SOFT])).remains]
+    assert names == [*4 * ['Joint compliance of joint 2'], '3 smaller causes']
+
+
+def test_a_robot_model_is_judged_as_it_is(fit_result):
+    """The calibrated model leaves what the offsets leave, the nominal one what there is today."""
+    session = fit_result.session
+    calibrated = errors_with_model_mm(session, exports(fit_result)['robot_calibrated.urdf'])
+    nominal = errors_with_model_mm(session, session.urdf)
+    held_out = session.measurements.is_validation
+    for found, residuals in (
+        (nominal, fit_result.residuals_before),
+        (calibrated, fit_result.residuals_after),
+    ):
+        expected = 1e3 * np.linalg.norm(residuals, axis=1)[held_out].mean()
+        assert found[held_out].mean() == pytest.approx(expected, rel=0.03)
+
+
+def test_what_no_cause_explains_is_never_called_noise(inputs, fit):
+    assert [row.what for row in answer_of(inputs([])).remains] == ['Noise']
+    fit.judgement.doubts = ['tracker: the error after is 0.500 mm; noise makes 0.100 mm.']
+    (alone,) = answer_of(inputs()).remains
+    assert alone.size == fit.judgement.doubts[0]
+    assert 'remaster discover' in alone.sentence
+    assert '..' not in alone.sentence
+    (searched,) = answer_of(inputs([])).remains
+    assert searched.what == 'More than noise'
+    assert '0.500 mm, and no cause' in searched.size
+
+
+def test_many_gross_errors_say_when_and_of_which_sensor(inputs):
+    made = inputs([])
+    m = made.session.measurements
+    rows = np.flatnonzero(m.sensor == m.sensor[-1])[-4:]
+    made.found.noise.outliers = m.observation[rows].tolist()
+    (gross,) = answer_of(made).remains
+    first, last = m.configuration[rows[[0, -1]]]
+    minutes = (m.stamp_s[rows[0]] - m.stamp_s[0]) / 60.0
+    name = made.session.sensor_names[m.sensor[-1]]
+    assert gross.size.startswith(f'4 of {len(m)} readings, of {name}: ')
+    assert f'configurations {first} to {last}, {minutes:.1f} to ' in gross.size
 
 
 def test_an_error_of_the_measurement_is_no_gain_of_the_arm(inputs):
@@ -287,7 +346,22 @@ def test_the_page_of_another_command_is_not_replaced(tmp_path):
         require_ready(tmp_path, pdf=False)
 
 
-def test_without_the_library_for_pdf_one_line_says_how_to_get_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'weasyprint', None)
-    with pytest.raises(InputError, match=r"pip install 'remaster_ros\[pdf\]'"):
+@pytest.mark.parametrize(
+    ('error', 'words'),
+    [
+        (ImportError('no'), r"pip install 'remaster_ros\[pdf\]'"),
+        (OSError("cannot load library 'pango'\nmore"), r"library 'pango'\): apt install libpango"),
+    ],
+)
+def test_without_what_makes_pdf_one_line_says_how_to_get_it(tmp_path, monkeypatch, error, words):
+    usual = builtins.__import__
+
+    def importing(name, *args, **kwargs):
+        if name == 'weasyprint':
+            raise error
+        return usual(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, '__import__', importing)
+    with pytest.raises(InputError, match=words) as found:
         require_ready(tmp_path, pdf=True)
+    assert '\n' not in str(found.value)
