@@ -17,6 +17,7 @@ from remaster_ros.planning.candidates import PlanningScene
 from remaster_ros.planning.collection_plan import CollectionPlan, plan_collection
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.planning.travel_time import DWELL_S, SETTLE_S, SPEED_SHARE, TravelTime
+from remaster_ros.reports.found_causes import read_causes
 from remaster_ros.reports.plan_json import plan_text, plan_to_dict
 from remaster_ros.reports.plan_page import check_plan_page, plan_page, write_plan_page
 from remaster_ros.reports.robot_scene import robot_scene
@@ -73,6 +74,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='write a page that plays the plan in 3-D, such as plan.html',
     )
     parser.add_argument(
+        '--separate',
+        metavar='FILE',
+        help='discovery.json: add configurations that separate its causes from their look-alikes',
+    )
+    parser.add_argument(
         '--json', action='store_true', help='print one JSON object and nothing else'
     )
 
@@ -114,9 +120,10 @@ def planned(
         args.settle,
         args.dwell,
     )
+    causes = read_causes(args.separate) if args.separate else ()
     counts = {'optimization': args.poses, 'validation': args.validation}
     planner = TourPlanner(
-        scene, counts, args.seed, args.reference_every, cell.design_settings(), travel
+        scene, counts, args.seed, args.reference_every, cell.design_settings(), travel, causes
     )
     start = free_start(scene.model, args.seed)
     return plan_collection(planner, planner.rough_places, start, progress)

@@ -21,7 +21,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.subscription import Subscription
@@ -48,7 +47,6 @@ from remaster_ros.nodes.run_token import LivingRun, new_token, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.planning.tour_order import REGISTRATION, PoseVisit
-from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanJournal
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
@@ -67,24 +65,11 @@ class PosePlanner(RemasterNode):
         self.chain = self.cell.chain()
         self._order = JointOrder(self.chain.joint_names)
         self._q: FloatArray | None = None
-        counts = {
-            'optimization': self.p.optimization_candidates,
-            'validation': self.p.validation_candidates,
-            REGISTRATION: self.p.registration_candidates,
-        }
-        scene = self.cell.planning_scene(self.chain, np.deg2rad(self.p.limit_margin_deg))
-        self._tours = TourPlanner(
-            scene,
-            counts,
-            self.p.seed,
-            self.p.reference_every,
-            self.cell.design_settings(),
-            self.p.travel(self.cell, scene.model),
-        )
+        causes = self.p.causes()
+        self._tours = self.p.tour_planner(self.cell, self.chain, causes)
+        settings = self.p.plan_settings(self.cell, causes)
         folder = Path(self.p.session)
-        self.journal = PlanJournal(
-            folder, self.p.plan_settings(self.cell), self.chain, self._tours.model
-        )
+        self.journal = PlanJournal(folder, settings, self.chain, self._tours.model)
         self.progress = TourProgress(self.journal, self._tours, PlanningThread())
         # Of the run, and of what may be published only while it is running.
         self._lock = threading.RLock()

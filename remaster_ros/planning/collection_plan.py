@@ -12,6 +12,7 @@ from remaster_ros.errors import InsufficientDataError
 from remaster_ros.motion.trajectory import Trajectory
 from remaster_ros.planning.candidates import PlannedPose
 from remaster_ros.planning.planned_design import Designed
+from remaster_ros.planning.separating_design import SeparatingDesign
 from remaster_ros.planning.tour_order import PoseVisit, Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.planning.travel_time import TravelTime
@@ -93,6 +94,8 @@ class CollectionPlan:
     undetermined
         What these configurations do not determine at all, so that there are no standard
         deviations (None and NaN above); ''.
+    separated
+        What was added to separate causes; None without causes.
     """
 
     tour: Tour
@@ -106,6 +109,7 @@ class CollectionPlan:
     tool_rms: float
     designed: Designed | None
     undetermined: str = ''
+    separated: SeparatingDesign | None = None
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -211,7 +215,23 @@ def look_ahead(
         *expected,
         planner.designed,
         undetermined,
+        planner.separated,
     )
+
+
+def outlook(planner: TourPlanner) -> tuple[Tour, Expected]:
+    """Return a collection with the sensors at their rough places, without its ways.
+
+    These take nearly all of the time that `plan_collection` takes; without them it is not known
+    which configurations no free way leads to, nor how long it all takes.
+
+    Raises
+    ------
+    InsufficientDataError
+        No pose is left to fit on, or the poses do not determine the offsets.
+    """
+    tour = planner.collection(planner.rough_places)
+    return tour, expected_precision(planner, planner.rough_places, tour.plans[FITTED].poses)
 
 
 class _Steps:

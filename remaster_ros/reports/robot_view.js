@@ -133,9 +133,6 @@ class RobotView {
     if (from === 'all') this.sensors.forEach((place) => box.expandByPoint(place));
     const eye = this.eye;
     box.getCenter(eye.target);
-    const radius = box.getSize(new THREE.Vector3()).length() / 2;
-    const half = THREE.MathUtils.degToRad(this.camera.fov) / 2;
-    eye.distance = (0.82 * radius) / Math.sin(Math.min(half, Math.atan(Math.tan(half) * this._aspect())));
     if (typeof from === 'number') {
       const back = this.sensors[from].clone().sub(eye.target);
       eye.distance = back.length();
@@ -146,8 +143,33 @@ class RobotView {
       const mean = this.sensors.reduce((sum, p) => sum.add(p), new THREE.Vector3());
       eye.turn = (this.sensors.length ? Math.atan2(mean.y, mean.x) : 0) + 0.9;
       eye.tilt = 0.35;
+      eye.distance = this._distanceToSee(box);
     }
     this.draw();
+  }
+
+  // How far off the target the camera must be for all corners of a box to be in the picture.
+  _distanceToSee(box) {
+    const {target, turn, tilt} = this.eye;
+    const right = new THREE.Vector3(-Math.sin(turn), Math.cos(turn), 0);
+    const back = this._back(turn, tilt);
+    const up = back.clone().cross(right);
+    const high = Math.tan(THREE.MathUtils.degToRad(this.camera.fov) / 2);
+    const wide = high * this._aspect();
+    let distance = 0.1;
+    for (let i = 0; i < 8; i += 1) {
+      const corner = new THREE.Vector3(
+        (i & 1 ? box.max : box.min).x, (i & 2 ? box.max : box.min).y, (i & 4 ? box.max : box.min).z
+      ).sub(target);
+      const across = Math.max(Math.abs(corner.dot(right)) / wide, Math.abs(corner.dot(up)) / high);
+      distance = Math.max(distance, across + corner.dot(back));
+    }
+    return 1.03 * distance;
+  }
+
+  // From the target towards the camera.
+  _back(turn, tilt) {
+    return new THREE.Vector3(Math.cos(tilt) * Math.cos(turn), Math.cos(tilt) * Math.sin(turn), Math.sin(tilt));
   }
 
   draw() {
@@ -156,8 +178,7 @@ class RobotView {
     requestAnimationFrame(() => {
       this.waiting = false;
       const {target, distance, turn, tilt} = this.eye;
-      this.camera.position.set(Math.cos(tilt) * Math.cos(turn), Math.cos(tilt) * Math.sin(turn), Math.sin(tilt));
-      this.camera.position.multiplyScalar(distance).add(target);
+      this.camera.position.copy(this._back(turn, tilt)).multiplyScalar(distance).add(target);
       this.camera.near = distance / 100;
       this.camera.far = distance * 50;
       this.camera.updateProjectionMatrix();
