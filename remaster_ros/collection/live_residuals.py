@@ -37,13 +37,14 @@ class LiveResiduals:
     def __init__(
         self, chain: SerialChain, markers: Mapping[str, Mapping[str, FloatArray]]
     ) -> None:
-        self._chain, self._markers = chain, markers
+        self._chain = chain
+        self._markers = {name: dict(places) for name, places in markers.items()}
         self._offsets: FloatArray | None = None
         self._q: FloatArray | None = None
         # Of each sensor and marker the sum of the readings, and their number.
         self._sums = {(name, marker): np.zeros(4) for name in markers for marker in markers[name]}
-        # Configuration, marker in the tool frame, marker as read.
-        self._pairs: dict[str, list[tuple[FloatArray, FloatArray, FloatArray]]] = {
+        # Configuration, marker, where it was read.
+        self._pairs: dict[str, list[tuple[FloatArray, str, FloatArray]]] = {
             name: [] for name in markers
         }
         self._found: dict[str, tuple[FloatArray, FloatArray]] = {}
@@ -64,8 +65,7 @@ class LiveResiduals:
         if self._q is not None and recorded:
             for (name, marker), total in self._sums.items():
                 if total[3]:
-                    place = self._markers[name][marker]
-                    self._pairs[name].append((self._q, place, total[:3] / total[3]))
+                    self._pairs[name].append((self._q, marker, total[:3] / total[3]))
                     del self._pairs[name][:-MOST]
                     self._found.pop(name, None)
         self._q = None
@@ -73,6 +73,12 @@ class LiveResiduals:
     def use_offsets(self, joint_offsets: FloatArray) -> None:
         """State residuals of the arm with these zero-offsets from now on, rad, (k,)."""
         self._offsets = joint_offsets
+        self._found.clear()
+
+    def use_markers(self, markers: Mapping[str, FloatArray]) -> None:
+        """Take markers as they were fitted from now on, marker -> m, (3,)."""
+        for places in self._markers.values():
+            places.update({name: markers[name] for name in places if name in markers})
         self._found.clear()
 
     @property
@@ -98,8 +104,12 @@ class LiveResiduals:
         nothing = np.empty(0), np.empty((0, 3))
         if len(pairs) < FEWEST:
             return nothing
-        q, places, read = (np.array(column) for column in zip(*pairs, strict=True))
-        expected = self._chain.positions(q, places, self._offsets)
+        q, markers, points = zip(*pairs, strict=True)
+        places, read = (
+            np.array([self._markers[sensor][name] for name in markers]),
+            np.array(points),
+        )
+        expected = self._chain.positions(np.array(q), places, self._offsets)
         try:
             T_R_N, _ = register_points(expected, read)
         except RemasterError:

@@ -41,6 +41,7 @@ from remaster_ros.nodes.rviz_markers import RvizMarkers
 from remaster_ros.nodes.status import LATCHED, LEVELS, RELIABLE, TOPIC, NodeStatus, Summary, listen
 from remaster_ros.nodes.waypoints import waypoints_by_solution
 from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE, read_fit
+from remaster_ros.reports.live_facts import FitFacts
 from remaster_ros.reports.live_server import COMMANDS, Done, LiveServer, Place
 from remaster_ros.reports.live_view import LiveView
 from remaster_ros.reports.robot_scene import robot_scene
@@ -207,7 +208,8 @@ class Watch(RemasterNode):
         )
 
     def _on_fit_facts(self, facts: Any) -> None:
-        self.view.take_fit({} if isinstance(facts, Exception) else facts)
+        if not isinstance(facts, Exception):
+            self.view.take_fit(facts)
 
     # What goes out
 
@@ -258,8 +260,8 @@ def _tolerant(callback: Callable[[Any], None]) -> Callable[[Any], None]:
     return receive
 
 
-def fit_facts(folder: Path, offsets: dict[str, float]) -> dict[str, str]:
-    """Return what the page shows of a fit beside its offsets, label -> text.
+def fit_facts(folder: Path, offsets: Mapping[str, float]) -> FitFacts:
+    """Return what the page shows of a fit beside its offsets.
 
     Parameters
     ----------
@@ -271,10 +273,10 @@ def fit_facts(folder: Path, offsets: dict[str, float]) -> dict[str, str]:
     try:
         fit = read_fit(folder / FIT_FILE)
     except RemasterError:
-        return {}
+        return FitFacts()
     of_file = {row['joint']: np.deg2rad(row['mean_deg']) for row in fit['joint_offsets']}
     if not all(np.isclose(offsets.get(name, np.nan), mean) for name, mean in of_file.items()):
-        return {}
+        return FitFacts()
     facts = {}
     for split, words in (('validation', 'held-out poses'), ('optimization', 'fitted poses')):
         errors = (fit['accuracy'].get(split) or {}).get('theoretical')
@@ -283,7 +285,11 @@ def fit_facts(folder: Path, offsets: dict[str, float]) -> dict[str, str]:
             facts[f'mean error, {words}'] = f'{before:.3f} mm → {after:.3f} mm'
     report = folder / REPORT_FILE
     facts['files'] = str((report if report.exists() else folder).resolve())
-    return facts
+    return FitFacts(
+        facts,
+        frozenset(row['joint'] for row in fit['joint_offsets'] if not row['identifiable']),
+        {name: np.array(marker['position_m']) for name, marker in fit['markers'].items()},
+    )
 
 
 def main(args: list[str] | None = None) -> int:

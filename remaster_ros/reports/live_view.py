@@ -20,6 +20,7 @@ from remaster_ros.collection import events
 from remaster_ros.collection.live_residuals import LiveResiduals
 from remaster_ros.collection.pace import Pace, minutes_text
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.reports.live_facts import FitFacts, Precision
 from remaster_ros.types import FloatArray
 
 SILENT_S = 3.0
@@ -38,21 +39,6 @@ STOP_LABEL = 'Stop the collection'
 STOP_NOTE = (
     'No emergency stop: it asks the planner over the network. In danger use the red button.'
 )
-
-
-class Look(msgspec.Struct, frozen=True):
-    """Of `precision_json`: what was known after so many configurations."""
-
-    configurations: int
-    minutes: float | None
-    joint_std_deg: dict[str, float | None]
-
-
-class Precision(msgspec.Struct, frozen=True):
-    """What the page shows of `precision_json`."""
-
-    message: str = ''
-    looks: list[Look] = []
 
 
 @dataclass
@@ -101,7 +87,7 @@ class LiveView:
         self.registration: dict[str, FloatArray] = {}
         self._precision = Precision()
         self._offsets: Mapping[str, tuple[float, float]] = {}
-        self._fit: Mapping[str, Any] = {}
+        self._fit = FitFacts()
 
     # What comes in
 
@@ -189,9 +175,10 @@ class LiveView:
             self._offsets = {name: (means[name], stds[name]) for name in names}
             self.residuals.use_offsets(np.array([means[name] for name in names]))
 
-    def take_fit(self, fit: Mapping[str, Any]) -> None:
-        """Take what else is to be shown of a fit: label -> text."""
+    def take_fit(self, fit: FitFacts) -> None:
+        """Take what else is known of the fit whose offsets were taken."""
         self._fit = fit
+        self.residuals.use_markers(fit.markers)
 
     def take_precision(self, text: str) -> None:
         """Take what is known so far (JSON of /remaster/precision); errors as of msgspec."""
@@ -308,11 +295,11 @@ class LiveView:
                 {
                     'joint': name,
                     'mean_deg': _degrees(mean),
-                    'std_deg': _determined(std),
+                    'std_deg': None if name in self._fit.unidentifiable else _determined(std),
                 }
                 for name, (mean, std) in self._offsets.items()
             ],
-            'fit': dict(self._fit),
+            'fit': dict(self._fit.shown),
         }
 
     def _commands(self, now_s: float) -> dict[str, dict[str, Any]]:

@@ -113,6 +113,7 @@ def test_from_begin_to_result(browser, played):
     browser.click('#fit')
     browser.until(lambda: '0.123 mm' in browser.text('#result'), 'the result')
     assert browser.text('#offsets').count('joint_') == 7
+    assert browser.text('#offsets').count('not identifiable') == 1
     assert played.collection.commands == ['collect', 'pause', 'collect', 'fit']
     # The arm stands in the picture, and nothing went wrong on the way.
     browser.until(

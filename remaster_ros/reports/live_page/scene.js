@@ -110,7 +110,7 @@ function drawResiduals(sensors) {
   }));
   const model = sensors.some((s) => s.corrected) ? 'the arm with the fitted zero-offsets' : 'the nominal arm';
   setText('residuals-note', made.length
-    ? `Distance from each measured marker to where ${model} has it, registered by all configurations so far.`
+    ? `Distance from each measured marker to where ${model} has it, registered by all configurations so far. The fit itself weighs them by their noise.`
     : 'After five measured points.');
   flat('residuals', made, { xaxis: axis('measured point since this page was started'), yaxis: axis('mm', { rangemode: 'tozero' }), showlegend: true });
 }

@@ -86,3 +86,5 @@ def test_the_markers_of_one_frame_share_a_registration():
     assert len(norms) == 40
     # Half of the millimetre stays with each of them, as only one of them was moved.
     assert np.median(norms) == pytest.approx(0.5e-3, rel=0.2)
+    residuals.use_markers({'smr': PLACES['smr'] + moved['smr'], 'other': np.zeros(3)})
+    assert np.max(residuals.norms_m('mocap')) < 1e-9

@@ -12,7 +12,14 @@ from played_collection import CHAIN, MARKERS, T_R_N, PlayedCollection
 from remaster_ros import simulate
 from remaster_ros.collection import events
 from remaster_ros.collection.stopping_rule import StoppingGoal, StoppingRule
-from remaster_ros.reports.live_view import LONGEST_TEXT, MOST_NODES, SILENT_S, LiveView, tool_path
+from remaster_ros.reports.live_facts import FitFacts
+from remaster_ros.reports.live_view import (
+    LONGEST_TEXT,
+    MOST_NODES,
+    SILENT_S,
+    LiveView,
+    tool_path,
+)
 from remaster_ros.reports.precision_json import precision_json
 
 
@@ -171,6 +178,11 @@ def test_a_result_needs_every_joint_as_a_number(played):
     joints = played.view.view(0.0)['result']['joints']
     assert [row['joint'] for row in joints] == list(names)
     assert joints[0]['mean_deg'] == pytest.approx(np.degrees(0.01), abs=1e-6)
+    assert None not in [row['std_deg'] for row in joints]
+    played.view.take_fit(FitFacts({'files': 'fit'}, frozenset({'joint_7'})))
+    result = played.view.view(0.0)['result']
+    assert result['fit'] == {'files': 'fit'}
+    assert [row['joint'] for row in result['joints'] if row['std_deg'] is None] == ['joint_7']
 
 
 def test_strangers_cannot_fill_the_memory_or_break_the_page(played):
