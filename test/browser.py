@@ -32,7 +32,14 @@ class Browser:
         )
         self._loop = asyncio.new_event_loop()
         self._number, self.errors, self.requests = 0, [], []
-        port_file = profile / 'DevToolsActivePort'
+        try:
+            self._connect(profile / 'DevToolsActivePort')
+        except BaseException:
+            self._process.kill()
+            self._process.wait()
+            raise
+
+    def _connect(self, port_file):
         deadline = time.monotonic() + 60.0
         while not (port_file.exists() and port_file.read_text().count('\n')):
             assert time.monotonic() < deadline, 'the browser does not start'
