@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from common import table
 from hidden_judge import CURVE_SHARE
+from hidden_third import HARM
 from scipy.optimize import minimize
 
 from remaster_ros.simulation.hidden_effects import NAMED
@@ -198,9 +199,10 @@ def report_outcomes(lines: list[dict[str, Any]]) -> None:
         '\nOutcomes. unexplained: said to be unexplained, at the right place, and no wrong name; '
         'elsewhere: at another\nplace; partly: some of several are named, nothing else; wrong: '
         'something named that is not there; harm:\nerror on a third set of poses more than 5 % '
-        'above that of the offsets, both without noise; by how much at most.\n'
+        'above that of the offsets, both without noise; by how much\nat most; measured: harm '
+        'where the third set has noise like the rows held out.\n'
     )
-    header = ('sessions', 'n', *OUTCOMES, 'harm', 'largest', 'named')
+    header = ('sessions', 'n', *OUTCOMES, 'harm', 'largest', 'measured', 'named')
     rows = []
     for kind, members in kinds.items():
         counts = Counter(line['outcome'] for line in members)
@@ -218,10 +220,19 @@ def report_outcomes(lines: list[dict[str, Any]]) -> None:
                 *(counts[outcome] for outcome in OUTCOMES),
                 sum(line['harm'] for line in members),
                 f'{max(ratios):.2f}',
+                sum(_harm_as_measured(line) for line in members),
                 ', '.join(f'{name} {n}' for name, n in names.most_common(4)),
             )
         )
     print(table(header, rows))
+
+
+def _harm_as_measured(line: dict[str, Any]) -> bool:
+    # Gross errors among the held-out rows would hide any harm.
+    noise = 0.0 if line['outliers'] else line['floor_mm']
+    return bool(
+        np.hypot(line['third_mm'], noise) > HARM * np.hypot(line['third_offsets_mm'], noise)
+    )
 
 
 def _percent(part: int, whole: int) -> str:

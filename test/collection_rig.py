@@ -20,7 +20,16 @@ class Cell:
     """A small collection of real nodes on fake devices, and what they publish."""
 
     def __init__(
-        self, start, client, folder, require, sensors, candidates=2, reference_every=0, cell='demo'
+        self,
+        start,
+        client,
+        folder,
+        require,
+        sensors,
+        candidates=2,
+        reference_every=0,
+        cell='demo',
+        held_out=1,
     ):
         from remaster_ros.nodes.status import listen
 
@@ -37,7 +46,7 @@ class Cell:
             'pose_planner': {
                 'session': self.session,
                 'optimization_candidates': candidates,
-                'validation_candidates': 1,
+                'validation_candidates': held_out,
                 'registration_candidates': 6,
                 'reference_every': reference_every,
             },

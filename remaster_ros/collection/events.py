@@ -16,24 +16,14 @@ from typing import Annotated, ClassVar, Literal, get_args
 import msgspec
 import numpy as np
 
+from remaster_ros.collection.event_body import Body
+from remaster_ros.collection.optimizer_state import OptimizerState
 from remaster_ros.errors import InputError
 
 VERSION = 1
 
 Index = Annotated[int, msgspec.Meta(ge=0)]
 Outcome = Literal['recorded', 'partial', 'rejected']
-
-
-class Body(msgspec.Struct, frozen=True, tag_field='kind'):
-    """What a record carries; ``kind`` names its type.
-
-    Attributes
-    ----------
-    sender
-        The name of the only node that may publish it; '' for any.
-    """
-
-    sender: ClassVar[str] = ''
 
 
 class Alive(Body, frozen=True, tag='alive'):
@@ -50,11 +40,14 @@ class PlannerState(Body, frozen=True, kw_only=True, tag='planner'):
         ``stopped``, ``complete`` or ``failed``.
     run
         Token of the run under way, '' for none. Each /remaster/collect begins another one.
+    planned
+        Configurations to fit that were planned; 0 before.
     """
 
     sender: ClassVar[str] = 'pose_planner'
     state: str
     run: str
+    planned: int = 0
 
     def run_held(self, before: str) -> str:
         """Return the token that recorder and bridge hold after this state.
@@ -145,7 +138,7 @@ class RecorderState(Body, frozen=True, kw_only=True, tag='recorder'):
     decided: Decided | None = None
     registration: str = ''
     require: str = 'all'
-    read_age_s: dict[str, float | None] = {}
+    read_age_s: dict[str, float | None] = msgspec.field(default_factory=dict)
     changed: str = ''
     changed_run: str | None = None
 
@@ -281,7 +274,7 @@ class ConfigurationEnded(Body, frozen=True, kw_only=True, tag='configuration'):
     reason: str = ''
     registered: bool = False
     measuring_s: float | None = None
-    waited_s: dict[str, float] = {}
+    waited_s: dict[str, float] = msgspec.field(default_factory=dict)
 
 
 class SetupChanged(Body, frozen=True, kw_only=True, tag='changed'):
@@ -314,7 +307,7 @@ class ShotMeasured(Body, frozen=True, tag='measured'):
     instrument_wall_s: float
 
 
-State = Alive | PlannerState | BridgeState | RecorderState | SensorReport
+State = Alive | PlannerState | BridgeState | RecorderState | SensorReport | OptimizerState
 Event = (
     TourPlanned
     | PoseAnnounced

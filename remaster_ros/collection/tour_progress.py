@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeVar
 from remaster_ros.collection.events import RecorderState
 from remaster_ros.collection.required_sensors import RequiredSensors
 from remaster_ros.errors import InputError, InsufficientDataError
-from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, PoseVisit, Tour
+from remaster_ros.planning.tour_order import FITTED, REFERENCE, REGISTRATION, PoseVisit, Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.types import FloatArray
 
@@ -33,6 +33,9 @@ class PlanMemory(Protocol):
 
     def reroute(self, stop: PoseVisit) -> None:
         """Remember other ways to what is left of the stop."""
+
+    def leave_rest(self) -> None:
+        """Remember that no more poses to fit are visited."""
 
     def outcome(self, solution: int, result: str) -> None:
         """Remember what became of a solution of the stop."""
@@ -67,6 +70,8 @@ class TourProgress:
         The registrations so far: sensor -> (4, 4).
     is_complete
         Whether all of the tour was visited.
+    enough
+        Whether enough is known: from then on only what is held out, and references, are visited.
     standing
         Why the next pose cannot be planned from where the arm stands; ''.
     """
@@ -81,6 +86,7 @@ class TourProgress:
         # What the recorder has reported; its transforms come on a topic of their own.
         self._registered = False
         self.is_complete = False
+        self.enough = False
         self.standing = ''
 
     def describe(self) -> str:
@@ -214,12 +220,25 @@ class TourProgress:
             # The bridge halts such an arm and offers a way out; after it the arm is elsewhere.
             self.standing = f'the arm stands too near to something: {standing}'
             return None
-        found = self._planning.ask((tour, tour.visited), q, lambda: tour.propose(q))
+        what = (tour, tour.visited, tour.has_left(FITTED))
+        found = self._planning.ask(what, q, lambda: tour.propose(q))
         if found is None or found[0] is None:
             return found
+        if self.enough and tour.has_left(FITTED):
+            # Here, as nothing is being planned; what was proposed may be one of them.
+            self._memory.leave_rest()
+            return None
         stop = tour.take(found[0])
         self._memory.open_stop(stop)
         return (stop,)
+
+    @property
+    def planned(self) -> int:
+        """How many configurations to fit the collection was planned with; 0 before it is."""
+        tour = self._memory.tour
+        if tour is None or FITTED not in tour.plans:
+            return 0
+        return sum(len(pose.solutions) for pose in tour.plans[FITTED].poses)
 
     def is_last_reference(self, stop: PoseVisit) -> bool:
         """Whether a stop is the last reference of its round."""

@@ -27,8 +27,9 @@ from remaster_ros.discovery.side_by_side import (
     compare_offsets,
     rms_sigmas,
 )
+from remaster_ros.discovery.undetected import undetected
 from remaster_ros.errors import InputError
-from remaster_ros.types import BoolArray, Session
+from remaster_ros.types import BoolArray, FloatArray, Session
 
 # Zero-offsets with which a session's error is so many times that with its own, and which differ
 # by so many standard deviations on the average, are not its own.
@@ -147,7 +148,9 @@ def confirm(discovery: Discovery, session: Session) -> Confirmation:
     every = [part.within for part in there.parts]
     before, own = there.error((), ()), there.error((), every)
     after = there.error(every, ())
-    offsets = compare_offsets(discovery.fit, there.found, there.data, there.own, there.parts)
+    offsets = compare_offsets(
+        discovery.fit, there.found, there.data, there.own, there.unmodelled, there.parts
+    )
     carried = share_of_gain(before, after, own)
     frozen_offsets = there.error_with_offsets(discovery)
     agree = not rms_sigmas(offsets) > OTHER_SIGMAS
@@ -209,6 +212,8 @@ class _OtherSession:
         Rows in which each cause was seen or has something in its place, (all rows,).
     own
         The fit with the causes and what lies beyond.
+    unmodelled
+        How causes too small to be found move its parameters, see `undetected`.
     """
 
     found: Estimate
@@ -219,6 +224,7 @@ class _OtherSession:
     beyond: tuple[Cell, ...]
     known: BoolArray
     own: Solution
+    unmodelled: FloatArray
 
     @classmethod
     def of(cls, discovery: Discovery, found: Estimate) -> _OtherSession:
@@ -250,7 +256,8 @@ class _OtherSession:
             parts = shown
         assert own is not None
         values = dict(zip(discovery.fit.theta_names, discovery.fit.theta, strict=True))
-        return cls(found, data, values, given, tuple(parts), tuple(beyond), known, own)
+        unmodelled = undetected(found, data, own)
+        return cls(found, data, values, given, tuple(parts), tuple(beyond), known, own, unmodelled)
 
     def error(
         self,
@@ -314,7 +321,9 @@ def _confirmed(
         tuple(
             row
             for part in mine
-            for row in compare_cell(discovery.fit, part, there.data.part, there.own)
+            for row in compare_cell(
+                discovery.fit, part, there.data.part, there.own, there.unmodelled
+            )
         ),
     )
 

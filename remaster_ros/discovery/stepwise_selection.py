@@ -31,6 +31,7 @@ from remaster_ros.discovery.families import (
 )
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, Screening, screen
+from remaster_ros.discovery.substitutes import named_instead
 
 # Family-wise error of one round.
 SIGNIFICANCE = 0.01
@@ -153,6 +154,7 @@ class Search:
             steps.append(step)
             solution = self.swap(self.prune(candidate))
             solution = refine_moments(solution, self.cells, self.data.part, self.fit)
+            solution = named_instead(solution, self.fit, self.grown, HYSTERESIS)
             solution = self._judged(self.backward_elimination(self.drop_unpredictive(solution)))
         empty = self.fit(())
         assert empty is not None

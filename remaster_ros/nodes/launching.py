@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from remaster_ros.errors import InputError
-from remaster_ros.sensors.registry import DRIVERS, GENERIC, kind_of
+from remaster_ros.sensors.registry import DRIVERS, GENERIC, TOPIC, kind_of
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.safe_yaml import YamlError, load_yaml
 from remaster_ros.session.workcell import YAML_LIMIT, read_cell
@@ -123,13 +123,22 @@ def real_nodes(
 
     # The recorder does not wait for a sensor whose node is not started.
     require = {'require': wanted[0]} if len(wanted) == 1 < len(known) else {}
-    values = {'pose_planner': own, 'robot_bridge': own, 'recorder': {**own, **require}}
+    values = {
+        'pose_planner': own,
+        'robot_bridge': own,
+        'recorder': {**own, **require},
+        'optimizer': own,
+    }
     for name, folders in FOLDERS.items():
         beside = _beside(params, sections[name], folders)
         values[name] = {**values.get(name, {}), **beside}
     nodes = [start(name, name, **values.get(name, {})) for name in CORE]
     for sensor in wanted:
         node = by_sensor.get(sensor, '')
+        if not node and known[sensor].source:
+            # Nothing of its node has to be set.
+            nodes.append(start(GENERIC, f'{TOPIC}_{sensor}', **own, sensor=sensor))
+            continue
         kind = kind_of(node)
         if not kind:
             raise InputError(

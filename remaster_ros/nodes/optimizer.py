@@ -2,6 +2,8 @@
 
 Offsets are published with their standard deviations, and only those of a fit: the ones that a
 discovery refits are right together with the effects it found, which a robot does not correct.
+
+While a collection is under way it looks at what is known so far (`precision_watch`).
 """
 
 from __future__ import annotations
@@ -25,8 +27,10 @@ from remaster_ros.calibration.fit import (
     PRECISION,
     fit_session,
 )
+from remaster_ros.collection.stopping_rule import StoppingGoal
 from remaster_ros.errors import RemasterError
 from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.precision_watch import PrecisionWatch
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import LATCHED, NodeStatus, Summary
 from remaster_ros.reports.fit_json import (
@@ -38,7 +42,8 @@ from remaster_ros.reports.fit_json import (
 )
 from remaster_ros.session.priors import read_priors
 from remaster_ros.session.reader import read_session
-from remaster_ros.types import FloatArray
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.types import FloatArray, Priors
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,18 @@ class Parameters:
     )
     prior: str = parameter('', 'YAML file of what is known before a fit; empty for nothing')
     seed: int = parameter(0, 'seed of the sampler', low=0)
+    cell: str = parameter(
+        '',
+        'cell file: once what its poses.joint_std_deg or poses.tool_std_m states is known, no '
+        'more poses to fit are visited; empty for all that are planned',
+    )
+    look_every: int = parameter(
+        5,
+        'how many configurations to fit lie between two looks at what is known so far '
+        '(remaster/precision); 0 for none',
+        low=0,
+        high=1000,
+    )
     figures: bool = parameter(True, 'write figures and the report')
 
 
@@ -86,6 +103,10 @@ class Optimizer(RemasterNode):
             serve = partial(self._serve, work)
             group = MutuallyExclusiveCallbackGroup()
             self.create_service(Trigger, service, serve, callback_group=group)
+        goal = read_cell(self.p.cell).poses.stopping_goal() if self.p.cell else StoppingGoal()
+        self._watch = PrecisionWatch(
+            self, Path(self.p.session), goal, self.p.look_every, self._priors
+        )
         self.status = NodeStatus(self, self._summary)
         self._publish_last()
 
@@ -122,13 +143,16 @@ class Optimizer(RemasterNode):
             precision=self.p.precision,
             progress=self._progress,
             clock=time.perf_counter,
-            priors=read_priors(self.p.prior) if self.p.prior else None,
+            priors=self._priors(),
         )
         report = save_fit(result, out, figures=self.p.figures)
         self._publish(result.joint_names, result.joint_offsets, result.joint_offsets_std)
         for line in result.implausible:
             self.get_logger().warning(line)
         return report, '; '.join(('fitted', *result.implausible))
+
+    def _priors(self) -> Priors | None:
+        return read_priors(self.p.prior) if self.p.prior else None
 
     def _discover(self) -> tuple[Path, str]:
         # Imported when it is needed, as it takes a second: the node is there at once.
@@ -182,12 +206,14 @@ class Optimizer(RemasterNode):
 
     def _summary(self) -> Summary:
         level = 'error' if self._failed else 'ok'
-        return Summary(level, self._state, {'session': self.p.session, 'out': self.p.out})
+        values = {'session': self.p.session, 'out': self.p.out}
+        return Summary(level, self._state, values, self._watch.state)
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the node."""
-    return run(Optimizer, args, threads=2)
+    # One for a fit, one for looks while measurements come in, one for the status.
+    return run(Optimizer, args, threads=3)
 
 
 if __name__ == '__main__':

@@ -31,6 +31,7 @@ from std_srvs.srv import Trigger
 from remaster_ros.collection import events
 from remaster_ros.collection.announcements import Announcements
 from remaster_ros.collection.collection_run import CollectionRun
+from remaster_ros.collection.optimizer_state import OptimizerState
 from remaster_ros.collection.preflight_facts import PreflightFacts
 from remaster_ros.collection.tour_progress import TourProgress
 from remaster_ros.errors import InputError, RemasterError
@@ -233,6 +234,9 @@ class PosePlanner(RemasterNode):
                 self._on_ended(end.stamp, end.solution, end.result, end.registered)
             case events.SolutionFailed() as end:
                 self._on_ended(end.stamp, end.solution, 'failed', False)
+            case OptimizerState(enough=True, plan=plan) if plan and plan == self.journal.id:
+                # The pose under way is finished, what is held out is measured: an ordinary end.
+                self.progress.enough = True
             case events.RecorderState() as recorder:
                 self._on_recorder(recorder)
 
@@ -359,7 +363,9 @@ class PosePlanner(RemasterNode):
         why = full or run.why
         level = 'error' if run.state == 'failed' else 'warn' if why else 'ok'
         held = full and run.state == 'running'
-        state = events.PlannerState(state='held' if held else run.state, run=run.token)
+        state = events.PlannerState(
+            state='held' if held else run.state, run=run.token, planned=self.progress.planned
+        )
         return Summary(level, why or run.state, values, state)
 
     def close(self) -> None:

@@ -6,6 +6,7 @@ import inspect
 import os
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable
 from functools import wraps
@@ -31,6 +32,9 @@ from remaster_ros.nodes.locking import NameLock
 
 TRACEBACK = 'REMASTER_TRACEBACK'
 """Environment variable: also print where in this program a fault came from."""
+
+ANSWERS_DELIVERED_S = 1.0
+"""How long a node that has failed, and is closed, waits for its last answers to arrive, s."""
 
 
 class RemasterNode(Node):
@@ -195,6 +199,9 @@ def run(
         finally:
             # First, as it ends what a callback may be waiting for.
             node.close()
+            if node.failure is not None:
+                # An answer sent just now is lost with its sender if the caller has not got it yet.
+                time.sleep(ANSWERS_DELIVERED_S)
             executor.shutdown(2.0)
             node.destroy_node()
         if node.failure is not None:

@@ -22,8 +22,10 @@ from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.running import RemasterNode, fault_of_this_program, run
 from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary
+from remaster_ros.nodes.topic_source import subscribe_to_source
 from remaster_ros.sensors.driver import SensorClock, StreamDriver, TriggeredDriver
-from remaster_ros.sensors.registry import kind_of, load_driver
+from remaster_ros.sensors.registry import TOPIC, kind_of, load_driver
+from remaster_ros.sensors.topic.driver import TopicDriver
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import MarkerReading
 
@@ -74,6 +76,16 @@ class SensorNode(RemasterNode):
                 f'{str(described.single_shot).lower()}, but a {driver.device} '
                 f'{"measures on request" if triggered else "streams"}; correct single_shot'
             )
+        if bool(described.source) != issubclass(driver, TopicDriver):
+            raise InputError(
+                f'{self.get_name()}: sensor {self.sensor} of {p.cell} '
+                + (
+                    f'has a message_type; its node is a {TOPIC}'
+                    if described.source
+                    else 'has no message_type; give that of its topic, such as '
+                    'geometry_msgs/msg/PoseStamped'
+                )
+            )
         if described.further_markers and not driver.several_markers:
             raise InputError(
                 f'{self.get_name()}: sensor {self.sensor} of {p.cell} has further_markers, but a '
@@ -94,6 +106,8 @@ class SensorNode(RemasterNode):
         self._started = False
         simulated = bool(self.get_parameter('use_sim_time').value)
         self.driver = driver(p, SensorClock(self.now_s, self._sleep, simulated))
+        if isinstance(self.driver, TopicDriver):
+            subscribe_to_source(self, self.driver, described)
         if isinstance(self.driver, TriggeredDriver):
             self._step = MeasureService(self, self.driver, cell, self._ending).step
         elif isinstance(self.driver, StreamDriver):

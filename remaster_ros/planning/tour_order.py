@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, takewhile
+from itertools import takewhile
 from typing import NamedTuple
 
 import numpy as np
 
-from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import Plan
@@ -19,6 +18,7 @@ from remaster_ros.types import FloatArray
 
 REGISTRATION = 'registration'
 REFERENCE = 'reference'
+FITTED = 'optimization'
 FIRST_ROUNDS = 2
 """The references are measured so often at the beginning: their difference is the noise."""
 
@@ -284,6 +284,20 @@ class Tour:
         self.visited += 1
         return stop
 
+    def leave_out(self, split: str, reason: str) -> None:
+        """Visit nothing more of a split: what is left of it counts as dropped for this reason."""
+        left, self._left[split] = self._left[split], {}
+        for index, numbers in left.items():
+            self.dropped_solutions[reason] += len(numbers)
+            self.configurations[split] -= len(numbers)
+            if (split, index) not in self._numbers:
+                self.dropped[reason] += 1
+                self.poses[split] -= 1
+
+    def has_left(self, split: str) -> bool:
+        """Whether anything of a split is still to be visited."""
+        return bool(self._left.get(split))
+
     def _begin_reference(self, index: int) -> None:
         """Count a reference visited: the round is over with its last one."""
         self.reference_stops += 1
@@ -331,54 +345,6 @@ class Tour:
             f'{self.reference_every}'
         ) * bool(self.references)
         return f'planned {kept}{watched}; dropped poses: {reasons or "none"}'
-
-
-def registration_tour(
-    chain: SerialChain,
-    plan: Plan,
-    markers_T: Sequence[FloatArray],
-    model: CollisionModel | None = None,
-) -> Tour:
-    """Choose poses for a three-point registration: the first three span the largest triangle.
-
-    The others follow in case a sensor cannot see one of them.
-
-    Parameters
-    ----------
-    chain
-        The arm.
-    plan
-        Poses that face roughly towards the sensors.
-    markers_T
-        The markers that are seen, in the tool frame, m, (3,) each.
-    model
-        What the arm must not hit on its way.
-
-    Raises
-    ------
-    InsufficientDataError
-        If there are fewer than three poses.
-    """
-    if len(plan.poses) < 3:
-        reasons = ', '.join(f'{count} {reason}' for reason, count in plan.dropped.items())
-        raise InsufficientDataError(
-            f'only {len(plan.poses)} of the poses for the registration can be reached '
-            f'({reasons}); correct rough_position_m of the sensors or the ranges of poses'
-        )
-    # The triangle of the worst-off marker counts: every sensor is registered by its own.
-    points = np.array(
-        [[chain.positions(pose.solutions[0], m) for m in markers_T] for pose in plan.poses]
-    )
-    candidates = list(combinations(range(len(plan.poses)), 3))
-    areas = [
-        np.min(np.linalg.norm(np.cross(points[b] - points[a], points[c] - points[a]), axis=-1))
-        for a, b, c in candidates
-    ]
-    best = candidates[int(np.argmax(areas))]
-    rest = [i for i in range(len(plan.poses)) if i not in best]
-    poses = tuple(plan.poses[i] for i in (*best, *rest))
-    ordered = Plan(poses, plan.dropped, plan.dropped_solutions)
-    return Tour(chain, {REGISTRATION: ordered}, in_order=True, one_solution=True, model=model)
 
 
 def nearest_solution(

@@ -16,11 +16,11 @@ from remaster_ros.planning.planned_design import (
     visit_order,
 )
 from remaster_ros.planning.reference_choice import choose_references
+from remaster_ros.planning.registration_tour import registration_tour
 from remaster_ros.planning.tour_order import (
     REFERENCE,
     REGISTRATION,
     Tour,
-    registration_tour,
 )
 from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.types import FloatArray

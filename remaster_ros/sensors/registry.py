@@ -10,9 +10,12 @@ from remaster_ros.sensors.driver import Driver
 DRIVERS = {
     'optitrack_markers': 'optitrack.driver:OptiTrackDriver',
     'laser_tracker_markers': 'laser_tracker.driver:LaserTrackerDriver',
+    'topic_markers': 'topic.driver:TopicDriver',
 }
 """What the names of a device's nodes begin with, and where its driver is in this folder."""
 
+TOPIC = 'topic_markers'
+"""Reads a topic of a node that is not of this package."""
 GENERIC = 'sensor_markers'
 """The executable that runs any of them, by the name given to its node."""
 

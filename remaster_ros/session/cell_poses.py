@@ -9,6 +9,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
+from remaster_ros.collection.stopping_rule import StoppingGoal
 from remaster_ros.planning.candidates import PoseRanges
 from remaster_ros.planning.expected_sensors import ExpectedSensor, ToolBox
 from remaster_ros.planning.planned_design import DesignSettings
@@ -42,7 +43,8 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
     tool_share
         0 for the joint offsets alone, 1 for the tool's error alone, between them for a mixture.
     joint_std_deg, tool_std_m
-        What an optimal design is to reach; without, what the Latin hypercube reaches.
+        What is to be reached: an optimal design is made for it (without, for what the Latin
+        hypercube reaches), and a collection ends where it is known to be.
     tool_box
         Where the tool's error counts; without, at all candidate poses.
     """
@@ -81,6 +83,16 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
             box=None if box is None else ToolBox(np.array(box.center_m), np.array(box.size_m)),
         )
 
+    def stopping_goal(self) -> StoppingGoal:
+        """Return what ends a collection, in SI units: all that counts, where it is stated."""
+        optimal, stated = self.design == OPTIMAL, (self.joint_std_deg, self.tool_std_m)
+        counts = (self.tool_share < 1.0, self.tool_share > 0.0)
+        if optimal and any(one and value is None for one, value in zip(counts, stated)):
+            # The design is made for what the Latin hypercube reaches, which no one has stated.
+            return StoppingGoal()
+        settings = self.settings((), 0.0)
+        return StoppingGoal(settings.joint_std_rad, settings.tool_std_m, settings.box)
+
     def given(self) -> Mapping[str, object]:
         """Return the keys beside the ranges that are not as by default."""
         plain = CellPoses()
@@ -111,12 +123,17 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
     def _without_effect(self) -> str:
         """Return which key changes nothing beside the others; '' where each does."""
         given = self.given()
-        for key in ('tool_share', 'joint_std_deg', 'tool_std_m', 'tool_box'):
-            if key in given and self.design != OPTIMAL:
+        if 'tool_share' in given and self.design != OPTIMAL:
+            return (
+                f'poses.tool_share has no effect with design: {self.design}; write design: '
+                f'{OPTIMAL}, or leave it out'
+            )
+        if self.design != OPTIMAL:
+            if 'tool_box' in given and 'tool_std_m' not in given:
                 return (
-                    f'poses.{key} has no effect with design: {self.design}; write design: '
-                    f'{OPTIMAL}, or leave it out'
+                    'poses.tool_box has no effect without tool_std_m; write it, or leave both out'
                 )
+            return ''
         if 'joint_std_deg' in given and self.tool_share == 1.0:
             return 'poses.joint_std_deg has no effect with tool_share: 1; write less, such as 0.5'
         if 'tool_std_m' in given and self.tool_share == 0.0:

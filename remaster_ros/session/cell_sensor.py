@@ -13,6 +13,7 @@ import numpy as np
 from remaster_ros.collection.plausibility import SMALLEST_M
 from remaster_ros.errors import did_you_mean
 from remaster_ros.planning.expected_sensors import POSE_SIGMA_M, SIGMA_M
+from remaster_ros.session.source_topics import source_problem
 from remaster_ros.session.yaml_records import Bounds, Triple
 from remaster_ros.types import FARTHEST_M
 
@@ -49,6 +50,9 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     max_angle_deg
         Largest angle between the tool's z axis and the line to the sensor at which the marker
         is seen.
+    message_type
+        Where `topic` is of a node that is not of this package, the type of its messages, one of
+        `source_topics.MESSAGE_TYPES`.
     noise_m, pose_noise_m, frame_noise_m
         Standard deviations per axis that are expected: of a reading, of the error that all
         readings at one pose share, and of the one that the markers of one frame share. Only plans
@@ -65,6 +69,14 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     pose_noise_m: Annotated[float, Bounds(0.0, 0.05, 'm')] = POSE_SIGMA_M
     frame_noise_m: Annotated[float, Bounds(0.0, 0.05, 'm')] = 0.0
     further_markers: dict[str, int] = {}
+    message_type: str = ''
+    # No key of the file: the topic of such a node, whose readings are published on `topic` anew.
+    source: str = ''
+
+    def publish_anew(self, name: str) -> None:
+        """Read the topic of a node that is not of this package; publish it as others are."""
+        if self.message_type:
+            self.source, self.topic = self.topic, f'{name}/marker'
 
     @property
     def markers(self) -> tuple[str, ...]:
@@ -78,7 +90,12 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
         return {self.marker: self.topic, **further}
 
     def problem(self, where: str, markers: Mapping[str, Triple]) -> str:
-        """Return what is wrong with its markers, being at `where`; '' where nothing is."""
+        """Return what is wrong with it, being at `where` in the file; '' where nothing is."""
+        return self._marker_problem(where, markers) or source_problem(
+            where, self.source, self.message_type, single_shot=self.single_shot
+        )
+
+    def _marker_problem(self, where: str, markers: Mapping[str, Triple]) -> str:
         known = ', '.join(markers)
         if self.marker not in markers:
             meant = did_you_mean(self.marker, markers)

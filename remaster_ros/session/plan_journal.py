@@ -21,7 +21,14 @@ from remaster_ros.errors import DiskError, InputError
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import Plan
-from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, PoseVisit, Route, Tour
+from remaster_ros.planning.tour_order import (
+    FITTED,
+    REFERENCE,
+    REGISTRATION,
+    PoseVisit,
+    Route,
+    Tour,
+)
 from remaster_ros.session.files import make_folder
 from remaster_ros.session.journal import Journal, Record
 from remaster_ros.session.plain_data import from_plain, to_plain
@@ -30,6 +37,8 @@ from remaster_ros.types import FloatArray
 
 NO_FREE_PATH = 'no_free_path'
 """Outcome of a configuration that the arm cannot get to without hitting something."""
+ENOUGH = 'enough is known'
+"""Why planned poses are not visited once the wanted precision is reached."""
 
 
 class _Begun(msgspec.Struct, tag_field='kind', tag='plan'):
@@ -72,6 +81,10 @@ class _Round(msgspec.Struct, tag_field='kind', tag='round'):
     """A round of the references is next, by request."""
 
 
+class _Enough(msgspec.Struct, tag_field='kind', tag='enough'):
+    """Enough is known: no more poses to fit are visited."""
+
+
 class _Outcome(msgspec.Struct, tag_field='kind', tag='outcome'):
     id: int
     result: str
@@ -82,7 +95,7 @@ class _State(msgspec.Struct, tag_field='kind', tag='state'):
     run: str = ''
 
 
-_Record = _Begun | _Tour | _Route | _Stop | _Round | _Outcome | _State
+_Record = _Begun | _Tour | _Route | _Stop | _Round | _Enough | _Outcome | _State
 
 
 class PlanJournal:
@@ -205,6 +218,8 @@ class PlanJournal:
                 self._take(tour.along(stop, *record.route(joints)))
             case _Round() if tour is not None:
                 tour.ask_round()
+            case _Enough() if tour is not None:
+                tour.leave_out(FITTED, ENOUGH)
             case _Outcome():
                 self._close_solution(record.id, record.result)
             case _State():
@@ -257,6 +272,12 @@ class PlanJournal:
         if self.tour is not None and self.tour.references:
             self._append(_Round())
             self.tour.ask_round()
+
+    def leave_rest(self) -> None:
+        """Visit no more poses to fit, since enough is known; note that."""
+        if self.tour is not None:
+            self._append(_Enough())
+            self.tour.leave_out(FITTED, ENOUGH)
 
     def open_stop(self, stop: PoseVisit) -> None:
         """Note the next stop, before the arm is sent there."""

@@ -136,6 +136,8 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
                 ('pose_noise_m', POSE_SIGMA_M),
                 ('frame_noise_m', 0.0),
                 ('further_markers', {}),
+                ('message_type', ''),
+                ('source', ''),
             ):
                 if sensor[key] == usual:
                     del sensor[key]
@@ -284,6 +286,8 @@ def parse_cell(data: bytes, path: Path) -> Workcell:
     cell = read_yaml(data, path, Workcell)
     urdf = path.parent / cell.robot.urdf
     cell.file = str(path)
+    for name, sensor in cell.sensors.items():
+        sensor.publish_anew(name)
     missing = (
         f'robot.urdf in {path} is {cell.robot.urdf!r}, which is relative to that file; copy the '
         'URDF there, or give its absolute path'

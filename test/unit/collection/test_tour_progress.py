@@ -27,8 +27,9 @@ def plan_of(seed, poses, solutions):
 class Tours:
     """Plans of a few poses; the arm stands where nothing is near unless told otherwise."""
 
-    def __init__(self, references=0):
-        self.references, self.standing, self.seen = references, '', []
+    def __init__(self, references=0, held_out=0):
+        self.references, self.held_out = references, held_out
+        self.standing, self.seen = '', []
 
     def registration(self):
         return Tour(CHAIN, {REGISTRATION: plan_of(1, 2, 1)}, in_order=True)
@@ -36,6 +37,8 @@ class Tours:
     def collection(self, T_R_N):
         self.seen.append(T_R_N)
         plans = {'optimization': plan_of(2, 2, 2)}
+        if self.held_out:
+            plans['validation'] = plan_of(4, self.held_out, 2)
         if self.references:
             plans[REFERENCE] = plan_of(3, self.references, 1)
         return Tour(CHAIN, plans, reference_every=100 * bool(self.references))
@@ -240,3 +243,46 @@ def test_the_last_reference_of_a_round_is_known(bench):
     stop = b.next()
     assert stop.split == 'optimization'
     assert not b.progress.is_last_reference(stop)
+
+
+def test_once_enough_is_known_the_rest_is_what_is_held_out_and_the_references(bench):
+    b = bench(references=1, held_out=2)
+    b.register()
+    assert b.progress.planned == 0
+    while (stop := b.next()).split != 'optimization':
+        b.visit(stop)
+    assert b.progress.planned == 4
+    assert b.progress.ended(stop.ids[0], 'recorded', registered=False)
+    b.progress.enough = True
+    # The pose under way is finished, all of it.
+    assert b.progress.open_pose.ids == stop.ids[1:]
+    b.progress.ended(stop.ids[1], 'recorded', registered=False)
+    splits = []
+    while (stop := b.next()) is not None:
+        splits.append(stop.split)
+        b.visit(stop)
+        if len(splits) == 1:
+            # It is in the journal: a planner that is started again does the same.
+            b.restart()
+            assert not b.progress.enough
+    assert b.progress.is_complete
+    assert splits.count('validation') == 2
+    assert 'optimization' not in splits
+    assert splits[-1] == REFERENCE, 'the round at the end'
+    counts = b.progress.counts()
+    assert counts['poses_done'] == counts['poses']
+    assert counts['configurations_done'] == counts['configurations']
+    assert counts['dropped_enough is known'] == 1
+    assert counts['dropped_solutions_enough is known'] == 2
+    assert b.progress.planned == 4
+
+
+def test_enough_at_the_last_pose_changes_nothing(bench):
+    b = bench()
+    b.register()
+    for _ in range(2):
+        b.visit(b.next())
+    b.progress.enough = True
+    assert b.next() is None
+    assert b.progress.is_complete
+    assert 'dropped_solutions_enough is known' not in b.progress.counts()

@@ -7,14 +7,29 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibration_scenes import CHAIN, MARKERS, URDF, sensors
-from discovery_scenes import residuals_of
+from discovery_scenes import residuals_of, session_with
 
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.stepwise_selection import LEAST_GAIN, Search
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.stepwise_selection import HYSTERESIS, LEAST_GAIN, Search
+from remaster_ros.discovery.substitutes import named_instead
 from remaster_ros.simulation.session_simulator import simulate_session
+from remaster_ros.types import FloatArray, Session
 
 SCALE = 50e-6
 ECCENTRICITY_RAD = np.radians(0.03)
+
+
+def searching(data: Residuals) -> Search:
+    cells = tuple(
+        cell
+        for name, effect in EFFECTS.items()
+        if name not in ('marker_offset', 'gear_periodic') and not effect.needs(data.context)
+        for cell in effect.cells(data.context)
+    )
+    return Search(
+        data, cells, np.random.default_rng(7), lambda data, solution: data, lambda share: None
+    )
 
 
 @pytest.mark.qualify
@@ -40,15 +55,8 @@ def test_curves_that_stand_in_for_a_weak_cause_give_way_to_it():
     data = residuals_of(
         replace(session, measurements=replace(m, q=reported, position=(1 + SCALE) * m.position))
     )
-    cells = tuple(
-        cell
-        for name, effect in EFFECTS.items()
-        if name not in ('marker_offset', 'gear_periodic') and not effect.needs(data.context)
-        for cell in effect.cells(data.context)
-    )
-    search = Search(
-        data, cells, np.random.default_rng(7), lambda data, solution: data, lambda share: None
-    )
+    search = searching(data)
+    cells = search.cells
     curves = [c for c in cells if c.name == 'joint_error_curve' and c.joints[0] in (2, 3, 6)]
     found = search.run(search.fit(curves))
     assert {(cell.name, cell.joints) for cell in found.solution.cells} == {
@@ -56,3 +64,32 @@ def test_curves_that_stand_in_for_a_weak_cause_give_way_to_it():
         ('sensor_scale', ()),
     }
     assert 0.0 < found.steps[0].held_out_share < LEAST_GAIN
+
+
+def waves_of_three_joints(session: Session) -> FloatArray:
+    q = session.measurements.q
+    angles = np.zeros_like(q)
+    for joint, waves in ((1, 3), (3, 2), (5, 3)):
+        angles[:, joint] = 0.6e-3 * np.sin(waves * q[:, joint])
+    return angles
+
+
+def bent(session: Session) -> FloatArray:
+    place = session.measurements.position - session.measurements.position.mean(axis=0)
+    return 2e-3 * np.sin(6.0 * place[:, [0]]) * np.array([0.6, 0.0, 0.8])
+
+
+@pytest.mark.parametrize('where', ['joints', 'sensor'])
+def test_a_field_gives_way_to_named_causes_that_together_explain_more_and_stays_otherwise(where):
+    hidden = {'angles': waves_of_three_joints} if where == 'joints' else {'sensor': bent}
+    search = searching(residuals_of(session_with(5, **hidden)))
+    field = next(cell for cell in search.cells if cell.name == 'sensor_field')
+    first = next(c for c in search.cells if c.name == 'joint_error_curve' and c.joints == (2,))
+    begun = search.fit((first, field))
+    found = named_instead(begun, search.fit, search.grown, HYSTERESIS)
+    if where == 'sensor':
+        assert found is begun
+    else:
+        assert found.log_evidence > begun.log_evidence
+        assert {cell.name for cell in found.cells} == {'joint_error_curve'}
+        assert {2, 4, 6} <= {cell.joints[0] for cell in found.cells}

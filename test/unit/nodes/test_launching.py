@@ -65,6 +65,7 @@ def test_folders_are_beside_the_parameter_file_wherever_launch_was_started(tmp_p
     assert nodes['recorder'].parameters[1] == {'cell': CELL, **session}
     assert nodes['pose_planner'].parameters[1] == {'cell': CELL, **session}
     assert nodes['optimizer'].parameters[1] == {
+        'cell': CELL,
         **session,
         'out': str(tmp_path / 'results/fit'),
         'discovery': str(tmp_path / 'discovery'),
@@ -101,6 +102,20 @@ def test_sensors_by_the_names_of_the_cell(tmp_path, monkeypatch):
     lost = edited(tmp_path, lambda data: data.pop('/**/laser_tracker_markers'))
     with pytest.raises(InputError, match="no node for the sensor 'tracker'"):
         real_nodes(CELL, lost)
+
+
+def test_a_topic_of_another_package_needs_no_section(tmp_path):
+    text = Path(CELL).read_text(encoding='utf-8')
+    text = text.replace('../robots', str(Path(CELL).parents[1] / 'robots')).replace(
+        'topic: optitrack/marker',
+        'topic: /vrpn/tool\n    message_type: geometry_msgs/msg/PoseStamped',
+    )
+    cell = tmp_path / 'cell.yaml'
+    cell.write_text(text, encoding='utf-8')
+    params = edited(tmp_path, lambda data: data.pop('/**/optitrack_markers'))
+    (node,) = real_nodes(str(cell), params, 'mocap')[len(CORE) :]
+    assert (node.executable, node.name) == ('sensor_markers', 'topic_markers_mocap')
+    assert node.parameters[1] == {'cell': str(cell), 'sensor': 'mocap'}
 
 
 def test_the_names_of_the_arm_are_remapped_within_the_namespace():

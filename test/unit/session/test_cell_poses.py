@@ -22,7 +22,10 @@ def cell_file(folder, poses='', sensor=''):
         ('  design: best\n', "poses.design is 'best'; write latin_hypercube or optimal"),
         ('  order: fast\n', "poses.order is 'fast'; write nearest or fastest"),
         ('  tool_share: 0.5\n', 'poses.tool_share has no effect with design: latin_hypercube'),
-        ('  joint_std_deg: 0.003\n', 'poses.joint_std_deg has no effect with design'),
+        (
+            '  tool_box: {center_m: [0.4, 0, 0.5], size_m: [0.2, 0.3, 0.2]}\n',
+            'poses.tool_box has no effect without tool_std_m',
+        ),
         ('  design: optimal\n  tool_share: 2\n', 'poses.tool_share is 2; it must be from 0 to 1'),
         ('  design: optimal\n  joint_std_deg: 0\n', 'poses.joint_std_deg is 0; it must be above'),
         ('  design: optimal\n  tool_std_m: 0.0001\n', 'poses.tool_std_m has no effect with tool'),
@@ -78,3 +81,26 @@ def test_a_plan_depends_on_the_keys_and_defaults_are_as_before(tmp_path):
     assert read_cell(cell_file(tmp_path, '  order: fastest\n')).fingerprint() != plain
     noisy = cell_file(tmp_path, sensor='    noise_m: 2.0e-4\n')
     assert read_cell(noisy).fingerprint() != plain
+
+
+@pytest.mark.parametrize(
+    ('poses', 'joint', 'tool'),
+    [
+        ('', None, None),
+        ('  joint_std_deg: 0.003\n', 5.236e-5, None),
+        ('  tool_std_m: 0.0001\n', None, 1e-4),
+        ('  design: optimal\n  joint_std_deg: 0.003\n', 5.236e-5, None),
+        # The design is also made for a tool error that no one has stated.
+        ('  design: optimal\n  tool_share: 0.5\n  joint_std_deg: 0.003\n', None, None),
+        (
+            '  design: optimal\n  tool_share: 0.5\n  joint_std_deg: 0.003\n  tool_std_m: 0.0001\n',
+            5.236e-5,
+            1e-4,
+        ),
+    ],
+)
+def test_what_ends_a_collection_is_what_counts_and_is_stated(tmp_path, poses, joint, tool):
+    goal = read_cell(cell_file(tmp_path, poses)).poses.stopping_goal()
+    assert goal.joint_std_rad == (joint if joint is None else pytest.approx(joint, rel=1e-3))
+    assert goal.tool_std_m == tool
+    assert goal.stated == (joint is not None or tool is not None)

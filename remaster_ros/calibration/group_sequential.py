@@ -1,0 +1,75 @@
+"""Limits of p-values for a test that is looked at again and again while data come in.
+
+A test at 1 % that is looked at a dozen times fires in far more than 1 % of the sessions where
+nothing is wrong. Here each look may spend a part of the error rate: after the share t of all
+data 2 - 2 Φ(z / √t) of it, z being the upper quantile at half of the error rate (Lan and DeMets
+1983, doi:10.1093/biomet/70.3.659, in the form of O'Brien and Fleming 1979). Early looks spend next
+to nothing, so that the last one is nearly as powerful as a single test.
+
+The limits follow from the joint distribution of the looks (Armitage, McPherson and Rowe 1969,
+doi:10.2307/2343787). Between looks at shares s < t of the data a mean correlates by √(s / t), the
+sum of many squares, such as an F statistic with many degrees of freedom, by s / t. The smaller
+one is taken: by Slepian's inequality the error rate is then held for either.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import norm
+
+from remaster_ros.types import FloatArray
+
+LOWEST = -8.0
+"""Below this many standard deviations the statistic never is, as good as."""
+POINTS = 401
+"""Of the grid on which the density of what no look has stopped is followed."""
+NEGLIGIBLE = 1e-14
+"""Of the error rate: what a look spends less is not followed on the grid."""
+
+
+def spent(share: FloatArray, error_rate: float) -> FloatArray:
+    """Return what may be spent of the error rate after shares (n,) of all data, above 0 to 1."""
+    z = norm.isf(0.5 * error_rate)
+    found: FloatArray = 2.0 * norm.sf(z / np.sqrt(share))
+    return found
+
+
+@lru_cache(maxsize=64)
+def p_value_limits(shares: tuple[float, ...], error_rate: float) -> tuple[float, ...]:
+    """Return below which p-value the test fires at each look.
+
+    Parameters
+    ----------
+    shares
+        Of all data that each look has, ascending, above 0 to 1.
+    error_rate
+        Of all looks together, where nothing is wrong.
+    """
+    t = np.array(shares)
+    steps = np.diff(spent(t, error_rate), prepend=0.0)
+    # The statistic times t is a sum of independent steps, of variance t² - s².
+    spread = np.sqrt(np.diff(t**2, prepend=0.0))
+    grid, density = np.zeros(1), np.ones(1)
+    limits = []
+    for place, step, width in zip(t, steps, spread, strict=True):
+        limit = norm.isf(step)
+        if step > NEGLIGIBLE:
+            limit = brentq(_above, 0.0, -LOWEST, (grid, density, place, width, step))
+        limits.append(float(norm.sf(limit)))
+        edges = np.linspace(LOWEST * place, place * min(limit, -LOWEST), POINTS)
+        # Trapezoids: half weights at both ends.
+        weight = np.full(POINTS, edges[1] - edges[0])
+        weight[[0, -1]] *= 0.5
+        density = weight * (norm.pdf((edges[:, None] - grid) / width) / width @ density)
+        grid = edges
+    return tuple(limits)
+
+
+def _above(
+    limit: float, grid: FloatArray, density: FloatArray, place: float, width: float, step: float
+) -> float:
+    """Return how much more than a step of the error rate lies above a limit."""
+    return float(density @ norm.sf((limit * place - grid) / width)) - step

@@ -1,0 +1,184 @@
+"""How well a fit knows its offsets and its tool, the noise integrated out; and what more would do.
+
+Given the noise the parameters are Gaussian (`laplace`). Their covariance is that over the draws of
+the noise: the mean of the covariances, and the covariance of the means. With few observations the
+noise itself is uncertain, and the standard deviation at its most probable value too small: judged
+by that one a collection would end early where the noise happens to look small.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+
+from remaster_ros.calibration.estimate import Estimate
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.laplace import Mode
+from remaster_ros.calibration.proposal import NOISE_FREEDOM, StudentT
+from remaster_ros.types import BoolArray, FloatArray
+
+NOISE_DRAWS = 256
+"""Of the noise: standard deviations come out to about 1 %."""
+MOST_TIMES = 1e4
+"""More data than so many times those at hand are not asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseMixture:
+    """The posterior of the f free parameters as a mixture of Gaussians over draws of the noise.
+
+    Attributes
+    ----------
+    weight
+        Sum 1, (n,).
+    mean
+        Free pinned parameters, (n, f).
+    covariance
+        (n, f, f).
+    """
+
+    weight: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def of(cls, mode: Mode, rng: np.random.Generator) -> NoiseMixture:
+        """Weigh draws of the noise by its density with the parameters integrated out."""
+        # That density is the same for a negative ratio of the noises: no draw is mirrored.
+        factor = np.asarray(np.linalg.cholesky(mode.eta_covariance))
+        eta, drawn = StudentT(mode.eta, factor, NOISE_FREEDOM).sample(NOISE_DRAWS, rng)
+        mean, precision, log_marginal = mode.linearisation.conditional(eta)
+        weight = np.exp(log_marginal - drawn - np.max(log_marginal - drawn))
+        root = np.linalg.inv(precision)
+        return cls(weight / weight.sum(), mean, np.swapaxes(root, -1, -2) @ root)
+
+    @property
+    def total(self) -> FloatArray:
+        """Covariance of the free parameters, (f, f)."""
+        apart = self.mean - self.weight @ self.mean
+        within: FloatArray = np.einsum('n,nij->ij', self.weight, self.covariance)
+        return within + (apart * self.weight[:, None]).T @ apart
+
+
+@dataclass(frozen=True, eq=False)
+class Precision:
+    """What a fit knows of its f free parameters.
+
+    Attributes
+    ----------
+    joints
+        For each joint its place among the free parameters; -1 where it is not identifiable, (k,).
+    covariance
+        The noise integrated out, (f, f).
+    tool
+        Mean of J'J over the predicted markers that count, m² per unit, (f, f); None for none.
+    prior
+        Information of the priors, (f, f).
+    freedom
+        Numbers measured, less the free parameters.
+    """
+
+    joints: tuple[int, ...]
+    covariance: FloatArray
+    tool: FloatArray | None
+    prior: FloatArray
+    freedom: int
+
+    @classmethod
+    def of(cls, found: Estimate, counting: BoolArray, rng: np.random.Generator) -> Precision:
+        """Judge a fit.
+
+        Parameters
+        ----------
+        found
+            The fit.
+        counting
+            Which rows of the session's measurements, fitted or not, the tool's error counts at,
+            (n,).
+        rng
+            Of the draws of the noise.
+        """
+        posterior, free = found.posterior, found.posterior.free
+        place = {int(index): i for i, index in enumerate(free)}
+        tool = None
+        if counting.any():
+            model = found.model
+            rows = Rows.of(found.problem.measurements, np.flatnonzero(counting), model.reference)
+            by_z = model.jacobian(found.mode.z, rows)[:, :, free]
+            tool = np.einsum('nij,nik->jk', by_z, by_z) / len(rows)
+        return cls(
+            tuple(
+                -1 if why else place.get(joint, -1) for joint, why in enumerate(found.gauge.why)
+            ),
+            NoiseMixture.of(found.mode, rng).total,
+            tool,
+            found.mode.linearisation.prior[:-1, :-1],
+            int(posterior.noise_model.freedom.sum()) - len(free),
+        )
+
+    @property
+    def parameters(self) -> int:
+        """Number of free parameters f."""
+        return len(self.covariance)
+
+    @property
+    def joint_std(self) -> tuple[float | None, ...]:
+        """Standard deviation of each joint's offset, rad, k; None where it is not identifiable."""
+        std = np.sqrt(np.diag(self.covariance))
+        return tuple(float(std[i]) if i >= 0 else None for i in self.joints)
+
+    @property
+    def joint_rms(self) -> float:
+        """Root mean square over the identifiable joints, rad; infinite where there is none."""
+        return self._joint_rms(self.covariance)
+
+    @property
+    def tool_rms(self) -> float:
+        """Root mean square of the 3-D error of the predicted markers, m; infinite without any."""
+        return self._tool_rms(self.covariance)
+
+    def _joint_rms(self, covariance: FloatArray) -> float:
+        variances = [covariance[i, i] for i in self.joints if i >= 0]
+        return float(np.sqrt(np.mean(variances))) if variances else np.inf
+
+    def _tool_rms(self, covariance: FloatArray) -> float:
+        return np.inf if self.tool is None else float(np.sqrt(np.sum(covariance * self.tool)))
+
+    def shortfall(self, joint_std: float | None, tool_std: float | None) -> float:
+        """Return the largest ratio of a standard deviation to the one that is wanted; 0 for none.
+
+        Parameters
+        ----------
+        joint_std, tool_std
+            Wanted `joint_rms`, rad, and `tool_rms`, m; None where it does not matter.
+        """
+        return self._shortfall(self.covariance, joint_std, tool_std)
+
+    def _shortfall(
+        self, covariance: FloatArray, joint_std: float | None, tool_std: float | None
+    ) -> float:
+        joints = 0.0 if joint_std is None else self._joint_rms(covariance) / joint_std
+        tool = 0.0 if tool_std is None else self._tool_rms(covariance) / tool_std
+        return max(joints, tool)
+
+    def times_the_data(self, joint_std: float | None, tool_std: float | None) -> float:
+        """Return how many times the data of this kind reach what is wanted; 1 where these do.
+
+        Infinite where no amount does. Further configurations are taken to tell as much as those
+        so far, on average.
+        """
+        information = np.linalg.inv(self.covariance)
+        data = information - self.prior
+
+        def excess(log_times: float) -> float:
+            covariance = np.linalg.inv(np.exp(log_times) * data + self.prior)
+            return self._shortfall(covariance, joint_std, tool_std) - 1.0
+
+        if excess(0.0) <= 0.0:
+            return 1.0
+        most = float(np.log(MOST_TIMES))
+        if excess(most) > 0.0:
+            return np.inf
+        return float(np.exp(brentq(excess, 0.0, most, xtol=1e-4)))

@@ -1,0 +1,59 @@
+"""Structure without a name, taken for what many named causes do together.
+
+A smooth field over the sensor's volume, or a free form of one link, can explain more in one step
+than the next named cause does alone. Once it is there, those causes gain nothing beside it, though
+all of them together explain the data better. Whether they do is tried here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.evidence import Solution
+from remaster_ros.discovery.families import FAMILIES
+
+# Families join one after another: this often at most.
+JOINS = 6
+
+
+def named_instead(
+    solution: Solution,
+    fit: Callable[[Sequence[Cell], Solution], Solution | None],
+    grown: Callable[[Solution, tuple[str, ...]], Solution | None],
+    least: float,
+) -> Solution:
+    """Return the better one: a solution, or families of causes in place of what has no name.
+
+    Parameters
+    ----------
+    solution
+        What the search found.
+    fit
+        Fits a set of cells.
+    grown
+        Adds to a solution all of a family that raises the evidence; None for nothing.
+    least
+        By how much the log evidence has to rise.
+    """
+    named = [cell for cell in solution.cells if _has_a_name(cell)]
+    if not named or len(named) == len(solution.cells):
+        return solution
+    better = fit(named, solution)
+    for _ in range(JOINS):
+        if better is None:
+            return solution
+        joined = [one for family in FAMILIES if (one := grown(better, family)) is not None]
+        best = max(joined, key=lambda one: one.log_evidence, default=better)
+        if best.log_evidence <= better.log_evidence + least:
+            break
+        better = best
+    if better is not None and better.log_evidence > solution.log_evidence + least:
+        return better
+    return solution
+
+
+def _has_a_name(cell: Cell) -> bool:
+    effect = EFFECTS[cell.name]
+    return effect.is_cause and effect.plausible is not None

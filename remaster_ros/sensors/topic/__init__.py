@@ -1,0 +1,1 @@
+"""A topic of a node that is not of this package: mocap drivers, tag detectors, trackers."""

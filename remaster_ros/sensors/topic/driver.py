@@ -1,0 +1,219 @@
+"""A topic as a sensor: the positions that a node which is not of this package publishes.
+
+That node sends no heartbeat. Whether it works, and how well, is judged from its messages: how many
+come, how old they are, whether the marker stands still in them.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.errors import DeviceError
+from remaster_ros.parameters import parameter
+from remaster_ros.sensors.driver import SensorClock, SensorParameters, SensorState, StreamDriver
+from remaster_ros.sensors.topic.messages import READERS
+from remaster_ros.types import MarkerReading
+
+WAIT_S = 0.2
+SILENT_S = 1.0
+"""Without a message for so long, wall time, nothing comes any more."""
+JUDGED = 200
+"""Messages that rate and stillness are judged by, at most,"""
+JUDGED_S = 1.0
+"""and how far they go back, by their stamps."""
+EARLY_S = 0.1
+"""A stamp further in the future is of another clock."""
+FROZEN = 10
+"""So many messages with the same position to the last bit are no measurements."""
+
+
+@dataclass(frozen=True)
+class Parameters(SensorParameters):
+    """Parameters of the node that reads a topic; the topic is in the cell file."""
+
+    select: str = parameter(
+        '', "name or number of the marker in mocap4r2_msgs/msg/Markers; empty for the cell's name"
+    )
+    stamps: str = parameter(
+        'header',
+        'what counts as the time of capture; arrival where the other host has another clock, and '
+        'the arm stands still for far longer than a message takes',
+        choices=('header', 'arrival'),
+    )
+    max_age_s: float = parameter(
+        1.0, 'an older message, by its stamp, is left out', unit='s', low=0.01, high=60.0
+    )
+    min_rate_hz: float = parameter(
+        5.0, 'fewer messages are reported as too few', unit='Hz', low=0.1, high=1000.0
+    )
+
+
+class TopicDriver(StreamDriver):
+    """See the module's text. The node subscribes, and hands each message to `take`."""
+
+    parameters_type = Parameters
+    device = 'topic'
+
+    def __init__(self, parameters: Parameters, clock: SensorClock) -> None:
+        self.p, self._clock = parameters, clock
+        self._readings: queue.SimpleQueue[MarkerReading] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        self._recent: deque[MarkerReading] = deque(maxlen=JUDGED)
+        self._counts: Counter[str] = Counter()
+        self._came_wall: float | None = None
+        self._stamp_s, self._age_s = 0.0, 0.0
+        self._frame = self._trouble = ''
+        self._hidden = False
+        self.topic = self._type = self._marker = ''
+        self._publishers: Callable[[], Sequence[tuple[str, str]]] = tuple
+
+    def follow(
+        self,
+        topic: str,
+        message_type: str,
+        marker: str,
+        publishers: Callable[[], Sequence[tuple[str, str]]],
+    ) -> None:
+        """Learn what is subscribed to.
+
+        Parameters
+        ----------
+        topic, message_type
+            As in the cell file.
+        marker
+            Its name in the cell.
+        publishers
+            Gives node and message type of each publisher of the topic now.
+        """
+        self.topic, self._type, self._marker = topic, message_type, self.p.select or marker
+        self._publishers = publishers
+
+    def open(self) -> None:
+        """Refuse a topic that no node publishes, or with messages of another type."""
+        if problem := self._unpublished():
+            raise DeviceError(problem)
+
+    def close(self) -> None:
+        """Do nothing: the subscription is the node's."""
+
+    def _unpublished(self) -> str:
+        found = self._publishers()
+        if any(kind == self._type for _, kind in found):
+            return ''
+        if not found:
+            return f'no node publishes {self.topic}; is its driver running, in this namespace?'
+        node, kind = found[0]
+        return (
+            f'{node} publishes {self.topic} as {kind}, message_type of the cell file is '
+            f'{self._type}; correct that'
+        )
+
+    def take(self, message: Any) -> None:
+        """Take a message; called from any thread."""
+        found, now = READERS[self._type](message, self._marker), self._clock.now()
+        arrival = self.p.stamps == 'arrival' or found.stamp_s == 0.0
+        stamp_s = now if arrival else found.stamp_s
+        with self._lock:
+            self._came_wall = time.monotonic()
+            self._age_s = now - stamp_s
+            self._frame = self._frame or found.frame
+            reason, self._trouble = self._refused(found.frame, stamp_s)
+            self._hidden = not reason and found.position is None
+            if reason or found.position is None:
+                self._counts[reason or 'occluded'] += 1
+                return
+            self._stamp_s = stamp_s
+            reading = MarkerReading(stamp_s, found.position)
+            self._recent.append(reading)
+        self._readings.put(reading)
+
+    def _refused(self, frame: str, stamp_s: float) -> tuple[str, str]:
+        """Return why a message is left out, in a word and as a sentence; '' where it is not."""
+        if frame != self._frame:
+            return 'other_frame', (
+                f'{self.topic} was in frame {self._frame!r} and is in {frame!r} now; one marker '
+                'needs one frame: start this node again where the new one is meant'
+            )
+        if not -EARLY_S <= self._age_s <= self.p.max_age_s:
+            way = 'behind' if self._age_s > 0.0 else 'ahead of'
+            return 'other_clock', (
+                f'stamps of {self.topic} are {abs(self._age_s):.2f} s {way} the clock of this '
+                'host; synchronise the clocks (chrony), or set the parameter stamps to arrival'
+            )
+        if stamp_s <= self._stamp_s:
+            # The last measurement once more, or out of order: counted, and no trouble.
+            return 'repeated', ''
+        return '', ''
+
+    def read(self) -> MarkerReading | None:
+        """Return the next position; see `StreamDriver.read`."""
+        try:
+            return self._readings.get(timeout=WAIT_S)
+        except queue.Empty:
+            return None
+
+    def state(self) -> SensorState:
+        """Return what the messages show."""
+        with self._lock:
+            came, counts = self._came_wall, dict(self._counts)
+            trouble, hidden, age_s = self._trouble, self._hidden, self._age_s
+            recent = [r for r in self._recent if r.stamp_s > self._stamp_s - JUDGED_S]
+            same = [r.position for r in list(self._recent)[-FROZEN:]]
+        ready, level = True, 'ok'
+        rate_hz, std_m = _rate_hz(recent), _std_m(recent)
+        silent_s = np.inf if came is None else time.monotonic() - came
+        if silent_s > SILENT_S:
+            trouble = self._unpublished()
+            # A detector that sends only what it sees: the next configuration may show it again.
+            ready, hidden = not trouble, not trouble
+            ago = 'yet' if came is None else f'for {silent_s:.1f} s'
+            trouble = trouble or f'nothing on {self.topic} {ago}: is the marker in view?'
+        elif trouble:
+            ready = False
+        elif len(same) == FROZEN and not np.any(np.ptp(same, axis=0)):
+            ready = False
+            trouble = (
+                f'{self.topic} repeats one position to the last bit, which no measurement does; '
+                'look at its driver'
+            )
+        elif hidden:
+            trouble = f'the marker is not in view ({self.topic})'
+        elif rate_hz is not None and rate_hz < self.p.min_rate_hz:
+            level = 'warn'
+            trouble = (
+                f'{self.topic} comes at {rate_hz:.1f} Hz, fewer than min_rate_hz '
+                f'({self.p.min_rate_hz:g}); prolong dwell_s of the recorder, or look at its driver'
+            )
+        if trouble and level == 'ok':
+            level = 'warn' if ready else 'error'
+        values = {
+            'source': self.topic,
+            'frame': self._frame,
+            'rate_hz': 'unknown' if rate_hz is None else f'{rate_hz:.1f}',
+            'age_s': f'{age_s:.3f}',
+            'std_mm': 'unknown' if std_m is None else f'{1e3 * std_m:.3f}',
+            'fault': 'marker' if hidden else 'none',
+            **{f'dropped_{reason}': count for reason, count in sorted(counts.items())},
+        }
+        return SensorState(ready, trouble, 'ok', level, values)
+
+
+def _rate_hz(recent: Sequence[MarkerReading]) -> float | None:
+    if len(recent) < 2:
+        return None
+    return (len(recent) - 1) / (recent[-1].stamp_s - recent[0].stamp_s)
+
+
+def _std_m(recent: Sequence[MarkerReading]) -> float | None:
+    """Return the largest standard deviation of an axis: how still the marker stands."""
+    if len(recent) < 2:
+        return None
+    return float(np.max(np.std([r.position for r in recent], axis=0, ddof=1)))
