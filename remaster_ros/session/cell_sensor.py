@@ -40,7 +40,8 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     topic
         Where its readings are published (geometry_msgs/PointStamped, sensor frame); relative to
         the nodes' namespace, unless it begins with ``/``. Further markers have topics of their
-        own below it, ``TOPIC/NAME``.
+        own below it, ``TOPIC/NAME``; each has a message for every frame in which one of them was
+        seen, NaN where this one was not.
     rough_position_m
         Where it stands in the robot base, roughly.
     single_shot
