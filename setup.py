@@ -21,6 +21,7 @@ JAZZY = [
         'trajectory-msgs',
         'diagnostic-msgs',
         'rosgraph-msgs',
+        'visualization-msgs',
     )
 ]
 
@@ -58,8 +59,8 @@ setup(
     packages=[*find_packages(include=[NAME, f'{NAME}.*']), f'{NAME}.config'],
     package_dir={f'{NAME}.config': 'config'},
     package_data={
-        f'{NAME}.config': ['*.yaml', '*.rviz', 'robots/*', 'cells/*', 'sros2/*'],
-        f'{NAME}.reports': ['*.jinja'],
+        f'{NAME}.config': ['*.yaml', '*.rviz', '*.json', 'robots/*', 'cells/*', 'sros2/*'],
+        f'{NAME}.reports': ['*.jinja', '*.js', 'live_page/*'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
@@ -90,10 +91,12 @@ setup(
         'mcap>=1.2',
         'python-dateutil>=2.8',
         'rosbags>=0.10',
+        'tornado>=6.4',
         'xacro>=2.0.8',
     ],
     extras_require={
         'jazzy': JAZZY,
+        'pdf': ['weasyprint>=62'],
         'natnetclient': ['NatNetClient==0.8.3'],
         # colcon, with which a test builds the package, runs pytest only where it is in this list.
         'test': [

@@ -22,6 +22,7 @@ FIRST = (
     'recorder',
     'optimizer',
     'replay',
+    'watch',
 )
 HEAD = """\
 # Parameters of the nodes

@@ -22,5 +22,6 @@ def generate_launch_description():
                 'description': 'parameter file of nodes and fakes',
             },
             'namespace': {'default_value': '', 'description': 'of every node and name'},
+            'dashboard': {'default_value': 'false', 'description': 'serve the live page too'},
         },
     )

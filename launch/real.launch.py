@@ -31,5 +31,6 @@ def generate_launch_description():
                 'default_value': '',
                 'description': 'topic of its joint states; empty: joint_states in the namespace',
             },
+            'dashboard': {'default_value': 'false', 'description': 'serve the live page too'},
         },
     )

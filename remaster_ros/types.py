@@ -236,6 +236,8 @@ class Session:
         Who measured, and which arm; '' where the file has none.
     extra
         Keys of session.yaml this version does not know, kept as they are.
+    observations_sha256
+        Of the file that the rows were read from; '' where they were not read, or are a part of it.
     """
 
     urdf: str
@@ -256,6 +258,7 @@ class Session:
     extra: Mapping[str, Any] = field(default_factory=dict)
     references: Measurements | None = None
     further_markers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    observations_sha256: str = ''
 
     @property
     def urdf_sha256(self) -> str:
@@ -274,4 +277,4 @@ class Session:
 
     def select(self, rows: BoolArray | IntArray) -> Session:
         """Return this session with only the given rows."""
-        return replace(self, measurements=self.measurements.select(rows))
+        return replace(self, measurements=self.measurements.select(rows), observations_sha256='')

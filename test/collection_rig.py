@@ -30,12 +30,14 @@ class Cell:
         reference_every=0,
         cell='demo',
         held_out=1,
+        collect=True,
+        rate=10.0,
     ):
         from remaster_ros.nodes.status import listen
 
         self.client, self.folder, self.session = client, folder, folder / 'session'
         print('seed', SEED)
-        self.world = make_world(folder / 'world', read_cell(cell), SEED, 10.0)
+        self.world = make_world(folder / 'world', read_cell(cell), SEED, rate)
         self.said, self.messages, self.results, self.events = {}, {}, [], []
         listen(client, self._record, self._summary)
         command, data, tracker = free_ports(
@@ -72,8 +74,9 @@ class Cell:
         self._begin = begin
         self.nodes = {name: begin(name) for name in own}
         self.until(lambda: self.said.get('pose_planner', {}).get('robot') == 'heard', 'the robot')
-        response = call(client, '/remaster/collect')
-        assert response.success, response.message
+        if collect:
+            response = call(client, '/remaster/collect')
+            assert response.success, response.message
 
     def kill_and_start(self, name):
         self.nodes[name].kill()

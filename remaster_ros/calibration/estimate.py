@@ -13,6 +13,7 @@ from remaster_ros.calibration.identifiability import WEAK_ANGLE, Gauge, find_gau
 from remaster_ros.calibration.initial_guess import robust_start
 from remaster_ros.calibration.laplace import Mode, find_mode
 from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.moved_since import moved_since
 from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.posterior import Posterior
@@ -259,7 +260,10 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
         return rows.target - model.predict(fitted(keep).z, rows)
 
     errors = rows.target - model.predict(z, rows)
-    judgement = find_outliers(rows, refit, errors, model.sensor_names)
+    try:
+        judgement = find_outliers(rows, refit, errors, model.sensor_names)
+    except InsufficientDataError as error:
+        raise InsufficientDataError(f'{error}{_moved(problem, rows, errors)}') from None
     _require_information(int(np.sum(~judgement.gross)), free, model)
     mode = with_directions(fitted(~judgement.gross))
     gauge = _judged_at(mode, gauge, known)
@@ -348,3 +352,18 @@ def _require_information(count: int, free: IntArray, model: Model) -> None:
             f'{count} observations of 3 coordinates for {len(free)} unknowns; '
             f'measure at least {-(-needed // 3)}, better ten times as many'
         )
+
+
+def _moved(problem: Problem, rows: Rows, errors: FloatArray) -> str:
+    """Return from when on sensors with too many gross errors are off; '' if nothing shows it."""
+    text = ''
+    for sensor, span in rows.spans:
+        moved = moved_since(problem.measurements, rows.source[span], errors[span])
+        if moved is not None:
+            text += (
+                f'; {problem.sensor_names[sensor]} is off by '
+                f'{1e3 * np.linalg.norm(moved.shift):.1f} mm from about observation '
+                f'{moved.observation} on: it, or its marker, was moved then; fasten both, and '
+                'keep only what was measured before or since, or measure again'
+            )
+    return text

@@ -57,6 +57,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=10.0,
         help='world time over wall time (1 to 20; default 10)',
     )
+    parser.add_argument(
+        '--watch', action='store_true', help='show it on the live page, until Ctrl-C'
+    )
 
 
 def run(args: argparse.Namespace) -> NoReturn:
@@ -72,6 +75,7 @@ def run(args: argparse.Namespace) -> NoReturn:
             'figures': not args.no_figures,
             'quiet': args.quiet,
             'hide': ','.join(args.hide),
+            'watch': args.watch,
         },
     )
 

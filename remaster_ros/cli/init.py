@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.cli.console import progress_bar, show
-from remaster_ros.cli.options import names, number
-from remaster_ros.errors import InputError, did_you_mean
+from remaster_ros.cli.options import CANDIDATES, names, number
+from remaster_ros.errors import InputError, InsufficientDataError, did_you_mean
 from remaster_ros.kinematics.arm_ends import likely_base, likely_tips
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.urdf import parse_urdf
@@ -26,6 +26,9 @@ from remaster_ros.planning.cell_proposal import (
     reach_of,
     widest_ranges,
 )
+from remaster_ros.planning.collection_plan import outlook
+from remaster_ros.planning.tour_planner import TourPlanner
+from remaster_ros.reports.plan_json import outlook_text, outlook_to_dict
 from remaster_ros.session.cell_template import (
     LINK_RADIUS_M,
     SENSORS,
@@ -36,15 +39,12 @@ from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.session.meshes import find_mesh, mesh_reader
 from remaster_ros.session.robot_description import read_description
 from remaster_ros.session.workcell import Workcell, parse_cell
-from remaster_ros.simulation.offline_tour import plan_tour
 
-# Tool poses by which the joints to hold are compared; poses that are planned to find the ranges,
-# and those of the trial.
+# Tool poses by which the joints to hold are compared; poses that are planned to find the ranges.
 COMPARED = 80
 TRIED = 200
 # Fewer that can be visited do not show ranges.
 FEWEST = 12
-TRIAL = {'optimization': 20, 'validation': 10}
 # How far the sensor stands behind what the arm reaches, m.
 SENSOR_BEHIND_M = 1.2
 REMEDY = 'give another name with --out'
@@ -84,11 +84,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='where it stands in the base link, m, roughly (default: in front of the arm)',
     )
     parser.add_argument('--no-floor', action='store_true', help='the arm hangs, or stands high')
+    parser.add_argument(
+        '--no-plan', action='store_true', help='write the cell file, and do not plan in it'
+    )
     parser.add_argument('--json', action='store_true', help='print one JSON object')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read the robot, try what is proposed, write the cell file, and plan a little in it."""
+    """Read the robot, try what is proposed, write the cell file, and plan in it."""
     for sensor in args.sensors:
         if sensor not in SENSORS:
             meant = did_you_mean(sensor, SENSORS)
@@ -98,25 +101,27 @@ def run(args: argparse.Namespace) -> int:
     rng = np.random.default_rng(args.seed)
     with progress_bar(args.quiet or args.json) as progress:
         progress('reading', 0.0)
-        text = read_description(args.robot, _arguments(args.arguments), args.package_path)
-        urdf = _urdf_file(args.robot, args.out, text)
+        description = read_description(args.robot, _arguments(args.arguments), args.package_path)
+        urdf = _urdf_file(args.robot, args.out, description)
         make_folder(args.out.parent)
         if urdf != args.robot:
-            write_atomically(urdf, text)
+            write_atomically(urdf, description)
         progress('trying', 0.1)
-        widest = _propose(args, text, urdf, rng)
+        widest = _propose(args, description, urdf, rng)
         progress('planning', 0.4)
         proposal = _narrowed(widest, _cell(widest, args.out), rng)
         write_atomically(args.out, cell_text(proposal))
-        progress('planning', 0.9)
-        said = _trial(_cell(proposal, args.out), bool(proposal.missing_meshes), rng)
+        progress('planning', 0.7)
+        cell, missing = _cell(proposal, args.out), bool(proposal.missing_meshes)
+        planned, text = ({}, '') if args.no_plan else _plan(cell, missing, args.seed)
     if args.json:
-        print(json.dumps(_as_json(args.out, proposal, said)))
+        print(json.dumps(_as_json(args.out, proposal) | planned))
         return 0
     show(args.quiet, _as_text(proposal))
-    show(args.quiet, said)
+    if text:
+        show(args.quiet, text)
     show(args.quiet, f'written: {args.out}; look at its lines marked CHECK')
-    show(args.quiet, f'go on with: remaster plan {args.out}')
+    show(args.quiet, f'every way, in 3-D: remaster plan {args.out} --out plan.html')
     return 0
 
 
@@ -220,13 +225,16 @@ def _narrowed(p: CellProposal, cell: Workcell, rng: np.random.Generator) -> Cell
     return replace(p, ranges=ranges_around(places), kept=f'{found}; these ranges are around them.')
 
 
-def _trial(cell: Workcell, without_meshes: bool, rng: np.random.Generator) -> str:
-    """Plan a few poses in the new cell; return what became of them."""
+def _plan(cell: Workcell, without_meshes: bool, seed: int) -> tuple[dict[str, Any], str]:
+    """Plan in the new cell as the nodes do, without the ways; return it for JSON and as text."""
+    scene = cell.planning_scene(cell.chain(), without_meshes=without_meshes)
+    counts = {'optimization': CANDIDATES, 'validation': CANDIDATES}
     try:
-        tour = plan_tour(cell.chain(), cell, None, TRIAL, rng, without_meshes=without_meshes)
-    except InputError as error:
-        return f'a trial plan found nothing: {error}'
-    return f'a trial of {sum(TRIAL.values())} poses: {tour.describe()}'
+        tour, expected = outlook(TourPlanner(scene, counts, seed, design=cell.design_settings()))
+    except InsufficientDataError as error:
+        return {'plan': None, 'why': str(error)}, f'nothing can be measured like this: {error}'
+    text = f'planned from {sum(counts.values())} candidate poses:\n{outlook_text(tour, expected)}'
+    return {'plan': outlook_to_dict(tour, expected)}, text
 
 
 def _as_text(p: CellProposal) -> str:
@@ -253,7 +261,7 @@ def _as_text(p: CellProposal) -> str:
     return '\n'.join(lines)
 
 
-def _as_json(out: Path, p: CellProposal, said: str) -> dict[str, Any]:
+def _as_json(out: Path, p: CellProposal) -> dict[str, Any]:
     held = p.held
     return {
         'cell': str(out),
@@ -263,5 +271,4 @@ def _as_json(out: Path, p: CellProposal, said: str) -> dict[str, Any]:
         'held_joint': None if held.joint is None else p.chain.joint_names[held.joint],
         'solutions': held.solutions,
         'missing_meshes': list(p.missing_meshes),
-        'trial': said,
     }

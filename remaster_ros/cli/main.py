@@ -26,8 +26,10 @@ VERBS = {
     'simulate': 'Make a session from a known truth, which is written beside it.',
     'fit': 'Fit the zero-offsets of a session: fit.json, figures and report.html.',
     'discover': 'Find what the offsets leave, name the cause, extend the model, prove the gain.',
+    'report': 'One page of fit and causes: what to do, what it brings, what remains.',
     'accuracy': 'Judge the zero-offsets of a fit on any session: the three metrics.',
     'recover': 'Finish the files of a session whose recorder was killed; print what was lost.',
+    'watch': 'Show a collection under way on a local web page.',
     'replay': 'Publish a recorded session again (as `ros2 bag play` does).',
 }
 SHELLS = ('bash', 'zsh', 'fish')

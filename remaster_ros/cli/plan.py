@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -11,11 +13,14 @@ from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.options import add_poses, integer, number
 from remaster_ros.kinematics.body_pairs import RESERVE_M
 from remaster_ros.kinematics.collision import CollisionModel
-from remaster_ros.kinematics.transforms import transform
+from remaster_ros.planning.candidates import PlanningScene
 from remaster_ros.planning.collection_plan import CollectionPlan, plan_collection
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.planning.travel_time import DWELL_S, SETTLE_S, SPEED_SHARE, TravelTime
+from remaster_ros.reports.found_causes import read_causes
 from remaster_ros.reports.plan_json import plan_text, plan_to_dict
+from remaster_ros.reports.plan_page import check_plan_page, plan_page, write_plan_page
+from remaster_ros.reports.robot_scene import robot_scene
 from remaster_ros.session.workcell import Workcell, read_cell
 from remaster_ros.types import FloatArray
 
@@ -63,41 +68,65 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'how long a reading takes, s (default {DWELL_S:g})',
     )
     parser.add_argument(
+        '--out',
+        metavar='PAGE',
+        type=Path,
+        help='write a page that plays the plan in 3-D, such as plan.html',
+    )
+    parser.add_argument(
+        '--separate',
+        metavar='FILE',
+        help='discovery.json: add configurations that separate its causes from their look-alikes',
+    )
+    parser.add_argument(
         '--json', action='store_true', help='print one JSON object and nothing else'
     )
 
 
 def run(args: argparse.Namespace) -> int:
     """Plan, and print what is planned."""
+    if args.out is not None:
+        check_plan_page(args.out)
     cell = read_cell(args.cell)
+    scene = cell.planning_scene(cell.chain())
     with progress_bar(args.quiet or args.json) as progress:
         progress('planning', 0.0)
-        plan = planned(cell, args)
+        plan = planned(cell, scene, args, lambda share: progress('planning', share))
+        if args.out is not None:
+            progress('drawing', 0.0)
+            name = Path(cell.file).stem
+            write_plan_page(args.out, plan_page(plan, robot_scene(cell, scene), name))
     if args.json:
         print(json.dumps(plan_to_dict(plan), indent=2))
-    else:
-        show(args.quiet, plan_text(plan, cell.design_settings()))
+        return 0
+    show(args.quiet, plan_text(plan, cell.design_settings()))
+    if args.out is not None:
+        show(args.quiet, f'written: {args.out}; open it in a browser to see every way')
     return 0
 
 
-def planned(cell: Workcell, args: argparse.Namespace) -> CollectionPlan:
+def planned(
+    cell: Workcell,
+    scene: PlanningScene,
+    args: argparse.Namespace,
+    progress: Callable[[float], None] = lambda share: None,
+) -> CollectionPlan:
     """Return the collection as the nodes plan it, before sensors at their rough places."""
-    chain = cell.chain()
-    scene = cell.planning_scene(chain)
     travel = TravelTime.of(
         scene.model,
         args.speed_share,
         args.cartesian_speed_limit or np.inf,
-        cell.acceleration_limits(chain),
+        cell.acceleration_limits(scene.model.chain),
         args.settle,
         args.dwell,
     )
+    causes = read_causes(args.separate) if args.separate else ()
     counts = {'optimization': args.poses, 'validation': args.validation}
     planner = TourPlanner(
-        scene, counts, args.seed, args.reference_every, cell.design_settings(), travel
+        scene, counts, args.seed, args.reference_every, cell.design_settings(), travel, causes
     )
-    places = {name: transform(np.eye(3), origin) for name, origin in scene.rough_R.items()}
-    return plan_collection(planner, places, free_start(scene.model, args.seed))
+    start = free_start(scene.model, args.seed)
+    return plan_collection(planner, planner.rough_places, start, progress)
 
 
 def free_start(model: CollisionModel, seed: int) -> FloatArray:

@@ -28,6 +28,7 @@ from remaster_ros.discovery.gain import (
     gain_of,
     noise_by_range,
     pose_common_fraction,
+    residuals_of,
 )
 from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, unfitted
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
@@ -82,6 +83,9 @@ class Discovery:
     thinning
         Which part of a large session was searched, and how the causes hold on the rest; None where
         all of it was searched.
+    residuals_before
+        Measured minus modelled position of every row with the zero-offsets alone, in the frame of
+        its sensor, m, (n, 3).
     unexplained
         Structure that no cause explains.
     """
@@ -98,6 +102,7 @@ class Discovery:
     selection: Selection
     residuals: Residuals
     fit: FitResult
+    residuals_before: FloatArray
     thinning: Thinning | None = None
     unexplained: tuple[Unexplained, ...] = ()
 
@@ -170,6 +175,7 @@ def discover_session(
         selection=findings.selection,
         residuals=residuals,
         fit=fit,
+        residuals_before=residuals_of(findings.before),
         thinning=findings.thinning,
         unexplained=unexplained,
     )

@@ -18,6 +18,7 @@ from remaster_ros.discovery.gain import shares
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, screen
 from remaster_ros.discovery.stepwise_selection import Selection
+from remaster_ros.discovery.words import clock_time
 
 # Look-alikes within this of the evidence are named; within the other, the leaders tie.
 CONFUSABLE = 5.0
@@ -179,7 +180,11 @@ def _described(
         )
     )
     if not np.isnan(first.moment):
-        parameters += (Parameter('moment', first.moment, first.moment_std, 's'),)
+        # Nothing tells where between two readings it was.
+        elapsed = data.part.elapsed_s
+        gap = elapsed[elapsed > first.moment].min() - elapsed[elapsed <= first.moment].max()
+        std = float(np.hypot(first.moment_std, gap / np.sqrt(12.0)))
+        parameters += (Parameter('moment', first.moment, std, 's'),)
     rest = tuple(cell for cell in solution.cells if cell not in group)
     without = solve(data, rest, solution, prior=family_log_prior(rest, catalogue.cells))
     gain = sum(step.log_evidence_gain for step in selection.steps)
@@ -339,14 +344,16 @@ def in_words(group: Sequence[Cell], context: Context) -> str:
 
 
 def _when(cell: Cell, context: Context) -> str:
-    """Return when a cell's step was: minutes since the first row, and configurations."""
+    """Return when a cell's step was: by the clock, since the first row, and in configurations."""
     if np.isnan(cell.moment):
         return ''
     configuration, after = context.measurements.configuration, context.elapsed_s > cell.moment
     before = configuration[~after][np.argmax(context.elapsed_s[~after])]
     behind = configuration[after][np.argmin(context.elapsed_s[after])]
+    stamp = cell.moment + float(context.measurements.stamp_s[0] - context.elapsed_s[0])
+    clock = f'at {words}, ' if (words := clock_time(stamp)) else ''
     return (
-        f'{cell.moment / 60.0:.1f} min after the first reading, '
+        f'{clock}{cell.moment / 60.0:.1f} min after the first reading, '
         f'between configurations {before} and {behind},'
     )
 

@@ -56,17 +56,24 @@ def gain_of(
     floor = float(np.sqrt(np.mean(variance[measurements.sensor[rows]])))
     if not held_out.any():
         return Gain(None, None, floor, {})
-    before = predicted_rows(found.problem, found.model, found.mode.z)
+    errors_before = residuals_of(found)
+    before = measurements.position - errors_before
     after = measurements.position - fit.residuals_after
     none = np.arange(0)
     metrics = accuracy_of(measurements, none, before, after, None, rng)['validation']
     assert metrics is not None
     return Gain(
-        rms(measurements.position - before, held_out),
+        rms(errors_before, held_out),
         rms(fit.residuals_after, held_out),
         floor,
         {name: metrics[name] for name in ('relative', 'post_registration')},
     )
+
+
+def residuals_of(found: Estimate) -> FloatArray:
+    """Return measured minus modelled position of every row of an estimate, m, (n, 3)."""
+    predicted = predicted_rows(found.problem, found.model, found.mode.z)
+    return found.problem.measurements.position - predicted
 
 
 def rms(errors: FloatArray, rows: BoolArray) -> float:

@@ -21,6 +21,7 @@ from remaster_ros.discovery.evidence import Solution
 from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.gain import rms
 from remaster_ros.discovery.guard import Unexplained
+from remaster_ros.discovery.moved_meanwhile import far_off, moved_text
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
@@ -66,6 +67,7 @@ def structure_left(
             for found in located
         ),
         *checks.pairing(),
+        *far_off(data.context, checks.errors, checks.gross & ~checks.mispaired),
         *checks.held_out(),
         *checks.beyond_stated(),
     )
@@ -190,15 +192,23 @@ class _Checks:
         if p_value > SIGNIFICANCE:
             return
         ratio = float(np.sqrt(np.median(found) / np.median(expected)))
+        moved = [
+            text
+            for sensor in range(len(data.context.sensor_names))
+            if (text := moved_text(data.context, self.errors, sensor))
+        ]
         yield Unexplained(
             where='held_out_poses',
-            driver='unknown',
+            driver='time' if moved else 'unknown',
             size_m=rms(self.errors, measurements.is_validation & ~self.gross),
             p_value=p_value,
-            next=(
-                f'The errors on the held-out poses are {ratio:.1f} times those on poses left out '
-                'of the fit in turn: what is held out lies elsewhere, or something changed in '
-                'between. Compare where and when the two were measured.'
+            next=' '.join(
+                [
+                    f'The errors on the held-out poses are {ratio:.1f} times those on poses left '
+                    'out of the fit in turn: what is held out lies elsewhere, or something '
+                    'changed in between.',
+                    *(moved or ['Compare where and when the two were measured.']),
+                ]
             ),
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import UTC, datetime
 
 import numpy as np
 
@@ -22,6 +23,10 @@ SHOWN_UNITS = {
 }
 
 
+# Stamps between 2001 and 2100 are counted from 1970 on, smaller ones from the start of something.
+EARLIEST_S, LATEST_S = 1e9, 4.1e9
+
+
 def shown(value: float, std: float, unit: str) -> tuple[str, str, str]:
     """Return value, standard deviation and unit of a parameter as people read them."""
     words, times = SHOWN_UNITS.get(unit, (unit, 1.0))
@@ -38,6 +43,13 @@ def p_value_text(p_value: float, floor: float) -> str:
     if np.isnan(p_value):
         return 'p unknown'
     return f'p < {floor:.2g}' if p_value <= floor * (1.0 + 1e-9) else f'p = {p_value:.2g}'
+
+
+def clock_time(stamp_s: float) -> str:
+    """Return '08:11:05 UTC on 2026-11-22'; '' for a time that is not counted from 1970 on."""
+    if not EARLIEST_S < stamp_s < LATEST_S:
+        return ''
+    return f'{datetime.fromtimestamp(stamp_s, UTC):%H:%M:%S UTC on %Y-%m-%d}'
 
 
 def called(name: str, joints: Sequence[int]) -> str:

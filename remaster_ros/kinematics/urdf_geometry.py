@@ -1,9 +1,14 @@
-"""The collision geometry of a URDF: which shapes hang on which joint of the arm, and where."""
+"""The geometry of a URDF: which shapes hang on which joint of the arm, and where.
+
+Collision geometry is read strictly, as it decides what the arm may do; visual geometry is for
+pictures, where an element that cannot be read is one that is missing.
+"""
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +33,38 @@ class LinkShape:
     link: str
     T_link_shape: FloatArray
     shape: Shape
+
+
+@dataclass(frozen=True, eq=False)
+class Visual:
+    """One ``<visual>`` element of a link of the arm.
+
+    Attributes
+    ----------
+    link_name
+        The URDF's link.
+    link
+        0 for what stands still, i for what moves with joint i.
+    T_link_visual
+        Its place in the frame after that joint (in the base for 0), (4, 4).
+    shape
+        A box, cylinder or sphere; None for a mesh.
+    mesh
+        The mesh's file name as the URDF writes it; '' for none, with no shape either where the
+        element cannot be read.
+    scale
+        Of the mesh, (3,).
+    color
+        Red, green and blue, 0 to 1; None where the URDF gives none.
+    """
+
+    link_name: str
+    link: int
+    T_link_visual: FloatArray
+    shape: Shape | None
+    mesh: str
+    scale: FloatArray
+    color: tuple[float, float, float] | None
 
 
 def link_shapes(text: str, read_mesh: MeshReader) -> list[LinkShape]:
@@ -108,6 +145,19 @@ def chain_bodies(text: str, chain: SerialChain, read_mesh: MeshReader) -> list[B
     read_mesh
         See `link_shapes`.
     """
+    carrier = _carriers(text, chain)
+    bodies = []
+    for found in link_shapes(text, read_mesh):
+        link, T = carrier(found.link)
+        bodies.append(Body(found.link, link, found.shape, T @ found.T_link_shape))
+    return bodies
+
+
+def _carriers(text: str, chain: SerialChain) -> Callable[[str], tuple[int, FloatArray]]:
+    """Return what gives, for a link's name, the joint that it moves with and T_joint_link.
+
+    The joint is 0 for what stands still, whose place is then in the base.
+    """
     model = parse_urdf(text)
     index = {
         joint.child: chain.joint_names.index(joint.name) + 1
@@ -115,11 +165,56 @@ def chain_bodies(text: str, chain: SerialChain, read_mesh: MeshReader) -> list[B
         if joint.name in chain.joint_names
     }
     _, T_root_base = model.carrier(chain.base_link, index)
-    bodies = []
-    for found in link_shapes(text, read_mesh):
-        carrier, T = model.carrier(found.link, index)
-        if carrier not in index:
-            # No joint of the arm carries it, so that this is its place in the root's frame.
-            T = inverse(T_root_base) @ T
-        bodies.append(Body(found.link, index.get(carrier, 0), found.shape, T @ found.T_link_shape))
-    return bodies
+
+    def carrier(link: str) -> tuple[int, FloatArray]:
+        name, T = model.carrier(link, index)
+        # Where no joint of the arm carries it, this is its place in the root's frame.
+        return index.get(name, 0), T if name in index else inverse(T_root_base) @ T
+
+    return carrier
+
+
+def chain_visuals(text: str, chain: SerialChain) -> list[Visual]:
+    """Return the visual elements of URDF text (that `parse_urdf` accepts), for pictures.
+
+    Parameters
+    ----------
+    text
+        The URDF that the chain was read from.
+    chain
+        The arm.
+    """
+    carrier, robot = _carriers(text, chain), ElementTree.fromstring(text)
+    colors = {element.get('name', ''): _color(element) for element in robot.findall('material')}
+    found = []
+    for link in robot.findall('link'):
+        name = link.get('name', '')
+        number, T = carrier(name)
+        for element in link.findall('visual'):
+            where = f"the visual geometry of link '{name}'"
+            shape, mesh, scale, T_visual = None, '', np.ones(3), np.eye(4)
+            with suppress(InputError):
+                T_visual = origin_of(element, where)
+                geometry = element.find('geometry/')
+                if geometry is not None and geometry.tag == 'mesh':
+                    scale = numbers(geometry.get('scale', '1 1 1'), 3, where)
+                    mesh = attribute(geometry, 'filename', where)
+                elif geometry is not None:
+                    shape = _shape(geometry, where, lambda name: None)
+            material = element.find('material')
+            color = None
+            if material is not None:
+                color = _color(material) or colors.get(material.get('name', ''))
+            found.append(Visual(name, number, T @ T_visual, shape, mesh, scale, color))
+    return found
+
+
+def _color(material: ElementTree.Element) -> tuple[float, float, float] | None:
+    """Return red, green and blue of a ``<material>``; None where it has no colour that is one."""
+    element = material.find('color')
+    with suppress(InputError):
+        if element is not None:
+            rgba = numbers(element.get('rgba', ''), 4, 'a colour')
+            red, green, blue = np.clip(rgba[:3], 0.0, 1.0).tolist()
+            return red, green, blue
+    return None

@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,7 @@ from remaster_ros.nodes.demo_summary import (
     print_times,
 )
 from remaster_ros.nodes.launching import ALL_NODES, CORE, SENSORS
+from remaster_ros.nodes.page_address import opening_path, page_name
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.processes import NodeProcesses
 from remaster_ros.nodes.running import report
@@ -83,6 +85,7 @@ class Parameters:
         '', 'what else is wrong with the hidden arm: NAME[@JOINT][:SIZE_MM],…, or random'
     )
     figures: bool = parameter(True, 'write figures and the report')
+    watch: bool = parameter(False, 'serve the live page, and end with a signal')
     quiet: bool = parameter(False, 'print nothing but errors')
 
 
@@ -168,6 +171,8 @@ class Demo:
             self.console.print('looking for causes')
             self._trigger('remaster/discover', 'optimizer', timeout_s=300.0)
             results.append(('causes', self.discovery, 'discovery.json'))
+        if self.p.watch:
+            self._stay()
         self.processes.stop()
         print_times(self.console, self.node.times)
         # Only here, after everything that estimates has ended, is the truth opened.
@@ -214,6 +219,10 @@ class Demo:
             if name in HAVE_CELL:
                 values['cell'] = self.p.cell
             self.processes.start(name, common, values)
+        if self.p.watch:
+            self.processes.start('watch', common, {'cell': self.p.cell, 'fit': str(self.fit)})
+            name = page_name(self.node.context.get_domain_id(), '/watch')
+            self.console.print(f'live page: open {opening_path(name)}', soft_wrap=True)
 
     def _spin(self) -> None:
         self._executor.spin_once(timeout_sec=0.1)
@@ -223,6 +232,14 @@ class Demo:
             # The last summary of the killed process no longer holds.
             self.node.summaries.pop(name, None)
             self.console.print(f'{name} was killed, and is started again')
+
+    def _stay(self) -> None:
+        """Leave the nodes to the live page until a signal."""
+        self.console.print('the live page stays until Ctrl-C')
+        with suppress(KeyboardInterrupt):
+            while True:
+                self._spin()
+        self._stopping.clear()
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
         deadline = time.monotonic() + timeout_s

@@ -65,6 +65,6 @@ def _action(node: NodeToStart) -> Node:
 
 def _on_exit(event: Any, context: Any) -> list[EmitEvent]:
     """End everything where a node is configured wrongly; to start it again does not help."""
-    if exit_ends_launch(event.returncode):
+    if exit_ends_launch(event.process_name, event.returncode):
         return [EmitEvent(event=Shutdown(reason=f'{event.process_name} ended with status 2'))]
     return []

@@ -22,6 +22,7 @@ SENSORS = ('optitrack_markers', 'laser_tracker_markers')
 """The sensors that have a fake and an executable of their own."""
 FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
 ALL_NODES = (*FAKES, *CORE, *SENSORS)
+PAGE = 'watch'
 ALL = 'all'
 RESPAWN_DELAY_S = 1.0
 MAX_RESPAWNS = 5
@@ -29,7 +30,7 @@ MAX_RESPAWNS = 5
 WRONG = 2
 """The exit status of a node that is configured wrongly, or whose device does not answer."""
 FOLDERS = {
-    'pose_planner': {'session': 'session'},
+    'pose_planner': {'session': 'session', 'separate': ''},
     'recorder': {'session': 'session'},
     'optimizer': {'session': 'session', 'out': 'fit', 'discovery': 'discovery', 'prior': ''},
 }
@@ -70,6 +71,7 @@ def real_nodes(
     namespace: str = '',
     controller: str = '',
     joint_states: str = '',
+    dashboard: str = 'false',
 ) -> list[NodeToStart]:
     """Return the nodes of a real cell.
 
@@ -84,6 +86,8 @@ def real_nodes(
     controller, joint_states
         The arm's controller and the topic of its joint states; empty for ros2_control's usual
         names in the namespace.
+    dashboard
+        ``true`` to serve the live page too.
 
     Raises
     ------
@@ -147,6 +151,8 @@ def real_nodes(
                 'out with sensors:='
             )
         nodes.append(start(kind if kind in SENSORS else GENERIC, node, **own))
+    if _is_true('dashboard', dashboard):
+        nodes.append(start(PAGE, PAGE, **own, fit=values['optimizer']['out']))
     return nodes
 
 
@@ -157,13 +163,20 @@ def _beside(params: str, section: Mapping[str, Any], folders: Mapping[str, str])
     return {key: str(home / path) for key, path in given.items() if path}
 
 
-def fake_nodes(params: str, namespace: str = '') -> list[NodeToStart]:
+def fake_nodes(params: str, namespace: str = '', dashboard: str = 'false') -> list[NodeToStart]:
     """Return the nodes of a fake cell and its fakes, whose clock is the namespace's own."""
     if not Path(params).is_file():
         raise InputError(f'params:={params}: there is no such file')
+    names = (*ALL_NODES, PAGE) if _is_true('dashboard', dashboard) else ALL_NODES
     return [
-        NodeToStart(name, name, (params,), (('/clock', 'clock'),), namespace) for name in ALL_NODES
+        NodeToStart(name, name, (params,), (('/clock', 'clock'),), namespace) for name in names
     ]
+
+
+def _is_true(name: str, text: str) -> bool:
+    if text.lower() not in ('true', 'false'):
+        raise InputError(f'{name}:={text}: true or false is needed')
+    return text.lower() == 'true'
 
 
 def read_sections(params: str, namespace: str = '') -> dict[str, Mapping[str, Any]]:
@@ -201,9 +214,16 @@ def read_sections(params: str, namespace: str = '') -> dict[str, Mapping[str, An
     return found
 
 
-def exit_ends_launch(returncode: int | None) -> bool:
-    """Return whether the end of a node ends them all: started again it would end the same way."""
-    return returncode == WRONG
+def exit_ends_launch(process: str, returncode: int | None) -> bool:
+    """Return whether the end of a node ends them all: started again it would end the same way.
+
+    Parameters
+    ----------
+    process
+        The executable's name, then a hyphen and a number. The live page, which the others do not
+        need, ends nobody.
+    """
+    return returncode == WRONG and process.rpartition('-')[0] != PAGE
 
 
 def _where(namespace: str) -> str:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from remaster_ros.kinematics.collision import CollisionModel
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.parameters import parameter
+from remaster_ros.planning.separating_design import FoundCause
+from remaster_ros.planning.tour_order import REGISTRATION
+from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.planning.travel_time import SPEED_SHARE, TravelTime
 from remaster_ros.session.workcell import Workcell
 
@@ -38,6 +42,11 @@ class Parameters:
     session: str = parameter(
         'session', "folder of the recorder's session, where the plan is kept (plan.jsonl)"
     )
+    separate: str = parameter(
+        '',
+        'discovery.json: configurations that separate its causes from their look-alikes are '
+        'added; empty for none',
+    )
     resume_within_s: float = parameter(
         30.0,
         'a planner killed while collecting that is started again within this time goes on by '
@@ -60,16 +69,35 @@ class Parameters:
         0.25, 'as of robot_bridge, likewise; 0 means no such limit', unit='m/s', low=0.0, high=10.0
     )
 
-    def travel(self, cell: Workcell, model: CollisionModel) -> TravelTime:
-        """Return how long the arm takes, for choices of poses and their order."""
-        return TravelTime.of(
-            model,
+    def tour_planner(
+        self, cell: Workcell, chain: SerialChain, causes: Sequence[FoundCause]
+    ) -> TourPlanner:
+        """Return what plans the tours of a cell with this arm; causes as of `causes`."""
+        scene = cell.planning_scene(chain, np.deg2rad(self.limit_margin_deg))
+        counts = {
+            'optimization': self.optimization_candidates,
+            'validation': self.validation_candidates,
+            REGISTRATION: self.registration_candidates,
+        }
+        travel = TravelTime.of(
+            scene.model,
             self.speed_share,
             self.cartesian_speed_limit_m_s or np.inf,
-            cell.acceleration_limits(model.chain),
+            cell.acceleration_limits(chain),
         )
+        design = cell.design_settings()
+        return TourPlanner(scene, counts, self.seed, self.reference_every, design, travel, causes)
 
-    def plan_settings(self, cell: Workcell) -> dict[str, Any]:
+    def causes(self) -> tuple[FoundCause, ...]:
+        """Return the causes that the plan is to separate; errors as of `read_causes`."""
+        if not self.separate:
+            return ()
+        # Imported when it is needed, as it takes a while.
+        from remaster_ros.reports.found_causes import read_causes
+
+        return read_causes(self.separate)
+
+    def plan_settings(self, cell: Workcell, causes: Sequence[FoundCause]) -> dict[str, Any]:
         """Return what the plan depends on."""
         design = cell.design_settings()
         speeds = {
@@ -86,4 +114,5 @@ class Parameters:
             'limit_margin_deg': self.limit_margin_deg,
             # Other plans do not depend on them, and are those of older versions.
             **(speeds if design.optimal or design.fastest else {}),
+            **({'separate': repr(causes)} if causes else {}),
         }

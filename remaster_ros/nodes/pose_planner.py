@@ -21,7 +21,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.subscription import Subscription
@@ -39,21 +38,15 @@ from remaster_ros.motion.preflight import preflight
 from remaster_ros.nodes.measure_calls import MeasureCalls
 from remaster_ros.nodes.messages import JointOrder, transform_array
 from remaster_ros.nodes.parameters import declare
+from remaster_ros.nodes.plan_preview import PlanPreview
 from remaster_ros.nodes.planner_parameters import Parameters
 from remaster_ros.nodes.planning_thread import PlanningThread
 from remaster_ros.nodes.pose_publisher import PosePublisher
+from remaster_ros.nodes.progress_lines import ProgressLines
 from remaster_ros.nodes.run_token import LivingRun, new_token, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import (
-    JOINT_STATES,
-    LATCHED,
-    RELIABLE,
-    NodeStatus,
-    Summary,
-    listen,
-)
+from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.planning.tour_order import REGISTRATION, PoseVisit
-from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanJournal
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
@@ -72,28 +65,17 @@ class PosePlanner(RemasterNode):
         self.chain = self.cell.chain()
         self._order = JointOrder(self.chain.joint_names)
         self._q: FloatArray | None = None
-        counts = {
-            'optimization': self.p.optimization_candidates,
-            'validation': self.p.validation_candidates,
-            REGISTRATION: self.p.registration_candidates,
-        }
-        scene = self.cell.planning_scene(self.chain, np.deg2rad(self.p.limit_margin_deg))
-        self._tours = TourPlanner(
-            scene,
-            counts,
-            self.p.seed,
-            self.p.reference_every,
-            self.cell.design_settings(),
-            self.p.travel(self.cell, scene.model),
-        )
+        causes = self.p.causes()
+        self._tours = self.p.tour_planner(self.cell, self.chain, causes)
+        settings = self.p.plan_settings(self.cell, causes)
         folder = Path(self.p.session)
-        self.journal = PlanJournal(
-            folder, self.p.plan_settings(self.cell), self.chain, self._tours.model
-        )
+        self.journal = PlanJournal(folder, settings, self.chain, self._tours.model)
         self.progress = TourProgress(self.journal, self._tours, PlanningThread())
         # Of the run, and of what may be published only while it is running.
         self._lock = threading.RLock()
         self.run = CollectionRun(self.p.resume_within_s)
+        # Every pose passes its gate in `_announce`.
+        self._preview = PlanPreview(self.cell, self._tours, self.journal, self.progress, folder)
         self._living: LivingRun | None = None
         self._tried_wall = 0.0
         self._resume()
@@ -103,6 +85,7 @@ class PosePlanner(RemasterNode):
         self.create_subscription(
             TransformStamped, 'remaster/registration', self._on_registration, LATCHED
         )
+        self.create_service(Trigger, 'remaster/confirm', self._on_confirm)
         at_once = MutuallyExclusiveCallbackGroup()
         self.create_service(Trigger, 'remaster/collect', self._on_collect)
         self.create_service(Trigger, 'remaster/pause', self._on_pause, callback_group=at_once)
@@ -112,6 +95,7 @@ class PosePlanner(RemasterNode):
         self._cleared = self._described = False
         self._measure = MeasureCalls(self, self.cell)
         listen(self, self._on_record)
+        ProgressLines(self, self.status.steady, self.progress.counts, lambda: self.run.state)
         self.create_timer(0.05, self._step, clock=self.status.steady)
 
     def _resume(self) -> None:
@@ -121,7 +105,9 @@ class PosePlanner(RemasterNode):
             return
         if journal.lost:
             self.get_logger().warning(journal.lost)
-        self.run.resume(journal.state, journal.run, self.progress.describe())
+        # Plans that need a confirmation need it after every start.
+        token = '' if self._preview.required else journal.run
+        self.run.resume(journal.state, token, self.progress.describe())
         self.get_logger().warning(f'{journal.path}: going on; {self.progress.describe()}')
 
     def _take_up_run(self) -> None:
@@ -161,7 +147,8 @@ class PosePlanner(RemasterNode):
     def _on_collect(self, request: Trigger.Request, response: Trigger.Response) -> Any:
         bridge, recorder = self._announcements.bridge, self._announcements.recorder
         has_joints = self._q is not None
-        response.message = self.run.refusal(bridge, recorder, has_joints=has_joints)
+        refusal = self.run.refusal(bridge, recorder, has_joints=has_joints)
+        response.message = refusal or self._preview.asked()
         if response.message:
             return response
         if self.run.state != 'running':
@@ -174,6 +161,12 @@ class PosePlanner(RemasterNode):
             self.run.collect(new_token())
             self._follow_run()
         response.success, response.message = True, 'collecting'
+        return response
+
+    def _on_confirm(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+        response.success, response.message = self._preview.confirm()
+        if response.success and self.run.state != 'running':
+            self.run.why = response.message
         return response
 
     def _on_pause(self, request: Trigger.Request, response: Trigger.Response) -> Any:
@@ -271,6 +264,8 @@ class PosePlanner(RemasterNode):
         if self.journal.trouble and not self._is_written():
             return
         q, recorder, now = self._q, self._announcements.recorder, time.monotonic()
+        if self.run.state in ('idle', 'paused', 'stopped') and q is not None:
+            self.run.why = self._preview.draw(q, self._facts) or self.run.why
         if self.run.state != 'running' or q is None:
             return
         try:
@@ -320,6 +315,10 @@ class PosePlanner(RemasterNode):
 
     def _announce(self, stop: PoseVisit) -> None:
         tour = self.journal.tour
+        if not self._preview.allows(tour):
+            self._preview.withdraw()
+            self._end('paused', self._preview.refusal())
+            return
         if tour is not None and self.progress.phase != REGISTRATION and not self._described:
             self._described = True
             designed = self._tours.designed
@@ -357,6 +356,7 @@ class PosePlanner(RemasterNode):
             'references_done': self.journal.references.total(),
             # Whether it may still go on by itself.
             'resuming': 'yes' if run.left else 'no',
+            **self._preview.values(),
             **self.progress.counts(),
             'dropped_solutions_no free path': self.journal.outcomes[NO_FREE_PATH],
         }

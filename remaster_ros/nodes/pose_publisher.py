@@ -14,6 +14,9 @@ from remaster_ros.nodes.status import LEASED, NodeStatus
 from remaster_ros.nodes.waypoints import waypoints_message
 from remaster_ros.planning.tour_order import PoseVisit
 
+LISTENERS = ('robot_bridge', 'recorder')
+"""Nodes that a pose is announced to. A viewer or `ros2 topic echo` stands for none of them."""
+
 
 class PosePublisher:
     """Publishes poses, and the stop that takes them back.
@@ -38,8 +41,10 @@ class PosePublisher:
 
     @property
     def subscribers(self) -> int:
-        """How many nodes subscribe to the solutions."""
-        return int(self._solutions.get_subscription_count())
+        """How many nodes subscribe to the solutions, without those that only look on."""
+        found = self._node.get_subscriptions_info_by_topic(self._solutions.topic_name)
+        others = sum(info.node_name not in LISTENERS for info in found)
+        return int(self._solutions.get_subscription_count()) - others
 
     def stop(self) -> None:
         """Take the pose back, on which the bridge stops the arm."""

@@ -2,43 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.motion.trajectory import Trajectory
 from remaster_ros.planning.candidates import PlannedPose
 from remaster_ros.planning.planned_design import Designed
-from remaster_ros.planning.tour_order import Tour
+from remaster_ros.planning.separating_design import SeparatingDesign
+from remaster_ros.planning.tour_order import PoseVisit, Tour
 from remaster_ros.planning.tour_planner import TourPlanner
+from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.types import FloatArray
 
 NO_FREE_PATH = 'no free path'
+FITTED = 'optimization'
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlannedVisit:
     """A configuration that is measured.
 
     Attributes
     ----------
     split
-        ``optimization``, ``validation`` or ``reference``.
+        ``optimization``, ``validation``, ``reference`` or ``registration``.
     pose
         Which of the poses of its split.
-    points
-        The way, from the configuration before to this one, rad, (n, k).
+    trajectory
+        The way, from the configuration before to this one.
+    tool_speed_m_s
+        Largest speed of the fastest point of arm and tool on it, m/s.
     """
 
     split: str
     pose: int
-    points: FloatArray
+    trajectory: Trajectory
+    tool_speed_m_s: float
+
+    @property
+    def points(self) -> FloatArray:
+        """The way's polyline, rad, (n + 1, k) for n lines."""
+        return self.trajectory.points
 
     @property
     def q(self) -> FloatArray:
         """The configuration, rad, (k,)."""
-        end: FloatArray = self.points[-1]
-        return end
+        return self.trajectory.end
+
+
+class Expected(NamedTuple):
+    """What a fit is expected to state; see `CollectionPlan`."""
+
+    joint_std: Mapping[str, float | None]
+    joint_rms: float
+    tool_rms: float
+
+
+NOTHING_EXPECTED = Expected({}, np.nan, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +77,8 @@ class CollectionPlan:
         All configurations in the order of their visits, references each time.
     unreached
         Configurations that no free path leads to.
+    measuring_s
+        Settling and dwell at each of them, s.
     robot_time_s
         Motion, settling and dwell, s.
     max_tool_speed_m_s
@@ -65,17 +91,25 @@ class CollectionPlan:
         Root mean square of the 3-D error of the predicted markers, m.
     designed
         Of an optimal design; None without one.
+    undetermined
+        What these configurations do not determine at all, so that there are no standard
+        deviations (None and NaN above); ''.
+    separated
+        What was added to separate causes; None without causes.
     """
 
     tour: Tour
     visits: tuple[PlannedVisit, ...]
     unreached: int
+    measuring_s: float
     robot_time_s: float
     max_tool_speed_m_s: float
     joint_std: Mapping[str, float | None]
     joint_rms: float
     tool_rms: float
     designed: Designed | None
+    undetermined: str = ''
+    separated: SeparatingDesign | None = None
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -85,7 +119,10 @@ class CollectionPlan:
 
 
 def plan_collection(
-    planner: TourPlanner, T_R_N: Mapping[str, FloatArray], start: FloatArray
+    planner: TourPlanner,
+    T_R_N: Mapping[str, FloatArray],
+    start: FloatArray,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> CollectionPlan:
     """Go through a collection from beginning to end, as the planner's node does it.
 
@@ -97,48 +134,145 @@ def plan_collection(
         Registration of each sensor, (4, 4).
     start
         Where the arm stands, rad, (k,).
+    progress
+        Is told which share is done.
 
     Raises
     ------
     InsufficientDataError
-        No pose is left to fit on.
+        No pose is left to fit on, no configuration can be reached, or those that can do not
+        determine the offsets.
     """
-    tour, travel = planner.collection(T_R_N), planner.travel
-    planned = Tour(
-        planner.model.chain,
-        tour.plans,
-        model=planner.model,
-        reference_every=tour.reference_every,
-        order=tour.order,
+    tour = planner.collection(T_R_N)
+    plan = look_ahead(planner, T_R_N, [tour], start, progress=progress)
+    if plan.undetermined:
+        raise InsufficientDataError(plan.undetermined)
+    return plan
+
+
+def look_ahead(
+    planner: TourPlanner,
+    T_R_N: Mapping[str, FloatArray],
+    tours: Sequence[Tour],
+    start: FloatArray,
+    stop: PoseVisit | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> CollectionPlan:
+    """Go through what is left of tours, the collection's last, without changing them.
+
+    Parameters
+    ----------
+    planner, T_R_N, start, progress
+        See `plan_collection`.
+    tours
+        One after the other.
+    stop
+        What is left of the pose under way, visited first.
+
+    Raises
+    ------
+    InsufficientDataError
+        No configuration can be reached.
+    """
+    configurations = sum(sum(tour.configurations.values()) for tour in tours)
+    steps = _Steps(start, planner.travel, lambda n: progress(min(n / configurations, 1.0)))
+    for tour in tours:
+        left = tour.fork()
+        if stop is not None:
+            steps.go(left.reroute(stop, steps.here))
+            stop = None
+        while (following := left.next(steps.here)) is not None:
+            steps.go(following)
+    if not steps.visits:
+        standing = planner.model.trouble(start) or 'no free way leads from there'
+        raise InsufficientDataError(
+            f'no configuration can be reached from where the arm stands: {standing}'
+        )
+    fitted = tours[-1].plans[FITTED].poses
+    lost = {(index, number) for split, index, number in steps.unreached if split == FITTED}
+    reached = [
+        PlannedPose(
+            pose.T_R_T, np.array([q for i, q in enumerate(pose.solutions) if (at, i) not in lost])
+        )
+        for at, pose in enumerate(fitted)
+    ]
+    expected, undetermined = NOTHING_EXPECTED, ''
+    try:
+        reached = [pose for pose in reached if len(pose.solutions)]
+        expected = expected_precision(planner, T_R_N, reached)
+    except InsufficientDataError as error:
+        # What the arm does is known all the same.
+        undetermined = str(error)
+    visits = tuple(steps.visits)
+    measuring_s = planner.travel.measuring_s
+    return CollectionPlan(
+        tours[-1],
+        visits,
+        len(steps.unreached),
+        measuring_s,
+        sum(visit.trajectory.duration_s + measuring_s for visit in visits),
+        max((visit.tool_speed_m_s for visit in visits), default=0.0),
+        *expected,
+        planner.designed,
+        undetermined,
+        planner.separated,
     )
-    visits: list[PlannedVisit] = []
-    unreached, duration_s, fastest, here = 0, 0.0, 0.0, start
-    while (stop := tour.next(here)) is not None:
-        unreached += len(stop.unreached)
+
+
+def outlook(planner: TourPlanner) -> tuple[Tour, Expected]:
+    """Return a collection with the sensors at their rough places, without its ways.
+
+    These take nearly all of the time that `plan_collection` takes; without them it is not known
+    which configurations no free way leads to, nor how long it all takes.
+
+    Raises
+    ------
+    InsufficientDataError
+        No pose is left to fit on, or the poses do not determine the offsets.
+    """
+    tour = planner.collection(planner.rough_places)
+    return tour, expected_precision(planner, planner.rough_places, tour.plans[FITTED].poses)
+
+
+class _Steps:
+    """Go from stop to stop.
+
+    Parameters
+    ----------
+    here
+        Where the arm stands, rad, (k,).
+    travel
+        How long the robot takes.
+    progress
+        Is told how many configurations are done.
+    """
+
+    def __init__(
+        self, here: FloatArray, travel: TravelTime, progress: Callable[[int], None]
+    ) -> None:
+        self.here, self._travel, self._progress = here, travel, progress
+        self.visits: list[PlannedVisit] = []
+        self.unreached: list[tuple[str, int, int]] = []
+
+    def go(self, stop: PoseVisit) -> None:
+        """Visit the solutions of a stop."""
+        self.unreached += [(stop.split, stop.index, number) for number in stop.unreached]
         for q, way in zip(stop.solutions, stop.paths, strict=True):
-            points = np.vstack((here, way, q))
-            trajectory, speed = travel.trajectory(points)
-            duration_s += trajectory.duration_s + travel.measuring_s
-            fastest = max(fastest, speed)
-            visits.append(PlannedVisit(stop.split, stop.index, points))
-            here = q
-    by_pose: dict[int, list[FloatArray]] = {}
-    for visit in visits:
-        if visit.split == 'optimization':
-            by_pose.setdefault(visit.pose, []).append(visit.q)
-    fitted = planned.plans['optimization'].poses
-    poses = [PlannedPose(fitted[i].T_R_T, np.array(q)) for i, q in by_pose.items()]
+            trajectory, speed = self._travel.trajectory(np.vstack((self.here, way, q)))
+            self.visits.append(PlannedVisit(stop.split, stop.index, trajectory, speed))
+            self.here = q
+        self._progress(len(self.visits))
+
+
+def expected_precision(
+    planner: TourPlanner, T_R_N: Mapping[str, FloatArray], poses: Sequence[PlannedPose]
+) -> Expected:
+    """Return what a fit of these poses, in all their solutions, is expected to state."""
     sensors_R = {name: T[:3, 3] for name, T in T_R_N.items()}
     information = planner.design.before(sensors_R).information(planner.scene, poses)
     chosen = range(len(information))
-    return CollectionPlan(
-        planned,
-        tuple(visits),
-        unreached,
-        duration_s,
-        fastest,
+    return Expected(
         information.joint_std(chosen),
         information.joint_rms(chosen),
         information.tool_rms(chosen),
-        planner.designed,
     )

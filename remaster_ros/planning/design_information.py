@@ -16,13 +16,16 @@ where own = J'J/v + (deviations of the markers' derivatives from J, squared) / s
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from remaster_ros.calibration.identifiability import find_gauge
+from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.priors import prior_rows
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import PlannedPose
@@ -34,11 +37,30 @@ from remaster_ros.planning.expected_sensors import (
     expected_rows,
     nominal_model,
 )
-from remaster_ros.types import FloatArray, IntArray, Priors
+from remaster_ros.types import FloatArray, IntArray, Measurements, Priors
 
 UNKNOWN = 1e-8
 """Share of the mean information of a configuration that stands for "nothing known": it keeps the
 first choices finite, and changes no standard deviation once the parameters are determined."""
+
+
+@dataclass(frozen=True, eq=False)
+class FurtherColumns:
+    """Parameters beyond those of the offsets model: of causes that are to be distinguished.
+
+    Attributes
+    ----------
+    names
+        m of them.
+    displacement
+        Of a context: displacement of the marker in R, m per unit, (n, 3, m).
+    std
+        Standard deviation of the prior on each about 0, (m,).
+    """
+
+    names: tuple[str, ...]
+    displacement: Callable[[Context], FloatArray]
+    std: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +119,7 @@ class DesignInformation:
         marker_std_m: float,
         priors: Priors | None = None,
         box: ToolBox | None = None,
+        further: FurtherColumns | None = None,
     ) -> DesignInformation:
         """Differentiate the model at the nominal arm.
 
@@ -114,6 +137,8 @@ class DesignInformation:
             What is known of offsets and registrations beforehand.
         box
             Where the tool is to be accurate; None for wherever these poses are.
+        further
+            Parameters beyond those of the offsets model; behind the others.
 
         Raises
         ------
@@ -135,9 +160,17 @@ class DesignInformation:
         free = np.setdiff1d(np.arange(model.size), held.held)
         derivative = model.natural_jacobian(x, rows)[:, :, free]
         by_x = prior_rows(model, known, x, natural=True)[1][:, free]
+        names = [model.names[index] for index in free]
+        if further is not None:
+            context = nominal_context(model, x, measurements)
+            more = further.displacement(context)[rows.source]
+            derivative = np.concatenate((derivative, more), axis=2)
+            by_x = block_diag(by_x, np.diag(1.0 / further.std))
+            names += further.names
 
-        own = np.zeros((len(q), len(free), len(free)))
-        weighted = np.zeros((len(q), len(sensors), 3, len(free)))
+        size = len(names)
+        own = np.zeros((len(q), size, size))
+        weighted = np.zeros((len(q), len(sensors), 3, size))
         weight = np.zeros(len(sensors))
         for index, span in rows.spans:
             sensor = sensors[index]
@@ -178,7 +211,7 @@ class DesignInformation:
                 for joint in range(len(chain))
                 if not held.why[joint]
             },
-            tuple(model.names[index] for index in free),
+            tuple(names),
         )
 
     def __len__(self) -> int:
@@ -272,6 +305,20 @@ class DesignInformation:
         """Return the root mean square of the 3-D error of the predicted markers in the box, m."""
         covariance = np.linalg.inv(self.finite(self.total(chosen)))
         return float(np.sqrt(np.sum(covariance * self.tool)))
+
+
+def nominal_context(model: Model, x: FloatArray, measurements: Measurements) -> Context:
+    """Return what effects depend on at the nominal arm; nothing is known of times and ways."""
+    return Context(
+        model.chain,
+        measurements,
+        model.sensor_names,
+        model.marker_names,
+        np.zeros(model.joints),
+        model.markers(x),
+        model.reference,
+        timed=False,
+    )
 
 
 def _squares(values: FloatArray) -> FloatArray:

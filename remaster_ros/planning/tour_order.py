@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from typing import NamedTuple
@@ -167,6 +168,12 @@ class Tour:
             self.dropped_solutions.update(plan.dropped_solutions)
         self.visited = 0
 
+    def fork(self) -> Tour:
+        """Return a tour as far as this one, which can go on without it."""
+        other = copy(self)
+        other._left, other._numbers = deepcopy(self._left), dict(self._numbers)
+        return other
+
     def next(self, q: FloatArray) -> PoseVisit | None:
         """Return the next stop for an arm at joint positions `q` (rad, (k,)); None at the end."""
         proposed = self.propose(q)
@@ -179,7 +186,7 @@ class Tour:
         left = [(split, index) for split, indices in self._left.items() for index in indices]
         if not left:
             return self._propose_reference(q) if self.references and self._since else None
-        split, index = self._nearest(left, q) if not self.order else self._next_in_order()
+        split, index = self._nearest(left, q) if not self.order else self._in_order()[0][:2]
         route = self._route(split, index, self._due(split, index), q)
         after = self._since + len(route.ids)
         if self.references and self._since and after > self.reference_every:
@@ -196,11 +203,6 @@ class Tour:
     def _in_order(self) -> list[tuple[str, int, int]]:
         """Return the visits of the given order that are left."""
         return [v for v in self.order if v[2] in self._left[v[0]].get(v[1], ())]
-
-    def _next_in_order(self) -> tuple[str, int]:
-        """Return the pose of the next visit of the given order."""
-        split, index, _ = self._in_order()[0]
-        return split, index
 
     def _due(self, split: str, index: int) -> list[int]:
         """Return the solutions of a pose to visit now: all, or those next to each other."""

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from remaster_ros.errors import InsufficientDataError
+from remaster_ros.kinematics.transforms import transform
 from remaster_ros.planning.candidates import Plan, PlannedPose, PlanningScene, order_solutions
 from remaster_ros.planning.free_order import free_way
 from remaster_ros.planning.planned_design import (
+    POOL_CANDIDATES,
     Designed,
     DesignSettings,
     designed_plans,
@@ -17,6 +20,12 @@ from remaster_ros.planning.planned_design import (
 )
 from remaster_ros.planning.reference_choice import choose_references
 from remaster_ros.planning.registration_tour import registration_tour
+from remaster_ros.planning.separating_design import (
+    FoundCause,
+    SeparatingDesign,
+    further_scene,
+    separate,
+)
 from remaster_ros.planning.tour_order import (
     REFERENCE,
     REGISTRATION,
@@ -46,6 +55,8 @@ class TourPlanner:
         Which of the poses are visited, and in which order; all of them, nearest first, by default.
     travel
         How long the robot takes; where None it moves with the bridge's defaults.
+    causes
+        Found before: configurations that separate them from their look-alikes are added.
 
     Attributes
     ----------
@@ -55,6 +66,8 @@ class TourPlanner:
         The arm and all that it must not hit.
     designed
         What an optimal design has led to; None without one.
+    separated
+        What was added to separate causes; None without causes.
     """
 
     def __init__(
@@ -65,6 +78,7 @@ class TourPlanner:
         reference_every: int = 0,
         design: DesignSettings | None = None,
         travel: TravelTime | None = None,
+        causes: Sequence[FoundCause] = (),
     ) -> None:
         self.scene, self._counts, self._seed = scene, counts, seed
         self._every = reference_every
@@ -72,6 +86,13 @@ class TourPlanner:
         self.design = design or DesignSettings()
         self.travel = travel or TravelTime.of(scene.model)
         self.designed: Designed | None = None
+        self._causes = tuple(causes)
+        self.separated: SeparatingDesign | None = None
+
+    @property
+    def rough_places(self) -> dict[str, FloatArray]:
+        """T_R_N of each sensor at its rough place, (4, 4)."""
+        return {name: transform(np.eye(3), at) for name, at in self.scene.rough_R.items()}
 
     def registration(self) -> Tour:
         """Plan poses for the three-point registration, before sensors at their rough places."""
@@ -102,12 +123,29 @@ class TourPlanner:
                 self.scene, self.design, plans, sensors_R, self.travel, rng
             )
             plans = dict(self.designed.plans)
+        if self._causes:
+            plans['optimization'] = self._separating(plans['optimization'], sensors_R)
         order = []
         if self.design.fastest:
             order = visit_order(plans, self.model, self.travel)
         if self._every:
             plans[REFERENCE] = self._references(plans)
         return Tour(self._chain, plans, model=self.model, reference_every=self._every, order=order)
+
+    def _separating(self, plan: Plan, sensors_R: Mapping[str, FloatArray]) -> Plan:
+        """Add configurations to a plan that separate the causes."""
+        rng = np.random.default_rng([self._seed, *b'separate'])
+        pool = further_scene(self.scene).plan(POOL_CANDIDATES, sensors_R, rng)
+        self.separated = separate(
+            self._chain,
+            plan.poses,
+            pool.poses,
+            self.design.before(sensors_R).sensors,
+            self.design.marker_std_m,
+            self._causes,
+            self.design.priors,
+        )
+        return replace(plan, poses=(*plan.poses, *self.separated.poses))
 
     def _references(self, plans: Mapping[str, Plan]) -> Plan:
         """Choose references among the planned configurations, each with a way from the last."""

@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import textwrap
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import driver_named
-from remaster_ros.reports.figures import AFTER, BEFORE, INK, WIDTH_IN, as_svg, error_histograms
+from remaster_ros.discovery.explain import FoundEffect
+from remaster_ros.reports.effect_words import STEP, title
+from remaster_ros.reports.figures import (
+    AFTER,
+    BEFORE,
+    GRID,
+    INK,
+    WIDTH_IN,
+    as_svg,
+    error_histograms,
+)
 from remaster_ros.types import FloatArray
 
 if TYPE_CHECKING:
@@ -29,6 +41,8 @@ MOST_DRAWN = 20_000
 NEAR = 0.5
 # A wave is not drawn across a larger share of its range without a measurement.
 WIDE_GAP = 1.0 / 30.0
+# Nor is anything else across such a share.
+EMPTY = 1.0 / 8.0
 
 
 def draw_discovery(discovery: Discovery) -> dict[str, str]:
@@ -46,38 +60,29 @@ def gain(discovery: Discovery) -> Figure:
     data, selection = discovery.residuals, discovery.selection
     held_out = data.context.measurements.is_validation
     rows = held_out if held_out.any() else np.isin(np.arange(len(held_out)), data.rows.source)
-    fits = selection.empty, selection.solution
-    lengths = [1e3 * np.linalg.norm(data.unexplained(fit)[rows], axis=1) for fit in fits]
+    errors = discovery.residuals_before, discovery.fit.residuals_after
+    lengths = [1e3 * np.linalg.norm(error[rows], axis=1) for error in errors]
     error_histograms(left, *(np.maximum(values, 1e-4) for values in lengths))
     left.set_title('Held-out poses' if held_out.any() else 'Fitted poses')
     left.legend(loc='upper left')
 
     names = data.context.sensor_names
+    fits = selection.empty, selection.solution
     noises = [data.noise_model.sensor_noise(fit.noise) for fit in fits]
     # By sensor, before or after, and part: shared by a pose, or within.
     values = 1e3 * np.array(
         [(noise.pose_sigma, np.hypot(noise.sigma, noise.frame_sigma)) for noise in noises]
     )
-    values = values.transpose(2, 0, 1)
-    x = np.arange(len(names))
+    values = values.transpose(2, 1, 0).reshape(-1, 2)
+    y = np.arange(len(values))
     for column, (color, label) in enumerate(((BEFORE, 'before'), (AFTER, 'after'))):
-        for part, shift in ((0, -0.3), (1, 0.1)):
-            right.bar(
-                x + shift + 0.2 * column,
-                values[:, column, part],
-                0.18,
-                color=color,
-                alpha=1.0 if part == 0 else 0.5,
-                label=label if part == 0 else None,
-            )
-    right.set_xticks(
-        np.concatenate((x - 0.2, x + 0.2)).tolist(),
-        [f'{n}\nshared' for n in names] + [f'{n}\nwithin' for n in names],
-    )
-    right.set_ylabel('RMS per axis (mm)')
-    right.set_ylim(0.0, 1.3 * float(values.max()))
+        right.barh(y + 0.36 * column - 0.18, values[:, column], 0.34, color=color, label=label)
+    parts = ('shared', 'within')
+    right.set_yticks(y.tolist(), [f'{name[:20]}, {part}' for name in names for part in parts])
+    right.invert_yaxis()
+    right.grid(False, axis='y')
+    right.set_xlabel('RMS per axis (mm)')
     right.set_title('Errors shared by a pose, and within')
-    right.legend(loc='upper right', ncols=2)
     return figure
 
 
@@ -121,7 +126,8 @@ def drivers(discovery: Discovery) -> Figure:
         for joint in range(joints):
             ax = axes[row, joint]
             ax.tick_params(labelsize=5.5, length=2)
-            ax.xaxis.get_major_locator().set_params(nbins=3)
+            # Labels at the very ends would touch those of the next panel.
+            ax.xaxis.set_major_locator(MaxNLocator(4, prune='both'))
             if ax.has_data():
                 ax.axhline(0.0, color=INK, linewidth=0.5)
             else:
@@ -140,20 +146,29 @@ def _binned(ax: Axes, x: FloatArray, y: FloatArray, color: str) -> None:
     """Draw means with their standard errors in bins of equal counts."""
     if np.ptp(x) < 1e-3:
         return
-    groups = np.array_split(np.argsort(x), min(BINS, max(2, len(x) // 8)))
-    centers = [float(x[g].mean()) for g in groups]
-    means = [float(y[g].mean()) for g in groups]
-    spread = [float(y[g].std() / np.sqrt(len(g))) for g in groups]
-    ax.errorbar(
-        centers, means, spread, color=color, linewidth=0.9, elinewidth=0.6, marker='.', ms=3
-    )
+    order = np.argsort(x)
+    # No bin, and no line from bin to bin, across what was not measured.
+    for part in np.split(order, np.flatnonzero(np.diff(x[order]) > EMPTY * np.ptp(x)) + 1):
+        bins = max(1, min(round(BINS * len(part) / len(x)), len(part) // 8))
+        groups = np.array_split(part, bins)
+        centers = [float(x[g].mean()) for g in groups]
+        means = [float(y[g].mean()) for g in groups]
+        spread = [float(y[g].std() / np.sqrt(len(g))) for g in groups]
+        ax.errorbar(
+            centers, means, spread, color=color, linewidth=0.9, elinewidth=0.6, marker='.', ms=3
+        )
 
 
 def causes(discovery: Discovery) -> Figure:
     """Draw each cause: what is left without it against what drives it, and the fit with band."""
-    panels = [cell for group in discovery.groups for cell in group if cell.place == 'joint_angle']
+    panels = [
+        cell
+        for group in discovery.groups
+        for cell in group
+        if cell.place == 'joint_angle' or not np.isnan(cell.moment)
+    ]
     constant = [
-        (effect, group)
+        effect
         for effect, group in zip(discovery.effects, discovery.groups, strict=False)
         if not any(cell in panels for cell in group)
     ]
@@ -163,16 +178,61 @@ def causes(discovery: Discovery) -> Figure:
     figure = Figure(figsize=(WIDTH_IN, 2.2 * lines + 0.2), layout='constrained')
     axes = list(figure.subplots(lines, 2 if count > 1 else 1, squeeze=False).flat)
     for cell, ax in zip(panels, axes, strict=False):
-        _cause(ax, discovery, cell)
+        (_cause if cell.place == 'joint_angle' else _step)(ax, discovery, cell)
     if constant:
-        ax = axes[len(panels)]
-        names = [f'{e.name.replace("_", " ")} {list(e.joints) or ""}' for e, _ in constant]
-        ax.barh(names[::-1], [1e3 * e.size_m for e, _ in constant][::-1], color=AFTER, height=0.5)
-        ax.set_xlabel('RMS at the marker (mm)')
-        ax.set_title('Constant causes, and those of the sensor')
+        _sizes(axes[len(panels)], discovery, constant)
     for spare in axes[count:]:
         spare.set_visible(False)
     return figure
+
+
+def _sizes(ax: Axes, discovery: Discovery, effects: Sequence[FoundEffect]) -> None:
+    """Draw how large the causes without a curve are, beside the noise."""
+    sizes = [1e3 * effect.size_m for effect in effects]
+    noise = 1e3 * discovery.gain.noise_floor_m
+    y = np.arange(len(sizes) + 1)
+    ax.barh(y[:-1], sizes, color=AFTER, height=0.4)
+    ax.barh(y[-1:], [noise], color=GRID, edgecolor=INK, linewidth=0.5, height=0.4)
+    names = [textwrap.fill(title(effect), 26) for effect in effects]
+    ax.set_yticks(y.tolist(), [*names, 'noise alone'])
+    # Few bars are no thicker than many.
+    ax.set_ylim(max(len(y), 4) - 0.5, -0.7)
+    ax.grid(False, axis='y')
+    ax.set_xlabel('RMS at the marker (mm)')
+    ax.set_title('Causes without a curve')
+
+
+def _step(ax: Axes, discovery: Discovery, cell: Cell) -> None:
+    """Draw a jump of a sensor, marker or base over time, along its own direction, mm."""
+    data, solution = discovery.residuals, discovery.selection.solution
+    context = data.part
+    columns = cell.columns(context).displacement(context)
+    where = dict(zip(solution.cells, solution.slices(), strict=True))[cell]
+    jump = columns @ solution.parameters[where]
+    moved = np.linalg.norm(jump, axis=1) > 0.0
+    # Before the moment every column is zero: what moved later tells which rows it is about.
+    own = np.isin(context.sensor, context.sensor[moved]) & np.isin(
+        context.marker, context.marker[moved]
+    )
+    way = jump[moved].mean(axis=0)
+    way /= np.linalg.norm(way)
+    along = 1e3 * (data.left(solution) + jump) @ way
+    minutes = context.elapsed_s / 60.0
+    ax.plot(minutes[own], along[own], '.', color=BEFORE, markersize=3, alpha=0.6)
+    index = {name: i for i, name in enumerate(discovery.fit.theta_names)}
+    draws = discovery.fit.theta_draws.reshape(-1, len(index))
+    chosen = draws[:, [index[name] for name in cell.parameters]]
+    levels = 1e3 * np.einsum('nij,i->nj', columns[moved], way).mean(axis=0) @ chosen.T
+    edge = cell.moment / 60.0
+    low, high = minutes[own].min(), minutes[own].max()
+    ax.plot([low, edge], [0.0, 0.0], color=AFTER, linewidth=1.3)
+    level, width = float(levels.mean()), 2.0 * float(levels.std())
+    ax.fill_between([edge, high], level - width, level + width, color=AFTER, alpha=0.25)
+    ax.plot([edge, high], [level, level], color=AFTER, linewidth=1.3)
+    ax.axvline(edge, color=INK, linewidth=0.8, ls=(0, (4, 2)))
+    ax.set_xlabel('minutes after the first reading')
+    ax.set_ylabel('along the jump (mm)')
+    ax.set_title(f'{cell.subject or "base"}: jump after {edge:.1f} min')
 
 
 def _driver(context: Context, cell: Cell, features: FloatArray) -> tuple[str, FloatArray, float]:
@@ -231,22 +291,31 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
             line = np.where(cell.curve.seen(at, NEAR), values @ mean, np.nan)
         else:
             values = values[np.argsort(x)]
-            if cell.form == 'sin/cos':
-                # No straight line where nothing was measured.
-                gap = np.diff(at, prepend=at[0]) > WIDE_GAP * np.ptp(at)
-                line = np.where(gap, np.nan, line)
+            # No straight line where nothing was measured.
+            widest = WIDE_GAP if cell.form == 'sin/cos' else EMPTY
+            gap = np.diff(at, prepend=at[0]) > widest * np.ptp(at)
+            line = np.where(gap, np.nan, line)
         spread = 2.0 * (values @ draws.T).std(axis=1)
         middle = values @ mean
+        if cell.curve is None:
+            # Nor a straight band: a curve's own is known everywhere.
+            holes = np.flatnonzero(gap)
+            around = np.insert(at, holes, at[holes])
+            middle, spread = (np.insert(v, holes, np.nan) for v in (middle, spread))
+        else:
+            around = at
         ax.plot(x[far][shown] / per_shown, points, '.', color=BEFORE, markersize=2.5, alpha=0.6)
-        ax.fill_between(
-            at / per_shown, middle - spread, middle + spread, color=AFTER, alpha=0.25, linewidth=0
-        )
-        ax.plot(at / per_shown, line, color=AFTER, linewidth=1.3)
+        low, high = middle - spread, middle + spread
+        ax.fill_between(around / per_shown, low, high, color=AFTER, alpha=0.25, linewidth=0)
+        # What jumps has no slope between two readings.
+        drawn = 'default' if np.isnan(cell.moment) else 'steps-mid'
+        ax.plot(at / per_shown, line, color=AFTER, linewidth=1.3, drawstyle=drawn)
     limit = np.quantile(np.abs(points), 0.99)
     ax.set_ylim(-1.2 * limit, 1.2 * limit)
     ax.set_xlabel(label)
     ax.set_ylabel('arc minutes')
-    ax.set_title(f'joint {cell.joints[0]}: {cell.name.replace("_", " ")}')
+    name = 'slip' if cell.name == STEP else cell.name.replace('_', ' ')
+    ax.set_title(f'joint {cell.joints[0]}: {name}')
 
 
 def _sides(

@@ -15,6 +15,7 @@ from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.stepwise_selection import DRAWS
 from remaster_ros.reports import schemas
 from remaster_ros.reports.discovery_apply import applied
+from remaster_ros.reports.discovery_judgement import judgement
 from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.fit_json import (
     APPLY_FOLDER,
@@ -87,7 +88,9 @@ def discovery_content(
                 for effect, cause in zip(discovery.effects, confirmation.effects, strict=False)
             ],
         }
-    return schemas.checked(content, Discovered)
+    checked = schemas.checked(content, Discovered)
+    checked.judgement = judgement(discovery, confirmation, checked)
+    return checked
 
 
 def _covariance(discovery: Discovery) -> dict[str, Any]:

@@ -16,12 +16,6 @@ from remaster_ros.reports.pages import inlined, page, write_report
 
 # Long lists of spline coefficients are for other programs; the figure shows the curve.
 MOST_PARAMETERS = 8
-# Regions meant for 95 % of the held-out rows that hold clearly less than this are too small.
-FEWEST_INSIDE = 0.92
-TOO_SURE = (
-    ' Fewer held-out rows than should lie where they were predicted: something is left that the '
-    'model does not have.'
-)
 
 
 def write_discovery_report(
@@ -50,10 +44,7 @@ def write_discovery_report(
     html = page(
         'discovery.html.jinja',
         found=msgspec.to_builtins(content),
-        headline=headline(discovery, confirmation) + (TOO_SURE if too_sure(content) else ''),
-        mood='good'
-        if _is_proven(discovery, confirmation) and not too_sure(content)
-        else 'caution',
+        session=discovery.fit.session,
         equations={name: effect.equation for name, effect in EFFECTS.items()},
         sources={name: effect.source for name, effect in EFFECTS.items()},
         most_parameters=MOST_PARAMETERS,
@@ -61,61 +52,3 @@ def write_discovery_report(
         drawings={name: inlined(name, text) for name, text in drawings.items()},
     )
     return write_report(folder, drawings, html)
-
-
-def too_sure(content: Discovered) -> bool:
-    """Whether clearly fewer held-out rows lie in their 95 % regions than should."""
-    regions = content.predicted_regions95
-    if isinstance(regions, msgspec.UnsetType) or regions.held_out.interval95 is None:
-        return False
-    return regions.held_out.interval95[1] < FEWEST_INSIDE
-
-
-def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
-    """Whether poses that were never fitted, and the other session if there is one, agree."""
-    if discovery.verdict in ('undetermined', 'unexplained') or discovery.unexplained:
-        return False
-    if not discovery.fit.sampler.converged:
-        return False
-    if confirmation is not None and not confirmation.same_offsets:
-        return False
-    if discovery.verdict == 'none':
-        return True
-    before, after = discovery.gain.held_out_rms_before_m, discovery.gain.held_out_rms_after_m
-    gains = before is not None and after is not None and after < before
-    return gains and (confirmation is None or confirmation.confirmed)
-
-
-def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> str:
-    """Return the result in one or a few sentences."""
-    gain = discovery.gain
-    change = ''
-    if gain.held_out_rms_before_m is not None and gain.held_out_rms_after_m is not None:
-        change = (
-            f' On poses it never fitted the error goes from '
-            f'{1e3 * gain.held_out_rms_before_m:.3f} to {1e3 * gain.held_out_rms_after_m:.3f} mm '
-            f'RMS; the noise alone is {1e3 * gain.noise_floor_m:.3f} mm.'
-        )
-    doubt = ''
-    if not discovery.fit.sampler.converged:
-        doubt = f' How uncertain the figures are is not known: {discovery.fit.sampler.message}.'
-    change += doubt
-    if discovery.verdict == 'none':
-        return f'Nothing is there beyond the zero-offsets and the noise.{doubt}'
-    if discovery.verdict == 'unexplained':
-        return f'Something is there that no cause explains.{change}'
-    count = len(discovery.effects)
-    causes = 'one cause' if count == 1 else f'{count} causes'
-    if discovery.verdict == 'undetermined':
-        return (
-            f'Something is there, but two explanations fit equally well: see which measurements '
-            f'would decide.{change}'
-        )
-    if confirmation is not None and not confirmation.confirmed:
-        change += f' The other session does not confirm {"it" if count == 1 else "them"}' + (
-            '.'
-            if confirmation.why
-            else f': its error is {1e3 * confirmation.rms_after_m:.3f} mm RMS with and '
-            f'{1e3 * confirmation.rms_before_m:.3f} mm without.'
-        )
-    return f'Beyond the zero-offsets there {"is" if count == 1 else "are"} {causes}.{change}'

@@ -9,6 +9,7 @@ from msgspec import UNSET, Struct, UnsetType
 
 from remaster_ros.reports.schemas import (
     JointOffset,
+    Judgement,
     Marker,
     MeasuredSession,
     Noise,
@@ -204,3 +205,4 @@ class Discovered(Struct):
     predicted_regions95: PredictedRegions | UnsetType = UNSET
     rows_searched: SearchedRows | UnsetType = UNSET
     confirmation: Confirmed | UnsetType = UNSET
+    judgement: Judgement | UnsetType = UNSET

@@ -113,7 +113,7 @@ def posteriors(result: FitResult) -> Figure:
             ax.axvspan(low, high, color=color, alpha=0.13, linewidth=0)
             ax.axvline(mean, color=color, linewidth=1.4)
             unseen = result.why[i].startswith('the data do not determine')
-            source = 'from the prior alone: ' if unseen and not result.identifiable[i] else ''
+            source = 'prior alone: ' if unseen and not result.identifiable[i] else ''
             text = f'{source}{mean:+.4f}° ± {std:.4f}°'.replace('-', '\N{MINUS SIGN}')
         ax.set_title(text, loc='right', fontweight='normal')
         ax.set_yticks([])
@@ -166,7 +166,7 @@ def errors_by_configuration(result: FitResult) -> Figure:
             picked = np.linspace(0, len(chosen) - 1, SCATTER_POINTS).round().astype(int)
             note = f', {SCATTER_POINTS} of {len(chosen)} rows shown'
             chosen = chosen[picked]
-        legend = [_legend_entry('_', BEFORE, 'before'), _legend_entry('_', AFTER, 'after')]
+        legend = [legend_entry('_', BEFORE, 'before'), legend_entry('_', AFTER, 'after')]
         for sensor, name in enumerate(result.session.sensor_names):
             mine = chosen[m.sensor[chosen] == sensor]
             if not len(mine):
@@ -182,7 +182,7 @@ def errors_by_configuration(result: FitResult) -> Figure:
                     markeredgewidth=0,
                     alpha=0.85,
                 )
-            legend.append(_legend_entry(marker, INK, name))
+            legend.append(legend_entry(marker, INK, name))
         log_axis(ax, 'y')
         ax.set_title(f'{title}{note}')
         ax.set_ylabel('3-D error (mm)')
@@ -254,7 +254,8 @@ def _legend_above(ax: Axes, handles: list[Line2D] | None = None) -> None:
     )
 
 
-def _legend_entry(marker: str, color: str, name: str) -> Line2D:
+def legend_entry(marker: str, color: str, name: str) -> Line2D:
+    """Return the entry of a legend for points of a marker and colour; a long name is cut."""
     return Line2D(
         [],
         [],

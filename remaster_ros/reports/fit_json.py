@@ -16,6 +16,8 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.reports import schemas
 from remaster_ros.reports.discovery_schema import Discovered
+from remaster_ros.reports.judgement import verdict
+from remaster_ros.reports.rows_csv import RESIDUALS_FILE, residuals_text
 from remaster_ros.session.files import (
     cannot_write,
     make_folder,
@@ -36,7 +38,7 @@ APPLY_FOLDER = 'apply'
 DISCOVERY_FILE = 'discovery.json'
 FORMATS = {FIT_FILE: schemas.FIT_FORMAT, DISCOVERY_FILE: schemas.DISCOVERY_FORMAT}
 # What the commands write beside their result.
-WRITTEN = (REPORT_FILE, APPLY_FOLDER, 'figures', 'predictions.csv')
+WRITTEN = (REPORT_FILE, APPLY_FOLDER, 'figures', 'predictions.csv', RESIDUALS_FILE)
 FIT_LIMIT = 64 * 1024**2
 
 
@@ -95,6 +97,7 @@ def fit_content(result: FitResult) -> schemas.Fit:
         ),
         'accuracy': result.accuracy,
         'left_out': [{'observation': row, 'why': why} for row, why in result.left_out],
+        'judgement': msgspec.to_builtins(verdict(result)),
         'explained_by_noise': {
             check.sensor: {
                 'explained': check.explained,
@@ -154,6 +157,7 @@ def _describe(session: Session) -> dict[str, Any]:
         'created': session.created,
         'exit_status': session.exit_status,
         **({} if session.timed else {'times': 'none'}),
+        **({'observations_sha256': digest} if (digest := session.observations_sha256) else {}),
     }
 
 
@@ -304,7 +308,7 @@ def require_own(path: Path, format_: str) -> None:
 
 
 def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = True) -> Path:
-    """Write fit.json, the files to apply the offsets, and the report with its figures.
+    """Write fit.json, residuals.csv, the files to apply the offsets, and the report with figures.
 
     Without figures there is no report; that of an earlier fit in the folder would contradict
     fit.json and is removed.
@@ -321,6 +325,7 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
     """
     folder = Path(folder)
     write_fit(result, folder / FIT_FILE)
+    write_atomically(folder / RESIDUALS_FILE, residuals_text(result))
     make_folder(folder / APPLY_FOLDER)
     for name, text in exports(result).items():
         write_atomically(folder / APPLY_FOLDER / name, text)

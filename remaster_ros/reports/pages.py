@@ -7,10 +7,13 @@ import re
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
 from remaster_ros.discovery.words import p_value_text, percent, shown
+from remaster_ros.reports.discovery_schema import Effect
+from remaster_ros.reports.effect_words import law, title
 from remaster_ros.reports.figures import GRID, INK, PAPER
 from remaster_ros.reports.fit_json import REPORT_FILE
 from remaster_ros.session.files import make_folder, write_atomically
@@ -31,6 +34,8 @@ def page(template: str, **content: Any) -> str:
         'percent': percent,
         'p_value': p_value_text,
         'shown': shown,
+        'heading': lambda effect: title(msgspec.convert(effect, Effect)),
+        'law': lambda effect: law(msgspec.convert(effect, Effect)),
     }
     return environment.get_template(template).render(**content)
 

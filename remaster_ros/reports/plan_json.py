@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from remaster_ros.planning.collection_plan import CollectionPlan
+from remaster_ros.planning.collection_plan import FITTED, CollectionPlan, Expected
 from remaster_ros.planning.planned_design import DesignSettings
+from remaster_ros.planning.separating_design import DECIDED, SeparatingDesign
+from remaster_ros.planning.tour_order import Tour
 
-FITTED, HELD_OUT = 'optimization', 'validation'
+HELD_OUT = 'validation'
 
 
 def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
@@ -26,10 +29,7 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
         'poses': sum(plan.tour.poses.values()),
         'dropped': dict(plan.tour.dropped),
         'robot_time_s': round(plan.robot_time_s, 1),
-        'expected_std_deg': {
-            name: None if std is None else float(np.degrees(std))
-            for name, std in plan.joint_std.items()
-        },
+        'expected_std_deg': _degrees(plan.joint_std),
         'expected_tool_std_mm': plan.tool_rms * 1e3,
         'max_tool_speed_m_s': round(plan.max_tool_speed_m_s, 4),
         'splits': {
@@ -46,13 +46,32 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
             'tool_share': design.goal.tool_share,
             'reached': design.reached,
         },
+        **({} if plan.separated is None else {'separate': _separated(plan.separated)}),
+    }
+
+
+def _separated(design: SeparatingDesign) -> dict[str, Any]:
+    return {
+        'configurations': sum(len(pose.solutions) for pose in design.poses),
+        'q_deg': [
+            np.degrees(q).round(4).tolist() for pose in design.poses for q in pose.solutions
+        ],
+        'pairs': [
+            {
+                'cause': pair.cause,
+                'look_alike': pair.look_alike,
+                'std_apart_before': round(pair.before, 2),
+                'std_apart': round(pair.after, 2),
+            }
+            for pair in design.pairs
+        ],
+        'otherwise': list(design.otherwise),
     }
 
 
 def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
     """Return the same for people, one subject a line."""
     visits = Counter(visit.split for visit in plan.visits)
-    minutes = plan.robot_time_s / 60
     poses = plan.tour.poses
     lines = [
         f'to fit: {visits[FITTED]} configurations at {poses[FITTED]} poses'
@@ -66,21 +85,87 @@ def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
     lines += [
         f'dropped poses: {_counts(plan.tour.dropped)}',
         f'dropped configurations: {_counts(plan.dropped)}',
-        f'robot time: {minutes:.1f} min, fastest point at {plan.max_tool_speed_m_s:.2f} m/s',
-        'expected standard deviation of the offsets:',
+        f'robot time: {minutes_text(plan.robot_time_s)}, '
+        f'fastest point at {plan.max_tool_speed_m_s:.2f} m/s',
     ]
-    for name, std in plan.joint_std.items():
-        value = 'not identifiable' if std is None else f'{np.degrees(std):.4f} deg'
-        lines.append(f'  {name:20s} {value}')
-    lines.append(f'  {"root mean square":20s} {np.degrees(plan.joint_rms):.4f} deg')
-    lines.append(f'expected error of the predicted markers: {plan.tool_rms * 1e3:.3f} mm (RMS)')
-    if plan.designed is not None and not plan.designed.reached:
-        lines.append(_missed(plan))
+    lines += _expected_lines(plan.joint_std, plan.joint_rms, plan.tool_rms)
+    if plan.separated is not None:
+        lines += _separated_text(plan.separated)
+    if missed := missed_goal(plan):
+        lines.append(missed)
     return '\n'.join(lines)
 
 
-def _missed(plan: CollectionPlan) -> str:
-    assert plan.designed is not None
+def outlook_to_dict(tour: Tour, expected: Expected) -> dict[str, Any]:
+    """Return a plan without its ways, with the words of `plan_to_dict`."""
+    return {
+        'configurations': sum(tour.configurations.values()),
+        'poses': sum(tour.poses.values()),
+        'dropped': dict(tour.dropped),
+        'dropped_configurations': dict(tour.dropped_solutions),
+        'expected_std_deg': _degrees(expected.joint_std),
+        'expected_tool_std_mm': expected.tool_rms * 1e3,
+        'splits': {
+            split: {'poses': poses, 'configurations': tour.configurations[split]}
+            for split, poses in tour.poses.items()
+        },
+    }
+
+
+def outlook_text(tour: Tour, expected: Expected) -> str:
+    """Return the same for people, one subject a line."""
+    counts = {split: (tour.configurations[split], poses) for split, poses in tour.poses.items()}
+    fitted, held_out = counts[FITTED], counts.get(HELD_OUT, (0, 0))
+    lines = [
+        f'to fit: {fitted[0]} configurations at {fitted[1]} poses',
+        f'held out: {held_out[0]} configurations at {held_out[1]} poses',
+        f'dropped poses: {_counts(tour.dropped)}',
+    ]
+    return '\n'.join([*lines, *_expected_lines(*expected)])
+
+
+def _expected_lines(
+    joint_std: Mapping[str, float | None], joint_rms: float, tool_rms: float
+) -> list[str]:
+    lines = ['expected standard deviation of the offsets:']
+    for name, std in joint_std.items():
+        value = 'not identifiable' if std is None else f'{np.degrees(std):.4f} deg'
+        lines.append(f'  {name:20s} {value}')
+    return [
+        *lines,
+        f'  {"root mean square":20s} {np.degrees(joint_rms):.4f} deg',
+        f'expected error of the predicted markers: {tool_rms * 1e3:.3f} mm (RMS)',
+    ]
+
+
+def _degrees(joint_std: Mapping[str, float | None]) -> dict[str, float | None]:
+    return {
+        name: None if std is None else float(np.degrees(std)) for name, std in joint_std.items()
+    }
+
+
+def _separated_text(design: SeparatingDesign) -> list[str]:
+    count = sum(len(pose.solutions) for pose in design.poses)
+    lines = [f'of these to separate causes: {count} configurations at {len(design.poses)} poses']
+    for pair in design.pairs:
+        verdict = 'decided' if pair.after >= DECIDED else 'may stay open'
+        lines.append(
+            f'  {pair.cause} or {pair.look_alike}: {pair.after:.1f} standard deviations apart '
+            f'({pair.before:.1f} without them), {verdict}'
+        )
+    lines += [f'  poses do not separate {words}' for words in design.otherwise]
+    return lines
+
+
+def minutes_text(seconds: float) -> str:
+    """Return a time for people."""
+    return f'{seconds / 60:.1f} min'
+
+
+def missed_goal(plan: CollectionPlan) -> str:
+    """Return which goal an optimal design does not reach, and what would help; '' for none."""
+    if plan.designed is None or plan.designed.reached:
+        return ''
     goal = plan.designed.goal
     return (
         f'not reached: {np.degrees(goal.joint_std_rad):.4f} deg for the offsets or '

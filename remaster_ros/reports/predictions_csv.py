@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-import csv
-import io
-
 import numpy as np
 
 from remaster_ros.calibration.predictions import Predictions
+from remaster_ros.reports.rows_csv import AXES, rows_text
 from remaster_ros.types import Measurements, Session
 
 PREDICTIONS_FILE = 'predictions.csv'
-AXES = 'xyz'
 # The upper triangle of the covariance, row by row.
 PAIRS = tuple((a, b) for a in range(3) for b in range(a, 3))
+MEASURED, PREDICTED = (tuple(f'{what}{axis}_m' for axis in AXES) for what in ('', 'predicted_'))
 COLUMNS = (
-    'observation',
-    'pose',
-    'configuration',
-    'split',
-    'sensor',
-    'marker',
-    *(f'{axis}_m' for axis in AXES),
-    *(f'predicted_{axis}_m' for axis in AXES),
+    *MEASURED,
+    *PREDICTED,
     *(f'cov_{AXES[a]}{AXES[b]}_m2' for a, b in PAIRS),
     'held_out',
     'left_out',
@@ -44,26 +36,16 @@ def predictions_text(session: Session, predictions: Predictions, left_out: set[i
         ``observation`` of the gross errors.
     """
     m: Measurements = session.measurements
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator='\n')
-    writer.writerow(COLUMNS)
     upper = predictions.covariance[:, [a for a, _ in PAIRS], [b for _, b in PAIRS]]
     numbers = np.concatenate((m.position, predictions.position), axis=1)
-    for i in range(len(m)):
-        held_out = bool(m.is_validation[i])
-        writer.writerow(
-            [
-                m.observation[i],
-                m.pose[i],
-                m.configuration[i],
-                'validation' if held_out else 'optimization',
-                session.sensor_names[m.sensor[i]],
-                session.marker_names[m.marker[i]],
-                *(f'{value:.7f}' for value in numbers[i]),
-                *(f'{value:.6e}' for value in upper[i]),
-                int(held_out),
-                int(m.observation[i] in left_out),
-                int(predictions.inside[i]),
-            ]
+    rows = (
+        (
+            *(f'{value:.7f}' for value in numbers[i]),
+            *(f'{value:.6e}' for value in upper[i]),
+            int(m.is_validation[i]),
+            int(m.observation[i] in left_out),
+            int(predictions.inside[i]),
         )
-    return text.getvalue()
+        for i in range(len(m))
+    )
+    return rows_text(session, COLUMNS, rows)

@@ -6,44 +6,25 @@ import base64
 import gzip
 import importlib.resources
 import json
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 from markupsafe import Markup
 
-from remaster_ros.calibration.noise_check import NoiseCheck
-from remaster_ros.collection.reference_session import changes
+from remaster_ros.reports.answer import answer_of
+from remaster_ros.reports.answer_figures import draw_stages
+from remaster_ros.reports.answer_inputs import Inputs
 from remaster_ros.reports.figures import draw_figures
 from remaster_ros.reports.fit_json import fit_content
+from remaster_ros.reports.fit_tables import accuracy_rows, marker_rows
+from remaster_ros.reports.judgement import references
 from remaster_ros.reports.pages import inlined, page, write_report
 
 if TYPE_CHECKING:
     from remaster_ros.calibration.result import FitResult
     from remaster_ros.reports.view_3d import View3D
-
-# Less than this is no gain a user would notice.
-NOTICEABLE_GAIN = 1.1
-
-
-class Headline(NamedTuple):
-    """The result for a reader who did not measure it.
-
-    Attributes
-    ----------
-    mood
-        ``good``, ``caution`` or ``bad``.
-    headline
-        One sentence.
-    points
-        What else matters before the offsets are used.
-    """
-
-    mood: str
-    headline: str
-    points: list[str]
 
 
 def write_fit_report(result: FitResult, folder: Path) -> Path:
@@ -54,8 +35,18 @@ def write_fit_report(result: FitResult, folder: Path) -> Path:
     InputError
         The folder cannot be written to.
     """
-    drawings = draw_figures(result)
+    drawings = draw_figures(result) | draw_stages(answer_of(inputs_of(result)))
     return write_report(folder, drawings, report_html(result, drawings))
+
+
+def inputs_of(result: FitResult) -> Inputs:
+    """Return a fit as the first screen takes it."""
+    lengths = (
+        1e3 * np.linalg.norm(residuals, axis=1)
+        for residuals in (result.residuals_before, result.residuals_after)
+    )
+    before_mm, after_mm = lengths
+    return Inputs(result.session, fit_content(result), None, before_mm, after_mm, None)
 
 
 def report_html(result: FitResult, drawings: dict[str, str]) -> str:
@@ -65,209 +56,21 @@ def report_html(result: FitResult, drawings: dict[str, str]) -> str:
         from remaster_ros.reports.view_3d import draw_view
 
         scene = draw_view(result)
+    inputs = inputs_of(result)
+    fit = msgspec.to_builtins(inputs.fit)
     return page(
         'report.html.jinja',
-        fit=msgspec.to_builtins(fit_content(result)),
-        verdict=verdict(result),
-        accuracy=_accuracy_rows(result),
-        markers=_marker_rows(result),
-        references=_references(result),
-        notes=result.session.notes,
+        fit=fit,
+        answer=answer_of(inputs),
+        accuracy=accuracy_rows(inputs.fit.accuracy),
+        markers=marker_rows(fit, result.session),
+        references=references(result),
+        session=result.session,
         drawings={name: inlined(name, text) for name, text in drawings.items()},
         scene=scene,
         scene_json=_json({'data': scene.data, 'layout': scene.layout}) if scene else '',
         plotly=_plotly() if scene else '',
     )
-
-
-def _references(result: FitResult) -> tuple[int, list[str]]:
-    """Return the rounds of the references, and what changed in the session, a sentence each."""
-    rounds, found = changes(result.session, result.chain, result.T_R_N)
-    return rounds, [f'While it was measured, {change.describe()}.' for change in found]
-
-
-def verdict(result: FitResult) -> Headline:
-    """Judge a fit: what was gained, whether the chains agree, what is not identifiable."""
-    validated = result.accuracy['validation'] is not None
-    split = 'validation' if validated else 'optimization'
-    metrics = result.accuracy[split]['post_registration']
-    before, after = metrics['before']['mean_mm'], metrics['after']['mean_mm']
-    gain = before / max(after, 1e-9)
-    where = 'on poses it never fitted' if validated else 'on the fitted poses'
-    change = f'{before:.3f} mm to {after:.3f} mm {where}'
-    unexplained = [check for check in result.noise_checks if not check.explained]
-    changes = _references(result)[1]
-    spoilt = [check.spoilt for check in result.noise_checks if check.spoilt]
-    points = [_compared(check) for check in unexplained] + _structure(result) + changes + spoilt
-    doubtful = bool(unexplained) or result.other_errors
-    mood = 'caution'
-    if result.sampler.wandering and not result.sampler.converged:
-        mood = 'bad'
-        headline = (
-            'The chains have not converged, so nothing is decided yet: '
-            f'for now the mean position error goes from {change}.'
-        )
-    elif not result.sampler.converged and result.sampler.method != 'metropolis':
-        headline = (
-            'The data leave some parameters so open that their distribution is known only '
-            f'approximately. The mean position error goes from {change}.'
-        )
-        if doubtful:
-            headline += f' {_dominated(result, unexplained)}'
-    elif gain >= NOTICEABLE_GAIN:
-        times = f'{gain:.1f} times' if gain < 10 else f'{gain:.0f} times'
-        headline = f'The mean position error falls from {change}: {times} smaller.'
-        if doubtful:
-            headline += f' {_dominated(result, unexplained)}'
-        elif validated and not changes and not spoilt and result.sampler.converged:
-            mood = 'good'
-    elif gain > 1 / NOTICEABLE_GAIN:
-        headline = (
-            f'The zero-offsets hardly matter here: the mean position error goes from {change}. '
-            + (_dominated(result, unexplained) if doubtful else 'That is what noise explains.')
-        )
-    else:
-        mood = 'bad'
-        headline = f'The offsets make it worse: the mean position error goes from {change}.'
-    if result.implausible:
-        mood = 'bad'
-        headline += ' Do not apply the offsets yet: they are larger than a mastering is off by.'
-        points = [*result.implausible, *points]
-    if not validated:
-        points.append(
-            'There are no validation poses, so the gain is not proven: measure some and fit again.'
-        )
-    sampler = result.sampler
-    if sampler.converged and sampler.method == 'metropolis':
-        points.append(f'The chains agree with each other ({sampler.message}).')
-    elif sampler.converged:
-        points.append(f'The weighted draws pass their check ({sampler.message}).')
-    elif sampler.method != 'metropolis':
-        points.append(
-            f'Do not trust the uncertainties ({sampler.message}): measure poses that are spread '
-            'further and turn the tool, or state what is known of these parameters (--prior).'
-        )
-    elif sampler.wandering:
-        points.append(
-            f'Do not trust offsets or uncertainties ({sampler.message}); '
-            'fit again with more draws.'
-        )
-    else:
-        points.append(f'The chains agree, but are shorter than asked for ({sampler.message}).')
-    unknown = [
-        joint
-        for joint, known in zip(result.joint_names, result.identifiable, strict=True)
-        if not known
-    ]
-    count = len(result.joint_names)
-    if unknown:
-        points.append(
-            f'{count - len(unknown)} of {count} zero-offsets are measured. The data do not '
-            f'distinguish {" and ".join(unknown)} from something else; the table names it.'
-        )
-    else:
-        points.append(f'All {count} zero-offsets are measured.')
-    if result.left_out:
-        plural = 's are' if len(result.left_out) > 1 else ' is'
-        points.append(
-            f'{len(result.left_out)} observation{plural} left out as gross errors; '
-            'they are listed below.'
-        )
-    return Headline(mood, headline, points)
-
-
-def _structure(result: FitResult) -> list[str]:
-    """Return what the residuals follow, and what that does to the intervals."""
-    found = result.structure.found if result.structure is not None else ()
-    lines = [f'{test.words} ({test.chance}).'.capitalize() for test in found]
-    if np.any(result.widening > 1.0):
-        lines.append(
-            'The standard deviations and intervals of the offsets include what the model leaves '
-            f'out: they are up to {np.max(result.widening):.1f} times as wide as without it.'
-        )
-    return lines
-
-
-def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
-    """Return why the error after is no success, and what to do."""
-    if not result.other_errors:
-        return 'Whether noise explains what is left, this session cannot show.'
-    if not any(check.noise_m is not None for check in unexplained):
-        return (
-            'But what is left has structure, which noise has not: other errors dominate; '
-            'run "remaster discover".'
-        )
-    return (
-        'But noise does not explain what is left: other errors dominate; run "remaster discover".'
-    )
-
-
-def _compared(check: NoiseCheck) -> str:
-    """Return the figures of a sensor whose error noise does not explain."""
-    if check.noise_error_m is None:
-        return (
-            f'{check.sensor}: no reading has a standard deviation, and no pose was seen in two '
-            f'joint solutions, so nothing shows how much of the {1e3 * check.error_m:.3f} mm is '
-            'noise: measure poses in all their joint solutions.'
-        )
-    sources = [
-        f'{1e3 * std:.3f} mm per axis {what}'
-        for std, what in (
-            (check.stated_m, 'stated by the sensor'),
-            (check.within_m, 'within a pose'),
-        )
-        if std is not None
-    ]
-    return (
-        f'{check.sensor}: the error after is {1e3 * check.error_m:.3f} mm; noise '
-        f'({", ".join(sources)}) makes {1e3 * check.noise_error_m:.3f} mm. A sensor or base that '
-        'was moved during the session, a soft joint or a worn gear leave such errors, and the '
-        'offsets take up a part of them.'
-    )
-
-
-def _accuracy_rows(result: FitResult) -> list[dict[str, Any]]:
-    """Return one row per split and metric, and the reason where there is no number."""
-    titles = {
-        'post_registration': 'Position, sensor registered (eq.\u00a018)',
-        'relative': 'Distances between solutions of a pose (eq.\u00a017)',
-        'theoretical': 'What the posterior predicts (section V-C)',
-        'paper_theoretical': '… in the robot base, offsets alone, as the paper has it',
-        'theoretical_random': 'The same predicted at 1,000 random configurations',
-        'paper_theoretical_random': '… in the robot base, as the paper has it',
-    }
-    rows = []
-    for split in ('validation', 'optimization'):
-        metrics = result.accuracy[split]
-        if metrics is None:
-            continue
-        for metric, title in titles.items():
-            at_random = metric.endswith('_random')
-            if at_random and split == 'validation':
-                continue  # They are the same for both.
-            sides = metrics[metric]
-            rows.append(
-                {
-                    'split': 'any' if at_random else split,
-                    'title': title,
-                    'cells': [sides.get(side) for side in ('before', 'after')],
-                    'offsets_only': sides.get('after_offsets_only'),
-                    'why': sides.get('why', ''),
-                }
-            )
-    return rows
-
-
-def _marker_rows(result: FitResult) -> list[dict[str, Any]]:
-    return [
-        {
-            'name': name,
-            'position_mm': (1e3 * position).tolist(),
-            'std_mm': (1e3 * result.marker_std_m[name]).tolist(),
-            'moved_mm': 1e3 * float(np.linalg.norm(position - result.session.markers[name])),
-        }
-        for name, position in result.marker_positions.items()
-    ]
 
 
 def _plotly() -> str:

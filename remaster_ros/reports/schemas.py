@@ -40,13 +40,14 @@ class Counts(Struct):
 
 
 class MeasuredSession(Struct):
-    """What was measured: counts, sensor -> marker, when, how it ended; if it has no times."""
+    """What was measured: counts, sensor -> marker, date, how it ended, hash; if it has times."""
 
     optimization: Counts
     validation: Counts
     sensors: dict[str, str]
     created: str
     exit_status: str
+    observations_sha256: str | UnsetType = UNSET
     times: Literal['none'] | UnsetType = UNSET
 
 
@@ -183,6 +184,20 @@ class NoiseCheck(Struct):
     within_pose_std_m: float | None
 
 
+class Judgement(Struct):
+    """A result for a reader who did not measure it: green, amber or red, and why.
+
+    ``points`` is what else matters before it is used. Of these, ``doubts`` are what noise does not
+    explain, but causes may; ``disagreements`` are data that contradict each other.
+    """
+
+    mood: Literal['good', 'caution', 'bad']
+    headline: str
+    points: list[str] = []
+    doubts: list[str] = []
+    disagreements: list[str] = []
+
+
 class StructureTest(Struct):
     """Do the residuals follow a driver: in the means of the poses, or in deviations from them?"""
 
@@ -215,6 +230,7 @@ class Fit(Struct):
     explained_by_noise: dict[str, NoiseCheck] | UnsetType = UNSET
     residual_structure: list[StructureTest] | UnsetType = UNSET
     intervals: Literal['model', 'robust'] | UnsetType = UNSET
+    judgement: Judgement | UnsetType = UNSET
 
 
 def checked(content: Mapping[str, Any], schema: type[Content]) -> Content:

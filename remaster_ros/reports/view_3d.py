@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 BEFORE, AFTER, ARM, SENSOR, TEXT = '#e07b39', '#3b82c4', '#7d8896', '#2f9e78', '#808a96'
 ARMS_SHOWN = 5
 ROWS_SHOWN = 600
+# A sensor farther from the middle of the data than so many times their extent is not at its place.
+FAR = 1.0
 
 
 class View3D(NamedTuple):
@@ -32,7 +34,8 @@ class View3D(NamedTuple):
     rows_shown, rows
         How many observations are drawn, of how many.
     far_sensors
-        Sensors so far off that they are hidden until asked for.
+        Sensors so far off that only their direction is drawn: at its place one would leave the arm
+        tiny.
     """
 
     data: list[dict[str, Any]]
@@ -75,12 +78,15 @@ def draw_view(result: FitResult) -> View3D:
             )
         )
     centre = points.mean(axis=0)
-    far = [
-        sensor
-        for sensor, T in result.T_R_N.items()
-        if np.linalg.norm(T[:3, 3] - centre) > 2.5 * max(extent, 0.5)
-    ]
-    data += [_sensor(sensor, T, sensor in far) for sensor, T in result.T_R_N.items()]
+    nearest = FAR * max(extent, 0.5)
+    far = []
+    for sensor, T in result.T_R_N.items():
+        way = T[:3, 3] - centre
+        if np.linalg.norm(way) > nearest:
+            far.append(sensor)
+            data.append(_direction(sensor, T, centre, way * nearest / np.linalg.norm(way)))
+        else:
+            data.append(_sensor(sensor, T))
     return View3D(data, _layout(), magnification, len(shown), len(m), far)
 
 
@@ -129,18 +135,30 @@ def _points(result: FitResult, points: FloatArray, shown: IntArray) -> dict[str,
     )
 
 
-def _sensor(name: str, T_R_N: FloatArray, is_far: bool) -> dict[str, Any]:
+def _sensor(name: str, T_R_N: FloatArray) -> dict[str, Any]:
     name = _plain(name)
+    marker = {'size': 6, 'symbol': 'diamond', 'color': SENSOR}
+    return _labelled(name, name, T_R_N[None, :3, 3], mode='markers+text', marker=marker)
+
+
+def _direction(name: str, T_R_N: FloatArray, start: FloatArray, way: FloatArray) -> dict[str, Any]:
+    """Return a line from the middle of the data towards a sensor that is farther off."""
+    name = _plain(name)
+    text = f'to {name}, {np.linalg.norm(T_R_N[:3, 3]):.1f} m from the base'
+    line = {'color': SENSOR, 'width': 3}
+    points = start + np.array((0.5, 0.65))[:, None] * way
+    return _labelled(name, text, points, mode='lines+text', line=line)
+
+
+def _labelled(name: str, text: str, points: FloatArray, **rest: Any) -> dict[str, Any]:
     return _trace(
         f'sensor {name}',
-        T_R_N[None, :3, 3],
-        mode='markers+text',
-        text=[name],
+        points,
+        text=[*[''] * (len(points) - 1), text],
         textposition='top center',
         textfont={'color': SENSOR},
-        marker={'size': 6, 'symbol': 'diamond', 'color': SENSOR},
         hoverinfo='text',
-        visible='legendonly' if is_far else True,
+        **rest,
     )
 
 

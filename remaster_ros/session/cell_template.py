@@ -91,7 +91,6 @@ def cell_text(p: CellProposal) -> str:
         for name, low, high in zip(chain.joint_names, chain.lower, chain.upper)
     )
     azimuth = np.degrees(ranges.azimuth_rad)
-    azimuth = np.degrees(ranges.azimuth_rad)
     parts = [
         *_comment(
             f'A cell for {chain.name}, proposed by "remaster init {p.source}". Lines marked CHECK '
@@ -155,6 +154,12 @@ def cell_text(p: CellProposal) -> str:
         'tool: {}',
         '',
         *_mesh_lines(p),
+        '',
+        *_comment(
+            'The nodes draw their plan on a page, and the arm waits until somebody has looked at '
+            'it and called /remaster/confirm. false: /remaster/collect alone moves it.'
+        ),
+        'confirm: true',
         '',
     ]
     return '\n'.join(parts)

@@ -1,13 +1,17 @@
-"""Meshes of collision geometry: found as a URDF names them, read into arrays of vertices."""
+"""Meshes: found as a URDF names them, read into arrays.
+
+Those of collision geometry as vertices alone, those of pictures with triangles and colours.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import unquote
 
 import numpy as np
@@ -15,10 +19,12 @@ import numpy as np
 from remaster_ros.errors import InputError
 from remaster_ros.session.files import read_limited
 from remaster_ros.session.packages import find_package
-from remaster_ros.types import FloatArray
+from remaster_ros.types import FloatArray, IntArray
 
 MESH_LIMIT = 64 * 1024**2
 KINDS = ('.stl', '.obj', '.dae', '.ply')
+
+Taken = TypeVar('Taken')
 
 
 def mesh_reader(urdf: Path, mesh_path: Sequence[Path] = ()) -> Callable[[str], FloatArray]:
@@ -75,6 +81,81 @@ def find_mesh(name: str, urdf: Path, mesh_path: Sequence[Path]) -> Path:
 
 def read_mesh(path: Path) -> FloatArray:
     """Return the vertices of a mesh file (STL, OBJ, DAE or PLY), m, (n, 3)."""
+    vertices = _loaded(path, _vertices, skip_materials=True)
+    if len(vertices) < 4 or not np.all(np.isfinite(vertices)):
+        raise InputError(f'{path}: the mesh has {len(vertices)} vertices, or some not finite')
+    return vertices
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """A part of a mesh, for pictures.
+
+    Attributes
+    ----------
+    vertices
+        m, (n, 3).
+    faces
+        Which three vertices each triangle has, (m, 3).
+    color
+        Red, green and blue, 0 to 1; None where the file gives none.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    color: tuple[float, float, float] | None
+
+
+def read_mesh_parts(path: Path) -> list[MeshPart]:
+    """Return the surfaces of a mesh file with their colours, those of one colour as one.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read, or one without any triangle.
+    """
+    parts = _loaded(path, _parts, skip_materials=False)
+    if not parts:
+        raise InputError(f'{path}: the mesh has no triangles, or vertices that are not finite')
+    return parts
+
+
+def _vertices(loaded: list[Any], unit: float) -> FloatArray:
+    points = [point for part in loaded for point in getattr(part, 'vertices', ())]
+    vertices: FloatArray = np.array(points, dtype=float).reshape(-1, 3) * unit
+    return vertices
+
+
+def _parts(loaded: list[Any], unit: float) -> list[MeshPart]:
+    by_color: dict[tuple[float, float, float] | None, list[Any]] = {}
+    for part in loaded:
+        if len(getattr(part, 'faces', ())) and np.all(np.isfinite(part.vertices)):
+            by_color.setdefault(_color(part), []).append(part)
+    parts = []
+    for color, same in by_color.items():
+        starts = np.cumsum([0, *(len(part.vertices) for part in same)])
+        vertices = np.concatenate([part.vertices for part in same]) * unit
+        faces = np.concatenate([part.faces + first for part, first in zip(same, starts)])
+        parts.append(MeshPart(vertices, faces.astype(np.int64), color))
+    return parts
+
+
+def _color(part: Any) -> tuple[float, float, float] | None:
+    """Return the colour of a part as trimesh has read it; None where none was given."""
+    visual = part.visual
+    main = getattr(getattr(visual, 'material', None), 'main_color', None)
+    if main is None and visual.defined:
+        main = getattr(visual, 'main_color', None)
+    if main is None:
+        return None
+    red, green, blue = (np.asarray(main, dtype=float)[:3] / 255.0).tolist()
+    return red, green, blue
+
+
+def _loaded(
+    path: Path, take: Callable[[list[Any], float], Taken], *, skip_materials: bool
+) -> Taken:
+    """Return what is taken of the parts of a mesh file and the length of its unit, m."""
     kind = path.suffix.lower()
     if kind not in KINDS:
         raise InputError(f'{path}: a mesh in a format that is not read; use {", ".join(KINDS)}')
@@ -83,18 +164,14 @@ def read_mesh(path: Path) -> FloatArray:
     import trimesh
 
     try:
-        loaded = trimesh.load_scene(BytesIO(content), file_type=kind[1:], skip_materials=True)
+        scene = trimesh.load_scene(
+            BytesIO(content), file_type=kind[1:], skip_materials=skip_materials
+        )
         # Instances in their places; COLLADA files state the length of their unit.
-        parts: list[Any] = [getattr(part, 'vertices', ()) for part in loaded.dump()]
-        vertices = np.array([point for part in parts for point in part], dtype=float)
-        vertices = vertices.reshape(-1, 3)
+        return take(list(scene.dump()), _collada_unit(content) if kind == '.dae' else 1.0)
     except Exception as error:
         # Whatever a parser of foreign bytes raises, one line comes out.
         raise InputError(f'{path}: no {kind[1:].upper()} mesh ({_line(error)})') from None
-    vertices = vertices * (_collada_unit(content) if kind == '.dae' else 1.0)
-    if len(vertices) < 4 or not np.all(np.isfinite(vertices)):
-        raise InputError(f'{path}: the mesh has {len(vertices)} vertices, or some not finite')
-    return vertices
 
 
 def _collada_unit(content: bytes) -> float:

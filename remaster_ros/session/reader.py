@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Mapping
 from dataclasses import replace
@@ -90,7 +91,8 @@ def _read(folder: Path, sums: dict[str, str]) -> Session:
             raise InputError(
                 f'{rows_path}: holds rows of split reference alone; measure before fitting'
             )
-    return header.session(urdf, measurements, references)
+    session = header.session(urdf, measurements, references)
+    return replace(session, observations_sha256=hashlib.sha256(data).hexdigest())
 
 
 def read_header(folder: Path) -> SessionHeader:

@@ -56,7 +56,8 @@ def _expanded(path: Path, arguments: dict[str, str], package_path: Sequence[Path
                 f'{path}: it needs the ROS package {name}, which is not around it; give the '
                 'folder that holds the package with --package-path, or source its workspace'
             )
-        return str(folder)
+        # xacro takes a relative one from the file that it stands in.
+        return str(folder.absolute())
 
     # Outside of ROS there is no ament_index_python, by which xacro finds packages.
     before: Any = substitution_args._eval_find

@@ -20,7 +20,7 @@ def source_problem(key: str, source: str, message_type: str, *, single_shot: boo
     key
         Of the sensor, such as ``sensors.mocap``.
     source, message_type, single_shot
-        As in `workcell.CellSensor`.
+        As in `cell_sensor.CellSensor`.
     """
     if source and not message_type:
         return f'{key}.source is no key; write it as topic, and give its message_type'

@@ -115,6 +115,8 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         float | list[float], Bounds(0.0, unit='rad/s²', above=True)
     ] = 5.0
     mesh_path: list[str] = []
+    # Whether the nodes show their plan and wait for /remaster/confirm before the arm moves.
+    confirm: bool = False
     urdf_text: str = ''
     # Where it was read from; nothing a plan depends on.
     file: str = ''
@@ -126,6 +128,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     def fingerprint(self) -> str:
         """Return a checksum of all that a plan depends on."""
         plain = msgspec.to_builtins(msgspec.structs.replace(self, file=''))
+        del plain['confirm']
         # Keys that files of older versions have not count where they are not as by default: plans
         # of those versions go on.
         given = self.poses.given()
@@ -134,10 +137,10 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
             for key, usual in (
                 ('noise_m', SIGMA_M),
                 ('pose_noise_m', POSE_SIGMA_M),
-                ('frame_noise_m', 0.0),
-                ('further_markers', {}),
                 ('message_type', ''),
                 ('source', ''),
+                ('frame_noise_m', 0.0),
+                ('further_markers', {}),
             ):
                 if sensor[key] == usual:
                     del sensor[key]

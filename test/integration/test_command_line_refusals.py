@@ -307,7 +307,7 @@ def without_ros(tmp_path: Path) -> dict[str, str]:
     return {'PYTHONPATH': os.pathsep.join((str(folder), str(root)))}
 
 
-@pytest.mark.parametrize('args', [('demo',), ('replay', 'bag')])
+@pytest.mark.parametrize('args', [('demo',), ('replay', 'bag'), ('watch',)])
 def test_without_ros_the_error_names_what_to_install(
     args: tuple[str, ...], without_ros: dict[str, str]
 ) -> None:

@@ -41,7 +41,8 @@ def changed(session: Path, folder: Path, change: object) -> Path:
 def page_of(out: Path) -> tuple[str, str, set[str]]:
     """Return a report's text, its verdict's mood, and its figures, all of which must be whole."""
     page = (out / 'report.html').read_text(encoding='utf-8')
-    assert not re.findall(r'(?:src|href)="(?!#)[^"]', page)
+    for address in re.findall(r'(?:src|href)="(?!#)([^"]*)"', page):
+        assert (out / 'apply' / Path(address).name).is_file(), address
     names = {path.stem for path in (out / 'figures').glob('*.svg')}
     for name in names:
         ElementTree.parse(out / 'figures' / f'{name}.svg')
@@ -95,7 +96,7 @@ def test_fit(case: str, healthy: Path, tmp_path: Path) -> None:
     process = remaster('fit', session, '--out', out, *options)
     assert process.returncode == 0, process.stderr
     page, found, names = page_of(out)
-    assert names == {'posteriors', 'traces', 'errors', 'residuals'}
+    assert names == {'stages', 'posteriors', 'traces', 'errors', 'residuals'}
     assert found == mood if mood else found != 'good'
     assert re.search(words, page)
     assert 'written: ' in process.stdout

@@ -121,7 +121,8 @@ def test_every_import_is_declared(setup_arguments: dict[str, Any]) -> None:
         normal(line).removeprefix('ros-jazzy-')
         for line in setup_arguments['extras_require']['jazzy']
     }
-    optional = {normal(line) for line in setup_arguments['extras_require']['natnetclient']}
+    extras = setup_arguments['extras_require']
+    optional = {normal(line) for line in extras['natnetclient'] + extras['pdf']}
     root = ElementTree.parse(ROOT / 'package.xml').getroot()
     depends = {element.text for element in root.findall('exec_depend')}
     # The launch files alone need these, which come with ROS and not with pip.

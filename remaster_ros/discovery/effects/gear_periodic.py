@@ -50,10 +50,12 @@ EFFECT = Effect(
     source='Tuttle & Seering 1996, IEEE Trans. Robot. Autom. 12 (harmonic drives)',
     unit='rad',
     plausible=(1e-5, 1e-3),
-    sentence='The gearbox of {subject} runs unevenly, in step with its teeth.',
+    sentence='The error of {subject} repeats a whole number of times a turn (teeth of a gear, or '
+    'the turns or poles of the motor).',
     separate_by='poses that step the joint finely through one period, all else held',
-    remedy='Correct it by the wave that was found; where it grows from session to session, '
-    'the gearbox wears.',
+    remedy='Compare the number with the ratio of the gear, and twice it: one that fits shows '
+    'which part runs unevenly, and where it grows from session to session that part wears. One '
+    'that fits nothing in this joint is a wave to correct, whatever its cause.',
     size=_wave,
     cells=cells,
     cause_per='joints',

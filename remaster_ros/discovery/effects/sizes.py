@@ -16,6 +16,8 @@ from remaster_ros.types import FloatArray
 
 ARC_MINUTE = np.radians(1.0 / 60.0)
 MM = 1e-3
+# Behind the point; what would take more is certain.
+MOST_DIGITS = 9
 
 
 def number(value: float, std: float, unit: str) -> str:
@@ -33,7 +35,7 @@ def rounded(value: float, std: float, sign: str = '-') -> tuple[str, str]:
     if std > 0.0 and np.isfinite(std):
         exponent = int(np.floor(np.log10(std)))
         leading = std / 10.0**exponent
-        digits = max(0, -exponent + (leading < 2.0))
+        digits = min(max(0, -exponent + (leading < 2.0)), MOST_DIGITS)
     text = f'{value:{sign}.{digits}f}'
     if float(text) == 0.0:
         text = text.removeprefix('-')

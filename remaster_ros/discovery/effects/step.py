@@ -133,10 +133,14 @@ LARGEST_RAD = 2e-2
 
 def _jump(context: Context, cell: Cell, draws: FloatArray) -> str:
     if cell.place == 'joint_angle':
-        return f'joint {cell.joints[0]} by {angle(np.abs(draws[:, 0]))}'
+        return f'joint {cell.joints[0]} by {angle(draws[:, 0])}'
     way = length(np.linalg.norm(draws[:, :3], axis=1))
     turn = f' and {angle(np.linalg.norm(draws[:, 3:], axis=1))}' if cell.size > 3 else ''
-    return f'{cell.subject or "the base"} by {way}{turn}'
+    mean = draws[:, :3].mean(axis=0)
+    parts = ', '.join(f'{part:+.2f}' for part in mean / max(float(np.linalg.norm(mean)), 1e-12))
+    frame = 'the tool' if cell.place == 'marker' else 'its own frame' if cell.subject else 'R'
+    direction = f'along ({parts}) in {frame}'.replace('-', '−')
+    return f'{cell.subject or "the base"} by {way} {direction}{turn}'
 
 
 EFFECT = Effect(
@@ -149,7 +153,7 @@ EFFECT = Effect(
     source='change point of one level: Hinkley 1970, Biometrika 57',
     unit='m',
     plausible=(1e-5, 2e-2),
-    sentence='The {place} jumped {when} and stayed so: something slipped or was bumped.',
+    sentence='The {place} jumped {when} and stayed so (something slipped or was bumped).',
     separate_by='reference poses measured again and again during the session',
     remedy='Find what slipped or was bumped, fasten it, and measure again.',
     size=_jump,

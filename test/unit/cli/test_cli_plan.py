@@ -5,7 +5,7 @@ import json
 import pytest
 
 from remaster_ros.cli import main as cli
-from remaster_ros.planning import planned_design, pose_design
+from remaster_ros.planning import planned_design, pose_design, tour_planner
 from remaster_ros.session.workcell import config_path
 
 
@@ -110,3 +110,70 @@ def test_a_cell_without_reachable_poses_is_one_line(tmp_path, capsys):
     assert (status, out) == (1, '')
     assert 'no pose is left to fit on' in err
     assert err.count('\n') == 1
+
+
+def discovery_file(folder, look_alikes):
+    """Write a discovery.json of a scale of joint 6."""
+    content = {
+        'format': 'remaster-discovery/1',
+        'verdict': 'undetermined',
+        'effects': [
+            {
+                'name': 'encoder_scale',
+                'joints': [6],
+                'place': 'joint_angle',
+                'driver': 'own_angle',
+                'form': 'linear',
+                'parameters': [{'name': 'scale_6', 'value': 1e-3, 'std': 1e-4, 'unit': '1'}],
+                'p_value': 0.003,
+                'log_evidence_gain': 20.0,
+                'confusable_with': [
+                    {'name': name, 'joints': [6], 'log_evidence_gain': 19.0, 'separate_by': words}
+                    for name, words in look_alikes.items()
+                ],
+                'cause': 'The angle reading of joint 6 is off in proportion.',
+            }
+        ],
+        'gain': {
+            'held_out_rms_before_m': 1e-3,
+            'held_out_rms_after_m': 1e-4,
+            'noise_floor_m': 1e-4,
+        },
+        'noise': {'pose_common_fraction': 0.5, 'outliers': [], 'heteroscedastic': {}},
+        'joint_offsets_after': [],
+    }
+    path = folder / 'discovery.json'
+    path.write_text(json.dumps(content), encoding='utf-8')
+    return path
+
+
+def test_what_separates_two_causes_is_added_to_the_plan(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(tour_planner, 'POOL_CANDIDATES', 40)
+    look_alikes = {'encoder_eccentricity': 'the whole range', 'backlash': 'both sides'}
+    path = discovery_file(tmp_path, look_alikes)
+    options = (*FEW, '--reference-every', 0)
+    plain = as_json(capsys, 'demo', *options)
+    found = as_json(capsys, 'demo', *options, '--separate', path)
+    added = found['separate']
+    assert 0 < added['configurations'] == len(added['q_deg']) <= 25
+    assert len(added['q_deg'][0]) == 7
+    assert found['splits']['optimization']['visits'] == (
+        plain['splits']['optimization']['visits'] + added['configurations']
+    )
+    assert found['robot_time_s'] > plain['robot_time_s']
+    (pair,) = added['pairs']
+    assert pair['std_apart'] > pair['std_apart_before']
+    assert added['otherwise'] == ['encoder scale of joint 6 and backlash of joint 6: both sides']
+    assert 'separate' not in plain
+    status, out, _ = run(capsys, 'demo', *options, '--separate', path)
+    assert status == 0
+    assert f'of these to separate causes: {added["configurations"]} configurations' in out
+    assert 'poses do not separate encoder scale of joint 6 and backlash of joint 6' in out
+
+
+def test_without_look_alikes_there_is_nothing_to_separate(tmp_path, capsys):
+    path = discovery_file(tmp_path, {})
+    status, out, err = run(capsys, 'demo', *FEW, '--separate', path)
+    assert (status, out) == (2, '')
+    assert 'none of its causes has a look-alike' in err
+    assert run(capsys, 'demo', '--separate', tmp_path / 'none.json')[0] == 2

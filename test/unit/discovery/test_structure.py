@@ -217,3 +217,20 @@ def test_causes_too_small_to_be_found_widen_the_offsets_and_nothing_else():
     expected = np.hypot(by_data, np.linalg.norm(spread[: len(known)], axis=1))
     # A standard deviation of 400 independent draws is known to 3.5 %.
     np.testing.assert_allclose(std[known], expected[known], rtol=0.15)
+
+
+@pytest.mark.parametrize('shift_m', [1e-3, 20e-3])
+def test_a_sensor_moved_while_the_held_out_poses_were_measured_is_dated(shift_m):
+    def moved(session: Session) -> FloatArray:
+        m = session.measurements
+        late = m.is_validation & (m.sensor == 0)
+        assert m.stamp_s[m.is_validation].min() > m.stamp_s[~m.is_validation].max()
+        return late[:, None] * np.array([shift_m, 0.0, 0.0])
+
+    found = discover_session(session_with(41, sensor=moved), rng=np.random.default_rng(0))
+    assert found.verdict == 'unexplained'
+    assert found.effects == ()
+    entry = next(entry for entry in found.unexplained if entry.where == 'held_out_poses')
+    assert entry.driver == 'time'
+    assert f'are off by ({1e3 * shift_m:+.0f}'[:-1] in entry.next or '(+0.9' in entry.next
+    assert 'was moved then' in entry.next

@@ -168,14 +168,27 @@ def test_fakes_have_the_clock_of_their_namespace():
 
 
 def test_a_wrong_configuration_is_not_started_again():
-    assert exit_ends_launch(2)
-    assert not any(exit_ends_launch(code) for code in (0, 1, -9, -11, None))
+    assert exit_ends_launch('recorder-3', 2)
+    assert not any(exit_ends_launch('recorder-3', code) for code in (0, 1, -9, -11, None))
+    assert not exit_ends_launch('watch-9', 2), 'the arm does not need the live page'
+
+
+def test_the_live_page_is_started_where_it_is_asked_for():
+    for nodes in (real_nodes(CELL, REAL), fake_nodes(REAL)):
+        assert 'watch' not in [node.name for node in nodes]
+    assert fake_nodes(REAL, dashboard='True')[-1].name == 'watch'
+    nodes = {node.name: node for node in real_nodes(CELL, REAL, dashboard='true')}
+    fit = nodes['optimizer'].parameters[1]['out']
+    assert nodes['watch'].parameters == (REAL, {'cell': CELL, 'fit': fit})
+    with pytest.raises(InputError, match='true or false'):
+        real_nodes(CELL, REAL, dashboard='yes')
 
 
 @pytest.mark.parametrize('name', ['real', 'fake'])
 def test_the_launch_files(name, monkeypatch):
     """Run with stand-ins for launch, which is not on every machine that runs this."""
     given = {'cell': CELL, 'params': REAL, 'sensors': 'all', 'namespace': '/left'}
+    given['dashboard'] = 'false'
     if name == 'fake':
         given['params'] = str(ROOT / 'config' / 'fake.yaml')
 

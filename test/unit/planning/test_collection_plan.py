@@ -6,7 +6,7 @@ import pytest
 from remaster_ros.kinematics.free_paths import is_straight_free
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.planning import planned_design, pose_design
-from remaster_ros.planning.collection_plan import plan_collection
+from remaster_ros.planning.collection_plan import look_ahead, plan_collection
 from remaster_ros.planning.planned_design import NOT_NEEDED
 from remaster_ros.planning.pose_design import HELD_OUT_POSES, HELD_OUT_SOLUTIONS, Floors
 from remaster_ros.planning.tour_planner import TourPlanner
@@ -84,3 +84,29 @@ def test_references_are_visited_between():
     _, plan = planned(CellPoses(design='optimal', joint_std_deg=0.01), every=25)
     assert plan.tour.references >= 4
     assert len(of(plan, 'reference')) >= 3 * plan.tour.references
+
+
+def test_looking_ahead_leaves_a_tour_as_it_is_and_begins_with_what_is_left_of_it():
+    cell = read_cell('demo')
+    scene = cell.planning_scene(cell.chain())
+    counts = {'optimization': 6, 'validation': 3}
+    planner = TourPlanner(scene, counts, 0, 5, cell.design_settings())
+    start = np.deg2rad([5.0, 7.0, 0.0, 112.0, 10.0, 35.0, -20.0])
+    tour = planner.collection(planner.rough_places)
+    whole = look_ahead(planner, planner.rough_places, [tour], start)
+    assert tour.visited == 0
+    visited = []
+    stop = tour.next(start)
+    while len(visited) < 6:
+        visited.append(stop)
+        stop = tour.next(stop.solutions[-1])
+    # The last one is under way, with its first solution measured.
+    here, rest = stop.solutions[0], stop.only(stop.ids[1:])
+    done = sum(len(one.ids) for one in visited) + 1
+    left = look_ahead(planner, planner.rough_places, [tour], here, rest)
+    assert len(left.visits) == len(whole.visits) - done
+    for one, other in zip(left.visits[len(rest.ids) :], whole.visits[done + len(rest.ids) :]):
+        assert (one.split, one.pose) == (other.split, other.pose)
+    assert tour.visited == 7
+    # What the fit will state depends on all of it.
+    assert left.joint_std == whole.joint_std

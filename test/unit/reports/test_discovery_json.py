@@ -173,8 +173,8 @@ def test_noise_along_the_line_of_sight_is_drawn_by_sensor(saved):
     )
     residuals = replace(data, noise_model=noise_model)
     figure = discovery_figures.gain(replace(found, residuals=residuals, selection=selection))
-    heights = [bar.get_height() for bar in figure.axes[1].patches]
-    np.testing.assert_allclose(heights, 2 * [0.6 * np.sqrt(2.0 / 3.0), 0.3 / np.sqrt(3.0)])
+    widths = [bar.get_width() for bar in figure.axes[1].patches]
+    np.testing.assert_allclose(widths, 2 * [0.6 * np.sqrt(2.0 / 3.0), 0.3 / np.sqrt(3.0)])
 
 
 def test_predictions_csv_has_every_row_with_its_covariance(saved):

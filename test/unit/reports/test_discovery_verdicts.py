@@ -8,9 +8,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from discovery_scenes import at_joint, session_with
+from matplotlib.figure import Figure
 
 from remaster_ros.cli.discover import summary
 from remaster_ros.discovery.discover import Verdict, discover_session
+from remaster_ros.reports import discovery_figures
 from remaster_ros.reports.discovery_json import read_discovery, save_discovery
 from remaster_ros.types import Measurements
 
@@ -118,3 +120,40 @@ def test_a_posterior_that_is_only_approximate_is_never_green(found, tmp_path):
     assert mood == 'caution'
     assert message in page
     assert message in summary(doubtful)
+
+
+def test_one_cause_without_a_curve_is_a_thin_bar_beside_the_noise(found):
+    (axes,) = [ax for ax in discovery_figures.causes(found['scale']).axes if ax.patches]
+    low, high = sorted(axes.get_ylim())
+    assert len(axes.patches) >= 2
+    assert all(bar.get_height() < 0.15 * (high - low) for bar in axes.patches)
+    assert axes.get_yticklabels()[-1].get_text() == 'noise alone'
+
+
+def test_no_bin_and_no_line_lies_where_nothing_was_measured():
+    rng = np.random.default_rng(5)
+    x = np.concatenate((rng.uniform(-100, -60, 70), rng.uniform(50, 90, 30)))
+    ax = Figure().subplots()
+    discovery_figures._binned(ax, x, rng.normal(size=100), 'black')
+    assert len(ax.containers) == 2
+    for container in ax.containers:
+        places = container[0].get_xdata()
+        assert np.all(places < -60) or np.all(places > 50)
+
+
+def test_a_wave_has_no_band_where_nothing_was_measured(found, monkeypatch):
+    discovery = found['bent']
+    data = discovery.residuals
+    q = np.degrees(data.context.measurements.q[:, 1])
+    middle = np.median(q)
+    rows = np.flatnonzero(np.abs(q - middle) > 25.0)
+    shown = replace(discovery, residuals=data.only(np.intersect1d(rows, data.rows.source)))
+    # Drawn at the rows that were searched.
+    monkeypatch.setattr(discovery_figures, 'MOST_DRAWN', 0)
+    ax = Figure().subplots()
+    (cell,) = discovery.groups[0]
+    discovery_figures._cause(ax, shown, cell)
+    (band,) = ax.collections
+    sides = [path.vertices[:, 0] for path in band.get_paths()]
+    assert len(sides) >= 2
+    assert all(x.max() < middle - 20.0 or x.min() > middle + 20.0 for x in sides)

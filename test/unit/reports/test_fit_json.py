@@ -246,7 +246,7 @@ def test_the_approximation_and_its_check_are_in_the_file(fit_result):
 def test_results_of_others_are_not_replaced(fit_result, tmp_path):
     save_fit(fit_result, tmp_path / 'fit', figures=False)
     prepare_folder(tmp_path / 'fit', 'fit.json')
-    with pytest.raises(InputError, match=r'holds apply, fit\.json, not written by this command'):
+    with pytest.raises(InputError, match=r'holds apply, fit\.json, residuals\.csv, not written'):
         prepare_folder(tmp_path / 'fit', 'discovery.json')
     for name, words in (
         ('report.html', r'holds report\.html, not written by this command'),

@@ -20,7 +20,8 @@ from remaster_ros.cli.fit import summary
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.reports.fit_json import save_fit
-from remaster_ros.reports.report import report_html, verdict
+from remaster_ros.reports.judgement import verdict
+from remaster_ros.reports.report import report_html
 from remaster_ros.reports.view_3d import _round_factor, draw_view
 
 VOID = {'meta', 'br', 'img', 'link', 'hr', 'input'}
@@ -85,17 +86,22 @@ def test_all_files_are_there(folder):
         'figures/errors.svg',
         'figures/posteriors.svg',
         'figures/residuals.svg',
+        'figures/stages.svg',
         'figures/traces.svg',
         'fit.json',
         'report.html',
+        'residuals.csv',
     ]
 
 
-def test_the_page_is_whole_and_needs_nothing_else(page, html):
+def test_the_page_is_whole_and_needs_nothing_else(page, html, folder):
     assert page.open == []
     assert len(page.ids) == len(set(page.ids))
     assert page.addresses
     for address in page.addresses:
+        if address.startswith('apply/'):
+            assert (folder / address).is_file()
+            continue
         assert address.startswith('#')
         assert address[1:] in page.ids
     for reference in re.findall(r'url\(#([^)]+)\)', html):
@@ -171,7 +177,11 @@ def test_the_same_fit_gives_the_same_page(fit_result, folder, tmp_path):
 def test_without_figures_there_is_no_report_and_none_of_an_earlier_fit(fit_result, tmp_path):
     (tmp_path / 'report.html').write_text('of an earlier fit')
     assert save_fit(fit_result, tmp_path, figures=False) == tmp_path / 'fit.json'
-    assert sorted(path.name for path in tmp_path.iterdir()) == ['apply', 'fit.json']
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        'apply',
+        'fit.json',
+        'residuals.csv',
+    ]
 
 
 def test_drawing_libraries_are_imported_only_for_a_report():
@@ -371,3 +381,26 @@ def test_what_changed_in_the_session_is_reported_first(fit_result):
     html = report_html(result, {})
     assert html.count('was moved between configurations') == 2
     assert 'off by up to 3.0' in html
+
+
+def test_a_far_sensor_leaves_the_arm_as_large_as_it_is(fit_result):
+    name, T = next(iter(fit_result.T_R_N.items()))
+    far = T.copy()
+    far[:3, 3] += (40.0, 0.0, 0.0)
+    # Measured points are carried to the base by the same frame: let them stay where they are.
+    m = fit_result.session.measurements
+    position = m.position.copy()
+    mine = m.sensor == list(fit_result.session.sensors).index(name)
+    position[mine] = apply(transforms.inverse(far) @ T, position[mine])
+    session = replace(fit_result.session, measurements=replace(m, position=position))
+    view = draw_view(replace(fit_result, session=session, T_R_N={**fit_result.T_R_N, name: far}))
+    assert name in view.far_sensors
+    largest = max(abs(x) for trace in view.data for x in trace['x'] if x is not None)
+    assert largest < 5.0
+    labels = [text for trace in view.data for text in trace.get('text', [])]
+    assert any('m from the base' in text for text in labels)
+
+
+def test_a_page_without_3d_says_what_is_missing(html):
+    assert 'needs WebGL, which this browser does not have' in html
+    assert '<noscript>The 3-D view needs JavaScript' in html

@@ -1,0 +1,303 @@
+"""Serve the live page: what the nodes publish, and the services that a person may call there.
+
+The page is `reports.live_view` and `reports.live_server`; this is their ROS shell. It commands
+nothing itself: its buttons call the services that everybody has, whose nodes decide. A halt
+cannot be cleared here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from remaster_ros.collection.events import EventRecord
+from remaster_ros.errors import RemasterError
+from remaster_ros.kinematics import transforms
+from remaster_ros.nodes.background import Background
+from remaster_ros.nodes.messages import JointOrder, solutions_of, transform_array
+from remaster_ros.nodes.page_address import opening_file, page_name
+from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.precision_watch import TOPIC as PRECISION
+from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.rviz_markers import RvizMarkers
+from remaster_ros.nodes.status import LATCHED, LEVELS, RELIABLE, TOPIC, NodeStatus, Summary, listen
+from remaster_ros.nodes.waypoints import waypoints_by_solution
+from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE, read_fit
+from remaster_ros.reports.live_facts import FitFacts
+from remaster_ros.reports.live_server import COMMANDS, Done, LiveServer, Place
+from remaster_ros.reports.live_view import LiveView
+from remaster_ros.reports.robot_scene import robot_scene
+from remaster_ros.reports.scene_view import scene_to_dict
+from remaster_ros.session.workcell import read_cell
+from remaster_ros.types import FloatArray
+
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+EVERY_S = 0.2
+IDLE_EVERY_S = 1.0
+"""How often the view is renewed while somebody looks, and while nobody does."""
+NICENESS = 5
+"""The page gives way to what moves the arm."""
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the live page."""
+
+    cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
+    fit: str = parameter('fit', "the optimizer's folder: what a fit has brought is read there")
+    address: str = parameter(
+        '127.0.0.1',
+        'IP address to listen on; one that other computers reach needs certificate and key',
+    )
+    port: int = parameter(
+        0,
+        'port to listen on; 0 for any free one, another one with every start: no other program '
+        'can wait there for the page',
+        low=0,
+        high=65535,
+    )
+    names: str = parameter('', 'names of this computer by which browsers may ask, with commas')
+    certificate: str = parameter('', 'PEM file of the certificate for https; empty for http')
+    key: str = parameter('', 'PEM file of its key')
+    publish_tf: bool = parameter(
+        True, 'publish where the sensors stand to /tf_static, where tf2_msgs is installed'
+    )
+
+
+class Watch(RemasterNode):
+    """See the module's text."""
+
+    # It moves nothing, and no node depends on it.
+    outlives_faults = True
+
+    def __init__(self) -> None:
+        super().__init__('watch')
+        self.p = declare(self, Parameters)
+        cell = read_cell(self.p.cell)
+        self.chain = cell.chain()
+        self._order = JointOrder(self.chain.joint_names)
+        markers = {
+            name: {marker: np.array(cell.markers[marker]) for marker in sensor.markers}
+            for name, sensor in cell.sensors.items()
+        }
+        self.view = LiveView(self.chain, markers)
+        self._waypoints, self._stds = JointTrajectory(), JointState()
+        self._means: JointState | None = None
+        self._background = Background(self)
+        self._published_s = float('-inf')
+        self._q: FloatArray | None = None
+        services = {name: f'remaster/{name}' for name in COMMANDS}
+        self._callers = {n: self.create_client(Trigger, path) for n, path in services.items()}
+        self._subscribe({name: sensor.topics for name, sensor in cell.sensors.items()})
+        scene = robot_scene(cell, cell.planning_scene(self.chain))
+        self._rviz = RvizMarkers(self, scene, publish_tf=self.p.publish_tf)
+        self.page = self._open_page(msgspec.json.encode(scene_to_dict(scene)))
+        self.status = NodeStatus(self, self._summary)
+        self.create_timer(EVERY_S, self._show, clock=self.status.steady)
+
+    def _open_page(self, scene: bytes) -> LiveServer:
+        names = tuple(name.strip() for name in self.p.names.split(',') if name.strip())
+        place = Place(self.p.address, self.p.port, names, self.p.certificate, self.p.key)
+        name = page_name(self.context.get_domain_id(), self.get_fully_qualified_name())
+        # New with every start: an open page sends the old one to whoever has the port then.
+        page = LiveServer(place, secrets.token_urlsafe(32), scene, self._send)
+        file = opening_file(name, page.url)
+        # Not by the logger: that publishes, and the token is for this user alone.
+        print(f'live page: {page.url if sys.stdout.isatty() else f"open {file}"}', flush=True)
+        return page
+
+    def _subscribe(self, sensors: Mapping[str, Mapping[str, str]]) -> None:
+        def take(kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
+            self.create_subscription(kind, topic, _tolerant(callback), qos)
+
+        take(JointState, 'joint_states', self._on_joint_state, NEWEST)
+        take(PoseStamped, 'remaster/target_pose', self._on_target, RELIABLE)
+        take(JointTrajectory, 'remaster/joint_waypoints', self._on_waypoints, RELIABLE)
+        take(JointTrajectory, 'remaster/joint_solutions', self._on_solutions, RELIABLE)
+        take(TransformStamped, 'remaster/registration', self._on_registration, LATCHED)
+        take(JointState, 'remaster/joint_offsets', self._on_means, LATCHED)
+        take(JointState, 'remaster/joint_offsets_std', self._on_stds, LATCHED)
+        take(DiagnosticArray, TOPIC, self._on_status, RELIABLE)
+        take(String, PRECISION, lambda message: self.view.take_precision(message.data), LATCHED)
+        for name, topics in sensors.items():
+            for marker, topic in topics.items():
+                take(PointStamped, topic, partial(self._on_point, name, marker), NEWEST)
+        listen(self, self._on_record)
+
+    # What comes in
+
+    def _on_record(self, record: EventRecord) -> None:
+        self.view.take(record.body, time.monotonic())
+
+    def _on_status(self, array: DiagnosticArray) -> None:
+        words = {level: word for word, level in LEVELS.items()}
+        for status in array.status:
+            values = {pair.key: pair.value for pair in status.values}
+            level, now = words.get(status.level, 'error'), time.monotonic()
+            self.view.take_summary(status.name, level, status.message, values, now)
+
+    def _on_joint_state(self, message: JointState) -> None:
+        self._q = self._order.positions(message)
+        self.view.take_joints(self._q)
+
+    def _on_point(self, sensor: str, marker: str, message: PointStamped) -> None:
+        point = message.point
+        self.view.residuals.reading(sensor, marker, np.array([point.x, point.y, point.z]))
+
+    def _on_target(self, message: PoseStamped) -> None:
+        place, turn = message.pose.position, message.pose.orientation
+        rotation = transforms.matrix_from_quaternion_xyzw(
+            np.array([turn.x, turn.y, turn.z, turn.w])
+        )
+        T = transforms.transform(rotation, np.array([place.x, place.y, place.z]))
+        self.view.take_target(T)
+
+    def _on_waypoints(self, message: JointTrajectory) -> None:
+        self._waypoints = message
+
+    def _on_solutions(self, message: JointTrajectory) -> None:
+        """Take the way from where the arm is through all solutions of the pose."""
+        names, waypoints = self.chain.joint_names, self._waypoints
+        targets = solutions_of(message, names)
+        belongs = waypoints.header.stamp == message.header.stamp
+        between = waypoints_by_solution(waypoints, names) if belongs else {}
+        way = [] if self._q is None else [self._q[None]]
+        for index, target in enumerate(targets):
+            way += [between.get(index, np.empty((0, len(names)))), target[None]]
+        self.view.take_way(np.concatenate(way) if way else targets)
+
+    def _on_registration(self, message: TransformStamped) -> None:
+        self.view.take_registration(message.child_frame_id, transform_array(message))
+        self._rviz.place_sensors(self.view.registration)
+
+    def _on_means(self, message: JointState) -> None:
+        self._means = message
+        self._take_offsets()
+
+    def _on_stds(self, message: JointState) -> None:
+        self._stds = message
+        self._take_offsets()
+
+    def _take_offsets(self) -> None:
+        """Take the offsets of a fit when both of its messages are there."""
+        means, stds = self._means, self._stds
+        if means is None or means.header.stamp != stds.header.stamp:
+            return
+        by_name = [dict(zip(m.name, m.position, strict=False)) for m in (means, stds)]
+        self.view.take_offsets(*by_name)
+        self._background.submit(
+            partial(fit_facts, Path(self.p.fit), by_name[0]), self._on_fit_facts
+        )
+
+    def _on_fit_facts(self, facts: Any) -> None:
+        if not isinstance(facts, Exception):
+            self.view.take_fit(facts)
+
+    # What goes out
+
+    def _send(self, name: str, done: Done) -> None:
+        """Call a service; in the thread of the page, whose executor this is not."""
+        client = self._callers[name]
+        if not client.service_is_ready():
+            done(False, f'nobody offers {client.srv_name}')
+            return
+
+        def answered(future: Any) -> None:
+            try:
+                answer = future.result()
+            except Exception as error:
+                done(False, f'{client.srv_name}: {error}')
+                return
+            done(answer.success, answer.message)
+
+        client.call_async(Trigger.Request()).add_done_callback(answered)
+
+    def _show(self) -> None:
+        now = time.monotonic()
+        watched = self.page.watched or self._rviz.wanted
+        if now - self._published_s >= (EVERY_S if watched else IDLE_EVERY_S) - 0.01:
+            self._published_s = now
+            view = self.view.view(now)
+            self.page.publish(view)
+            if self._rviz.wanted:
+                self._rviz.publish(view['scene'])
+
+    def _summary(self) -> Summary:
+        state = 'watched' if self.page.watched else 'serving'
+        return Summary('ok', state, {'address': self.p.address, 'port': self.page.port})
+
+    def close(self) -> None:
+        """End the server."""
+        self.page.close()
+        self._background.close(1.0)
+
+
+def _tolerant(callback: Callable[[Any], None]) -> Callable[[Any], None]:
+    """Return a callback that leaves out a message which makes no sense; the nodes report those."""
+
+    def receive(message: Any) -> None:
+        with contextlib.suppress(RemasterError, ValueError, msgspec.MsgspecError):
+            callback(message)
+
+    return receive
+
+
+def fit_facts(folder: Path, offsets: Mapping[str, float]) -> FitFacts:
+    """Return what the page shows of a fit beside its offsets.
+
+    Parameters
+    ----------
+    folder
+        The optimizer's, on this computer; where it is elsewhere there is nothing to show.
+    offsets
+        As published, joint -> rad: the file has to be that of the same fit.
+    """
+    try:
+        fit = read_fit(folder / FIT_FILE)
+    except RemasterError:
+        return FitFacts()
+    of_file = {row['joint']: np.deg2rad(row['mean_deg']) for row in fit['joint_offsets']}
+    if not all(np.isclose(offsets.get(name, np.nan), mean) for name, mean in of_file.items()):
+        return FitFacts()
+    facts = {}
+    for split, words in (('validation', 'held-out poses'), ('optimization', 'fitted poses')):
+        errors = (fit['accuracy'].get(split) or {}).get('theoretical')
+        if errors:
+            before, after = (errors[when]['mean_mm'] for when in ('before', 'after'))
+            facts[f'mean error, {words}'] = f'{before:.3f} mm → {after:.3f} mm'
+    report = folder / REPORT_FILE
+    facts['files'] = str((report if report.exists() else folder).resolve())
+    return FitFacts(
+        facts,
+        frozenset(row['joint'] for row in fit['joint_offsets'] if not row['identifiable']),
+        {name: np.array(marker['position_m']) for name, marker in fit['markers'].items()},
+    )
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    os.nice(NICENESS)
+    make: Callable[[], RemasterNode] = Watch
+    return run(make, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

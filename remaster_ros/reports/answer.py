@@ -1,0 +1,292 @@
+"""What to do after a fit and a search for causes, what it brings, and what remains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from remaster_ros.calibration.gauge_words import listed
+from remaster_ros.calibration.noise_check import MEAN_LENGTH
+from remaster_ros.compensation.export import GEOMETRY_FILE, LAYER_FILE, REMASTER_FILE, URDF_FILE
+from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, transform
+from remaster_ros.reports.answer_inputs import Inputs, all_taken_out
+from remaster_ros.reports.discovery_schema import Effect
+from remaster_ros.reports.effect_words import STEP, is_held_by_model, is_of_measurement, title
+from remaster_ros.reports.judgement import NOTICEABLE_GAIN
+from remaster_ros.reports.remaining import Remaining, what_remains
+from remaster_ros.reports.schemas import JointOffset, Judgement
+from remaster_ros.types import BoolArray, FloatArray
+
+ALL_FILES = (REMASTER_FILE, URDF_FILE, LAYER_FILE, GEOMETRY_FILE)
+Mood = Literal['good', 'caution', 'bad']
+
+
+class Stage(NamedTuple):
+    """The 3-D errors of the judged rows at one stage, mm.
+
+    Attributes
+    ----------
+    title
+        What is corrected.
+    errors
+        Of the judged rows, mm, (m,).
+    """
+
+    title: str
+    errors: FloatArray
+
+    @property
+    def mean(self) -> float:
+        """Mean, mm."""
+        return float(self.errors.mean())
+
+    @property
+    def most(self) -> float:
+        """What 95 % of the rows stay below, mm."""
+        return float(np.quantile(self.errors, 0.95))
+
+    @property
+    def largest(self) -> float:
+        """Largest, mm."""
+        return float(self.errors.max())
+
+
+class SensorNoise(NamedTuple):
+    """The mean 3-D error that a sensor's noise makes, mm.
+
+    Attributes
+    ----------
+    reading_mm
+        Of one reading.
+    shared_mm
+        With what all readings of a pose have in common; None where that is not known.
+    """
+
+    sensor: str
+    reading_mm: float
+    shared_mm: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The first screen.
+
+    Attributes
+    ----------
+    mood, headline
+        The judgement: 'good' where held-out poses bear out all of it.
+    action
+        'set' the offsets, 'wait' with them, or 'nothing' has to be set.
+    uses_causes
+        The offsets, and what stands in the files, are those of the model with causes.
+    has_geometry
+        The robot model holds lengths or tilts as well.
+    stages
+        From today on, each with more corrected.
+    brings
+        Index of the stage that the deed reaches.
+    final_mm
+        The error of every row there, (n,).
+    held_out
+        The stages are judged by poses that were never fitted.
+    noise
+        Of every sensor for which it is known.
+    remains
+        What the deed leaves.
+    """
+
+    mood: Mood
+    headline: str
+    action: Literal['set', 'wait', 'nothing']
+    uses_causes: bool
+    has_geometry: bool
+    stages: tuple[Stage, ...]
+    brings: int
+    final_mm: FloatArray
+    held_out: bool
+    noise: tuple[SensorNoise, ...]
+    remains: tuple[Remaining, ...]
+    offsets: tuple[JointOffset, ...]
+
+    @property
+    def known(self) -> list[JointOffset]:
+        """The offsets to set."""
+        return [row for row in self.offsets if row.identifiable]
+
+    @property
+    def unknown(self) -> list[JointOffset]:
+        """The offsets that the data do not determine."""
+        return [row for row in self.offsets if not row.identifiable]
+
+    @property
+    def files(self) -> list[str]:
+        """The files that belong to the deed, in the folder ``apply``."""
+        if self.action != 'set':
+            return []
+        return [name for name in ALL_FILES if self.has_geometry or name != GEOMETRY_FILE]
+
+
+def answer_of(inputs: Inputs) -> Answer:
+    """Return what to do, what it brings, and what remains."""
+    fit, found = inputs.fit, inputs.found
+    effects = found.effects if found is not None else []
+    judged, held_out = judged_rows(inputs)
+    rows, brings = _stages(inputs)
+    stages = tuple(Stage(text, errors[judged]) for text, errors in rows)
+    uses_causes = brings > 1
+    offsets = found.joint_offsets_after if uses_causes and found else fit.joint_offsets
+    action, reason = _action(
+        inputs.judgement, effects, stages[0].mean, stages[brings].mean, offsets
+    )
+    known = sum(row.identifiable for row in offsets)
+    geometry = uses_causes and any(map(is_held_by_model, effects))
+    taken_out = uses_causes and brings == len(rows) - 1
+    measured = [title(e) for e in effects if taken_out and is_of_measurement(e)]
+    return Answer(
+        mood=_mood(inputs, uses_causes, held_out and action != 'wait'),
+        headline=reason or _headline(known, stages, brings, held_out, measured, geometry),
+        action=action,
+        uses_causes=uses_causes,
+        has_geometry=geometry,
+        stages=stages,
+        brings=brings,
+        final_mm=rows[brings][1],
+        held_out=held_out,
+        noise=_noise(inputs),
+        remains=tuple(what_remains(inputs, uses_causes, held_out, stages[brings].mean)),
+        offsets=tuple(offsets),
+    )
+
+
+def judged_rows(inputs: Inputs) -> tuple[BoolArray, bool]:
+    """Return the rows that the stages are judged by, (n,), and whether they were held out."""
+    m = inputs.session.measurements
+    if m.is_validation.any():
+        return m.is_validation, True
+    return ~np.isin(m.observation, list(inputs.fit_left_out)), False
+
+
+def _stages(inputs: Inputs) -> tuple[list[tuple[str, FloatArray]], int]:
+    """Return title and errors of all rows, mm, at each stage, and the one that a deed reaches."""
+    rows = [('today', inputs.before_mm), ('with the zero-offsets', inputs.after_mm)]
+    if inputs.causes_mm is None or inputs.found is None:
+        return rows, 1
+    if all_taken_out(inputs.found):
+        effects = inputs.found.effects
+        text = 'with zero-offsets' + (
+            ' and lengths' if any(map(is_held_by_model, effects)) else ''
+        )
+        text += ', measuring errors taken out' if any(map(is_of_measurement, effects)) else ''
+        return [*rows, (text, inputs.causes_mm)], 2
+    brings = 1
+    if inputs.model_mm is not None:
+        rows.append(('with the corrected robot model', inputs.model_mm))
+        # Chosen by the fitted rows; those held out only show what it brings.
+        fitted = ~inputs.session.measurements.is_validation
+        means = [float(errors[fitted].mean()) for _, errors in rows]
+        brings = 2 if means[1] > NOTICEABLE_GAIN * means[2] else 1
+    rows.append(('with every cause corrected too', inputs.causes_mm))
+    return rows, brings
+
+
+def _action(
+    judgement: Judgement,
+    effects: list[Effect],
+    before: float,
+    after: float,
+    offsets: list[JointOffset],
+) -> tuple[Literal['set', 'wait', 'nothing'], str]:
+    """Return what to do, and where it is not to set the offsets, why."""
+    if judgement.mood == 'bad':
+        return 'wait', f'Set nothing yet. {judgement.headline}'
+    slipped = [e for e in effects if e.form == STEP and e.place == 'joint_angle']
+    if slipped:
+        names = listed([title(effect) for effect in slipped])
+        return 'wait', (
+            f'Set nothing yet. {names} while it was measured, so no one zero-offset holds for all '
+            'of the session.'
+        )
+    if not any(row.identifiable for row in offsets):
+        return 'nothing', 'Nothing can be set: these data determine no zero-offset.'
+    if before < NOTICEABLE_GAIN * after:
+        return 'nothing', (
+            'Nothing has to be set, the zero-offsets hardly matter here: the mean error is '
+            f'{before:.3f} mm without and {after:.3f} mm with them.'
+        )
+    return 'set', ''
+
+
+def _noise(inputs: Inputs) -> tuple[SensorNoise, ...]:
+    """Return the noise of the final model where there is one, else what the fit counts on."""
+    rows: list[SensorNoise] = []
+    if inputs.found is not None and isinstance(inputs.found.noise.sensors, dict):
+        for sensor, noise in inputs.found.noise.sensors.items():
+            # What the markers of a frame share is in each of its readings.
+            frame = noise.frame_sigma_m if isinstance(noise.frame_sigma_m, float) else 0.0
+            reading, pose = float(np.hypot(noise.sigma_m, frame)), noise.pose_sigma_m
+            both = None if pose is None else 1e3 * MEAN_LENGTH * float(np.hypot(reading, pose))
+            rows.append(SensorNoise(sensor, 1e3 * MEAN_LENGTH * reading, both))
+    elif isinstance(inputs.fit.explained_by_noise, dict):
+        for sensor, check in inputs.fit.explained_by_noise.items():
+            if check.noise_m is not None:
+                rows.append(SensorNoise(sensor, 1e3 * check.noise_m, None))
+    return tuple(rows)
+
+
+def _mood(inputs: Inputs, uses_causes: bool, may_be_good: bool) -> Mood:
+    """Return 'good' only where the fit, the discovery and the held-out poses all agree."""
+    fit, found = inputs.judgement, inputs.found
+    if fit.mood == 'bad':
+        return 'bad'
+    if fit.disagreements or not may_be_good:
+        return 'caution'
+    moods: list[Mood] = []
+    if found is None or not found.effects:
+        moods.append(fit.mood)
+    elif not uses_causes or not all(map(is_held_by_model, found.effects)):
+        # Something is left, in the arm or in how it was measured.
+        moods.append('caution')
+    if found is not None and isinstance(found.judgement, Judgement):
+        moods.append(found.judgement.mood)
+    return 'good' if all(mood == 'good' for mood in moods) else 'caution'
+
+
+def _headline(
+    joints: int,
+    stages: Sequence[Stage],
+    brings: int,
+    held_out: bool,
+    measured: Sequence[str],
+    corrects_model: bool,
+) -> str:
+    """Return the deed and its gain; ``measured`` is what was found of the measurement."""
+    before, after = stages[0], stages[brings]
+    deed = f'Set the zero-offsets of {joints} joint{"s" if joints > 1 else ""}'
+    deed += ' and correct the robot model' if corrects_model else ''
+    where = 'poses that were never fitted' if held_out else 'the fitted poses'
+    if measured:
+        # That part of the errors was never the arm's.
+        return (
+            f'{deed}: with them the mean error on {where} is {after.mean:.3f} mm, once the '
+            f'measuring error ({listed(measured)}) is taken out; the {before.mean:.3f} mm of '
+            'today contain it.'
+        )
+    times = before.mean / max(after.mean, 1e-9)
+    return (
+        f'{deed}: the mean error on {where} falls from {before.mean:.3f} mm to {after.mean:.3f} '
+        f'mm, {times:.{1 if times < 10 else 0}f} times smaller.'
+    )
+
+
+def registrations(inputs: Inputs) -> dict[str, FloatArray]:
+    """Return T_R_N of every sensor as fitted, (4, 4)."""
+    return {
+        sensor: transform(
+            matrix_from_quaternion_xyzw(np.array(frame.rotation_xyzw)),
+            np.array(frame.translation_m),
+        )
+        for sensor, frame in inputs.fit.registration.items()
+    }

@@ -1,0 +1,255 @@
+"""The figures of `remaster report`: errors by stage, over the session, and over the workspace."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import apply
+from remaster_ros.reports.answer import Answer, registrations
+from remaster_ros.reports.answer_inputs import Inputs
+from remaster_ros.reports.effect_words import moment, title
+from remaster_ros.reports.figures import (
+    AFTER,
+    BEFORE,
+    INK,
+    SENSOR_MARKERS,
+    as_svg,
+    legend_entry,
+    log_axis,
+)
+from remaster_ros.types import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MODEL, ALL_CAUSES, FAINT = '#8a6fc4', '#2f9e78', '#808a96'
+# Narrower than the figures of many panels: to be read on a phone.
+NARROW_IN, WIDE_IN = 5.2, 8.4
+MOST_POINTS = 1500
+ARMS = 4
+LETTERS = 'ABCDEFGHIJKLMNOPQRSTUVWXYZ'
+
+
+class Subject(NamedTuple):
+    """What is drawn."""
+
+    inputs: Inputs
+    answer: Answer
+    chain: SerialChain
+
+
+def draw_answer(subject: Subject) -> dict[str, str]:
+    """Return every figure as SVG text, by file name without ending."""
+    figures: dict[str, Callable[[Subject], Figure]] = {
+        'session': over_session,
+        'workspace': workspace,
+    }
+    return draw_stages(subject.answer) | as_svg(figures, subject)
+
+
+def draw_stages(answer: Answer) -> dict[str, str]:
+    """Return the figure of the first screen as SVG text, by its name."""
+    return as_svg({'stages': stages}, answer)
+
+
+def stages(answer: Answer) -> Figure:
+    """Draw the errors of the judged rows at each stage, with their mean and 95 %."""
+    shown = answer.stages
+    figure = Figure(figsize=(NARROW_IN, 0.62 * len(shown) + 0.75), layout='constrained')
+    ax = figure.subplots()
+    colors = (BEFORE, AFTER, *((MODEL,) if len(shown) > 3 else ()), ALL_CAUSES)
+    for row, (stage, color) in enumerate(zip(shown, colors, strict=False)):
+        errors = np.maximum(np.sort(stage.errors), 1e-4)
+        if len(errors) > MOST_POINTS:
+            picked = np.linspace(0, len(errors) - 1, MOST_POINTS).round().astype(int)
+            errors = errors[picked]
+        # Spread out evenly and without chance, so that no two figures of a session differ.
+        height = row + 0.22 * np.sin(2.399963 * np.arange(len(errors)))
+        ax.plot(errors, height, '.', color=color, markersize=3.0, alpha=0.55, markeredgewidth=0)
+        ax.plot(2 * [stage.mean], [row - 0.36, row + 0.36], color=color, linewidth=2.2)
+        ax.plot(
+            2 * [stage.most], [row - 0.3, row + 0.3], color=color, linewidth=1.0, ls=(0, (2, 1))
+        )
+    if noise := [row.reading_mm for row in answer.noise if row.reading_mm > 0.0]:
+        low, high = min(noise), max(noise)
+        ax.axvspan(low / 1.01, high * 1.01, color=FAINT, alpha=0.35, linewidth=0)
+    log_axis(ax, 'x')
+    ax.set_yticks(range(len(shown)), [_two_lines(stage.title) for stage in shown])
+    ax.set_ylim(len(shown) - 0.45, -0.55)
+    ax.grid(False, axis='y')
+    ax.spines['left'].set_visible(False)
+    ax.tick_params(axis='y', length=0)
+    ax.set_xlabel('3-D error of the marker (mm)')
+    entries = [
+        Line2D([], [], color=INK, linewidth=2.2, label='mean'),
+        Line2D([], [], color=INK, linewidth=1.0, ls=(0, (2, 1)), label='95 %'),
+    ]
+    if answer.noise:
+        entries.append(Line2D([], [], color=FAINT, alpha=0.5, linewidth=5, label='sensor noise'))
+    figure.legend(handles=entries, loc='outside upper right', ncols=3)
+    return figure
+
+
+def over_session(subject: Subject) -> Figure:
+    """Draw the error of every row in the order measured, as it is today and after the deed."""
+    inputs, answer = subject.inputs, subject.answer
+    m = inputs.session.measurements
+    timed = inputs.session.timed
+    x = (m.stamp_s - m.stamp_s.min()) / 60.0 if timed else m.configuration.astype(float)
+    figure = Figure(figsize=(WIDE_IN, 2.5), layout='constrained')
+    ax = figure.subplots()
+    shown = np.linspace(0, len(m) - 1, min(len(m), MOST_POINTS)).round().astype(int)
+    entries = [legend_entry('_', BEFORE, 'today'), legend_entry('_', AFTER, 'after')]
+    for sensor, name in enumerate(inputs.session.sensor_names):
+        mine = shown[m.sensor[shown] == sensor]
+        if not len(mine):
+            continue
+        marker = SENSOR_MARKERS[sensor % len(SENSOR_MARKERS)]
+        for errors, color in ((inputs.before_mm, BEFORE), (answer.final_mm, AFTER)):
+            for held_out in (False, True):
+                rows = mine[m.is_validation[mine] == held_out]
+                ax.plot(
+                    x[rows],
+                    np.maximum(errors[rows], 1e-4),
+                    marker,
+                    color=color,
+                    markersize=3.2,
+                    markerfacecolor=color if held_out else 'none',
+                    markeredgewidth=0.7,
+                    alpha=0.85,
+                )
+        entries.append(legend_entry(marker, INK, name))
+    _mark_moments(ax, subject)
+    log_axis(ax, 'y')
+    ax.set_ylabel('3-D error (mm)')
+    ax.set_xlabel('minutes after the first reading' if timed else 'joint configuration')
+    ax.margins(x=0.01)
+    figure.legend(handles=entries, loc='outside upper right', ncols=len(entries))
+    return figure
+
+
+def _mark_moments(ax: Axes, subject: Subject) -> None:
+    found = subject.inputs.found
+    for effect in found.effects if found is not None else ():
+        when = moment(effect)
+        if when is None:
+            continue
+        at = when[0] / 60.0
+        ax.axvline(at, color=INK, linewidth=1.0, ls=(0, (4, 2)))
+        low, high = ax.get_xlim()
+        left = at > 0.5 * (low + high)
+        ax.annotate(
+            title(effect),
+            (at, 1.0),
+            xycoords=('data', 'axes fraction'),
+            xytext=(-4 if left else 4, 3),
+            textcoords='offset points',
+            ha='right' if left else 'left',
+            fontweight='bold',
+        )
+
+
+def workspace(subject: Subject) -> Figure:
+    """Draw from above and from the side where the markers were, coloured by what remains."""
+    inputs, chain = subject.inputs, subject.chain
+    m = inputs.session.measurements
+    frames = registrations(inputs)
+    T_R_N = np.array([frames[name] for name in inputs.session.sensor_names])
+    shown = np.linspace(0, len(m) - 1, min(len(m), MOST_POINTS)).round().astype(int)
+    points = apply(T_R_N[m.sensor[shown]], m.position[shown])
+    errors = subject.answer.final_mm[shown]
+    order = np.argsort(errors)
+    rows = inputs.fit.joint_offsets
+    offsets = np.radians([row.mean_deg if row.identifiable else 0.0 for row in rows])
+    chosen = m.q[np.linspace(0, len(m) - 1, min(len(m), ARMS)).round().astype(int)]
+    joints = chain.frames(chosen, offsets)[..., :3, 3]
+    tips = chain.forward(chosen, offsets)[:, None, :3, 3]
+    arms = np.concatenate((np.zeros((len(chosen), 1, 3)), joints, tips), axis=1)
+    everything = np.concatenate((points, arms.reshape(-1, 3)))
+    middle = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
+    reach = 0.55 * float(np.ptp(everything, axis=0).max())
+
+    figure = Figure(figsize=(WIDE_IN, 3.9), layout='constrained')
+    axes = figure.subplots(1, 2)
+    views = ((0, 1, 'from above'), (0, 2, 'from the side'))
+    top = float(np.quantile(errors, 0.98))
+    for ax, (a, b, name) in zip(axes, views, strict=True):
+        for arm in arms:
+            ax.plot(arm[:, a], arm[:, b], color=FAINT, linewidth=2.0, alpha=0.6)
+            ax.plot(arm[:, a], arm[:, b], 'o', color=FAINT, markersize=3, alpha=0.6)
+        dots = ax.scatter(
+            points[order, a],
+            points[order, b],
+            c=errors[order],
+            s=11,
+            cmap='plasma_r',
+            vmin=0.0,
+            vmax=top,
+            linewidths=0.3,
+            edgecolors=INK,
+        )
+        ax.set_xlim(middle[a] - reach, middle[a] + reach)
+        ax.set_ylim(middle[b] - reach, middle[b] + reach)
+        # Of equal spans: one metre is as long in both.
+        ax.set_box_aspect(1.0)
+        ax.set_title(f'{name}, in the robot base')
+        ax.set_xlabel(f'{"xyz"[a]} (m)')
+        ax.set_ylabel(f'{"xyz"[b]} (m)')
+        _sensors(ax, frames, middle, reach, (a, b))
+    bar = figure.colorbar(dots, ax=axes, shrink=0.85, pad=0.02, extend='max')
+    bar.set_label('error after (mm)')
+    bar.outline.set_linewidth(0.5)
+    labels = [
+        f'{letter}: {name[:24]}, {np.linalg.norm(T[:3, 3]):.1f} m from the base'
+        for letter, (name, T) in zip(LETTERS, frames.items(), strict=False)
+    ]
+    entries = [Line2D([], [], color=ALL_CAUSES, marker='D', ls='', label=text) for text in labels]
+    figure.legend(handles=entries, loc='outside lower center', ncols=3, handletextpad=0.2)
+    return figure
+
+
+def _sensors(
+    ax: Axes,
+    frames: dict[str, FloatArray],
+    middle: FloatArray,
+    reach: float,
+    plane: tuple[int, int],
+) -> None:
+    """Draw a sensor at its place, or the direction to one that lies outside, with its distance."""
+    for letter, T in zip(LETTERS, frames.values(), strict=False):
+        centre = middle[list(plane)]
+        way = T[:3, 3][list(plane)] - centre
+        outside = float(np.abs(way).max()) / reach
+        start, end = (tuple(centre + way * share / outside) for share in (0.86, 0.98))
+        if outside > 0.98:
+            arrow = {'arrowstyle': '-|>', 'color': ALL_CAUSES, 'linewidth': 1.5}
+            ax.annotate('', end, xytext=start, arrowprops=arrow)
+        else:
+            start = tuple(centre + way)
+            ax.plot(*start, 'D', color=ALL_CAUSES, markersize=5)
+        ax.annotate(
+            letter,
+            start,
+            # Several sensors on one side: one letter above, the next below.
+            xytext=(0, 4 if LETTERS.index(letter) % 2 == 0 else -11),
+            textcoords='offset points',
+            ha='center',
+            color=ALL_CAUSES,
+            fontweight='bold',
+        )
+
+
+def _two_lines(text: str) -> str:
+    """Break a title near its middle."""
+    words = text.split(' ')
+    if len(words) < 3:
+        return text
+    breaks = [(abs(len(' '.join(words[:i])) - len(text) / 2), i) for i in range(1, len(words))]
+    i = min(breaks)[1]
+    return ' '.join(words[:i]) + '\n' + ' '.join(words[i:])

@@ -1,0 +1,179 @@
+"""What the page of `remaster report` is made of: a session, its fit, and its discovery if any."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.result import predicted_rows
+from remaster_ros.compensation.export import URDF_FILE
+from remaster_ros.errors import InputError
+from remaster_ros.reports.discovery_json import read_discovery
+from remaster_ros.reports.discovery_schema import Discovered
+from remaster_ros.reports.effect_words import is_held_by_model, is_of_measurement
+from remaster_ros.reports.fit_json import (
+    APPLY_FOLDER,
+    DISCOVERY_FILE,
+    FIT_FILE,
+    FIT_LIMIT,
+    read_fit,
+)
+from remaster_ros.reports.predictions_csv import PREDICTED, PREDICTIONS_FILE
+from remaster_ros.reports.rows_csv import AFTER, BEFORE, RESIDUALS_FILE, read_columns
+from remaster_ros.reports.schemas import Fit, Judgement
+from remaster_ros.session.files import decode_text, read_limited
+from remaster_ros.types import FloatArray, Session
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """What was read; n rows.
+
+    Attributes
+    ----------
+    session
+        All rows.
+    fit, found
+        fit.json and discovery.json; None without the latter.
+    before_mm, after_mm
+        3-D error of every row with all offsets at zero and with those of the fit, (n,).
+    causes_mm
+        With the causes as well, (n,); None where there are none.
+    model_mm
+        With the corrected robot model of the discovery and nothing else, (n,); None where it has
+        all causes or none.
+    """
+
+    session: Session
+    fit: Fit
+    found: Discovered | None
+    before_mm: FloatArray
+    after_mm: FloatArray
+    causes_mm: FloatArray | None
+    model_mm: FloatArray | None = None
+
+    @property
+    def judgement(self) -> Judgement:
+        """Of the fit."""
+        assert isinstance(self.fit.judgement, Judgement)
+        return self.fit.judgement
+
+    @cached_property
+    def fit_left_out(self) -> dict[int, str]:
+        """``observation`` of every row that was not fitted, and why."""
+        return {row.observation: row.why for row in self.fit.left_out}
+
+
+def located(path: Path) -> Path:
+    """Return the file fit.json or discovery.json that a path is, or that is in a folder.
+
+    Raises
+    ------
+    InputError
+        Neither, or both.
+    """
+    if not path.is_dir():
+        return path
+    there = [path / name for name in (FIT_FILE, DISCOVERY_FILE) if (path / name).exists()]
+    if len(there) != 1:
+        raise InputError(
+            f'{path}: holds {"both" if there else "neither"} {FIT_FILE} '
+            f'{"and" if there else "nor"} {DISCOVERY_FILE}; give one of the files'
+        )
+    return there[0]
+
+
+def read_inputs(session: Session, fit_path: Path, found_path: Path | None) -> Inputs:
+    """Read the results of a session, and refuse those of another.
+
+    Parameters
+    ----------
+    session
+        As read from its folder.
+    fit_path, found_path
+        fit.json and discovery.json; residuals.csv and predictions.csv are beside them.
+
+    Raises
+    ------
+    InputError
+        One line naming file and remedy.
+    """
+    fit = msgspec.convert(read_fit(fit_path), Fit)
+    _require_same(session, fit, fit_path, 'fit')
+    residuals = read_columns(fit_path.parent / RESIDUALS_FILE, session, BEFORE + AFTER, 'fit')
+    before_mm, after_mm = _lengths_mm(residuals[:, :3]), _lengths_mm(residuals[:, 3:])
+    if found_path is None:
+        return Inputs(session, fit, None, before_mm, after_mm, None)
+    found = msgspec.convert(read_discovery(found_path), Discovered)
+    _require_same(session, found, found_path, 'discover')
+    causes_mm = model_mm = None
+    if found.effects:
+        path = found_path.parent / PREDICTIONS_FILE
+        predicted = read_columns(path, session, PREDICTED, 'discover')
+        causes_mm = _lengths_mm(session.measurements.position - predicted)
+    if any(map(is_held_by_model, found.effects)) and not all_taken_out(found):
+        path = found_path.parent / APPLY_FOLDER / URDF_FILE
+        data = read_limited(path, FIT_LIMIT, 'discover again, which writes it')
+        model_mm = errors_with_model_mm(session, decode_text(data, path))
+    return Inputs(session, fit, found, before_mm, after_mm, causes_mm, model_mm)
+
+
+def all_taken_out(found: Discovered) -> bool:
+    """Whether all causes are in the corrected robot model, or in how the arm was measured."""
+    return found.verdict != 'undetermined' and all(
+        is_held_by_model(effect) or is_of_measurement(effect) for effect in found.effects
+    )
+
+
+def errors_with_model_mm(session: Session, urdf: str) -> FloatArray:
+    """Return the 3-D error of every row with another robot model, as it is, mm, (n,).
+
+    Registrations and markers are fitted to the optimization rows, as for the error of today.
+    """
+    found = estimate(Problem.of(replace(session, urdf=urdf)))
+    predicted = predicted_rows(found.problem, found.model, found.before.z)
+    return _lengths_mm(session.measurements.position - predicted)
+
+
+def _lengths_mm(errors: FloatArray) -> FloatArray:
+    lengths: FloatArray = 1e3 * np.linalg.norm(errors, axis=1)
+    return lengths
+
+
+def _require_same(session: Session, result: Fit | Discovered, path: Path, verb: str) -> None:
+    """Refuse the result of other data, or of a version whose files lack what the page has."""
+    if not isinstance(result.session, msgspec.Struct) or not isinstance(
+        result.judgement, msgspec.Struct
+    ):
+        raise InputError(f'{path}: of an earlier version; {verb} this session again')
+    if result.session.observations_sha256 != session.observations_sha256:
+        raise InputError(
+            f'{path}: of other data than this session (observations.csv has another SHA-256); '
+            f'{verb} this session'
+        )
+
+
+def parts(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
+    """Return which of at most two paths is fit.json and which discovery.json.
+
+    Raises
+    ------
+    InputError
+        Two of one kind, or a file of another name.
+    """
+    found: dict[str, Path] = {}
+    for path in map(located, paths):
+        if path.name not in (FIT_FILE, DISCOVERY_FILE):
+            raise InputError(
+                f'{path}: give {FIT_FILE} or {DISCOVERY_FILE}, or the folder of one of them'
+            )
+        if path.name in found:
+            raise InputError(f'{path}: two files {path.name}; give one of each')
+        found[path.name] = path
+    return found.get(FIT_FILE), found.get(DISCOVERY_FILE)

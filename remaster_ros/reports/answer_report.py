@@ -1,0 +1,279 @@
+"""The page of `remaster report`: the answer first, then its reasons; also as PDF."""
+
+from __future__ import annotations
+
+import base64
+import logging
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import msgspec
+import numpy as np
+from markupsafe import Markup
+
+from remaster_ros.discovery.words import clock_time
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import apply
+from remaster_ros.reports.answer import ALL_FILES, Answer, answer_of, registrations
+from remaster_ros.reports.answer_figures import Subject, draw_answer
+from remaster_ros.reports.answer_inputs import Inputs
+from remaster_ros.reports.fit_json import APPLY_FOLDER, REPORT_FILE
+from remaster_ros.reports.fit_tables import accuracy_rows, marker_rows
+from remaster_ros.reports.pages import inlined, page
+from remaster_ros.session.files import decode_text, make_folder, read_limited, write_atomically
+from remaster_ros.types import FloatArray
+
+PDF_FILE = 'report.pdf'
+ANSWER_GENERATOR = 'remaster report'
+WORST_ROWS = 10
+# Of the figures that `fit` and `discover` wrote, those that this page shows.
+FIT_FIGURES, FOUND_FIGURES = ('posteriors', 'traces'), ('causes', 'drivers')
+FILE_LIMIT = 64 * 1024**2
+PDF_REMEDY = "pip install 'remaster_ros[pdf]'"
+
+
+class WorstRow(NamedTuple):
+    """A row with a large error: which, when, where, and how large."""
+
+    observation: int
+    pose: int
+    configuration: int
+    split: str
+    sensor: str
+    when: str
+    place_mm: FloatArray
+    before_mm: float
+    after_mm: float
+    remark: str
+
+
+def write_answer(
+    inputs: Inputs,
+    fit_folder: Path,
+    found_folder: Path | None,
+    folder: Path,
+    figures: bool = True,
+    pdf: bool = False,
+) -> Answer:
+    """Write report.html, the files to apply and, if asked for, report.pdf; return the answer.
+
+    Parameters
+    ----------
+    inputs
+        What was read.
+    fit_folder, found_folder
+        Of the fit and of the discovery, which hold figures and files to apply.
+    folder
+        Where to; made if missing.
+    figures, pdf
+        Whether to have figures, and report.pdf.
+
+    Raises
+    ------
+    InputError
+        The folder holds another's report or cannot be written to, or there is no library for PDF.
+    """
+    printer = require_ready(folder, pdf)
+    answer = answer_of(inputs)
+    subject = Subject(inputs, answer, _chain(inputs))
+    drawings: dict[str, str] = {}
+    if figures:
+        drawings = draw_answer(subject) | _figures_of(fit_folder, FIT_FIGURES)
+        if found_folder is not None:
+            drawings |= _figures_of(found_folder, FOUND_FIGURES)
+    make_folder(folder)
+    html = answer_html(subject, {name: inlined(name, svg) for name, svg in drawings.items()})
+    source = found_folder if answer.uses_causes and found_folder else fit_folder
+    _copy_apply(source / APPLY_FOLDER, answer, folder)
+    write_atomically(folder / REPORT_FILE, html)
+    if printer is not None:
+        printed = {name: as_image(svg) for name, svg in drawings.items()}
+        document = printer.HTML(string=answer_html(subject, printed, printing=True))
+        write_atomically(folder / PDF_FILE, document.write_pdf())
+    return answer
+
+
+def require_ready(folder: Path, pdf: bool) -> Any:
+    """Refuse a folder with a report of another command; return the library for PDF if asked for.
+
+    Raises
+    ------
+    InputError
+        One line with the remedy.
+    """
+    path = folder / REPORT_FILE
+    if path.exists():
+        head = read_limited(path, FILE_LIMIT, 'it was there')[:2000]
+        if f'name="generator" content="{ANSWER_GENERATOR}"'.encode() not in head:
+            raise InputError(
+                f'{path}: is not of "remaster report"; name another folder with --out'
+            )
+    return _pdf_library() if pdf else None
+
+
+def answer_html(subject: Subject, drawings: dict[str, Markup], printing: bool = False) -> str:
+    """Return the page."""
+    inputs, answer = subject.inputs, subject.answer
+    fit = msgspec.to_builtins(inputs.fit)
+    found = msgspec.to_builtins(inputs.found) if inputs.found is not None else None
+    source = fit
+    if found is not None and answer.uses_causes:
+        source = fit | {key: found[key] for key in ('registration', 'markers', 'sampler')}
+        source |= {
+            'joint_offsets': found['joint_offsets_after'],
+            'noise': found['noise']['sensors'],
+        }
+    return page(
+        'answer.html.jinja',
+        generator=ANSWER_GENERATOR,
+        answer=answer,
+        session=inputs.session,
+        fit=fit,
+        found=found,
+        source=source,
+        how_sure=_how_sure(inputs, answer),
+        accuracy=accuracy_rows(inputs.fit.accuracy),
+        markers=marker_rows(source, inputs.session),
+        worst=worst_rows(inputs, answer),
+        measured=measured_when(inputs),
+        drawings=drawings,
+        printing=printing,
+    )
+
+
+def _chain(inputs: Inputs) -> SerialChain:
+    session = inputs.session
+    return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+
+
+def _how_sure(inputs: Inputs, answer: Answer) -> list[str]:
+    """Return what else matters: of the fit, of the model with causes, of the other session."""
+    judgement, found = inputs.judgement, inputs.found
+    answered = judgement.doubts if found is not None else []
+    lines = [] if answer.uses_causes else judgement.points
+    lines = [line for line in lines if line not in (*answered, *judgement.disagreements)]
+    if found is not None and isinstance(found.judgement, msgspec.Struct):
+        lines += found.judgement.points
+    return lines
+
+
+def measured_when(inputs: Inputs) -> str:
+    """Return the date of the measurement, from the session or from its times."""
+    stamps = inputs.session.measurements.stamp_s
+    if inputs.session.timed and (first := clock_time(float(stamps.min()))):
+        last = clock_time(float(stamps.max()))
+        return f'{first} to {last.removesuffix(first[8:])}'.strip()
+    return inputs.session.created
+
+
+def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
+    """Return the rows with the largest errors after the deed, the largest first."""
+    session, m = inputs.session, inputs.session.measurements
+    final = answer.final_mm
+    frames = registrations(inputs)
+    first = float(m.stamp_s.min())
+    gross = inputs.found.noise.outliers if inputs.found is not None else ()
+    left_out = {} if answer.uses_causes else inputs.fit_left_out
+    rows = []
+    for i in np.argsort(-final, kind='stable')[:WORST_ROWS]:
+        number, sensor = int(m.observation[i]), session.sensor_names[m.sensor[i]]
+        when = ''
+        if session.timed:
+            clock = clock_time(float(m.stamp_s[i]))[:8]
+            when = clock or f'{(m.stamp_s[i] - first) / 60.0:.1f} min'
+        remark = left_out.get(number, 'gross error' if number in gross else '')
+        rows.append(
+            WorstRow(
+                number,
+                int(m.pose[i]),
+                int(m.configuration[i]),
+                'held out' if m.is_validation[i] else 'fitted',
+                sensor,
+                when,
+                1e3 * apply(frames[sensor], m.position[i]),
+                float(inputs.before_mm[i]),
+                float(final[i]),
+                remark,
+            )
+        )
+    return rows
+
+
+def _copy_apply(source: Path, answer: Answer, folder: Path) -> None:
+    """Copy the files of the deed, so that the page can be handed on with them."""
+    make_folder(folder / APPLY_FOLDER)
+    for name in ALL_FILES:
+        # One of an earlier page would contradict this one.
+        (folder / APPLY_FOLDER / name).unlink(missing_ok=True)
+    for name in answer.files:
+        data = read_limited(source / name, FILE_LIMIT, 'fit or discover again, which write it')
+        write_atomically(folder / APPLY_FOLDER / name, data)
+
+
+def _figures_of(folder: Path, names: Sequence[str]) -> dict[str, str]:
+    """Return those figures of a fit or a discovery that are there."""
+    texts = {}
+    for name in names:
+        path = folder / 'figures' / f'{name}.svg'
+        if path.exists():
+            data = read_limited(path, FILE_LIMIT, 'it was there')
+            texts[name] = checked_svg(decode_text(data, path), path)
+    return texts
+
+
+# What Matplotlib draws with. A page runs nothing, and loads nothing, that a file brings along.
+SVG_ELEMENTS = {
+    *('svg', 'g', 'path', 'use', 'text', 'tspan', 'rect', 'clipPath', 'defs', 'style', 'title'),
+    *('metadata', 'line', 'circle', 'image', 'pattern', 'linearGradient', 'stop'),
+}
+
+
+def checked_svg(text: str, path: Path) -> str:
+    """Return a figure, refused where it holds more than a drawing.
+
+    Raises
+    ------
+    InputError
+        It is no SVG, or has scripts or addresses in it.
+    """
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError:
+        raise InputError(f'{path}: no SVG figure; fit or discover again') from None
+    for element in root.iter():
+        space, _, name = str(element.tag).rpartition('}')
+        drawn = name in SVG_ELEMENTS or not space.endswith('svg')
+        for key, value in element.attrib.items():
+            local = key.rpartition('}')[2].lower()
+            outside = local == 'href' and not value.startswith(('#', 'data:image/png;'))
+            drawn = drawn and not local.startswith('on') and not outside
+        if not drawn or (name == 'style' and re.search(r'@import|url\(', element.text or '')):
+            raise InputError(f'{path}: holds more than a drawing; fit or discover again')
+    return text
+
+
+def as_image(svg: str) -> Markup:
+    """Return a figure as an image of its own, in the colours of paper."""
+    data = base64.b64encode(svg.encode()).decode()
+    return Markup('<img alt="" src="data:image/svg+xml;base64,{}">').format(data)
+
+
+def _pdf_library() -> Any:
+    """Import the library that makes PDF; an `InputError` says how to get it."""
+    try:
+        import weasyprint
+    except ImportError:
+        raise InputError(f'--pdf needs WeasyPrint: {PDF_REMEDY}') from None
+    except OSError as error:
+        # Of its wheel everything but Pango, which draws text.
+        raise InputError(
+            f'--pdf: WeasyPrint lacks a library of the system ({str(error).splitlines()[0]}): '
+            'apt install libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0'
+        ) from None
+    # It warns of every rule of a style sheet that is for screens.
+    logging.getLogger('weasyprint').setLevel(logging.ERROR)
+    return weasyprint

@@ -1,0 +1,100 @@
+"""What a discovery is worth, in a headline: green where held-out poses bear it out, else amber."""
+
+from __future__ import annotations
+
+import msgspec
+
+from remaster_ros.discovery.confirmation import Confirmation
+from remaster_ros.discovery.confirmation_words import in_words
+from remaster_ros.discovery.discover import Discovery
+from remaster_ros.reports.discovery_schema import Discovered
+from remaster_ros.reports.effect_words import STEP
+from remaster_ros.reports.schemas import Judgement
+
+# Regions meant for 95 % of the held-out rows that hold clearly less than this are too small.
+FEWEST_INSIDE = 0.92
+TOO_SURE = (
+    ' Fewer held-out rows than should lie where they were predicted: something is left that the '
+    'model does not have.'
+)
+
+
+def judgement(
+    discovery: Discovery, confirmation: Confirmation | None, content: Discovered
+) -> Judgement:
+    """Judge what was found: 'good' where all data agree with the verdict, else 'caution'.
+
+    Parameters
+    ----------
+    discovery, confirmation
+        What was found.
+    content
+        The same as discovery.json has it.
+    """
+    sure = too_sure(content)
+    return Judgement(
+        mood='good' if _is_proven(discovery, confirmation) and not sure else 'caution',
+        headline=headline(discovery, confirmation) + (TOO_SURE if sure else ''),
+        points=in_words(discovery, confirmation) if confirmation is not None else [],
+    )
+
+
+def too_sure(content: Discovered) -> bool:
+    """Whether clearly fewer held-out rows lie in their 95 % regions than should."""
+    regions = content.predicted_regions95
+    if isinstance(regions, msgspec.UnsetType) or regions.held_out.interval95 is None:
+        return False
+    return regions.held_out.interval95[1] < FEWEST_INSIDE
+
+
+def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
+    """Whether poses that were never fitted, and the other session if there is one, agree."""
+    if discovery.verdict in ('undetermined', 'unexplained') or discovery.unexplained:
+        return False
+    if not discovery.fit.sampler.converged:
+        return False
+    if any(effect.form == STEP for effect in discovery.effects):
+        # What was measured before and after it does not agree.
+        return False
+    if confirmation is not None and not confirmation.same_offsets:
+        return False
+    if discovery.verdict == 'none':
+        return True
+    before, after = discovery.gain.held_out_rms_before_m, discovery.gain.held_out_rms_after_m
+    gains = before is not None and after is not None and after < before
+    return gains and (confirmation is None or confirmation.confirmed)
+
+
+def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> str:
+    """Return the result in one or a few sentences."""
+    gain = discovery.gain
+    change = ''
+    if gain.held_out_rms_before_m is not None and gain.held_out_rms_after_m is not None:
+        change = (
+            f' On poses it never fitted the error goes from '
+            f'{1e3 * gain.held_out_rms_before_m:.3f} to {1e3 * gain.held_out_rms_after_m:.3f} mm '
+            f'RMS; the noise alone is {1e3 * gain.noise_floor_m:.3f} mm.'
+        )
+    doubt = ''
+    if not discovery.fit.sampler.converged:
+        doubt = f' How uncertain the figures are is not known: {discovery.fit.sampler.message}.'
+    change += doubt
+    if discovery.verdict == 'none':
+        return f'Nothing is there beyond the zero-offsets and the noise.{doubt}'
+    if discovery.verdict == 'unexplained':
+        return f'Something is there that no cause explains.{change}'
+    count = len(discovery.effects)
+    causes = 'one cause' if count == 1 else f'{count} causes'
+    if discovery.verdict == 'undetermined':
+        return (
+            f'Something is there, but two explanations fit equally well: see which measurements '
+            f'would decide.{change}'
+        )
+    if confirmation is not None and not confirmation.confirmed:
+        change += f' The other session does not confirm {"it" if count == 1 else "them"}' + (
+            '.'
+            if confirmation.why
+            else f': its error is {1e3 * confirmation.rms_after_m:.3f} mm RMS with and '
+            f'{1e3 * confirmation.rms_before_m:.3f} mm without.'
+        )
+    return f'Beyond the zero-offsets there {"is" if count == 1 else "are"} {causes}.{change}'

@@ -1,0 +1,166 @@
+"""What a fit is worth, in a headline with its reasons: green, amber or red."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from remaster_ros.calibration.noise_check import NoiseCheck
+from remaster_ros.collection.reference_session import changes
+from remaster_ros.reports.schemas import Judgement
+
+if TYPE_CHECKING:
+    from remaster_ros.calibration.result import FitResult
+
+# Less than this is no gain a user would notice.
+NOTICEABLE_GAIN = 1.1
+
+
+def references(result: FitResult) -> tuple[int, list[str]]:
+    """Return the rounds of the references, and what changed in the session, a sentence each."""
+    rounds, found = changes(result.session, result.chain, result.T_R_N)
+    return rounds, [f'While it was measured, {change.describe()}.' for change in found]
+
+
+def verdict(result: FitResult) -> Judgement:
+    """Judge a fit: what was gained, whether the chains agree, what is not identifiable."""
+    validated = result.accuracy['validation'] is not None
+    split = 'validation' if validated else 'optimization'
+    metrics = result.accuracy[split]['post_registration']
+    before, after = metrics['before']['mean_mm'], metrics['after']['mean_mm']
+    gain = before / max(after, 1e-9)
+    where = 'on poses it never fitted' if validated else 'on the fitted poses'
+    change = f'{before:.3f} mm to {after:.3f} mm {where}'
+    unexplained = [check for check in result.noise_checks if not check.explained]
+    changes = references(result)[1]
+    spoilt = [check.spoilt for check in result.noise_checks if check.spoilt]
+    doubts = [_compared(check) for check in unexplained] + _structure(result)
+    disagreements = changes + spoilt
+    points = doubts + disagreements
+    doubtful = bool(unexplained) or result.other_errors
+    mood: Literal['good', 'caution', 'bad'] = 'caution'
+    if result.sampler.wandering and not result.sampler.converged:
+        mood = 'bad'
+        headline = (
+            'The chains have not converged, so nothing is decided yet: '
+            f'for now the mean position error goes from {change}.'
+        )
+    elif not result.sampler.converged and result.sampler.method != 'metropolis':
+        headline = (
+            'The data leave some parameters so open that their distribution is known only '
+            f'approximately. The mean position error goes from {change}.'
+        )
+        if doubtful:
+            headline += f' {_dominated(result, unexplained)}'
+    elif gain >= NOTICEABLE_GAIN:
+        times = f'{gain:.1f} times' if gain < 10 else f'{gain:.0f} times'
+        headline = f'The mean position error falls from {change}: {times} smaller.'
+        if doubtful:
+            headline += f' {_dominated(result, unexplained)}'
+        elif validated and not changes and not spoilt and result.sampler.converged:
+            mood = 'good'
+    elif gain > 1 / NOTICEABLE_GAIN:
+        headline = (
+            f'The zero-offsets hardly matter here: the mean position error goes from {change}. '
+            + (_dominated(result, unexplained) if doubtful else 'That is what noise explains.')
+        )
+    else:
+        mood = 'bad'
+        headline = f'The offsets make it worse: the mean position error goes from {change}.'
+    if result.implausible:
+        mood = 'bad'
+        headline += ' Do not apply the offsets yet: they are larger than a mastering is off by.'
+        points = [*result.implausible, *points]
+    if not validated:
+        points.append(
+            'There are no validation poses, so the gain is not proven: measure some and fit again.'
+        )
+    sampler = result.sampler
+    if sampler.converged and sampler.method == 'metropolis':
+        points.append(f'The chains agree with each other ({sampler.message}).')
+    elif sampler.converged:
+        points.append(f'The weighted draws pass their check ({sampler.message}).')
+    elif sampler.method != 'metropolis':
+        points.append(
+            f'Do not trust the uncertainties ({sampler.message}): measure poses that are spread '
+            'further and turn the tool, or state what is known of these parameters (--prior).'
+        )
+    elif sampler.wandering:
+        points.append(
+            f'Do not trust offsets or uncertainties ({sampler.message}); '
+            'fit again with more draws.'
+        )
+    else:
+        points.append(f'The chains agree, but are shorter than asked for ({sampler.message}).')
+    unknown = [
+        joint
+        for joint, known in zip(result.joint_names, result.identifiable, strict=True)
+        if not known
+    ]
+    count = len(result.joint_names)
+    if unknown:
+        points.append(
+            f'{count - len(unknown)} of {count} zero-offsets are measured. The data do not '
+            f'distinguish {" and ".join(unknown)} from something else; the table names it.'
+        )
+    else:
+        points.append(f'All {count} zero-offsets are measured.')
+    if result.left_out:
+        plural = 's are' if len(result.left_out) > 1 else ' is'
+        points.append(
+            f'{len(result.left_out)} observation{plural} left out as gross errors; '
+            'they are listed below.'
+        )
+    return Judgement(mood, headline, points, doubts, disagreements)
+
+
+def _structure(result: FitResult) -> list[str]:
+    """Return what the residuals follow, and what that does to the intervals."""
+    found = result.structure.found if result.structure is not None else ()
+    lines = [f'{test.words} ({test.chance}).'.capitalize() for test in found]
+    if np.any(result.widening > 1.0):
+        lines.append(
+            'The standard deviations and intervals of the offsets include what the model leaves '
+            f'out: they are up to {np.max(result.widening):.1f} times as wide as without it.'
+        )
+    return lines
+
+
+def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
+    """Return why the error after is no success, and what to do."""
+    if not result.other_errors:
+        return 'Whether noise explains what is left, this session cannot show.'
+    if not any(check.noise_m is not None for check in unexplained):
+        return (
+            'But what is left has structure, which noise has not: other errors dominate; '
+            'run "remaster discover".'
+        )
+    return (
+        'But noise does not explain what is left: other errors dominate; run "remaster discover".'
+    )
+
+
+def _compared(check: NoiseCheck) -> str:
+    """Return the figures of a sensor whose error noise does not explain."""
+    if check.noise_error_m is None:
+        return (
+            f'{check.sensor}: no reading has a standard deviation, and no pose was seen in two '
+            f'joint solutions, so nothing shows how much of the {1e3 * check.error_m:.3f} mm is '
+            'noise: measure poses in all their joint solutions.'
+        )
+    sources = [
+        f'{1e3 * std:.3f} mm per axis {what}'
+        for std, what in (
+            (check.stated_m, 'stated by the sensor'),
+            (check.within_m, 'within a pose'),
+        )
+        if std is not None
+    ]
+    return (
+        f'{check.sensor}: the error after is {1e3 * check.error_m:.3f} mm; noise '
+        f'({", ".join(sources)}) makes {1e3 * check.noise_error_m:.3f} mm. A sensor or base that '
+        'was moved during the session, a soft joint or a worn gear leave such errors, and the '
+        'offsets take up a part of them.'
+    )

@@ -1,0 +1,368 @@
+"""Web server of the live page: fixed files, the view as JSON, and four commands.
+
+Whoever may command here lets an arm move, so every request is judged as if it came from somebody
+who is not meant to:
+
+- Host has to be a name of this server (a foreign page that has its own name resolve to this
+  address is refused), and Origin, which every command needs, this server's own.
+- View, scene and commands need the token in the header Authorization. No cookie is set: browsers
+  would send it with requests of other pages, and to servers on other ports of this address. The
+  token stands behind the # of the page's address, which browsers never send.
+- ``collect`` also names the view that the person has seen. A request that was held up on its way,
+  or that belongs to another state of the collection, is refused.
+- Nothing is written, no path comes from a request, bodies are small, no page may frame this one,
+  and no script runs here but the ones of this package.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import hmac
+import importlib.resources
+import ipaddress
+import json
+import os
+import re
+import socket
+import ssl
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import msgspec
+from tornado.httpserver import HTTPServer
+from tornado.web import Application, HTTPError, RequestHandler
+
+from remaster_ros.errors import InputError
+from remaster_ros.reports.scene_view import view_script
+
+COMMANDS = ('collect', 'pause', 'stop', 'fit')
+FRESH_S = 3.0
+"""A view that is older has not been seen just now."""
+ANSWER_S = 5.0
+"""So long a command is waited for."""
+WATCHED_S = 5.0
+LARGEST_BODY = 1024
+Done = Callable[[bool, str], None]
+Send = Callable[[str, Done], None]
+
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'"
+)
+_HEADERS = {
+    'Content-Security-Policy': _POLICY,
+    'X-Frame-Options': 'DENY',
+    'X-Content-Type-Options': 'nosniff',
+    'Referrer-Policy': 'no-referrer',
+    'Cross-Origin-Resource-Policy': 'same-origin',
+    'Cross-Origin-Opener-Policy': 'same-origin',
+    'Cache-Control': 'no-store',
+}
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the page is served.
+
+    Attributes
+    ----------
+    address, port
+        The IP address to listen on, and the port; 0 for any free one.
+    names
+        Names of this computer by which a browser may ask besides the address.
+    certificate, key
+        PEM files for https; an address that other computers reach needs them.
+    """
+
+    address: str = '127.0.0.1'
+    port: int = 0
+    names: tuple[str, ...] = ()
+    certificate: str = ''
+    key: str = ''
+
+
+class Seen(msgspec.Struct, forbid_unknown_fields=True):
+    """What a person has seen who lets the arm move: number and mark of the view."""
+
+    view: int
+    seen: str
+
+
+class LiveServer:
+    """Serves the page in a thread of its own.
+
+    Parameters
+    ----------
+    place
+        Where.
+    token
+        What view and commands ask for.
+    scene
+        The fixed part of the 3-D view, JSON.
+    send
+        Called in the server's thread with the name of a command and with what takes its outcome,
+        from any thread: whether it was done, and a line for the person.
+
+    Raises
+    ------
+    InputError
+        The address or the certificate cannot be used.
+    """
+
+    def __init__(self, place: Place, token: str, scene: bytes, send: Send) -> None:
+        self.token, self.scene, self.send = token, gzip.compress(scene), send
+        self._tls = _tls(place)
+        self._socket = _listen(place)
+        self.port = self._socket.getsockname()[1]
+        self.scheme = 'http' if self._tls is None else 'https'
+        self.hosts = _hosts(place, self.port)
+        self.files = _files()
+        self._seen, self._view = '', b'null'
+        self._issued: deque[tuple[int, float]] = deque([(0, float('-inf'))], maxlen=100)
+        self._asked_s, self._used = float('-inf'), 0
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    @property
+    def url(self) -> str:
+        """The address of the page, with the token."""
+        return f'{self.scheme}://{self.hosts[0]}/#token={self.token}'
+
+    @property
+    def watched(self) -> bool:
+        """Whether somebody has asked for the view within the last seconds."""
+        return time.monotonic() - self._asked_s < WATCHED_S
+
+    def publish(self, view: dict[str, Any]) -> None:
+        """Show a view from now on; its ``seen`` is the mark that `collect` has to name."""
+        content = msgspec.json.encode(view)  # NaN becomes null, which browsers read.
+        self._loop.call_soon_threadsafe(self._show, content, str(view['seen']))
+
+    def _show(self, content: bytes, seen: str) -> None:
+        self._issued.append((self._issued[-1][0] + 1, time.monotonic()))
+        self._view, self._seen = content, seen
+
+    def view(self) -> bytes:
+        """Return the view as JSON, with its number and age."""
+        self._asked_s = time.monotonic()
+        number, issued_s = self._issued[-1]
+        age_s = min(self._asked_s - issued_s, 1e6)
+        return b'{"number":%d,"age_s":%.2f,"view":%s}' % (number, age_s, self._view)
+
+    def refusal(self, seen: Seen) -> str:
+        """Return why a person who has seen this must look again before the arm moves; ''."""
+        issued = dict(self._issued).get(seen.view, float('-inf'))
+        if time.monotonic() - issued > FRESH_S or seen.view <= self._used:
+            return 'the page was not up to date; look again'
+        if not hmac.compare_digest(seen.seen.encode(), self._seen.encode()):
+            return 'the collection has changed meanwhile; look again'
+        # A request that comes twice counts once.
+        self._used = seen.view
+        return ''
+
+    def close(self) -> None:
+        """End the server and its thread."""
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(5.0)
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        application = Application(
+            [
+                (r'/view', _View, {'server': self}),
+                (r'/scene', _Scene, {'server': self}),
+                (r'/command/([a-z]+)', _Command, {'server': self}),
+                *(('/' + re.escape(name), _File, {'server': self}) for name in self.files),
+            ],
+            default_handler_class=_Nothing,
+            default_handler_args={'server': self},
+            log_function=lambda handler: None,
+        )
+        server = HTTPServer(
+            application,
+            ssl_options=self._tls,
+            max_body_size=LARGEST_BODY,
+            max_buffer_size=16 * LARGEST_BODY,
+            max_header_size=8 * LARGEST_BODY,
+            idle_connection_timeout=30.0,
+            body_timeout=5.0,
+        )
+        server.add_socket(self._socket)
+        try:
+            self._loop.run_forever()
+        finally:
+            server.stop()
+            self._loop.run_until_complete(server.close_all_connections())
+            self._loop.close()
+
+
+class _Handler(RequestHandler):
+    """Refuses what does not come from the page of this server."""
+
+    SUPPORTED_METHODS = ('GET', 'HEAD', 'POST')  # type: ignore[assignment]
+
+    def initialize(self, server: LiveServer) -> None:
+        self._server = server
+
+    def set_default_headers(self) -> None:
+        self.clear_header('Server')
+        for name, value in _HEADERS.items():
+            self.set_header(name, value)
+
+    def prepare(self) -> None:
+        headers, server = self.request.headers, self._server
+        hosts, origins = headers.get_list('Host'), headers.get_list('Origin')
+        if len(hosts) != 1 or hosts[0].lower() not in server.hosts:
+            raise HTTPError(421, reason='not a name of this server')
+        own = f'{server.scheme}://{hosts[0].lower()}'
+        if self.request.method == 'POST' and not origins:
+            raise HTTPError(403, reason='a command needs the header Origin')
+        if origins and origins != [own]:
+            raise HTTPError(403, reason='the request comes from another page')
+
+    def write_error(self, status_code: int, **_: Any) -> None:
+        self.set_header('Content-Type', 'application/json')
+        self.finish(json.dumps({'done': False, 'message': self._reason}))
+
+    def _packed(self, content: bytes, kind: str) -> None:
+        """Answer with content that is compressed already."""
+        self.set_header('Content-Type', kind)
+        self.set_header('Content-Encoding', 'gzip')
+        self.finish(content)
+
+
+class _File(_Handler):
+    def get(self) -> None:
+        self._packed(*self._server.files[self.request.path.removeprefix('/')])
+
+
+class _Nothing(_Handler):
+    def prepare(self) -> None:
+        super().prepare()
+        raise HTTPError(404, reason='there is no such page')
+
+
+class _WithToken(_Handler):
+    def prepare(self) -> None:
+        super().prepare()
+        given = self.request.headers.get_list('Authorization')
+        wanted = f'Bearer {self._server.token}'
+        if len(given) != 1 or not hmac.compare_digest(given[0].encode(), wanted.encode()):
+            raise HTTPError(401, reason='open the page by the address that remaster watch gives')
+
+
+class _View(_WithToken):
+    def get(self) -> None:
+        self.set_header('Content-Type', 'application/json')
+        self.finish(self._server.view())
+
+
+class _Scene(_WithToken):
+    def get(self) -> None:
+        self._packed(self._server.scene, 'application/json')
+
+
+class _Command(_WithToken):
+    async def post(self, name: str) -> None:
+        if name not in COMMANDS:
+            raise HTTPError(404, reason='there is no such command')
+        if name == 'collect':
+            try:
+                seen = msgspec.json.decode(self.request.body, type=Seen)
+            except msgspec.MsgspecError:
+                raise HTTPError(400, reason='collect needs view and seen') from None
+            if refusal := self._server.refusal(seen):
+                raise HTTPError(409, reason=refusal)
+        loop = asyncio.get_running_loop()
+        outcome: asyncio.Future[tuple[bool, str]] = loop.create_future()
+
+        def done(success: bool, message: str) -> None:
+            loop.call_soon_threadsafe(_set, outcome, (success, message))
+
+        self._server.send(name, done)
+        try:
+            success, message = await asyncio.wait_for(outcome, ANSWER_S)
+        except TimeoutError:
+            if name != 'fit':
+                raise HTTPError(504, reason=f'no answer to {name} for {ANSWER_S:g} s') from None
+            success, message = True, 'fitting'
+        self.finish({'done': success, 'message': message})
+
+
+def _set(future: asyncio.Future[tuple[bool, str]], outcome: tuple[bool, str]) -> None:
+    if not future.done():
+        future.set_result(outcome)
+
+
+def _listen(place: Place) -> socket.socket:
+    try:
+        address = ipaddress.ip_address(place.address)
+    except ValueError:
+        raise InputError(
+            f'live page: address {place.address!r} is no IP address, such as 127.0.0.1'
+        ) from None
+    if not address.is_loopback and not place.certificate:
+        raise InputError(
+            f'live page: {place.address} can be reached from other computers, and without https '
+            'the token could be read on the way: give certificate and key, or leave the address '
+            'and use ssh -L PORT:127.0.0.1:PORT from there'
+        )
+    try:
+        family = socket.AF_INET6 if address.version == 6 else socket.AF_INET
+        found = socket.create_server((place.address, place.port), family=family)
+    except OSError as error:
+        raise InputError(
+            f'live page: {place.address} port {place.port}: {os.strerror(error.errno or 0)}; give '
+            'another port'
+        ) from None
+    found.setblocking(False)
+    return found
+
+
+def _tls(place: Place) -> ssl.SSLContext | None:
+    if not place.certificate:
+        return None
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    try:
+        context.load_cert_chain(place.certificate, place.key or None)
+    except (OSError, ssl.SSLError) as error:
+        raise InputError(f'live page: certificate {place.certificate}: {error}') from None
+    return context
+
+
+def _hosts(place: Place, port: int) -> tuple[str, ...]:
+    """Return what the header Host may be; the first one stands in the page's address."""
+    address = ipaddress.ip_address(place.address)
+    shown = f'[{address}]' if address.version == 6 else str(address)
+    names = [*place.names]
+    if not address.is_unspecified:
+        names.append(shown)
+    if address.is_loopback or address.is_unspecified:
+        names += ['localhost', '127.0.0.1']
+    return tuple(f'{name.lower()}:{port}' for name in dict.fromkeys(names))
+
+
+@cache
+def _files() -> dict[str, tuple[bytes, str]]:
+    """Return the page's files by name, compressed, with their types."""
+    folder = importlib.resources.files(__package__).joinpath('live_page')
+    plotly = importlib.resources.files('plotly').joinpath('package_data', 'plotly.min.js')
+    script = 'text/javascript; charset=utf-8'
+    found = {
+        '': (folder.joinpath('index.html'), 'text/html; charset=utf-8'),
+        'page.js': (folder.joinpath('page.js'), script),
+        'scene.js': (folder.joinpath('scene.js'), script),
+        'page.css': (folder.joinpath('page.css'), 'text/css; charset=utf-8'),
+        'plotly.js': (plotly, script),
+    }
+    texts = {name: (path.read_bytes(), kind) for name, (path, kind) in found.items()}
+    texts['robot_view.js'] = view_script().encode(), script
+    return {name: (gzip.compress(text, 6), kind) for name, (text, kind) in texts.items()}

@@ -1,0 +1,375 @@
+"""State of the live page: what the nodes publish in, a view for people out. No ROS, no clock.
+
+Every text that a view holds came over the network: it is clipped here and shown as text there.
+Which commands a view offers is for the eye; what they do is decided by the nodes that serve them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from remaster_ros.collection import events
+from remaster_ros.collection.live_residuals import LiveResiduals
+from remaster_ros.collection.pace import Pace, minutes_text
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.reports.live_facts import FitFacts, Precision
+from remaster_ros.types import FloatArray
+
+SILENT_S = 3.0
+"""A node that was not heard for longer counts as gone."""
+LONGEST_TEXT = 400
+MOST_NODES = 30
+MOST_MESSAGES = 40
+MOST_POINTS = 400
+LONGEST_WAY = 200
+UNDETERMINED_RAD = 0.0873
+"""5 degrees: what the fit assumes of a zero-offset before it has seen anything."""
+SHOWN_COUNTS = ('phase', 'poses_done', 'poses', 'configurations_done', 'configurations')
+PLANNER, BRIDGE, RECORDER, OPTIMIZER = 'pose_planner', 'robot_bridge', 'recorder', 'optimizer'
+NODES = (PLANNER, BRIDGE, RECORDER, OPTIMIZER)
+STOP_LABEL = 'Stop the collection'
+STOP_NOTE = (
+    'No emergency stop: it asks the planner over the network. In danger use the red button.'
+)
+
+
+@dataclass
+class _Node:
+    level: str = ''
+    message: str = ''
+    heard_s: float = float('-inf')
+
+
+class LiveView:
+    """What is known of a collection.
+
+    Parameters
+    ----------
+    chain
+        The arm.
+    markers
+        Sensor -> its markers -> their positions in the tool frame, m, (3,).
+
+    Attributes
+    ----------
+    registration
+        Where registered sensors stand, sensor -> (4, 4).
+    residuals
+        Of the markers.
+    """
+
+    def __init__(
+        self, chain: SerialChain, markers: Mapping[str, Mapping[str, FloatArray]]
+    ) -> None:
+        self._chain, self._sensors = chain, tuple(markers)
+        self.residuals = LiveResiduals(chain, markers)
+        self._pace = Pace()
+        self._nodes = {name: _Node() for name in NODES}
+        self._values: dict[str, str] = {}
+        self._planner: events.PlannerState | None = None
+        self._bridge: events.BridgeState | None = None
+        self._recorder: events.RecorderState | None = None
+        self._reports: dict[str, events.SensorReport] = {}
+        self._messages: deque[tuple[float, str]] = deque(maxlen=MOST_MESSAGES)
+        self._plan = ''
+        self._open: dict[tuple[str, int], FloatArray] = {}
+        self._q: FloatArray | None = None
+        self._target: FloatArray | None = None
+        self._way: FloatArray = np.empty((0, 3))
+        self.registration: dict[str, FloatArray] = {}
+        self._precision = Precision()
+        self._offsets: Mapping[str, tuple[float, float]] = {}
+        self._fit = FitFacts()
+
+    # What comes in
+
+    def take_summary(
+        self, node: str, level: str, message: str, values: Mapping[str, str], now_s: float
+    ) -> None:
+        """Take what a node shows to people (a status of /remaster/status)."""
+        if node not in self._nodes and len(self._nodes) >= MOST_NODES:
+            return
+        self._nodes[node] = _Node(level, _clip(message), now_s)
+        if node == PLANNER:
+            self._values = {name: _clip(values.get(name, '')) for name in SHOWN_COUNTS}
+            running = self._planner is not None and self._planner.state == 'running'
+            self._pace.update(self._count('configurations_done'), now_s, running=running)
+
+    def take(self, body: events.State | events.Event, now_s: float) -> None:
+        """Take a record of /remaster/events."""
+        match body:
+            case events.PlannerState():
+                self._planner = body
+            case events.BridgeState():
+                self._bridge = body
+            case events.RecorderState():
+                self._recorder = body
+            case events.SensorReport(sensor=sensor) if sensor in self._sensors:
+                self._reports[sensor] = body
+            case events.TourPlanned(description):
+                self._plan = _clip(description)
+            case events.SolutionSettled(stamp=stamp, solution=solution) if self._q is not None:
+                self._open = {(stamp, solution): self._q}
+                self.residuals.settled(self._q)
+            case events.ConfigurationEnded():
+                self._end(body, now_s)
+            case _:
+                self._tell(body, now_s)
+
+    def _end(self, end: events.ConfigurationEnded, now_s: float) -> None:
+        recorded = end.result in ('recorded', 'partial')
+        q = self._open.pop((end.stamp, end.solution), None)
+        self.residuals.ended(recorded=recorded and q is not None)
+        if end.result != 'recorded':
+            self._messages.append((now_s, _clip(f'configuration {end.result}: {end.reason}')))
+
+    def _tell(self, body: events.State | events.Event, now_s: float) -> None:
+        match body:
+            case events.SolutionFailed(reason=reason):
+                text = f'configuration failed: {reason}'
+            case events.ArmStopped(reason=reason):
+                text = f'the arm was stopped: {reason}'
+            case events.ArmHalted(reason=reason):
+                text = f'the arm is halted: {reason}'
+            case events.HaltCleared():
+                text = 'a person has cleared the halt'
+            case events.SetupChanged(text=change):
+                text = f'changed since the reference: {change}'
+            case _:
+                return
+        self._messages.append((now_s, _clip(text)))
+
+    def take_joints(self, q: FloatArray) -> None:
+        """Take where the arm is, rad, (k,)."""
+        if np.all(np.isfinite(q)):
+            self._q = q
+
+    def take_target(self, T_R_T: FloatArray) -> None:
+        """Take the pose of the tool that the arm goes to, (4, 4)."""
+        if np.all(np.isfinite(T_R_T)):
+            self._target = T_R_T
+
+    def take_way(self, way: FloatArray) -> None:
+        """Take the configurations that the arm goes through next, rad, (n, k)."""
+        if np.all(np.isfinite(way)):
+            self._way = tool_path(self._chain, way[:LONGEST_WAY])
+
+    def take_registration(self, sensor: str, T_R_N: FloatArray) -> None:
+        """Take where a sensor stands, (4, 4)."""
+        if sensor in self._sensors and np.all(np.isfinite(T_R_N)):
+            self.registration[sensor] = T_R_N
+
+    def take_offsets(self, means: Mapping[str, float], stds: Mapping[str, float]) -> None:
+        """Take the zero-offsets of a fit and their standard deviations, joint -> rad."""
+        names = self._chain.joint_names
+        values = [by_name.get(name, np.nan) for by_name in (means, stds) for name in names]
+        if np.all(np.isfinite(values)):
+            self._offsets = {name: (means[name], stds[name]) for name in names}
+            self.residuals.use_offsets(np.array([means[name] for name in names]))
+
+    def take_fit(self, fit: FitFacts) -> None:
+        """Take what else is known of the fit whose offsets were taken."""
+        self._fit = fit
+        self.residuals.use_markers(fit.markers)
+
+    def take_precision(self, text: str) -> None:
+        """Take what is known so far (JSON of /remaster/precision); errors as of msgspec."""
+        self._precision = msgspec.json.decode(text, type=Precision)
+
+    # What goes out
+
+    def view(self, now_s: float) -> dict[str, Any]:
+        """Return what the page shows now, of plain types."""
+        return {
+            'run': self._run(now_s),
+            'halted': _clip(self._bridge.halted) if self._bridge else '',
+            'changed': _clip(self._recorder.changed) if self._recorder else '',
+            'nodes': self._node_rows(now_s),
+            'sensors': [self._sensor_row(name) for name in self._sensors],
+            'precision': self._precision_table(),
+            'result': self._result(),
+            'messages': [
+                {'age_s': now_s - then, 'text': text} for then, text in reversed(self._messages)
+            ],
+            'commands': self._commands(now_s),
+            'seen': self.seen(now_s),
+            'scene': self._scene(),
+        }
+
+    def seen(self, now_s: float) -> str:
+        """Return a mark of what a person must have seen who lets the arm move.
+
+        It is another one as soon as the state of the run, a halt, a change of the set-up or
+        whether the planner is heard is another.
+        """
+        silent = self._silent(PLANNER, now_s)
+        state = self._planner.state if self._planner else ''
+        halted = self._bridge.halted if self._bridge else ''
+        changed = self._recorder.changed if self._recorder else ''
+        what = '\0'.join((str(silent), state, halted, changed))
+        return hashlib.sha256(what.encode()).hexdigest()[:16]
+
+    def _silent(self, node: str, now_s: float) -> bool:
+        return now_s - self._nodes[node].heard_s > SILENT_S
+
+    def _count(self, name: str) -> int:
+        try:
+            return int(self._values.get(name, '0'))
+        except ValueError:
+            return 0
+
+    def _run(self, now_s: float) -> dict[str, Any]:
+        done, of = self._count('configurations_done'), self._count('configurations')
+        phase = self._values.get('phase', '')
+        collecting = phase == 'collection' and of > 0
+        silent = self._silent(PLANNER, now_s)
+        state = _clip(self._planner.state) if self._planner else ''
+        message = self._nodes[PLANNER].message
+        waiting = _clip(self._recorder.waiting_for) if self._recorder else ''
+        left_s = self._pace.left_s(of - done) if collecting and state != 'complete' else None
+        return {
+            'state': 'silent' if silent else state,
+            'message': 'no sign of pose_planner' if silent else message,
+            'waiting_for': waiting,
+            'phase': phase,
+            'poses_done': self._count('poses_done'),
+            'poses': self._count('poses'),
+            'done': done if collecting else 0,
+            'of': of if collecting else 0,
+            'left': minutes_text(left_s),
+            'plan': self._plan,
+        }
+
+    def _node_rows(self, now_s: float) -> list[dict[str, Any]]:
+        rows = []
+        for name, node in self._nodes.items():
+            age_s = now_s - node.heard_s
+            if age_s > SILENT_S:
+                seen = f'silent for {age_s:.0f} s' if np.isfinite(age_s) else 'not seen yet'
+                rows.append({'name': _clip(name), 'level': 'error', 'message': seen})
+            else:
+                row = {'name': _clip(name), 'level': node.level, 'message': node.message}
+                rows.append(row)
+        return rows
+
+    def _sensor_row(self, name: str) -> dict[str, Any]:
+        report = self._reports.get(name)
+        ages = self._recorder.read_age_s if self._recorder else {}
+        norms = 1e3 * self.residuals.norms_m(name)
+        return {
+            'name': name,
+            'ready': bool(report and report.ready),
+            'hidden': bool(report and report.hidden),
+            'message': _clip(report.trouble or report.message) if report else 'not seen yet',
+            'read_age_s': ages.get(name),
+            'registered': name in self.registration,
+            'residuals_mm': _rounded(norms[-MOST_POINTS:], 3),
+            'median_mm': float(np.median(norms)) if len(norms) else None,
+            'corrected': self.residuals.corrected,
+        }
+
+    def _precision_table(self) -> dict[str, Any]:
+        """Return the standard deviations by configurations and minutes."""
+        looks = self._precision.looks[-MOST_POINTS:]
+        return {
+            'message': _clip(self._precision.message),
+            'configurations': [look.configurations for look in looks],
+            'minutes': [look.minutes for look in looks],
+            'std_deg': {
+                name: [look.joint_std_deg.get(name) for look in looks]
+                for name in self._chain.joint_names
+            },
+        }
+
+    def _result(self) -> dict[str, Any]:
+        return {
+            'joints': [
+                {
+                    'joint': name,
+                    'mean_deg': _degrees(mean),
+                    'std_deg': None if name in self._fit.unidentifiable else _determined(std),
+                }
+                for name, (mean, std) in self._offsets.items()
+            ],
+            'fit': dict(self._fit.shown),
+        }
+
+    def _commands(self, now_s: float) -> dict[str, dict[str, Any]]:
+        """Return what each command is called, whether it is of use now, and why not."""
+        silent = self._silent(PLANNER, now_s)
+        state = self._planner.state if self._planner else ''
+        halted = bool(self._bridge and self._bridge.halted)
+        why = 'the planner is silent' if silent else ''
+        if not why and halted:
+            why = 'the arm is halted'
+        if not why and state not in ('idle', 'paused', 'stopped'):
+            why = _clip(f'the collection is {state}')
+        begun = self._count('configurations_done') or self._count('poses_done')
+        measured = bool(self._recorder and self._recorder.observations)
+        idle = state not in ('running', 'held')
+        return {
+            'collect': {
+                'label': 'Go on' if begun else 'Begin the collection',
+                'on': not why,
+                'note': why or 'the arm moves',
+            },
+            'pause': {'label': 'Pause', 'on': not silent and not idle, 'note': ''},
+            'stop': {'label': STOP_LABEL, 'on': True, 'note': STOP_NOTE},
+            'fit': {'label': 'Fit', 'on': idle and measured, 'note': ''},
+        }
+
+    def _scene(self) -> dict[str, Any]:
+        q, target = self._q, self._target
+        return {
+            'q': None if q is None else _rounded(q, 6),
+            # By rows.
+            'target': None if target is None else _rounded(target.ravel(), 5),
+            'way': _rounded(self._way, 4),
+            'sensors': {name: _rounded(T[:3, 3], 3) for name, T in self.registration.items()},
+            'points': {
+                name: _rounded(self.residuals.points_R(name)[-MOST_POINTS:], 4)
+                for name in self._sensors
+            },
+        }
+
+
+def tool_path(chain: SerialChain, way: FloatArray, steps: int = 12) -> FloatArray:
+    """Return where the tool goes along straight lines between configurations, m, (m, 3).
+
+    Parameters
+    ----------
+    way
+        The configurations, rad, (n, k).
+    steps
+        Points for each line.
+    """
+    if len(way) < 2:
+        return np.empty((0, 3))
+    share = np.linspace(0.0, 1.0, steps)[:, None]
+    lines = [a + share * (b - a) for a, b in pairwise(way)]
+    return chain.positions(np.concatenate(lines), np.zeros(3))
+
+
+def _clip(text: str) -> str:
+    return text if len(text) <= LONGEST_TEXT else f'{text[: LONGEST_TEXT - 1]}…'
+
+
+def _determined(std: float | None) -> float | None:
+    """Return a standard deviation in degrees; None as long as nearly nothing is known."""
+    return _degrees(std) if std is not None and std < UNDETERMINED_RAD else None
+
+
+def _degrees(radians: float | None) -> float | None:
+    return None if radians is None else round(float(np.degrees(radians)), 6)
+
+
+def _rounded(values: FloatArray | Sequence[float], digits: int) -> Any:
+    return np.round(np.asarray(values, dtype=float), digits).tolist()

@@ -1,0 +1,199 @@
+"""A planned collection as one page: the arm in 3-D with every way and configuration, and figures.
+
+The page is complete in itself: nothing is fetched when it is opened.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.motion.trajectory import RAMP_S, REST_S
+from remaster_ros.planning.collection_plan import FITTED, CollectionPlan
+from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
+from remaster_ros.reports.plan_json import HELD_OUT, minutes_text, missed_goal
+from remaster_ros.reports.robot_scene import RobotScene
+from remaster_ros.reports.scene_view import compressed, scene_to_dict, view_script
+from remaster_ros.session.files import make_folder, write_atomically
+from remaster_ros.version import __version__
+
+GENERATOR = 'remaster plan'
+WORDS = {
+    REGISTRATION: ('for the registration', 'the first three that are seen register the sensors'),
+    FITTED: ('to fit', 'the offsets are fitted on these'),
+    HELD_OUT: ('held out', 'the gain is proved on these, which nothing is fitted on'),
+    REFERENCE: ('references', 'measured again and again, so that what moves meanwhile is seen'),
+}
+
+
+def plan_page(
+    plan: CollectionPlan,
+    scene: RobotScene,
+    cell: str,
+    *,
+    registered: bool = False,
+    confirm: str = '',
+) -> str:
+    """Return the page.
+
+    Parameters
+    ----------
+    plan
+        What is going to be done.
+    scene
+        The arm and all around it.
+    cell
+        What the cell is called.
+    registered
+        Whether the sensors are where they were measured, not at their rough places.
+    confirm
+        Name of the plan where the arm waits until it is confirmed.
+    """
+    # Only here: it brings the libraries of figures.
+    from remaster_ros.reports.pages import page
+
+    minutes = minutes_text(plan.robot_time_s)
+    poses = len({(visit.split, visit.pose) for visit in plan.visits if visit.split != REFERENCE})
+    moving_s = plan.robot_time_s - plan.measuring_s * len(plan.visits)
+    fastest = max(range(len(plan.visits)), key=lambda i: plan.visits[i].tool_speed_m_s)
+    return page(
+        'plan.html.jinja',
+        generator=GENERATOR,
+        robot=scene.chain.name,
+        cell=cell,
+        registered=registered,
+        confirm=confirm,
+        mood='caution' if missed_goal(plan) or plan.undetermined else 'good',
+        headline=(
+            f'{len(plan.visits)} configurations at {poses} poses in {minutes} of robot time; no '
+            f'point of arm and tool faster than {plan.max_tool_speed_m_s:.2f} m/s.'
+        ),
+        moving=minutes_text(moving_s),
+        measuring_s=f'{plan.measuring_s:g}',
+        fastest=fastest + 1,
+        undetermined=plan.undetermined,
+        points=_points(plan),
+        sensors=[
+            (number, sight.sensor)
+            for number, sight in enumerate(scene.sights)
+            if sight.sensor not in [other.sensor for other in scene.sights[:number]]
+        ],
+        notes=scene.notes,
+        splits=_splits(plan),
+        visits=len(plan.visits),
+        dropped=_dropped(plan),
+        joints=_joints(plan, scene.chain),
+        rms_deg=float(np.degrees(plan.joint_rms)),
+        tool_mm=1e3 * plan.tool_rms,
+        version=__version__,
+        data=compressed(json.dumps(_played(plan, scene), separators=(',', ':'), allow_nan=False)),
+        code=compressed(view_script('plan_page.js')),
+    )
+
+
+def check_plan_page(path: Path) -> None:
+    """Refuse a file that is there and is no page of a plan: `InputError`."""
+    if not path.exists():
+        return
+    if path.is_file():
+        with path.open('rb') as file:
+            if f'content="{GENERATOR}"'.encode() in file.read(2000):
+                return
+    raise InputError(f'{path}: already there, and no page of {GENERATOR}; give another name')
+
+
+def write_plan_page(path: Path, html: str) -> None:
+    """Write the page, also over one that was written before, but over nothing else.
+
+    Raises
+    ------
+    InputError
+        Something else is there, or it cannot be written.
+    """
+    check_plan_page(path)
+    make_folder(path.parent)
+    write_atomically(path, html)
+
+
+def _points(plan: CollectionPlan) -> list[str]:
+    """Return what asks for attention."""
+    points = [missed_goal(plan)]
+    if plan.undetermined:
+        points.append(f'A fit of these configurations states nothing: {plan.undetermined}')
+    if plan.unreached:
+        points.append(f'No free way leads to {plan.unreached} configurations: they are left out')
+    return [point for point in points if point]
+
+
+def _splits(plan: CollectionPlan) -> list[dict[str, Any]]:
+    rows = []
+    for split, (words, why) in WORDS.items():
+        visits = [visit for visit in plan.visits if visit.split == split]
+        if visits:
+            poses = len({visit.pose for visit in visits})
+            rows.append(
+                {'split': split, 'words': words, 'why': why, 'poses': poses, 'visits': len(visits)}
+            )
+    return rows
+
+
+def _dropped(plan: CollectionPlan) -> list[dict[str, Any]]:
+    """Return why poses and configurations were dropped, the most frequent reason first."""
+    poses, solutions = plan.tour.dropped, plan.dropped
+    rows = [
+        {'reason': reason, 'poses': poses.get(reason, 0), 'solutions': solutions.get(reason, 0)}
+        for reason in {**poses, **solutions}
+    ]
+    return sorted(rows, key=lambda row: -max(row['poses'], row['solutions']))
+
+
+def _joints(plan: CollectionPlan, chain: SerialChain) -> list[dict[str, Any]]:
+    q = np.degrees([visit.q for visit in plan.visits])
+    return [
+        {
+            'name': name,
+            'std': None if std is None else float(np.degrees(std)),
+            'low': float(q[:, joint].min()),
+            'high': float(q[:, joint].max()),
+            'limits': _limits(chain.lower[joint], chain.upper[joint]),
+        }
+        for joint, name in enumerate(chain.joint_names)
+        for std in (plan.joint_std.get(name),)
+    ]
+
+
+def _limits(lower: float, upper: float) -> str:
+    if not np.isfinite([lower, upper]).all():
+        return 'none'
+    return f'{np.degrees(lower):.0f} to {np.degrees(upper):.0f}'.replace('-', '\N{MINUS SIGN}')
+
+
+def _played(plan: CollectionPlan, scene: RobotScene) -> dict[str, Any]:
+    """Return what plan_page.js plays: angles in rad, times in s."""
+    return {
+        'scene': scene_to_dict(scene),
+        'start': _rounded(plan.visits[0].points[0]),
+        'ramp_s': RAMP_S,
+        'rest_s': REST_S,
+        'measuring_s': plan.measuring_s,
+        'words': {split: words for split, (words, _) in WORDS.items()},
+        'visits': [
+            {
+                'split': visit.split,
+                'pose': visit.pose,
+                'way': [_rounded(q) for q in visit.points[1:]],
+                'rates': [round(line.rate, 6) for line in visit.trajectory.lines],
+                'speed': round(visit.tool_speed_m_s, 4),
+            }
+            for visit in plan.visits
+        ],
+    }
+
+
+def _rounded(q: Any) -> list[float]:
+    return [round(float(angle), 5) for angle in q]

@@ -1,0 +1,126 @@
+"""What the deed of a report leaves: causes, gross errors, data that disagree, and the remedy."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from remaster_ros.calibration.gauge_words import listed
+from remaster_ros.discovery.words import clock_time
+from remaster_ros.reports.answer_inputs import Inputs
+from remaster_ros.reports.discovery_judgement import too_sure
+from remaster_ros.reports.discovery_schema import Discovered
+from remaster_ros.reports.effect_words import is_held_by_model, title
+
+# Fewer gross errors are in the table of left-out rows alone.
+FEWEST_GROSS, LEAST_SHARE = 3, 0.01
+# The first screen names so many causes, with so many sizes each; all of them stand below.
+MOST_NAMED, MOST_SIZES = 4, 2
+
+
+class Remaining(NamedTuple):
+    """Something that the deed leaves: its name, its size in words, and what to do."""
+
+    what: str
+    size: str
+    remedy: str
+
+    @property
+    def sentence(self) -> str:
+        """All of it."""
+        size = self.size.rstrip('.')
+        return f'{self.what}{": " if size else ""}{size}. {self.remedy}'.rstrip()
+
+
+def what_remains(
+    inputs: Inputs, uses_causes: bool, held_out: bool, left_mm: float
+) -> list[Remaining]:
+    """Return what the deed leaves, the causes first; ``left_mm`` is the mean error after it."""
+    found, judgement = inputs.found, inputs.judgement
+    rows = [] if found is None else _of_discovery(found, uses_causes)
+    if judgement.doubts and found is None:
+        rows.append(
+            Remaining(
+                'More than noise',
+                judgement.doubts[0],
+                'Search for its cause: remaster discover SESSION --out DIR, then give DIR to '
+                'remaster report.',
+            )
+        )
+    elif found is not None and not rows and (judgement.doubts or too_sure(found)):
+        rows.append(
+            Remaining(
+                'More than noise',
+                f'noise does not explain the mean error of {left_mm:.3f} mm, and no cause that '
+                'was tried does either',
+                'Look at the largest errors below; measure again, with references in between.',
+            )
+        )
+    if (gross := _gross(inputs)) is not None:
+        rows.append(gross)
+    rows += [Remaining('The data disagree', line, '') for line in judgement.disagreements]
+    if not held_out:
+        rows.append(
+            Remaining('Not proven', 'no poses were held out', 'Measure some more, and fit again.')
+        )
+    if not rows:
+        words = (
+            'every cause was tried, and none explains more of what is left than chance does'
+            if found is not None
+            else 'what is left is what noise explains'
+        )
+        rows.append(Remaining('Noise', words, ''))
+    return rows
+
+
+def _of_discovery(found: Discovered, uses_causes: bool) -> list[Remaining]:
+    """Return the causes that stay, and what has none."""
+    rows: list[Remaining] = []
+    stay = [e for e in found.effects if not (uses_causes and is_held_by_model(e))]
+    for effect in stay[:MOST_NAMED]:
+        sizes = effect.sizes if isinstance(effect.sizes, list) else []
+        size = '; '.join(sizes)
+        if len(sizes) > MOST_SIZES and isinstance(effect.size_m, float):
+            size = f'{1e3 * effect.size_m:.3f} mm RMS at the marker'
+        remedy = effect.remedy if isinstance(effect.remedy, str) else ''
+        rows.append(Remaining(title(effect), size, remedy))
+    if more := stay[MOST_NAMED:]:
+        largest = max(e.size_m for e in more if isinstance(e.size_m, float))
+        size = f'up to {1e3 * largest:.3f} mm RMS at the marker'
+        name = f'{len(more)} smaller cause{"s" if len(more) > 1 else ""}'
+        rows.append(Remaining(name, size, 'See below.'))
+    if found.verdict == 'undetermined':
+        remedy = 'Measure what the look-alikes below call for.'
+        rows.append(Remaining('Undecided', 'another explanation fits as well', remedy))
+    if isinstance(found.unexplained, list):
+        rows += [
+            Remaining('Unexplained', f'{1e3 * left.size_m:.3f} mm RMS', left.next)
+            for left in found.unexplained
+        ]
+    return rows
+
+
+def _gross(inputs: Inputs) -> Remaining | None:
+    """Return how many readings are gross errors, of which sensors and when; None of few."""
+    session, m = inputs.session, inputs.session.measurements
+    # With the causes some of those that the fit left out are none.
+    gross = inputs.fit_left_out if inputs.found is None else inputs.found.noise.outliers
+    rows = np.isin(m.observation, list(gross))
+    if rows.sum() < max(FEWEST_GROSS, LEAST_SHARE * len(m)):
+        return None
+    sensors = listed([session.sensor_names[i] for i in np.unique(m.sensor[rows])])
+    first, last = m.stamp_s[rows].min(), m.stamp_s[rows].max()
+    when = f'configurations {m.configuration[rows].min()} to {m.configuration[rows].max()}'
+    if session.timed:
+        start = m.stamp_s.min()
+        when += f', {(first - start) / 60.0:.1f} to {(last - start) / 60.0:.1f} min'
+        if clock := clock_time(float(first)):
+            when += f' after the first reading, from {clock} on'
+        else:
+            when += ' after the first reading'
+    return Remaining(
+        'Gross errors',
+        f'{rows.sum()} of {len(m)} readings, of {sensors}: {when}',
+        'Find out what was moved or hidden then.',
+    )

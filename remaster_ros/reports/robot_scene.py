@@ -1,0 +1,267 @@
+"""An arm and what stands around it as surfaces, for pictures in 3-D.
+
+Only plain arrays, in base_link or in the frames that move: whatever draws them, a page or a
+viewer, needs nothing of kinematics or files. The arm is drawn with the meshes of its URDF where
+all of a link's can be read, else with what stands for that link in the collision checks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from remaster_ros.errors import InputError
+from remaster_ros.kinematics.bodies import Body, Shape, triangles
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import apply
+from remaster_ros.kinematics.urdf_geometry import Visual, chain_visuals
+from remaster_ros.planning.candidates import LineOfSight, PlanningScene
+from remaster_ros.session.meshes import MeshPart, find_mesh, read_mesh_parts
+from remaster_ros.session.workcell import Workcell
+from remaster_ros.types import FloatArray, IntArray
+
+Color = tuple[float, float, float]
+MeshParts = Callable[[str], Sequence[MeshPart]]
+
+MOST_TRIANGLES = 2500
+"""So many triangles a surface has at most; arms of today have twenty such surfaces."""
+_EQUAL_M = 1e-5
+_FINEST_M, _COARSEST_M = 5e-4, 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles that move together.
+
+    Attributes
+    ----------
+    name
+        What it is, for people.
+    link
+        0 for what stands still, i for what moves with joint i.
+    role
+        ``link``, ``tool``, ``marker`` or ``obstacle``.
+    vertices
+        In the frame of `RobotScene.transforms` for that link, m, (n, 3).
+    faces
+        Which three vertices each triangle has, (m, 3), seen from outside counter-clockwise.
+    color
+        Red, green and blue, 0 to 1; None where the robot description gives none.
+    """
+
+    name: str
+    link: int
+    role: str
+    vertices: FloatArray
+    faces: IntArray
+    color: Color | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RobotScene:
+    """An arm, its tool and what stands around it.
+
+    Attributes
+    ----------
+    chain
+        The arm.
+    surfaces
+        All that is drawn.
+    sights
+        Where each sensor is, and which marker it follows.
+    floor_z
+        Height of the floor, m; None where there is none.
+    notes
+        What is not drawn as the robot description has it, and the remedy.
+    """
+
+    chain: SerialChain
+    surfaces: Sequence[Surface]
+    sights: Sequence[LineOfSight]
+    floor_z: float | None
+    notes: Sequence[str]
+
+    def transforms(self, q: FloatArray) -> FloatArray:
+        """Return where the links are at joint angles (..., k), rad: T_R_link, (..., k + 1, 4, 4).
+
+        The first is the base's own, the identity.
+        """
+        frames = self.chain.frames(q)
+        base = np.broadcast_to(np.eye(4), (*frames.shape[:-3], 1, 4, 4))
+        return np.concatenate((base, frames), axis=-3)
+
+    def with_sensors(self, T_R_N: Mapping[str, FloatArray]) -> RobotScene:
+        """Return the scene with these sensors where they were measured to be, (4, 4) each."""
+        sights = [
+            replace(sight, sensor_R=T_R_N[sight.sensor][:3, 3]) if sight.sensor in T_R_N else sight
+            for sight in self.sights
+        ]
+        return replace(self, sights=sights)
+
+    def sight_ends(self, q: FloatArray) -> FloatArray:
+        """Return where the marker of each sight is at joint angles (..., k): m, (..., s, 3)."""
+        markers = np.array([sight.marker_T for sight in self.sights])
+        return self.chain.positions(np.asarray(q)[..., None, :], markers)
+
+
+def robot_scene(cell: Workcell, scene: PlanningScene) -> RobotScene:
+    """Return the scene of a cell.
+
+    Parameters
+    ----------
+    cell
+        The cell.
+    scene
+        Its planning scene: what the collision checks have, and the sensors.
+    """
+    chain, folder = scene.model.chain, Path(cell.file).parent
+    urdf, mesh_path = folder / cell.robot.urdf, [folder / path for path in cell.mesh_path]
+    parts = cache(lambda name: read_mesh_parts(find_mesh(name, urdf, mesh_path)))
+    visuals = chain_visuals(cell.urdf_text, chain)
+    surfaces, notes = arm_surfaces(visuals, scene.model.bodies, parts)
+    return RobotScene(chain, surfaces, scene.sights, scene.model.floor_z, notes)
+
+
+def arm_surfaces(
+    visuals: Sequence[Visual], bodies: Sequence[Body], mesh_parts: MeshParts
+) -> tuple[list[Surface], list[str]]:
+    """Return the surfaces of an arm and all around it, and what is not drawn as described.
+
+    Parameters
+    ----------
+    visuals
+        Of the URDF.
+    bodies
+        Of the collision checks; drawn are tool, markers, obstacles, and the links whose visual
+        geometry is missing.
+    mesh_parts
+        Reads a mesh by its name in the URDF; its InputError means that it is missing.
+    """
+    surfaces: list[Surface] = []
+    missing: dict[str, None] = {}
+    seen: set[int] = set()
+    without: set[int] = set()
+    for visual in visuals:
+        drawn = _drawn(visual, mesh_parts)
+        if drawn:
+            seen.add(visual.link)
+            surfaces += drawn
+        else:
+            without.add(visual.link)
+            missing[visual.mesh or f'the geometry of {visual.link_name}'] = None
+    # A link of which a part is missing would look as if it had a gap to go through.
+    surfaces = [surface for surface in surfaces if surface.link not in without]
+    for body in bodies:
+        if body.role != 'link' or body.link not in seen - without:
+            role = 'marker' if body.name.startswith('marker ') else body.role
+            points, faces = _hull(body.shape)
+            placed = apply(body.T_link_body, points)
+            surfaces.append(Surface(body.name, body.link, role, placed, faces))
+    return surfaces, _notes(list(missing))
+
+
+def _notes(missing: Sequence[str]) -> list[str]:
+    if not missing:
+        return []
+    more = f' and {len(missing) - 1} more' if len(missing) > 1 else ''
+    return [
+        f'{missing[0]}{more} cannot be read, so that these links are drawn as the collision '
+        'checks have them; mesh_path of the cell file names the folder of the meshes'
+    ]
+
+
+def _drawn(visual: Visual, mesh_parts: MeshParts) -> list[Surface]:
+    """Return the surfaces of a visual element; none where it cannot be drawn."""
+    if visual.shape is not None:
+        points, faces = _hull(visual.shape)
+        parts = [MeshPart(points, faces, None)]
+    elif not visual.mesh:
+        return []
+    else:
+        try:
+            parts = list(mesh_parts(visual.mesh))
+        except InputError:
+            return []
+    surfaces = []
+    for part in parts:
+        points, faces = coarser(part.vertices * visual.scale, part.faces)
+        if np.prod(visual.scale) < 0.0:
+            faces = faces[:, ::-1]
+        if len(faces):
+            placed = apply(visual.T_link_visual, points)
+            color = visual.color or part.color
+            surfaces.append(Surface(visual.link_name, visual.link, 'link', placed, faces, color))
+    return surfaces
+
+
+def coarser(
+    vertices: FloatArray, faces: IntArray, most: int = MOST_TRIANGLES
+) -> tuple[FloatArray, IntArray]:
+    """Return a mesh with at most so many triangles, vertices that are near each other as one.
+
+    Vertices of one cell of a grid become their mean, and triangles that lose a corner go (J.
+    Rossignac and P. Borrel, "Multi-resolution 3D approximations for rendering complex scenes",
+    1993); the grid widens until few enough are left. Equal vertices are always merged.
+
+    Parameters
+    ----------
+    vertices, faces
+        m, (n, 3), and (m, 3).
+    most
+        How many triangles are left at most; more only where cells of 5 cm leave more.
+    """
+    points, left = _clustered(vertices, faces, _EQUAL_M)
+    cell = _FINEST_M
+    while len(left) > most and cell < _COARSEST_M:
+        points, left = _clustered(vertices, faces, cell)
+        # The number of triangles falls with the square of the cell, where it falls.
+        cell *= max(1.1, 0.95 * float(np.sqrt(len(left) / most)))
+    return points, left
+
+
+def _clustered(vertices: FloatArray, faces: IntArray, cell: float) -> tuple[FloatArray, IntArray]:
+    steps = np.round((vertices - vertices.min(axis=0)) / cell).astype(np.int64)
+    _, index = np.unique(_numbered(steps), return_inverse=True)
+    counts = np.bincount(index)
+    points = np.stack([np.bincount(index, column) / counts for column in vertices.T], axis=1)
+    corners = index[faces]
+    a, b, c = corners.T
+    corners = corners[(a != b) & (b != c) & (c != a)]
+    # Of triangles on the same corners one is enough.
+    _, first = np.unique(_numbered(np.sort(corners, axis=1)), return_index=True)
+    return _used(points, corners[np.sort(first)])
+
+
+def _numbered(rows: IntArray) -> IntArray:
+    """Return one number for each different row of three numbers from 0 on, (n,)."""
+    size = rows.max(axis=0, initial=0) + 1
+    return (rows[:, 0] * size[1] + rows[:, 1]) * size[2] + rows[:, 2]
+
+
+def _used(points: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
+    """Return the points that triangles have, and the triangles with the new numbers."""
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return points[used], renumbered.reshape(-1, 3).astype(np.int64)
+
+
+def _hull(shape: Shape) -> tuple[FloatArray, IntArray]:
+    """Return a convex shape as a surface in its own frame."""
+    points = shape.outline
+    if shape.ball > 0.0:
+        # Its outline encloses it with few points; this is the shape itself, rounder.
+        core = Shape(shape.kind, shape.points, shape.disc).outline
+        points = (core[:, None] + shape.ball * _ball()).reshape(-1, 3)
+    return _used(points, triangles(points))
+
+
+@cache
+def _ball(count: int = 200) -> FloatArray:
+    """Return points spread evenly over the unit sphere, (n, 3), along a spiral."""
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    turn = np.arange(count) * np.pi * (3.0 - 5.0**0.5)
+    radius = np.sqrt(1.0 - z**2)
+    return np.column_stack((radius * np.cos(turn), radius * np.sin(turn), z))

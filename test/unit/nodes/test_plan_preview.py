@@ -1,0 +1,178 @@
+"""The arm follows no plan that a person has not looked at, where the cell asks for that."""
+
+import dataclasses
+import time
+
+import numpy as np
+import pytest
+from simple_cells import write_cell
+
+from remaster_ros.collection.plan_confirmation import PlanConfirmation, fingerprint
+from remaster_ros.collection.preflight_facts import PreflightFacts
+from remaster_ros.collection.tour_progress import TourProgress
+from remaster_ros.nodes.plan_preview import PlanPreview
+from remaster_ros.nodes.planning_thread import PlanningThread
+from remaster_ros.planning.tour_planner import TourPlanner
+from remaster_ros.session.plan_journal import PlanJournal
+from remaster_ros.session.workcell import read_cell
+
+START = np.deg2rad([5.0, 7.0, 0.0, 112.0, 10.0, 35.0, -20.0])
+COUNTS = {'optimization': 3, 'validation': 2, 'registration': 6}
+
+
+class Bench:
+    """What a planner's node has, without the node."""
+
+    def __init__(self, folder, confirm=True):
+        cell = read_cell(write_cell(folder / 'cell.yaml', confirm=confirm))
+        self.chain = cell.chain()
+        self.tours = TourPlanner(
+            cell.planning_scene(self.chain), COUNTS, 0, design=cell.design_settings()
+        )
+        self.journal = PlanJournal(folder / 'session', {}, self.chain, self.tours.model)
+        self.progress = TourProgress(self.journal, self.tours, PlanningThread())
+        self.facts = PreflightFacts(cell.sensors)
+        self.preview = PlanPreview(
+            cell, self.tours, self.journal, self.progress, folder / 'session'
+        )
+        self.page = folder / 'session.plan.html'
+
+    def draw(self):
+        """Draw what is next; return what a person is told."""
+        until = time.monotonic() + 60.0
+        while not (told := self.preview.draw(START, self.facts)):
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        return told
+
+    def registered(self):
+        self.progress.T_R_N.update(self.tours.rough_places)
+
+
+@pytest.fixture
+def bench(tmp_path):
+    return Bench(tmp_path)
+
+
+def test_the_plan_is_shown_and_followed_only_once_it_is_confirmed(bench):
+    preview = bench.preview
+    assert 'it is being drawn' in preview.asked()
+    assert preview.confirm() == (False, preview.refusal())
+    told = bench.draw()
+    registration = bench.tours.registration()
+    name = fingerprint(registration)
+    assert told == preview.asked()
+    assert told == (
+        f'plan {name} is not confirmed: look at {bench.page}, then call /remaster/confirm and '
+        '/remaster/collect'
+    )
+    html = bench.page.read_text(encoding='utf-8')
+    assert f'confirmation of plan {name}' in html
+    assert 'for the registration' in html
+    assert 'ros2 service call /remaster/confirm' in html
+    assert not preview.allows(registration)
+    assert preview.confirm()[0]
+    assert preview.asked() == ''
+    assert preview.allows(registration)
+    assert not preview.allows(None)
+    # Nothing new: the page stays as it is.
+    before = bench.page.stat().st_mtime_ns
+    for _ in range(5):
+        assert preview.draw(START, bench.facts) == ''
+    assert bench.page.stat().st_mtime_ns == before
+
+
+def test_another_plan_needs_another_confirmation(bench):
+    preview = bench.preview
+    bench.draw()
+    preview.confirm()
+    collection = bench.tours.collection(bench.tours.rough_places)
+    assert not preview.allows(collection)
+    bench.registered()
+    # From now on the page is out of date, and cannot be confirmed.
+    assert preview.draw(START, bench.facts) == ''
+    assert not preview.confirm()[0]
+    assert 'it is being drawn' in preview.asked()
+    assert fingerprint(collection) in bench.draw()
+    assert not preview.allows(collection)
+    assert 'for the registration' not in bench.page.read_text(encoding='utf-8')
+    assert preview.confirm()[0]
+    assert preview.allows(collection)
+    assert not preview.allows(bench.tours.registration())
+    # As the node takes it up and pauses in the middle: still the same plan.
+    bench.journal.begin(collection)
+    bench.progress.phase = 'collection'
+    stop = collection.next(START)
+    bench.journal.open_stop(stop)
+    bench.journal.outcome(stop.ids[0], 'recorded')
+    assert preview.draw(START, bench.facts) == ''
+    assert preview.asked() == ''
+    assert preview.allows(bench.journal.tour)
+
+
+def test_a_planner_started_again_has_no_confirmation(bench, tmp_path):
+    collection = bench.tours.collection(bench.tours.rough_places)
+    bench.registered()
+    bench.draw()
+    bench.preview.confirm()
+    bench.journal.begin(collection)
+    stop = collection.next(START)
+    bench.journal.open_stop(stop)
+    bench.journal.outcome(stop.ids[0], 'recorded')
+    bench.journal.close()
+    again = Bench(tmp_path)
+    assert not again.preview.allows(again.journal.tour)
+    # The same plan, of which the page has what is left.
+    name = fingerprint(again.journal.tour)
+    assert name == fingerprint(collection)
+    assert name in again.draw()
+    total = sum(len(pose.solutions) for plan in collection.plans.values() for pose in plan.poses)
+    assert f'<p>{total - 1} configurations at ' in again.page.read_text(encoding='utf-8')
+    assert not again.preview.allows(again.journal.tour)
+    again.journal.close()
+
+
+def test_a_page_that_cannot_be_written_holds_the_arm_and_is_tried_again(bench):
+    bench.page.write_text('my own')
+    told = bench.draw()
+    assert told.startswith('the plan cannot be shown: ')
+    assert str(bench.page) in told
+    assert not bench.preview.confirm()[0]
+    bench.page.unlink()
+    assert bench.preview.asked() == told
+    assert 'is not confirmed: look at' in bench.draw()
+
+
+def test_cells_that_do_not_ask_for_it_go_without(tmp_path):
+    bench = Bench(tmp_path, confirm=False)
+    assert bench.preview.draw(START, bench.facts) == ''
+    assert bench.preview.asked() == ''
+    assert bench.preview.allows(bench.tours.registration())
+    done, why = bench.preview.confirm()
+    assert not done
+    assert 'confirm: true' in why
+    assert not bench.page.exists()
+
+
+def test_asking_for_a_confirmation_leaves_plans_as_they_are(tmp_path):
+    plain, asking = (
+        read_cell(write_cell(tmp_path / f'{confirm}.yaml', confirm=confirm))
+        for confirm in (False, True)
+    )
+    assert plain.fingerprint() == asking.fingerprint()
+
+
+def test_any_other_configuration_or_order_is_another_plan(bench):
+    tour = bench.tours.registration()
+    name = fingerprint(tour)
+    assert name == fingerprint(bench.tours.registration())
+    confirmation = PlanConfirmation(True, 'page')
+    confirmation.show(name)
+    confirmation.confirm()
+    assert confirmation.allows(tour)
+    plan = tour.plans['registration']
+    moved = dataclasses.replace(plan.poses[0], solutions=plan.poses[0].solutions + 1e-9)
+    for poses in (plan.poses[1:], plan.poses[::-1], (moved, *plan.poses[1:])):
+        other = tour.fork()
+        other.plans = {'registration': dataclasses.replace(plan, poses=poses)}
+        assert not confirmation.allows(other)

@@ -1,0 +1,152 @@
+"""The planner's node announces no pose of a plan that was not confirmed, whatever led there."""
+
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+
+import rclpy
+from bridge_rig import DOMAIN
+from simple_cells import write_cell
+from std_srvs.srv import Trigger
+
+from remaster_ros.collection.events import RecorderState
+from remaster_ros.nodes.pose_planner import PosePlanner
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
+
+START = np.deg2rad([5.0, 7.0, 0.0, 112.0, 10.0, 35.0, -20.0])
+
+
+class Planner:
+    """The node in this process; `step` is what its timer does. The test is bridge and recorder."""
+
+    def __init__(self, folder, cell):
+        parameters = {
+            'cell': cell,
+            'session': folder / 'session',
+            'optimization_candidates': 4,
+            'validation_candidates': 1,
+            'registration_candidates': 6,
+            'reference_every': 0,
+        }
+        args = ['--ros-args', '--log-level', 'fatal']
+        for name, value in parameters.items():
+            args += ['-p', f'{name}:={value}']
+        rclpy.init(args=args, domain_id=DOMAIN)
+        self.node = node = PosePlanner()
+        node._q = START
+        node._announcements.recorder = RecorderState(waiting_for='', run='')
+        node._hindrance = lambda now: ''
+        self.announced = []
+        node._poses.announce = self._announce
+
+    def _announce(self, stop, plan, status, *, last):
+        self.announced.append(stop)
+        return f'stamp {len(self.announced)}'
+
+    def call(self, what):
+        response = getattr(self.node, f'_on_{what}')(Trigger.Request(), Trigger.Response())
+        return response.success, response.message
+
+    def step_until(self, condition, what):
+        until = time.monotonic() + 30.0
+        while not condition():
+            assert time.monotonic() < until, what
+            self.node._step()
+            time.sleep(0.005)
+
+    def confirm(self):
+        self.step_until(lambda: self.node._preview.shown, 'the page')
+        assert self.call('confirm')[0]
+        assert self.call('collect') == (True, 'collecting')
+
+    def done(self):
+        """Have every solution of the open pose recorded."""
+        for number in self.announced[-1].ids:
+            self.node.journal.outcome(number, 'recorded')
+
+    def kill(self):
+        """End it without a word; what is written stays as it is."""
+        self.node.journal.close()
+        self.node.destroy_node()
+        rclpy.shutdown()
+
+
+@pytest.fixture
+def begin(tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    running = []
+
+    def make(confirm=True):
+        cell = write_cell(tmp_path / 'cell.yaml', confirm=confirm)
+        running.append(Planner(tmp_path, cell))
+        return running[-1]
+
+    yield make
+    if rclpy.ok():
+        running[-1].kill()
+
+
+def test_a_pose_is_announced_only_where_its_own_plan_was_confirmed(begin, tmp_path):
+    planner = begin()
+    node = planner.node
+    done, why = planner.call('collect')
+    assert not done
+    assert str(tmp_path / 'session.plan.html') in why
+    planner.step_until(lambda: node._preview.shown, 'the page')
+    done, why = planner.call('collect')
+    assert not done
+    assert why.endswith('then call /remaster/confirm and /remaster/collect')
+    # Even where a run has begun in some other way.
+    node.run.collect('token')
+    planner.step_until(lambda: node.run.state != 'running', 'the end of that run')
+    assert node.run.state == 'paused'
+    assert planner.announced == []
+    planner.confirm()
+    planner.step_until(lambda: planner.announced, 'the first pose')
+    assert [stop.split for stop in planner.announced] == ['registration']
+    # The registration leads to another plan, which nobody has seen.
+    planner.done()
+    node.progress.T_R_N.update(node._tours.rough_places)
+    planner.step_until(lambda: node.run.state == 'paused', 'the pause')
+    assert 'is not confirmed' in node.run.why
+    planner.step_until(lambda: node._preview.shown, 'the page')
+    assert node.run.why == planner.call('collect')[1]
+    assert len(planner.announced) == 1
+    planner.confirm()
+    planner.step_until(lambda: len(planner.announced) > 1, 'the first pose to fit')
+    assert planner.announced[1].split in ('optimization', 'validation')
+    # Paused, the plan is the same.
+    assert planner.call('pause')[0]
+    assert planner.call('collect') == (True, 'collecting')
+    planner.node._step()
+    assert planner.node.journal.state == 'running'
+    planner.kill()
+
+    # Killed and started again while it ran: it neither goes on nor takes the old confirmation.
+    again = begin()
+    assert again.node.run.left == ''
+    for _ in range(3):
+        again.node._step()
+    assert again.node.run.state != 'running'
+    assert not again.call('collect')[0]
+    again.node.run.collect('token')
+    again.step_until(lambda: again.node.run.state == 'paused', 'the end of that run')
+    assert again.announced == []
+    again.confirm()
+    again.step_until(lambda: again.announced, 'what is left of the pose')
+    assert again.announced[0].pose == planner.announced[1].pose
+
+
+def test_without_the_key_it_collects_as_before(begin, tmp_path):
+    planner = begin(confirm=False)
+    assert planner.call('collect') == (True, 'collecting')
+    planner.step_until(lambda: planner.announced, 'the first pose')
+    done, why = planner.call('confirm')
+    assert not done
+    assert 'confirm: true' in why
+    assert not (tmp_path / 'session.plan.html').exists()

@@ -1,0 +1,367 @@
+"""What the page of `remaster report` decides: the deed, the gain, the colour, what remains."""
+
+from __future__ import annotations
+
+import builtins
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from remaster_ros.compensation.export import exports
+from remaster_ros.errors import InputError
+from remaster_ros.reports.answer import answer_of
+from remaster_ros.reports.answer_inputs import Inputs, errors_with_model_mm, parts, read_inputs
+from remaster_ros.reports.answer_report import checked_svg, require_ready, worst_rows
+from remaster_ros.reports.discovery_schema import Discovered
+from remaster_ros.reports.effect_words import law, title
+from remaster_ros.reports.fit_json import fit_content, save_fit
+from remaster_ros.reports.schemas import Fit, Judgement
+
+STEP = {'driver': 'time', 'form': 'step', 'name': 'unnamed'}
+LENGTH = {'name': 'link_length', 'place': 'link_translation', 'driver': 'constant'}
+SOFT = {'name': 'joint_compliance', 'place': 'joint_angle', 'driver': 'gravity_torque'}
+SLIP = {**STEP, 'place': 'joint_angle', 'joints': [3], 'parameter': 'joint_3_step'}
+BUMP = {**STEP, 'place': 'sensor_frame', 'joints': [], 'parameter': 'tracker_step_rx'}
+
+
+def effect(name, place, driver, form='constant', joints=(2,), parameter='size_2'):
+    return {
+        'name': name,
+        'joints': list(joints),
+        'place': place,
+        'driver': driver,
+        'form': form,
+        'parameters': [
+            {'name': parameter, 'value': 1e-3, 'std': 1e-5, 'unit': 'm'},
+            {'name': 'moment', 'value': 455.0, 'std': 3.0, 'unit': 's'},
+        ],
+        'p_value': 0.003,
+        'log_evidence_gain': 40.0,
+        'confusable_with': [],
+        'cause': 'The cause.',
+        'sizes': ['by 1.00 mm ± 0.01 mm'],
+        'size_m': 1e-3,
+        'remedy': 'The remedy.',
+    }
+
+
+def discovery(fit, effects, verdict='effects', mood='good'):
+    content = msgspec.to_builtins(fit)
+    offsets = [row | {'mean_deg': row['mean_deg'] + 0.5} for row in content['joint_offsets']]
+    return msgspec.convert(
+        {
+            'format': 'remaster-discovery/1',
+            'verdict': verdict,
+            'effects': [effect(**found) for found in effects],
+            'gain': dict.fromkeys(('held_out_rms_before_m', 'held_out_rms_after_m'), 1e-3)
+            | {'noise_floor_m': 1e-4},
+            'noise': {
+                'pose_common_fraction': 0.5,
+                'outliers': [],
+                'heteroscedastic': {},
+                'sensors': content['noise'],
+            },
+            'joint_offsets_after': offsets,
+            'judgement': {'mood': mood, 'headline': '.'},
+        },
+        Discovered,
+    )
+
+
+@pytest.fixture
+def fit(fit_result) -> Fit:
+    fit = msgspec.convert(msgspec.to_builtins(fit_content(fit_result)), Fit)
+    fit.judgement = Judgement('good', 'The mean position error falls.')
+    return fit
+
+
+@pytest.fixture
+def inputs(fit_result, fit):
+    """Return a function: effects of a discovery (None without one) and changes -> inputs."""
+
+    def made(
+        effects=None, verdict='effects', mood='good', errors=(3.0, 0.5, 0.3), model=None
+    ) -> Inputs:
+        rows = np.ones(len(fit_result.session.measurements))
+        found = None if effects is None else discovery(fit, effects, verdict, mood)
+        before, after, causes = (rows * error for error in errors)
+        return Inputs(
+            fit_result.session,
+            fit,
+            found,
+            before,
+            after,
+            causes if effects else None,
+            None if model is None else rows * model,
+        )
+
+    return made
+
+
+@pytest.mark.parametrize(
+    ('effects', 'action', 'uses_causes', 'mood'),
+    [
+        (None, 'set', False, 'good'),
+        ([], 'set', False, 'good'),
+        ([LENGTH], 'set', True, 'good'),
+        ([SOFT], 'set', False, 'caution'),
+        ([LENGTH, SOFT], 'set', False, 'caution'),
+        ([BUMP], 'set', True, 'caution'),
+        ([SLIP], 'wait', False, 'caution'),
+    ],
+)
+def test_the_deed_takes_the_offsets_that_belong_to_its_files(
+    inputs, fit, effects, action, uses_causes, mood
+):
+    answer = answer_of(inputs(effects))
+    assert (answer.action, answer.uses_causes, answer.mood) == (action, uses_causes, mood)
+    shift = 0.5 if uses_causes else 0.0
+    assert answer.offsets[1].mean_deg == fit.joint_offsets[1].mean_deg + shift
+    assert answer.brings == (2 if uses_causes else 1)
+    assert len(answer.stages) == (3 if effects else 2)
+    assert ('robot_geometry.urdf' in answer.files) == (effects == [LENGTH])
+    assert bool(answer.files) == (action == 'set')
+
+
+def test_causes_that_stay_are_listed_with_their_remedy_and_the_others_are_not(inputs):
+    remains = answer_of(inputs([LENGTH, SOFT])).remains
+    assert [row.what for row in remains] == [
+        'Link length of joint 2',
+        'Joint compliance of joint 2',
+    ]
+    assert all(row.remedy == 'The remedy.' for row in remains)
+    (left,) = answer_of(inputs([LENGTH])).remains
+    assert left.what == 'Noise'
+
+
+@pytest.mark.parametrize(('model', 'uses_causes'), [(0.4, True), (0.49, False)])
+def test_a_robot_model_that_holds_a_part_is_used_where_that_helps(inputs, model, uses_causes):
+    answer = answer_of(inputs([LENGTH, SOFT], model=model))
+    assert answer.uses_causes == uses_causes
+    assert [stage.mean for stage in answer.stages] == pytest.approx([3.0, 0.5, model, 0.3])
+    assert answer.brings == (2 if uses_causes else 1)
+    assert answer.final_mm[0] == (model if uses_causes else 0.5)
+    assert answer.mood == 'caution'
+    named = [row.what for row in answer.remains]
+    assert ('Link length of joint 2' in named) != uses_causes
+    assert 'Joint compliance of joint 2' in named
+
+
+def test_the_first_screen_names_the_largest_causes_alone(inputs):
+    names = [row.what for row in answer_of(inputs(7 * [SOFT])).remains]
+    assert names == [*4 * ['Joint compliance of joint 2'], '3 smaller causes']
+
+
+def test_a_robot_model_is_judged_as_it_is(fit_result):
+    """The calibrated model leaves what the offsets leave, the nominal one what there is today."""
+    session = fit_result.session
+    calibrated = errors_with_model_mm(session, exports(fit_result)['robot_calibrated.urdf'])
+    nominal = errors_with_model_mm(session, session.urdf)
+    held_out = session.measurements.is_validation
+    for found, residuals in (
+        (nominal, fit_result.residuals_before),
+        (calibrated, fit_result.residuals_after),
+    ):
+        expected = 1e3 * np.linalg.norm(residuals, axis=1)[held_out].mean()
+        assert found[held_out].mean() == pytest.approx(expected, rel=0.03)
+
+
+def test_what_no_cause_explains_is_never_called_noise(inputs, fit):
+    assert [row.what for row in answer_of(inputs([])).remains] == ['Noise']
+    fit.judgement.doubts = ['tracker: the error after is 0.500 mm; noise makes 0.100 mm.']
+    (alone,) = answer_of(inputs()).remains
+    assert alone.size == fit.judgement.doubts[0]
+    assert 'remaster discover' in alone.sentence
+    assert '..' not in alone.sentence
+    (searched,) = answer_of(inputs([])).remains
+    assert searched.what == 'More than noise'
+    assert '0.500 mm, and no cause' in searched.size
+
+
+def test_many_gross_errors_say_when_and_of_which_sensor(inputs):
+    made = inputs([])
+    m = made.session.measurements
+    rows = np.flatnonzero(m.sensor == m.sensor[-1])[-4:]
+    made.found.noise.outliers = m.observation[rows].tolist()
+    (gross,) = answer_of(made).remains
+    first, last = m.configuration[rows[[0, -1]]]
+    minutes = (m.stamp_s[rows[0]] - m.stamp_s[0]) / 60.0
+    name = made.session.sensor_names[m.sensor[-1]]
+    assert gross.size.startswith(f'4 of {len(m)} readings, of {name}: ')
+    assert f'configurations {first} to {last}, {minutes:.1f} to ' in gross.size
+
+
+def test_an_error_of_the_measurement_is_no_gain_of_the_arm(inputs):
+    headline = answer_of(inputs([BUMP])).headline
+    assert 'Sensor tracker moved' in headline
+    assert 'times smaller' not in headline
+    assert '10 times smaller' in answer_of(inputs([LENGTH])).headline
+
+
+@pytest.mark.parametrize('held', ['fit', 'discovery', 'disagreement', 'undetermined', 'unproven'])
+def test_no_green_where_anything_disagrees(inputs, fit, held):
+    effects, options = [LENGTH], {}
+    if held == 'fit':
+        effects, fit.judgement.mood = [], 'caution'
+    elif held == 'discovery':
+        options['mood'] = 'caution'
+    elif held == 'disagreement':
+        fit.judgement.disagreements = ['While it was measured, tracker moved.']
+    elif held == 'undetermined':
+        options['verdict'] = 'undetermined'
+    made = inputs(effects, **options)
+    if held == 'unproven':
+        m = made.session.measurements
+        fitted = replace(m, is_validation=np.zeros(len(m), bool))
+        made = replace(made, session=replace(made.session, measurements=fitted))
+    answer = answer_of(made)
+    assert answer.mood == 'caution'
+    if held == 'disagreement':
+        assert any('tracker moved' in row.size for row in answer.remains)
+
+
+def test_a_fit_that_is_red_sets_nothing(inputs, fit):
+    fit.judgement = Judgement('bad', 'The chains have not converged.')
+    answer = answer_of(inputs())
+    assert (answer.action, answer.mood, answer.files) == ('wait', 'bad', [])
+    assert answer.headline == 'Set nothing yet. The chains have not converged.'
+
+
+def test_offsets_that_bring_nothing_are_not_set(inputs):
+    answer = answer_of(inputs(errors=(0.52, 0.5, 0.5)))
+    assert answer.action == 'nothing'
+    assert answer.headline.startswith('Nothing has to be set')
+
+
+@pytest.mark.parametrize(
+    ('found', 'heading'),
+    [
+        (SLIP, 'Joint 3 slipped'),
+        (BUMP, 'Sensor tracker moved'),
+        ({**BUMP, 'place': 'marker', 'parameter': 'marker_sir_step_x'}, 'Marker sir moved'),
+        (
+            {**BUMP, 'place': 'base_rotation', 'parameter': 'base_step_x'},
+            'The base moved, or all sensors together',
+        ),
+        (LENGTH, 'Link length of joint 2'),
+        (
+            {**SOFT, 'name': 'unnamed', 'driver': 'angle_of_joint_6', 'joints': [7, 6]},
+            'Joint angle of joint 7: an error that follows angle of joint 6',
+        ),
+    ],
+)
+def test_headings_say_what_moved_and_never_unnamed(fit, found, heading):
+    (made,) = discovery(fit, [found]).effects
+    assert title(made) == heading
+    assert ('t₀' in law(made)) == (found.get('form') == 'step')
+
+
+def test_the_worst_rows_come_first_with_time_and_place(inputs):
+    made = inputs()
+    made.after_mm[[5, 9]] = 4.0, 7.0
+    first, second = worst_rows(made, answer_of(made))[:2]
+    m = made.session.measurements
+    assert [first.observation, second.observation] == m.observation[[9, 5]].tolist()
+    assert first.after_mm == 7.0
+    assert first.when.endswith(' min')
+    assert np.all(np.abs(first.place_mm) < 3000.0)
+
+
+def test_results_of_other_data_are_refused(fit_result, tmp_path):
+    save_fit(fit_result, tmp_path, figures=False)
+    session = fit_result.session
+    path = tmp_path / 'fit.json'
+    content = msgspec.json.decode(path.read_bytes())
+    content['session']['observations_sha256'] = 'ab'
+    path.write_bytes(msgspec.json.encode(content))
+    with pytest.raises(InputError, match=r'of other data than this session .*; fit this session'):
+        read_inputs(session, path, None)
+    del content['judgement']
+    path.write_bytes(msgspec.json.encode(content))
+    with pytest.raises(InputError, match='of an earlier version; fit this session again'):
+        read_inputs(session, path, None)
+
+
+@pytest.mark.parametrize(
+    ('change', 'words'),
+    [
+        (lambda text: text.replace('before_x_m', 'x'), "has no column 'before_x_m'"),
+        (lambda text: '\n'.join(text.splitlines()[:-1]) + '\n', r'\d+ rows of \d+'),
+        (lambda text: text.replace('\n0,', '\n7777,', 1), 'line 2: not the rows of this session'),
+        (lambda text: text + text.splitlines()[-1], 'not the rows of this session'),
+    ],
+)
+def test_damaged_residuals_are_named(fit_result, tmp_path, change, words):
+    save_fit(fit_result, tmp_path, figures=False)
+    path = tmp_path / 'residuals.csv'
+    path.write_text(change(path.read_text()))
+    content = msgspec.json.decode((tmp_path / 'fit.json').read_bytes())
+    content['session']['observations_sha256'] = ''
+    (tmp_path / 'fit.json').write_bytes(msgspec.json.encode(content))
+    with pytest.raises(InputError, match=words) as error:
+        read_inputs(fit_result.session, tmp_path / 'fit.json', None)
+    assert 'residuals.csv' in str(error.value)
+
+
+def test_which_file_is_which_is_found_by_its_name(tmp_path):
+    for name in ('fit', 'discovery'):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / f'{name}.json').write_text('{}')
+    fit, found = tmp_path / 'fit/fit.json', tmp_path / 'discovery/discovery.json'
+    assert parts([tmp_path / 'discovery', tmp_path / 'fit']) == (fit, found)
+    assert parts([found]) == (None, found)
+    assert parts([]) == (None, None)
+    for wrong, words in (
+        ([fit, tmp_path / 'fit'], 'two files fit.json'),
+        ([tmp_path], 'neither fit.json nor discovery.json'),
+        ([tmp_path / 'other.json'], 'give fit.json or discovery.json'),
+    ):
+        with pytest.raises(InputError, match=words):
+            parts(wrong)
+
+
+@pytest.mark.parametrize(
+    'content',
+    [
+        '<script>alert(1)</script>',
+        '<g onload="alert(1)"/>',
+        '<use href="http://example.org/x"/>',
+        '<style>* {fill: url(http://example.org)}</style>',
+        '<foreignObject/>',
+    ],
+)
+def test_a_figure_that_is_more_than_a_drawing_is_refused(content, tmp_path):
+    svg = '<svg xmlns="http://www.w3.org/2000/svg">{}</svg>'
+    path = tmp_path / 'traces.svg'
+    assert checked_svg(svg.format('<g><path d="M 0 0"/></g>'), path)
+    with pytest.raises(InputError, match='more than a drawing'):
+        checked_svg(svg.format(content), path)
+
+
+def test_the_page_of_another_command_is_not_replaced(tmp_path):
+    (tmp_path / 'report.html').write_text('<meta name="generator" content="remaster_ros">')
+    with pytest.raises(InputError, match='name another folder with --out'):
+        require_ready(tmp_path, pdf=False)
+
+
+@pytest.mark.parametrize(
+    ('error', 'words'),
+    [
+        (ImportError('no'), r"pip install 'remaster_ros\[pdf\]'"),
+        (OSError("cannot load library 'pango'\nmore"), r"library 'pango'\): apt install libpango"),
+    ],
+)
+def test_without_what_makes_pdf_one_line_says_how_to_get_it(tmp_path, monkeypatch, error, words):
+    usual = builtins.__import__
+
+    def importing(name, *args, **kwargs):
+        if name == 'weasyprint':
+            raise error
+        return usual(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, '__import__', importing)
+    with pytest.raises(InputError, match=words) as found:
+        require_ready(tmp_path, pdf=True)
+    assert '\n' not in str(found.value)

@@ -1,0 +1,176 @@
+"""The page of a plan: complete in itself, true to the plan, and played in a browser."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from page_probe import NO_WEBGL, WEBGL, seen
+
+from remaster_ros.cli import main as cli
+from remaster_ros.reports.plan_page import write_plan_page
+from remaster_ros.session.workcell import read_cell
+
+FEW = ('--poses', '12', '--validation', '8')
+
+
+@pytest.fixture(scope='module')
+def planned(tmp_path_factory):
+    """The page of a small plan of the demo cell, and the plan as JSON."""
+    folder = tmp_path_factory.mktemp('plan')
+    path = folder / 'plan.html'
+    with pytest.MonkeyPatch.context() as patch:
+        printed = []
+        patch.setattr('builtins.print', lambda *args, **_: printed.append(' '.join(args)))
+        assert cli.main(['plan', 'demo', *FEW, '--json', '--out', str(path)]) == 0
+    return path, json.loads(''.join(printed))
+
+
+class Page(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.sources, self.text, self.skipping = [], [], False
+
+    def handle_starttag(self, tag, attrs):
+        self.sources += [value for key, value in attrs if key in ('src', 'href', 'srcset')]
+        self.skipping = tag in ('script', 'style')
+
+    def handle_data(self, data):
+        if not self.skipping:
+            self.text += data.split()
+
+    def handle_endtag(self, tag):
+        self.skipping = False
+
+
+def test_the_page_is_complete_in_itself_and_has_the_figures_of_the_plan(planned):
+    path, plan = planned
+    html = path.read_text(encoding='utf-8')
+    page = Page()
+    page.feed(html)
+    assert all(source.startswith('#') for source in page.sources)
+    assert not re.search(r'url\((?!#)|@import', html)
+    text = ' '.join(page.text)
+    assert f'{plan["configurations"]} configurations at {plan["poses"]} poses' in text
+    assert f'{plan["robot_time_s"] / 60:.1f} min of robot time' in text
+    assert f'faster than {plan["max_tool_speed_m_s"]:.2f} m/s' in text
+    for name, std in plan['expected_std_deg'].items():
+        assert f'{name} {"not identifiable" if std is None else f"{std:.4f}"}' in text
+    for reason, count in plan['dropped'].items():
+        lost = plan['dropped_configurations'][reason]
+        assert f'{reason} {count} {lost}' in text
+    # The 3-D library is a quarter of a megabyte of it.
+    assert len(html) < 400_000
+
+
+def check_arm(q, drawn):
+    """Check that the page has the arm at joint angles (n, k) where the kinematics have it."""
+    cell = read_cell('demo')
+    chain = cell.chain()
+    marker = cell.planning_scene(chain).sights[0].marker_T
+    for angles, there in zip(q, drawn, strict=True):
+        np.testing.assert_allclose(there['tip'], chain.positions(angles, marker), atol=1e-6)
+        # Column by column; the base first, the tool last.
+        frames = np.array(there['frames']).reshape(-1, 4, 4).swapaxes(1, 2)
+        np.testing.assert_allclose(frames[1:-1], chain.frames(angles), atol=1e-6)
+        np.testing.assert_allclose(frames[-1], chain.forward(angles), atol=1e-6)
+
+
+def test_every_configuration_is_played_in_its_own_time(planned):
+    path, plan = planned
+    q = np.random.default_rng(3).uniform(-2.0, 2.0, (3, 7))
+    found = seen(
+        path,
+        """
+        const at = (id) => document.getElementById(id).textContent;
+        const key = (name) => document.getElementById(name).click();
+        const texts = (cells) => [...cells].map((cell) => cell.textContent);
+        const angles = () => texts(document.querySelectorAll('#joints .n'));
+        const first = {state: at('state'), angles: angles(), clock: at('clock')};
+        key('after');
+        const second = {state: at('state'), angles: angles()};
+        document.getElementById('all').open = true;
+        await wait(100);
+        const rows = [...document.querySelectorAll('#visits tr')].map((row) => texts(row.cells));
+        const slider = document.getElementById('time');
+        slider.value = slider.max;
+        slider.dispatchEvent(new Event('input'));
+        const last = {state: at('state'), clock: at('clock')};
+        location.hash = '#c3';
+        await wait(100);
+        const linked = at('state');
+        document.getElementById('speed').value = '30';
+        key('play');
+        await wait(700);
+        key('play');
+        for (const button of document.querySelectorAll('#views button')) button.click();
+        const canvas = document.querySelector('#scene canvas');
+        const plan = JSON.parse(await unpacked('plan-gzip'));
+        const view = new RobotView(document.createElement('div'), plan.scene);
+        const arm = ANGLES.map((q) => ({
+            tip: view.tip(q).toArray(), frames: view.frames(q).map((T) => T.toArray())}));
+        return {arm, first, second, rows, last, linked, played: Number(slider.value),
+                canvas: [canvas.clientWidth, canvas.clientHeight],
+                hidden: ['no-webgl', 'loading'].map((id) => document.getElementById(id).hidden)};
+        """.replace('ANGLES', json.dumps(q.tolist())),
+        *WEBGL,
+    )
+    check_arm(q, found['arm'])
+    count = plan['configurations']
+    assert found['first']['state'].startswith(f'1 of {count}: references, pose 1, measured')
+    assert found['second']['state'].startswith(f'2 of {count}: ')
+    assert found['first']['angles'] != found['second']['angles']
+    rows = found['rows']
+    assert [row[0] for row in rows] == [str(i + 1) for i in range(count)]
+    # What the bars show is what the list has.
+    shown = ', '.join(found['second']['angles']).replace('°', '')
+    assert shown == rows[1][-1]
+    # Its times add up to the plan's: ways and standstill.
+    total = sum(float(row[4]) for row in rows) + 3.5 * count
+    assert total == pytest.approx(plan['robot_time_s'], abs=0.06 * count)
+    minutes, seconds = map(int, found['last']['clock'].partition(' / ')[2].split(':'))
+    assert 60 * minutes + seconds == pytest.approx(plan['robot_time_s'], abs=1.0)
+    assert found['last']['state'].startswith(f'{count} of {count}: ')
+    assert found['linked'].startswith(f'3 of {count}: ')
+    # It went on from the third configuration.
+    third = sum(float(row[4]) + 3.5 for row in rows[:3]) - 3.5
+    assert found['played'] > third + 1.0
+    assert found['canvas'][0] > 300
+    assert found['canvas'][1] > 200
+    assert found['hidden'] == [True, True]
+
+
+def test_without_webgl_the_page_says_so_and_has_all_else(planned):
+    path, plan = planned
+    found = seen(
+        path,
+        """
+        document.getElementById('after').click();
+        const missing = document.getElementById('no-webgl');
+        return {text: missing.textContent, shown: missing.checkVisibility(),
+                canvas: document.querySelectorAll('canvas').length,
+                state: document.getElementById('state').textContent};
+        """,
+        *NO_WEBGL,
+    )
+    assert found['text'].startswith('This browser has no WebGL')
+    assert 'JavaScript' not in found['text']
+    assert found['shown']
+    assert found['canvas'] == 0
+    assert found['state'].startswith(f'2 of {plan["configurations"]}: ')
+
+
+def test_only_a_page_of_its_own_is_written_over(planned, tmp_path, capsys):
+    path, _ = planned
+    html = path.read_text(encoding='utf-8')
+    write_plan_page(path, html.replace('fetches nothing', 'fetches nothing at all'))
+    assert 'fetches nothing at all' in path.read_text(encoding='utf-8')
+    write_plan_page(path, html)
+    other = tmp_path / 'notes.html'
+    other.write_text('<html>mine</html>')
+    assert cli.main(['plan', 'demo', *FEW, '--quiet', '--out', str(other)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith('error: ')
+    assert 'give another name' in error
+    assert other.read_text() == '<html>mine</html>'
