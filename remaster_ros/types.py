@@ -30,7 +30,8 @@ class MarkerReading:
     stamp_s
         Time of capture, s.
     position
-        Marker position in N, m, shape (3,).
+        Marker position in N, m, shape (3,). NaN where other markers of the frame were seen and
+        this one was not.
     temperature_c
         Of the air, by the sensor's own thermometer; NaN where it has none.
     marker
@@ -42,6 +43,11 @@ class MarkerReading:
     position: FloatArray
     temperature_c: float = nan
     marker: str = ''
+
+    @property
+    def seen(self) -> bool:
+        """Whether the marker was measured."""
+        return bool(np.isfinite(self.position[0]))
 
 
 @dataclass(frozen=True)

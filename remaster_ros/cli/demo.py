@@ -87,7 +87,7 @@ def _collection(candidates: int | None, hidden: bool) -> dict[str, object]:
     is to show causes has all solutions of its poses.
     """
     if candidates is None and not hidden:
-        return {'cell': 'quick', 'candidates': DESIGNED_FROM}
+        return {'cell': 'quick', 'candidates': DESIGNED_FROM, 'reference_every': 50}
     return {'cell': 'demo', 'candidates': candidates or WITH_CAUSES}
 
 

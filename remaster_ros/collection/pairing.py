@@ -92,10 +92,6 @@ class Rejection:
     detail: str
 
 
-HIDDEN_S = 0.3
-"""So long after the dwell a marker of which nothing comes counts as hidden, where others of its
-frames were seen: messages of several topics come in no common order, s."""
-
 LONGEST_GAP_S = 5.0
 """Without a report of the joints for so long it is unknown whether the arm stood still, s."""
 
@@ -123,8 +119,7 @@ class Pairing:
     Attributes
     ----------
     decided
-        What was decided of each sensor. One reading is enough: a marker that is hidden costs
-        nothing while another one of the same frames is seen.
+        What was decided of each sensor. One of its markers is enough.
     further
         Readings of further markers in the same frames, of sensors that have a reading.
     left_out
@@ -210,7 +205,12 @@ class Pairing:
         for name, rules in self.rules.items():
             allowed = self._allowed_s(rules)
             unsure = self.is_required(name) and self._silent_s[name] > 0.0
-            if now_s > self.settled_stamp_s + allowed and not unsure:
+            if now_s <= self.settled_stamp_s + allowed or unsure or name in self.decided:
+                continue
+            used = self._used(rules, waits=False)
+            if used and self._joints and self._joints[-1][0] >= used[0]:
+                self._settle(rules, *used)
+            else:
                 self._set(self._late(rules, allowed))
 
     def _add_silence(
@@ -271,7 +271,7 @@ class Pairing:
         return dwell_s + rules.timeout_s + self._excused_s[rules.sensor]
 
     def _late(self, rules: SensorRules, allowed: float) -> Rejection:
-        count = max(map(len, self._by_marker(rules).values()))
+        count = max(len(_seen(part)) for part in self._by_marker(rules).values())
         if 0 < count < rules.min_samples and not rules.single_shot:
             detail = f'{count} usable samples in {allowed:.1f} s (at least {rules.min_samples})'
             return Rejection(rules.sensor, 'too_few', detail)
@@ -315,10 +315,13 @@ class Pairing:
             for name in (rules.marker, *rules.further)
         }
 
-    def _used(self, rules: SensorRules) -> tuple[float, dict[str, list[MarkerReading]]] | None:
+    def _used(
+        self, rules: SensorRules, *, waits: bool = True
+    ) -> tuple[float, dict[str, list[MarkerReading]]] | None:
         """Return the end of a measurement and each marker's readings in it; None while it lasts.
 
-        Markers with too few readings up to the end are left out, unless all are.
+        Markers with too few readings up to the end are left out, unless all are. Where nothing
+        is waited for any more, one of which nothing has come is hidden.
         """
         if not self._readings[rules.sensor]:
             return None
@@ -327,34 +330,34 @@ class Pairing:
             readings = parts[rules.marker]
             return readings[0].stamp_s, {rules.marker: readings[:1]}
 
+        seen = {name: _seen(part) for name, part in parts.items()}
+
         def within(end: float) -> dict[str, list[MarkerReading]]:
             used = {
                 name: [reading for reading in part if reading.stamp_s <= end]
-                for name, part in parts.items()
+                for name, part in seen.items()
             }
             return {name: part for name, part in used.items() if len(part) >= rules.min_samples}
 
         end = self.settled_stamp_s + rules.dwell_s
-        # The dwell is over for a marker once something later than its end has come of it.
+        # The dwell is over for a marker once something later than its end has come: every frame
+        # has a message of every marker, also of one that is hidden.
         over = [bool(part) and part[-1].stamp_s > end for part in parts.values()]
-        if not any(over) or not (all(over) or self._hidden_since(rules, end)):
+        if not any(over) or (waits and not all(over)):
             return None
         if used := within(end):
             return end, used
         enough = [
             part[rules.min_samples - 1].stamp_s
-            for part in parts.values()
+            for part in seen.values()
             if len(part) >= rules.min_samples
         ]
         end = min(enough, default=np.inf)
         if end > self.settled_stamp_s + self._allowed_s(rules):
             return None
+        # Others of the same frame may still come.
         complete = all(part and part[-1].stamp_s >= end for part in parts.values())
-        return (end, within(end)) if complete or self._hidden_since(rules, end) else None
-
-    def _hidden_since(self, rules: SensorRules, end: float) -> bool:
-        """Whether what has not come of a marker up to a time will not come any more."""
-        return self._now_s > end + min(HIDDEN_S, 0.5 * rules.timeout_s)
+        return (end, within(end)) if complete or not waits else None
 
     def _judge(
         self, rules: SensorRules, end: float, marker: str, used: list[MarkerReading]
@@ -387,3 +390,8 @@ class Pairing:
         return PairedReading(
             rules.sensor, marker, end, q_mean, positions.mean(axis=0), std, len(used)
         )
+
+
+def _seen(readings: list[MarkerReading]) -> list[MarkerReading]:
+    """Return those in which the marker was seen."""
+    return [reading for reading in readings if reading.seen]

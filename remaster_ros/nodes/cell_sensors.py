@@ -120,11 +120,14 @@ class CellSensors:
         def receive(message: PointStamped) -> None:
             point = message.point
             position = np.array([point.x, point.y, point.z])
-            if not np.all(np.isfinite(position)):
+            reading = MarkerReading(seconds(message.header.stamp), position, marker=marker)
+            hidden = bool(np.all(np.isnan(position))) and len(self._sensors[sensor].markers) > 1
+            # Hidden, while others of the frame are seen on topics of their own.
+            if not (hidden or np.all(np.isfinite(position))):
                 self.not_finite[sensor] += 1
                 return
-            self._liveness.reads(sensor, time.monotonic())
-            reading = MarkerReading(seconds(message.header.stamp), position, marker=marker)
+            if not hidden:
+                self._liveness.reads(sensor, time.monotonic())
             self._recording.take_reading(sensor, reading)
             self._on_reading()
 

@@ -75,6 +75,9 @@ class Parameters:
     candidates: int = parameter(
         14, 'candidate poses for optimization and for validation, each', low=1, high=1000
     )
+    reference_every: int = parameter(
+        25, 'configurations between two visits to the references; 0 for none', low=0, high=10_000
+    )
     rate: float = parameter(
         10.0, 'how many times as fast as the wall clock world time runs', low=1.0, high=20.0
     )
@@ -198,6 +201,7 @@ class Demo:
                 'session': session,
                 'optimization_candidates': size,
                 'validation_candidates': size,
+                'reference_every': self.p.reference_every,
             },
             'recorder': {'session': session},
             'optimizer': {

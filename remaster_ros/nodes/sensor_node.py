@@ -182,7 +182,7 @@ class SensorNode(RemasterNode):
         position = np.asarray(reading.position, float)
         message.point.x, message.point.y, message.point.z = map(float, position)
         self._readings[reading.marker].publish(message)
-        self.published += 1
+        self.published += reading.seen
 
     def _summary(self) -> Summary:
         state = self.driver.state()

@@ -159,8 +159,10 @@ class Watch(RemasterNode):
         self.view.take_joints(self._q)
 
     def _on_point(self, sensor: str, marker: str, message: PointStamped) -> None:
-        point = message.point
-        self.view.residuals.reading(sensor, marker, np.array([point.x, point.y, point.z]))
+        position = np.array([message.point.x, message.point.y, message.point.z])
+        # A marker that is hidden while others of its frame are seen is NaN.
+        if np.all(np.isfinite(position)):
+            self.view.residuals.reading(sensor, marker, position)
 
     def _on_target(self, message: PoseStamped) -> None:
         place, turn = message.pose.position, message.pose.orientation

@@ -40,7 +40,8 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     topic
         Where its readings are published (geometry_msgs/PointStamped, sensor frame); relative to
         the nodes' namespace, unless it begins with ``/``. Further markers have topics of their
-        own below it, ``TOPIC/NAME``.
+        own below it, ``TOPIC/NAME``; each has a message for every frame in which one of them was
+        seen, NaN where this one was not.
     rough_position_m
         Where it stands in the robot base, roughly.
     single_shot
@@ -90,15 +91,16 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
         return {self.marker: self.topic, **further}
 
     def problem(self, where: str, markers: Mapping[str, Triple]) -> str:
-        """Return what is wrong with its markers or topic, at `where`; '' where nothing is."""
+        """Return what is wrong with it, being at `where` in the file; '' where nothing is."""
+        return self._marker_problem(where, markers) or source_problem(
+            where, self.source, self.message_type, single_shot=self.single_shot
+        )
+
+    def _marker_problem(self, where: str, markers: Mapping[str, Triple]) -> str:
         known = ', '.join(markers)
         if self.marker not in markers:
             meant = did_you_mean(self.marker, markers)
             return f'{where}.marker is {self.marker!r}; markers has {known}{meant}'
-        if problem := source_problem(
-            where, self.source, self.message_type, single_shot=self.single_shot
-        ):
-            return problem
         where += '.further_markers'
         for name, number in self.further_markers.items():
             if name not in markers:

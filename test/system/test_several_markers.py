@@ -37,10 +37,11 @@ def test_markers_of_a_frame_are_recorded_together_and_a_hidden_one_costs_nothing
         mine = names == name
         expected = truth.without_noise(chain, 'mocap', m.q[mine], name)
         assert np.all(np.linalg.norm(m.position[mine] - expected, axis=1) < 0.4e-3), name
-    # Each marker once in a configuration, all of one frame, and where it was hidden the others.
+    # Each marker once in a configuration, and where one was hidden (at times the bar loses one
+    # by itself) the others.
     of = [sorted(names[m.configuration == number]) for number in np.unique(m.configuration)]
-    assert all(found in (['sir', 'sir_2', 'sir_3'], ['sir_2', 'sir_3']) for found in of), of
-    assert 2 <= of.count(['sir_2', 'sir_3']) < len(of) - 4
+    assert all(len(set(found)) == len(found) > 1 for found in of), of
+    assert 2 <= sum('sir' not in found for found in of) < len(of) - 3
     np.testing.assert_array_equal(m.frame, m.configuration)
     assert len(of) == cell.planned() > 3
 
@@ -48,11 +49,16 @@ def test_markers_of_a_frame_are_recorded_together_and_a_hidden_one_costs_nothing
     from geometry_msgs.msg import PointStamped
     from rclpy.serialization import deserialize_message
 
+    hidden = 0
     for message in BagReader(cell.session / 'bag'):
         if message.topic.startswith('/optitrack/marker'):
-            stamp = deserialize_message(message.cdr, PointStamped).header.stamp
+            point = deserialize_message(message.cdr, PointStamped)
+            stamp = point.header.stamp
             stamps.setdefault(message.topic, set()).add(stamp.sec * 10**9 + stamp.nanosec)
-    second, third = stamps['/optitrack/marker/sir_2'], stamps['/optitrack/marker/sir_3']
-    # Equal stamps in a frame; single frames may have one of them hidden.
-    assert len(second & third) > 0.9 * len(second | third)
-    assert len(stamps['/optitrack/marker'] & second) < len(second)
+            hidden += message.topic == '/optitrack/marker' and np.isnan(point.point.x)
+    first, second, third = (
+        stamps[f'/optitrack/marker{name}'] for name in ('', '/sir_2', '/sir_3')
+    )
+    # Equal stamps in a frame, but for those that a bag began or ended in.
+    assert len(first & second & third) > 0.98 * len(first | second | third)
+    assert hidden > 10

@@ -9,6 +9,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
+import numpy as np
+
 from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.optitrack.diagnosis import (
     Diagnosis,
@@ -35,8 +37,8 @@ _log = logging.getLogger('remaster_ros')
 class MarkerFollower(ABC):
     """Follows the markers of one rigid body of an OptiTrack server in a thread of its own.
 
-    Each marker is judged by itself: one that is hidden, filled in by the model or that jumps gives
-    no reading, and the others of the frame do.
+    Each marker is judged by itself: one that is hidden, filled in by the model or jumps is NaN
+    in a frame of which others are seen. Where none is, there is no reading at all.
 
     Parameters
     ----------
@@ -217,14 +219,19 @@ class MarkerFollower(ABC):
         self._frame_at = now
         connection = self._status.server.connection if self._status.server is not None else None
         ticks_per_s = connection.clock_frequency if connection is not None else 0
-        sample = self._gate.admit(frame, received_s, ticks_per_s)
-        samples = [] if sample is None else [sample]
-        for name, gate in self._further.items():
-            if (sample := gate.admit(frame, received_s, ticks_per_s)) is not None:
-                samples.append(replace(sample, marker=name))
+        found = {
+            name: gate.admit(frame, received_s, ticks_per_s)
+            for name, gate in {'': self._gate, **self._further}.items()
+        }
         if self._gate.resolved:
             self._ready.set()
-        return samples
+        seen = next(filter(None, found.values()), None)
+        if seen is None:
+            return []
+        # A message for every marker: whoever listens to several topics then knows, by the stamps
+        # alone, that nothing of a frame is still to come.
+        hidden = replace(seen, position=np.full(3, np.nan), residual_m=np.nan)
+        return [replace(sample or hidden, marker=name) for name, sample in found.items()]
 
     def _begin_source(self, source: Source) -> None:
         """Report whose frames are believed from now on."""
