@@ -5,18 +5,23 @@ import base64
 import json
 import shutil
 import subprocess
+import tempfile
 import time
 import urllib.request
+from pathlib import Path
 
 import pytest
-from page_probe import NAMES, WEBGL
 from tornado.websocket import websocket_connect
+
+NAMES = ('chromium', 'chromium-browser', 'google-chrome')
+WEBGL = ('--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader')
+NO_WEBGL = ('--disable-3d-apis',)
 
 
 class Browser:
     """One tab. Errors of the page's scripts are collected in `errors`."""
 
-    def __init__(self, profile):
+    def __init__(self, profile, *flags):
         program = next(filter(None, map(shutil.which, NAMES)), None)
         if program is None:
             pytest.skip(f'needs a browser: one of {", ".join(NAMES)} on PATH')
@@ -25,7 +30,7 @@ class Browser:
                 program,
                 *('--headless', '--no-sandbox', '--no-first-run', '--disable-extensions'),
                 *('--remote-debugging-port=0', *WEBGL),
-                *(f'--user-data-dir={profile}', '--window-size=1200,1500', 'about:blank'),
+                *(f'--user-data-dir={profile}', '--window-size=1200,1500', *flags, 'about:blank'),
             ],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -35,6 +40,7 @@ class Browser:
         try:
             self._connect(profile / 'DevToolsActivePort')
         except BaseException:
+            self._loop.close()
             self._process.kill()
             self._process.wait()
             raise
@@ -155,3 +161,22 @@ class Browser:
         self._loop.close()
         self._process.terminate()
         self._process.wait(20)
+
+
+def seen(page, script, *flags):
+    """Return what an asynchronous script returns in a file that was opened without a network.
+
+    The test is skipped where there is no Chromium.
+    """
+    profile = Path(tempfile.mkdtemp(dir=page.parent))
+    tab = Browser(profile, '--host-resolver-rules=MAP * ~NOTFOUND', *flags)
+    try:
+        tab.open(page.as_uri())
+        loaded = f'document.readyState == "complete" && location.href == {page.as_uri()!r}'
+        tab.until(lambda: tab.value(loaded), 'the page')
+        wait = 'const wait = (ms) => new Promise((done) => setTimeout(done, ms)); await wait(500);'
+        found = tab.value(f'(async () => {{ {wait} {script} }})()')
+        assert tab.errors == []
+        return found
+    finally:
+        tab.close()

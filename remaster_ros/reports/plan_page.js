@@ -111,10 +111,11 @@ async function playPlan(plan) {
     show();
   };
 
-  let last = 0;
+  // A frame's time may lie before the click that began to play: the first one only sets the clock.
+  let last = null;
   const tick = (now) => {
     if (!playing) return;
-    goTo(time + ((now - last) / 1000) * Number(element('speed').value));
+    goTo(time + ((now - (last ?? now)) / 1000) * Number(element('speed').value));
     last = now;
     if (time >= total) play(false);
     else requestAnimationFrame(tick);
@@ -124,7 +125,7 @@ async function playPlan(plan) {
     element('play').textContent = on ? 'Pause' : 'Play';
     if (!on) return;
     if (time >= total) time = 0;
-    last = performance.now();
+    last = null;
     requestAnimationFrame(tick);
   };
   element('play').addEventListener('click', () => play(!playing));
