@@ -5,7 +5,7 @@
 #   make qualify  all of them, and the campaigns of minutes that make test leaves out; an hour
 #   make check    lint, types, layers; CI runs this and make test
 #   make bench    the benchmarks, small (BENCH='bench_speed …' chooses, FULL=1 for all sizes)
-#   make docs     docs/parameters.md from the code
+#   make docs     the site, build/docs/index.html, and its pages that come from the code
 #   make faults   the tables of docs/faults.md from what the tests observe (FAULTS=add keeps the old)
 # The first of them makes a virtual environment. With ROS 2 Jazzy sourced its rclpy is used and the
 # system's NumPy kept; else the ROS 2 wheels are installed. PYTHON=... chooses the interpreter.
@@ -75,8 +75,16 @@ $(VENV)/bench-installed: $(VENV)/installed
 	$(BIN)/python -m pip install -qq -c $(CONSTRAINTS) --no-build-isolation -e '.[bench]'
 	@touch $@
 
-docs: $(VENV)/installed
+# A page that warns (a link to nowhere, a name that is not there) ends it with an error.
+docs: $(VENV)/docs-installed
 	$(BIN)/python docs/make_parameters.py
+	$(BIN)/python docs/make_command_line.py
+	$(BIN)/python -m sphinx -q -W --keep-going docs build/docs
+	@echo "the site: build/docs/index.html"
+
+$(VENV)/docs-installed: $(VENV)/installed
+	$(BIN)/python -m pip install -qq -c $(CONSTRAINTS) --no-build-isolation -e '.[docs]'
+	@touch $@
 
 faults: $(VENV)/installed
 	FAULTS_PAGE=$(or $(FAULTS),write) tools/run-tests $(BIN)/python -q \

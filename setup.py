@@ -97,6 +97,8 @@ setup(
     extras_require={
         'jazzy': JAZZY,
         'pdf': ['weasyprint>=62'],
+        # What `make docs` builds the site with.
+        'docs': ['sphinx>=8.1', 'myst-parser>=4', 'furo>=2024.8'],
         'natnetclient': ['NatNetClient==0.8.3'],
         # colcon, with which a test builds the package, runs pytest only where it is in this list.
         'test': [

@@ -42,7 +42,7 @@ def what_remains(
     if judgement.doubts and found is None:
         rows.append(
             Remaining(
-                'More than noise',
+                'Not shown to be noise',
                 judgement.doubts[0],
                 'Search for its cause: remaster discover SESSION --out DIR, then give DIR to '
                 'remaster report.',

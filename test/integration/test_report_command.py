@@ -184,7 +184,7 @@ def test_a_session_alone_is_fitted_first(made: Path, tmp_path: Path) -> None:
     assert 'remaster discover' in done.stdout
     html = (tmp_path / 'out/report.html').read_text(encoding='utf-8')
     assert '<svg' not in html
-    assert 'More than noise' in html
+    assert 'Not shown to be noise' in html
 
 
 def test_a_session_in_which_something_moved_is_green_on_no_page(made: Path) -> None:

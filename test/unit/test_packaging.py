@@ -225,15 +225,26 @@ def test_every_requirement_is_pinned_exactly(setup_arguments: dict[str, Any]) ->
     assert differing <= numpy_2 | {'pytest'}
 
 
-def test_parameters_page_is_up_to_date() -> None:
-    pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
-    path = ROOT / 'docs' / 'make_parameters.py'
-    spec = importlib.util.spec_from_file_location('make_parameters', path)
+@pytest.mark.parametrize('name', ['parameters', 'command_line'])
+def test_pages_from_the_code_are_up_to_date(name: str) -> None:
+    if name == 'parameters':
+        pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+    path = ROOT / 'docs' / f'make_{name}.py'
+    spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     assert module.PAGE.read_text(encoding='utf-8') == module.page(), 'run: make docs'
+
+
+def test_every_page_is_in_the_table_of_contents() -> None:
+    pages = {page.stem for page in (ROOT / 'docs').glob('*.md')} - {'index'}
+    blocks = re.findall(
+        r'```{toctree}\n(.*?)```', (ROOT / 'docs/index.md').read_text('utf-8'), re.S
+    )
+    listed = [line for block in blocks for line in block.splitlines() if re.match(r'[a-z]', line)]
+    assert sorted(listed) == sorted(pages)
 
 
 def test_links_in_the_pages_lead_somewhere() -> None:

@@ -1,0 +1,144 @@
+"""Every command of README and docs: those without ROS are run, the others are parsed.
+
+The pages are run one by one in a scratch folder, in the order of their commands. A file or folder
+that a page takes for the reader's own (`my_session`, `points.csv`, …) is put there before it is
+first read.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from documented_commands import PAGES as ALL
+from documented_commands import (
+    ROOT,
+    Command,
+    commands,
+    fault,
+    hidden_commands,
+    parser,
+    reads,
+    small,
+)
+from foreign_tables import measured, text, write
+from robot_descriptions import ROBOTS
+
+from remaster_ros.cli.main import main
+
+CHEAP = {'tutorial-table.md'}
+
+
+@pytest.mark.parametrize('page', ALL, ids=lambda page: page.stem)
+def test_every_command_can_be_given_as_it_stands(page: Path) -> None:
+    faults = [(c.line, ' '.join(c.words), why) for c in commands(page) if (why := fault(c))]
+    assert faults == []
+    assert hidden_commands(page) == [], 'commands belong into blocks of bash or console'
+
+
+def test_commands_of_every_kind_are_found_and_wrong_ones_refused() -> None:
+    found = [command for page in ALL for command in commands(page)]
+    assert {c.words[0] for c in found} >= {'remaster', 'ros2', 'make', 'pip', 'python'}
+    assert sum(c.is_run for c in found) > 30
+    for wrong in (
+        'remaster fit s --out f --fast',
+        'make dem',
+        'pip install .[jazz]',
+        'python benchmarks/no_such.py',
+        'python -m remaster_ros.nodes recorder --ros-args -p sesion:=x',
+        'ros2 service call /remaster/colect std_srvs/srv/Trigger',
+        'ros2 launch remaster_ros real.launch.py cel:=x',
+        'remastr fit',
+    ):
+        assert fault(Command('', 0, wrong.split(), '')), wrong
+
+
+def test_every_option_that_the_page_on_import_names_is_there() -> None:
+    named = re.findall(r'`(--[a-z][a-z-]+)', (ROOT / 'docs/import.md').read_text('utf-8'))
+    assert len(named) > 15
+    assert {*named} <= {*parser('import')._option_string_actions}
+
+
+@pytest.fixture(scope='module')
+def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with what the pages take for the reader's own."""
+    folder = tmp_path_factory.mktemp('own')
+    arm = measured(rows=24)
+    names, degrees, mm = [f'P{i}' for i in range(24)], np.rad2deg(arm.q).T, 1e3 * arm.points.T
+    joints = [f'A{i}' for i in range(1, 7)]
+    for name in ('arm.urdf', 'robot.urdf', 'robot.urdf.xacro', 'my.urdf.xacro'):
+        (folder / name).write_text(arm.urdf, encoding='utf-8')
+    write(folder, 'table.csv', text(['name', *joints, 'X', 'Y', 'Z'], [names, *degrees, *mm]))
+    write(folder, 'points.csv', text(['name', 'X', 'Y', 'Z'], [names, *mm]))
+    write(folder, 'joints.csv', text(['name', *joints], [names, *degrees]))
+    return folder
+
+
+def run(page: Path, own: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> int:
+    """Run the commands of a page that can be run here; return how many."""
+    (here / 'docs').symlink_to(ROOT / 'docs')
+    count = 0
+    for command in commands(page):
+        if not command.is_run:
+            continue
+        for word in reads(command):
+            supply(word, own, here)
+        capsys.readouterr()
+        status = main(small(command))
+        shown = capsys.readouterr().err
+        place = f'{command.page}:{command.line}: {" ".join(command.words)}'
+        if command.error:
+            assert status in (1, 2), place
+            # Figures may differ in the last digit.
+            assert without_numbers(shown.splitlines()[-1]) == without_numbers(command.error), place
+        else:
+            assert status == 0, f'{place}\n{shown}'
+        count += 1
+    return count
+
+
+def supply(word: str, own: Path, here: Path) -> None:
+    """Put a file or folder that a page reads and has not made into the scratch folder."""
+    name, target = Path(word).parts[0], here / Path(word).parts[0]
+    if target.exists() or word.startswith('-'):
+        return
+    if (own / name).exists():
+        shutil.copy(own / name, target)
+    elif name in ('my_session', 'session', 'other_session', 's1', 's2', 'saggy'):
+        size = ('--poses', '24', '--validation', '12', '--quiet')
+        assert main(['simulate', name, *size]) == 0
+    elif name == 'my_fit':
+        supply('my_session', own, here)
+        assert main(['fit', 'my_session', '--out', name, '--no-figures', '--quiet']) == 0
+    elif name == 'causes':
+        supply('my_session', own, here)
+        assert main(['discover', 'my_session', '--out', name, '--no-figures', '--quiet']) == 0
+    elif name == 'my_cell.yaml':
+        (here / 'ur.urdf').write_text(ROBOTS['ur5e']().urdf, encoding='utf-8')
+        assert main(['init', 'ur.urdf', '--out', name, '--quiet']) == 0
+
+
+def without_numbers(line: str) -> str:
+    return re.sub(r'\d+(\.\d+)?', '#', line)
+
+
+@pytest.mark.parametrize(
+    'page',
+    [
+        pytest.param(p, marks=[] if p.name in CHEAP else pytest.mark.qualify, id=p.stem)
+        for p in ALL
+        if any(c.is_run for c in commands(p))
+    ],
+)
+def test_the_commands_of_a_page_work_one_after_the_other(
+    page: Path,
+    own: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(page, own, tmp_path, capsys) > 0
