@@ -121,7 +121,8 @@ class Designed:
         )
         return (
             f'expected std of the offsets {np.degrees(self.joint_rms):.4f} deg (RMS), '
-            f'error of the predicted markers {self.tool_rms * 1e3:.3f} mm (RMS){goal}'
+            f'error of the predicted markers {self.tool_rms * 1e3:.3f} mm (RMS), with the noise '
+            f'that the cell file has{goal}'
         )
 
 
