@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from calibration_scenes import CHAIN, MARKERS, URDF, sensors
 from command_line import ROOT
 
@@ -75,6 +76,7 @@ def peak_mb(rows: int, folder: Path) -> float:
     return float(process.stdout) / 1024
 
 
+@pytest.mark.qualify
 def test_memory_hardly_grows_with_the_rows(tmp_path):
     """100,000 rows fit into 2 GiB: a search of a gigabyte, and what each row adds."""
     few, many = (peak_mb(rows, tmp_path / str(rows)) for rows in (FEW, MANY))

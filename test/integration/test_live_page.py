@@ -169,6 +169,7 @@ def test_without_the_token_the_page_is_empty(browser, played):
     assert browser.value('sessionStorage.clear()') is None
 
 
+@pytest.mark.qualify
 def test_a_page_of_another_origin_gets_nowhere(browser, played):
     """Another server on this computer, whose page a person has open beside this one."""
     own, other = f'http://127.0.0.1:{played.server.port}', HTTPServer(('127.0.0.1', 0), Empty)

@@ -86,8 +86,10 @@ def test_the_state_is_a_record_and_text(bench):
 
 def test_diagnostics_come_once_a_second_with_name_level_and_hardware(bench):
     bench.wait(lambda: len(bench.diagnostics) > 2)
-    times, arrays = zip(*bench.diagnostics)
-    assert (times[-1] - times[0]) / (len(times) - 1) == pytest.approx(1.0, abs=0.6)
+    _, arrays = zip(*bench.diagnostics)
+    stamps = [array.header.stamp.sec + 1e-9 * array.header.stamp.nanosec for array in arrays]
+    # No oftener; later only where the machine is busy.
+    assert (stamps[-1] - stamps[0]) / (len(stamps) - 1) > 0.9
     (found,) = arrays[-1].status
     assert (found.name, found.hardware_id) == ('left/robot_bridge: state', 'lwr4plus')
     assert (found.level, found.message) == (DiagnosticStatus.ERROR, HALT)
