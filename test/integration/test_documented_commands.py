@@ -115,8 +115,9 @@ def supply(word: str, own: Path, here: Path) -> None:
     if (own / name).exists():
         shutil.copy(own / name, target)
     elif name in ('my_session', 'session', 'other_session', 's1', 's2', 'saggy'):
-        size = ('--poses', '24', '--validation', '12', '--quiet')
-        assert main(['simulate', name, *size]) == 0
+        # A cause so small that it has look-alikes, which `plan --separate` needs.
+        options = '--poses 24 --validation 12 --effect joint_compliance@2:0.15 --quiet'
+        assert main(['simulate', name, *options.split()]) == 0
     elif name == 'my_fit':
         supply('my_session', own, here)
         assert main(['fit', 'my_session', '--out', name, '--no-figures', '--quiet']) == 0
