@@ -122,8 +122,8 @@ def supply(word: str, own: Path, here: Path) -> None:
         supply('my_session', own, here)
         assert main(['fit', 'my_session', '--out', name, '--no-figures', '--quiet']) == 0
     elif name in ('causes', 'discovery.json'):
-        supply('my_session', own, here)
-        assert main(['discover', 'my_session', '--out', 'causes', '--no-figures', '--quiet']) == 0
+        supply('s1', own, here)
+        assert main(['discover', 's1', '--out', 'causes', '--no-figures', '--quiet']) == 0
         shutil.copy('causes/discovery.json', 'discovery.json')
     elif name == 'my_cell.yaml':
         cell = (ROOT / 'config/cells/demo.yaml').read_text('utf-8')
