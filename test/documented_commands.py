@@ -190,6 +190,7 @@ def small(command: Command) -> list[str]:
     if find_spec('weasyprint') is None:
         words = [word for word in words if word != '--pdf']
     options = {
+        'init': ['--no-plan'],
         'simulate': ['--poses', '24', '--validation', '12'],
         'plan': ['--poses', '20', '--validation', '6', '--reference-every', '0'],
         'fit': ['--draws', '500', '--no-figures'],
