@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from documented_commands import PAGES as ALL
 from documented_commands import (
+    FENCE,
     ROOT,
     Command,
     commands,
@@ -24,9 +24,10 @@ from documented_commands import (
     reads,
     small,
 )
+from documented_commands import PAGES as ALL
 from foreign_tables import measured, text, write
 
-from remaster_ros.cli.main import main
+from remaster_ros.cli.main import VERBS, main
 
 # Together some 15 s; the others are run by `make qualify`.
 CHEAP = {
@@ -61,6 +62,17 @@ def test_commands_of_every_kind_are_found_and_wrong_ones_refused() -> None:
         'remastr fit',
     ):
         assert fault(Command('', 0, wrong.split(), '')), wrong
+
+
+@pytest.mark.parametrize('page', ALL, ids=lambda page: page.stem)
+def test_commands_within_sentences_have_verbs_and_options_that_exist(page: Path) -> None:
+    for words in re.findall(r'`remaster ([^`]+)`', FENCE.sub('', page.read_text('utf-8'))):
+        verb, *rest = words.split()
+        if verb in ('VERB', '…') or verb.startswith('-'):
+            continue
+        assert verb in VERBS, words
+        options = {word for word in rest if word.startswith('--')}
+        assert options <= {*parser(verb)._option_string_actions}, words
 
 
 def test_every_option_that_the_page_on_import_names_is_there() -> None:
