@@ -15,7 +15,6 @@ html_copy_source = False
 html_theme_options = {'footer_icons': []}
 # Links such as safety.md#a-halt work as they do on the code host.
 myst_heading_anchors = 3
-myst_enable_extensions = ['deflist']
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 autodoc_member_order = 'bysource'

@@ -6,6 +6,7 @@ import argparse
 import re
 import shlex
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,8 +19,8 @@ PAGES = [
     # The page of the verbs is written from the parsers, that of the paper by a benchmark.
     *(p for p in sorted((ROOT / 'docs').glob('*.md')) if p.stem not in ('command-line', 'paper')),
 ]
-# What moves an arm, needs ROS or goes on for ever is parsed, not run.
-NOT_RUN = {'demo', 'watch', 'replay'}
+# What needs ROS, or a session that a recorder has left, is parsed, not run.
+NOT_RUN = {'demo', 'recover', 'replay', 'watch'}
 # Programs of others; those of this project are checked word by word.
 OTHERS = {'apt', 'cd', 'chronyc', 'colcon', 'eval', 'export', 'git', 'rviz2', 'source', 'sudo'}
 ROS2 = {'bag', 'control', 'pkg', 'security', 'topic'}
@@ -186,7 +187,10 @@ def reads(command: Command) -> list[str]:
 def small(command: Command) -> list[str]:
     """Return the words for `main`, with sizes that cost little where the page leaves them open."""
     words = command.words[1:]
+    if find_spec('weasyprint') is None:
+        words = [word for word in words if word != '--pdf']
     options = {
+        'init': ['--no-plan'],
         'simulate': ['--poses', '24', '--validation', '12'],
         'plan': ['--poses', '20', '--validation', '6', '--reference-every', '0'],
         'fit': ['--draws', '500', '--no-figures'],

@@ -146,7 +146,10 @@ def plan_collection(
     tour = planner.collection(T_R_N)
     plan = look_ahead(planner, T_R_N, [tour], start, progress=progress)
     if plan.undetermined:
-        raise InsufficientDataError(plan.undetermined)
+        raise InsufficientDataError(
+            f'{len(tour.plans[FITTED].poses)} poses to fit can be visited, too few or too alike: '
+            f'{plan.undetermined}; plan more candidates, or widen their ranges in the cell file'
+        )
     return plan
 
 

@@ -38,8 +38,7 @@ def find_package(name: str, beside: Path, package_path: Sequence[Path] = ()) -> 
 
 
 def _candidates(beside: Path, package_path: Sequence[Path]) -> Iterator[Path]:
-    # Absolute: xacro takes a relative path to be beside the file that includes it.
-    yield from (folder.resolve() for folder in package_path)
+    yield from package_path
     for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
         if prefix:
             yield Path(prefix) / 'share'

@@ -137,18 +137,6 @@ def test_a_package_that_is_elsewhere_is_asked_for_and_found(do, tmp_path, monkey
     assert do(apart, 'name:=mine', '--package-path', 'elsewhere', '--no-plan')[0] == 0
 
 
-def test_a_folder_of_packages_may_be_relative(do, tmp_path, monkeypatch):
-    """A relative path in an include is taken to be beside the including file."""
-    path = macro(tmp_path, ROBOTS['irb120']())
-    apart = tmp_path / 'apart' / 'robot.urdf.xacro'
-    apart.parent.mkdir()
-    (tmp_path / 'src').rename(tmp_path / 'elsewhere')
-    (tmp_path / 'elsewhere' / path.relative_to(tmp_path / 'src')).rename(apart)
-    monkeypatch.chdir(tmp_path)
-    status, _, error = do(apart, 'name:=mine', '--package-path', 'elsewhere')
-    assert (status, error) == (0, '')
-
-
 def test_meshes_are_found_or_named(do, tmp_path):
     description = ROBOTS['irb120']()
     mesh = '<geometry><mesh filename="package://abb/meshes/{}.stl"/></geometry>'

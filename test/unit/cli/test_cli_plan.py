@@ -102,6 +102,14 @@ def test_a_wrong_cell_is_one_line(tmp_path, capsys, poses, status, words):
     assert err.count('\n') == 1
 
 
+def test_too_few_poses_are_told_from_too_few_measurements(capsys):
+    status, _, err = run(capsys, 'demo', '--poses', 2, '--validation', 0, '--reference-every', 0)
+    assert status == 1
+    assert '1 poses to fit can be visited, too few' in err
+    assert 'plan more candidates, or widen their ranges in the cell file' in err
+    assert err.count('\n') == 1
+
+
 def test_a_cell_without_reachable_poses_is_one_line(tmp_path, capsys):
     path = cell_with(tmp_path, '')
     text = path.read_text(encoding='utf-8')
