@@ -46,8 +46,10 @@ DISCOVERY_S = 4.0
 3 s, and its first announcement can get lost on a busy machine."""
 NEWCOMER_S = 0.5
 """How long after its first endpoint all others of a node are known, s."""
-DEPTH = 1000
+DEPTH = 20_000
 """Messages that a publisher keeps for subscribers that have not taken them yet."""
+BEHIND_S = 0.05
+"""So much of a delay of its own a replay makes up for, s; the rest it goes on later."""
 TAKEN_S = 10.0
 """How long a subscriber may take for half of them before they count as dropped, s."""
 SHOWN_S = 5.0
@@ -198,6 +200,9 @@ class Replay(RemasterNode):
                 self._ending.wait(min(ahead, 0.01))
             if self._ending.is_set():
                 return
+            if -ahead > BEHIND_S:
+                # Made up for at once, it would flood subscribers that keep a few messages only.
+                start_wall -= ahead + BEHIND_S
             if time.monotonic() - looked > LOOK_S:
                 looked = time.monotonic()
                 self._refuse_live()
