@@ -184,16 +184,7 @@ def test_a_replay_at_ten_times_the_speed_gives_the_same_session_and_fit(
     recorder = start(
         'remaster_ros.nodes.recorder',
         *node_arguments(
-            ROOT / 'config' / 'fake.yaml',
-            **{
-                f'recorder:{name}': value
-                for name, value in {
-                    'cell': 'quick',
-                    'session': fresh,
-                    'call_measure': False,
-                    'bag': False,
-                }.items()
-            },
+            ROOT / 'config' / 'fake.yaml', session=fresh, call_measure=False, bag=False
         ),
     )
     start(
