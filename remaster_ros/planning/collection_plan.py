@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -110,6 +111,11 @@ class CollectionPlan:
     designed: Designed | None
     undetermined: str = ''
     separated: SeparatingDesign | None = None
+
+    @property
+    def poses(self) -> dict[str, int]:
+        """Split -> number of poses with at least one configuration that is visited."""
+        return dict(Counter(split for split, _ in {(v.split, v.pose) for v in self.visits}))
 
     @property
     def dropped(self) -> dict[str, int]:

@@ -11,7 +11,7 @@ import numpy as np
 from remaster_ros.planning.collection_plan import FITTED, CollectionPlan, Expected
 from remaster_ros.planning.planned_design import DesignSettings
 from remaster_ros.planning.separating_design import DECIDED, SeparatingDesign
-from remaster_ros.planning.tour_order import Tour
+from remaster_ros.planning.tour_order import REFERENCE, Tour
 
 HELD_OUT = 'validation'
 
@@ -26,15 +26,14 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
     design = plan.designed
     return {
         'configurations': len(plan.visits),
-        'poses': sum(plan.tour.poses.values()),
+        'poses': sum(count for split, count in plan.poses.items() if split != REFERENCE),
         'dropped': dict(plan.tour.dropped),
         'robot_time_s': round(plan.robot_time_s, 1),
         'expected_std_deg': _degrees(plan.joint_std),
         'expected_tool_std_mm': plan.tool_rms * 1e3,
         'max_tool_speed_m_s': round(plan.max_tool_speed_m_s, 4),
         'splits': {
-            split: {'poses': plan.tour.poses.get(split, plan.tour.references), 'visits': count}
-            for split, count in visits.items()
+            split: {'poses': plan.poses[split], 'visits': count} for split, count in visits.items()
         },
         'dropped_configurations': plan.dropped,
         'expected_rms_std_deg': float(np.degrees(plan.joint_rms)),
@@ -72,9 +71,9 @@ def _separated(design: SeparatingDesign) -> dict[str, Any]:
 def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
     """Return the same for people, one subject a line."""
     visits = Counter(visit.split for visit in plan.visits)
-    poses = plan.tour.poses
+    poses = plan.poses
     lines = [
-        f'to fit: {visits[FITTED]} configurations at {poses[FITTED]} poses'
+        f'to fit: {visits[FITTED]} configurations at {poses.get(FITTED, 0)} poses'
         + (', chosen for what they tell' if settings.optimal else ' of a Latin hypercube'),
         f'held out: {visits[HELD_OUT]} configurations at {poses.get(HELD_OUT, 0)} poses',
     ]

@@ -58,7 +58,7 @@ def plan_page(
     from remaster_ros.reports.pages import page
 
     minutes = minutes_text(plan.robot_time_s)
-    poses = len({(visit.split, visit.pose) for visit in plan.visits if visit.split != REFERENCE})
+    poses = sum(count for split, count in plan.poses.items() if split != REFERENCE)
     moving_s = plan.robot_time_s - plan.measuring_s * len(plan.visits)
     fastest = max(range(len(plan.visits)), key=lambda i: plan.visits[i].tool_speed_m_s)
     return page(
@@ -135,7 +135,7 @@ def _splits(plan: CollectionPlan) -> list[dict[str, Any]]:
     for split, (words, why) in WORDS.items():
         visits = [visit for visit in plan.visits if visit.split == split]
         if visits:
-            poses = len({visit.pose for visit in visits})
+            poses = plan.poses[split]
             rows.append(
                 {'split': split, 'words': words, 'why': why, 'poses': poses, 'visits': len(visits)}
             )
