@@ -56,7 +56,7 @@ class LiveResiduals:
             total[:] = 0.0
 
     def reading(self, sensor: str, marker: str, position_N: FloatArray) -> None:
-        """Take a reading of a marker in the sensor's frame, m, (3,)."""
+        """Take a reading of a marker in the sensor's frame, m, (3,); NaN while it is hidden."""
         if self._q is not None and np.all(np.isfinite(position_N)):
             self._sums[sensor, marker] += [*position_N, 1.0]
 

@@ -160,9 +160,7 @@ class Watch(RemasterNode):
 
     def _on_point(self, sensor: str, marker: str, message: PointStamped) -> None:
         position = np.array([message.point.x, message.point.y, message.point.z])
-        # A marker that is hidden while others of its frame are seen is NaN.
-        if np.all(np.isfinite(position)):
-            self.view.residuals.reading(sensor, marker, position)
+        self.view.residuals.reading(sensor, marker, position)
 
     def _on_target(self, message: PoseStamped) -> None:
         place, turn = message.pose.position, message.pose.orientation

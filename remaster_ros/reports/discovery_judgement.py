@@ -13,10 +13,8 @@ from remaster_ros.reports.schemas import Judgement
 
 # Regions meant for 95 % of the held-out rows that hold clearly less than this are too small.
 FEWEST_INSIDE = 0.92
-TOO_SURE = (
-    ' Fewer held-out rows than should lie where they were predicted: something is left that the '
-    'model does not have.'
-)
+# So many times the noise the error on held-out poses may be, and more by chance with few rows.
+MOST_OVER_NOISE = 1.25
 
 
 def judgement(
@@ -31,20 +29,31 @@ def judgement(
     content
         The same as discovery.json has it.
     """
-    sure = too_sure(content)
+    more = more_than_noise(content)
     return Judgement(
-        mood='good' if _is_proven(discovery, confirmation) and not sure else 'caution',
-        headline=headline(discovery, confirmation) + (TOO_SURE if sure else ''),
+        mood='good' if _is_proven(discovery, confirmation) and not more else 'caution',
+        headline=headline(discovery, confirmation) + (f' {more}' if more else ''),
         points=in_words(discovery, confirmation) if confirmation is not None else [],
     )
 
 
-def too_sure(content: Discovered) -> bool:
-    """Whether clearly fewer held-out rows lie in their 95 % regions than should."""
-    regions = content.predicted_regions95
+def more_than_noise(content: Discovered) -> str:
+    """Return in what held-out rows show that the model does not have something; ''."""
+    regions, gain = content.predicted_regions95, content.gain
     if isinstance(regions, msgspec.UnsetType) or regions.held_out.interval95 is None:
-        return False
-    return regions.held_out.interval95[1] < FEWEST_INSIDE
+        return ''
+    if regions.held_out.interval95[1] < FEWEST_INSIDE:
+        return (
+            'Fewer held-out rows than should lie where they were predicted: something is left '
+            'that the model does not have.'
+        )
+    after, most = gain.held_out_rms_after_m, MOST_OVER_NOISE + regions.held_out.rows**-0.5
+    if after is not None and after > most * gain.noise_floor_m:
+        return (
+            f'The error on held-out poses is {after / gain.noise_floor_m:.1f} times that of the '
+            'noise alone: something is left that the model does not have.'
+        )
+    return ''
 
 
 def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.discovery.words import clock_time
 from remaster_ros.reports.answer_inputs import Inputs
-from remaster_ros.reports.discovery_judgement import too_sure
+from remaster_ros.reports.discovery_judgement import more_than_noise
 from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.effect_words import is_held_by_model, title
 
@@ -48,7 +48,12 @@ def what_remains(
                 'remaster report.',
             )
         )
-    elif found is not None and not rows and (judgement.doubts or too_sure(found)):
+    elif (
+        found is not None
+        and not rows
+        # Causes have answered the doubts of the fit without them.
+        and ((judgement.doubts and not found.effects) or more_than_noise(found))
+    ):
         rows.append(
             Remaining(
                 'More than noise',

@@ -14,6 +14,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.reports.answer import answer_of
 from remaster_ros.reports.answer_inputs import Inputs, errors_with_model_mm, parts, read_inputs
 from remaster_ros.reports.answer_report import checked_svg, require_ready, worst_rows
+from remaster_ros.reports.discovery_judgement import more_than_noise
 from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.effect_words import law, title
 from remaster_ros.reports.fit_json import fit_content, save_fit
@@ -178,6 +179,8 @@ def test_what_no_cause_explains_is_never_called_noise(inputs, fit):
     (searched,) = answer_of(inputs([])).remains
     assert searched.what == 'More than noise'
     assert '0.500 mm, and no cause' in searched.size
+    # A cause that the robot model then holds has answered the doubts of the fit without it.
+    assert [row.what for row in answer_of(inputs([LENGTH])).remains] == ['Noise']
 
 
 def test_many_gross_errors_say_when_and_of_which_sensor(inputs):
@@ -365,3 +368,25 @@ def test_without_what_makes_pdf_one_line_says_how_to_get_it(tmp_path, monkeypatc
     with pytest.raises(InputError, match=words) as found:
         require_ready(tmp_path, pdf=True)
     assert '\n' not in str(found.value)
+
+
+@pytest.mark.parametrize(
+    ('rows', 'inside', 'after_m', 'says'),
+    [
+        (400, (0.93, 0.97), 0.41e-3, ''),
+        (400, (0.93, 0.97), 0.70e-3, '1.8 times that of the noise'),
+        # Ten rows may be that far off by chance.
+        (10, (0.70, 1.00), 0.60e-3, ''),
+        (400, (0.80, 0.88), 0.41e-3, 'Fewer held-out rows'),
+    ],
+)
+def test_what_held_out_rows_show_to_be_more_than_noise(fit, rows, inside, after_m, says):
+    content = discovery(fit, [LENGTH])
+    content.gain.held_out_rms_after_m, content.gain.noise_floor_m = after_m, 0.4e-3
+    held_out = {'rows': rows, 'inside': rows, 'share': 1.0, 'interval95': inside}
+    regions = {'widening': 1.0, 'held_out': held_out, 'fitted': held_out}
+    kind = msgspec.structs.fields(Discovered)
+    kind = next(field.type for field in kind if field.name == 'predicted_regions95')
+    content.predicted_regions95 = msgspec.convert(regions, kind)
+    found = more_than_noise(content)
+    assert (says in found) if says else not found
