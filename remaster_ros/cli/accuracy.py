@@ -65,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar(args.quiet or args.json) as progress:
         progress('fitting', 0.0)
         judged = accuracy_with_offsets(session, offsets, std, np.random.default_rng(args.seed))
+    warn_of_harm(judged, args.offsets)
     content = {
         'format': FORMAT,
         'version': __version__,
@@ -96,6 +97,25 @@ def warn_of_another_urdf(fit: dict[str, Any], session: Session, path: Path) -> N
             'but the geometry may differ',
             path,
         )
+
+
+def warn_of_harm(judged: OffsetsJudgement, path: Path) -> None:
+    """Warn where the error is larger with the offsets than without them."""
+    for split, metrics in judged.accuracy.items():
+        errors = {} if metrics is None else metrics['post_registration']
+        if errors is None or errors.get('after') is None:
+            continue
+        before, after = (errors[side]['mean_mm'] for side in SIDES)
+        if after > before:
+            log.warning(
+                '%s: with these offsets the mean error of the %s rows is %.3f mm, without them '
+                '%.3f mm: they are those of another arm, the arm was mastered anew since, or it '
+                'uses them already',
+                path,
+                split,
+                after,
+                before,
+            )
 
 
 def table(judged: OffsetsJudgement) -> str:

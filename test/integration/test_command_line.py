@@ -217,6 +217,16 @@ def test_accuracy_on_the_own_session_and_on_another(made: Path, tmp_path: Path) 
     assert (process.returncode, process.stdout, process.stderr) == (0, '', '')
     other = json.loads(out.read_text(encoding='utf-8'))['accuracy']['validation']
     assert other['relative']['after']['mean_mm'] > 1.0
+    # The offsets of the other arm the wrong way round do harm.
+    fit = json.loads((made / 'fit/fit.json').read_text(encoding='utf-8'))
+    for row in fit['joint_offsets']:
+        row['mean_deg'] *= -1.0
+    (tmp_path / 'turned').mkdir()
+    (tmp_path / 'turned/fit.json').write_text(json.dumps(fit))
+    process = remaster('accuracy', made / 'session', '--offsets', tmp_path / 'turned/fit.json')
+    assert process.returncode == 0
+    assert process.stderr.count('turned/fit.json: with these offsets the mean error') == 2
+    assert 'or it uses them already' in process.stderr
 
 
 def test_json_is_all_that_is_printed_and_what_the_files_hold(made: Path, tmp_path: Path) -> None:
