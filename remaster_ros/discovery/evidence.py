@@ -33,7 +33,7 @@ ABSORBED = 1e-4
 # Of the noise and smoothness coordinates, which are logarithms.
 STEPS = 60
 # Where the slope in these units falls below this, L is within its square of the maximum.
-SLOPE = 0.03
+SLOPE = 0.1
 _LARGE = 18.0
 
 
@@ -102,6 +102,7 @@ def solve(
     start: Solution | None = None,
     *,
     prior: float | None = None,
+    settled: bool = True,
 ) -> Solution | None:
     """Fit a set of cells; None where one of them adds nothing to the others.
 
@@ -115,10 +116,14 @@ def solve(
         A fit whose noise and smoothness are near.
     prior
         Log prior probability of the set; by default that of its cells one by one.
+    settled
+        False: with noise and smoothness as they are at the start, which costs one evaluation in
+        place of half a dozen; the evidence is too low then, if anything.
     """
     cells = tuple(cells)
-    columns = data.columns(cells)
-    scale = np.sqrt(np.einsum('nim,nim->m', columns, columns))
+    norms, grams = data.gram_matrices(cells)
+    p = data.base.shape[2]
+    scale = norms[p:-1]
     free = np.array([cell.penalty is None for cell in cells for _ in cell.parameters], dtype=bool)
     if np.any(scale[free] == 0.0):
         return None
@@ -131,7 +136,6 @@ def solve(
     largest = np.array([cell.largest or np.nan for cell in cells for _ in cell.parameters])
     typical = LARGEST_M * np.sqrt(len(data)) / scale
     std = np.where(np.isnan(largest), typical, largest)
-    p = data.base.shape[2]
     # Of free forms the heights of a curve have a plausible size, weights of kernels have none.
     sized = np.array(
         [
@@ -143,13 +147,15 @@ def solve(
     )
     ridge = np.concatenate((np.zeros(p), np.where(sized, (std * scale) ** -2.0, 0.0)))
     unit = np.concatenate((np.ones(p), scale))
-    joined = np.concatenate((data.base, columns / scale, data.errors[:, :, None]), axis=2)
-    grams = data.noise_model.gram(lambda _, where: joined[where], joined.shape[2])
+    inverse_unit = 1.0 / np.append(unit, 1.0)
+    grams = grams * (inverse_unit[:, None] * inverse_unit)
     system = _System(data.noise_model, grams, data.noise, cells, p, unit, ridge)
     if not system.visible():
         return None
     try:
-        return system.solution(start, log_prior_one_by_one(cells) if prior is None else prior)
+        if prior is None:
+            prior = log_prior_one_by_one(cells)
+        return system.solution(start, prior, settled)
     except np.linalg.LinAlgError:
         # The columns agree up to rounding: they cannot be distinguished.
         return None
@@ -213,7 +219,11 @@ class _System:
         weights = 1.0 / self.model.variances(noise)
         factors = np.exp(eta[len(eta) - len(self.penalised) :])
         _, root, beta = self._solve(weights, factors)
-        inverse = self._inverse(root)
+        # Below the diagonal twice: products with symmetric matrices are then those of the whole.
+        inverse = self._lower_inverse(root)
+        diagonal = np.diag(inverse).copy()
+        inverse = 2.0 * inverse
+        np.fill_diagonal(inverse, diagonal)
         rss = self._squares(beta)
         padded = np.zeros((self.size + 1, self.size + 1))
         padded[:-1, :-1] = inverse
@@ -261,18 +271,46 @@ class _System:
         root: FloatArray = np.linalg.cholesky(H).astype(float)
         return H, root, cho_solve((root, True), total[:-1, -1], check_finite=False)
 
-    def _inverse(self, root: FloatArray) -> FloatArray:
-        """Return the inverse of the matrix with this lower Cholesky factor."""
-        lower, _ = dpotri(root, lower=1)
-        return np.tril(lower) + np.tril(lower, -1).T
+    def _lower_inverse(self, root: FloatArray) -> FloatArray:
+        """Return the inverse of the matrix with this lower Cholesky factor, above it zeros."""
+        # The transpose is the same memory in LAPACK's order.
+        upper, _ = dpotri(root.T, lower=0)
+        inverse: FloatArray = upper.T
+        return inverse
 
     def _squares(self, beta: FloatArray) -> FloatArray:
         """Return the sum of squared errors in each error group, m², (groups,)."""
         error = np.append(-beta, 1.0)
         return self.flat @ np.outer(error, error).ravel()
 
-    def solution(self, start: Solution | None, prior: float) -> Solution:
+    def solution(self, start: Solution | None, prior: float, settled: bool) -> Solution:
         eta, bounds = self._start(start)
+        if settled:
+            eta = self._most_likely(eta, bounds)
+        noise = self.noise(eta)
+        weights = 1.0 / self.model.variances(noise)
+        factors = np.exp(eta[len(eta) - len(self.penalised) :])
+        H, root, beta = self._solve(weights, factors)
+        evidence = self._evidence(H, weights, factors, beta)
+        lower = self._lower_inverse(root)
+        covariance = (lower + np.tril(lower, -1).T) / np.outer(self.unit, self.unit)
+        beta = beta / self.unit
+        smoothness = np.full(len(self.cells), np.nan)
+        smoothness[self.penalised] = factors
+        return Solution(
+            self.cells,
+            beta[self.p :],
+            covariance[self.p :, self.p :],
+            beta[: self.p],
+            covariance,
+            noise,
+            smoothness,
+            (self.ridge * self.unit**2)[self.p :],
+            evidence + prior,
+        )
+
+    def _most_likely(self, eta: FloatArray, bounds: list[tuple[float, float]]) -> FloatArray:
+        """Return the noise and smoothness, as logarithms, that maximise L."""
         # In units of about their own standard deviations: L has a curvature near 1 everywhere.
         unit = self._curvature() ** -0.5
 
@@ -288,27 +326,8 @@ class _System:
             bounds=np.array(bounds) / unit[:, None],
             options={'maxiter': STEPS, 'ftol': 1e-9, 'gtol': SLOPE},
         )
-        eta = unit * best.x
-        noise = self.noise(eta)
-        weights = 1.0 / self.model.variances(noise)
-        factors = np.exp(eta[len(eta) - len(self.penalised) :])
-        H, root, beta = self._solve(weights, factors)
-        evidence = self._evidence(H, weights, factors, beta)
-        covariance = self._inverse(root) / np.outer(self.unit, self.unit)
-        beta = beta / self.unit
-        smoothness = np.full(len(self.cells), np.nan)
-        smoothness[self.penalised] = factors
-        return Solution(
-            self.cells,
-            beta[self.p :],
-            covariance[self.p :, self.p :],
-            beta[: self.p],
-            covariance,
-            noise,
-            smoothness,
-            (self.ridge * self.unit**2)[self.p :],
-            evidence + prior,
-        )
+        most_likely: FloatArray = unit * best.x
+        return most_likely
 
     def _evidence(
         self, H: FloatArray, weights: FloatArray, factors: FloatArray, beta: FloatArray
