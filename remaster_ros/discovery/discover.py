@@ -21,7 +21,7 @@ from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import Solution, solve
+from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.explain import FoundEffect, describe
 from remaster_ros.discovery.gain import (
     Gain,
@@ -34,6 +34,7 @@ from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, unfit
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
 from remaster_ros.discovery.omnibus import structure_left
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stepwise_selection import Search, Selection
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
 from remaster_ros.discovery.to_extension import extension_of

@@ -17,12 +17,12 @@ from scipy.stats import binom, mannwhitneyu
 
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.cross_validation import held_out_error
-from remaster_ros.discovery.evidence import Solution
 from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.gain import rms
 from remaster_ros.discovery.guard import Unexplained
 from remaster_ros.discovery.moved_meanwhile import far_off, moved_text
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 # Of one check where nothing is wrong.

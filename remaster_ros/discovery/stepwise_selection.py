@@ -21,7 +21,7 @@ from remaster_ros.discovery.cross_validation import held_out_error, worth_of
 from remaster_ros.discovery.dating import refine_moments
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import Solution, solve
+from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.families import (
     FAMILIES,
     family_log_prior,
@@ -31,6 +31,7 @@ from remaster_ros.discovery.families import (
 )
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, Screening, screen
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.substitutes import named_instead
 
 # Family-wise error of one round.
