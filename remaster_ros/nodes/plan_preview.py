@@ -67,7 +67,8 @@ class PlanPreview(PlanConfirmation):
             return {}
         done = self.shown and self.shown == self.confirmed
         page = str(self.page) if self.shown else ''
-        return {'plan_page': page, 'confirmed': 'yes' if done else 'no'}
+        confirmed = 'yes' if done else 'no'
+        return {'plan_page': page, 'plan_shown': self.shown, 'confirmed': confirmed}
 
     def asked(self) -> str:
         """Return the refusal of a person's request; what could not be shown is tried again."""
