@@ -17,6 +17,7 @@ from remaster_ros.nodes.planning_thread import PlanningThread
 from remaster_ros.planning.collection_plan import look_ahead
 from remaster_ros.planning.tour_order import REGISTRATION, PoseVisit, Tour
 from remaster_ros.planning.tour_planner import TourPlanner
+from remaster_ros.session.recorded_plan import plan_page_path
 from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import FloatArray
 
@@ -49,7 +50,7 @@ class PlanPreview(PlanConfirmation):
         progress: TourProgress,
         session: Path,
     ) -> None:
-        self.page = session.absolute().with_name(f'{session.absolute().name}.plan.html')
+        self.page = plan_page_path(session)
         super().__init__(cell.confirm, str(self.page))
         self._cell, self._tours = cell, tours
         self._memory, self._progress = memory, progress
