@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -183,7 +184,7 @@ def workspace(subject: Subject) -> Figure:
     tips = chain.forward(chosen, offsets)[:, None, :3, 3]
     arms = np.concatenate((np.zeros((len(chosen), 1, 3)), joints, tips), axis=1)
     everything = np.concatenate((points, arms.reshape(-1, 3)))
-    figure = Figure(figsize=(WIDE_IN, 3.9), layout='constrained')
+    figure = Figure(figsize=(WIDE_IN, 4.0), layout=_with_room())
     top = float(np.quantile(errors, 0.98))
     axes = two_views(figure, everything, frames)
     for ax, (a, b) in axes:
@@ -231,7 +232,7 @@ def planned(subject: Subject) -> Figure:
         axis=1,
     )
     frames = registrations(subject.inputs)
-    figure = Figure(figsize=(WIDE_IN, 4.3), layout='constrained')
+    figure = Figure(figsize=(WIDE_IN, 4.3), layout=_with_room())
     everything = np.concatenate((*map(np.array, kinds.values()), arms.reshape(-1, 3)))
     for ax, (a, b) in two_views(figure, everything, frames):
         for arm in arms:
@@ -265,8 +266,6 @@ def two_views(
     middle = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
     reach = 0.55 * float(np.ptp(everything, axis=0).max())
     views = ((0, 1, 'from above'), (0, 2, 'from the side'))
-    # Printers draw letters a little higher than matplotlib reckons.
-    figure.get_layout_engine().set(h_pad=0.1)
     found = []
     for ax, (a, b, name) in zip(figure.subplots(1, 2), views, strict=True):
         ax.set_xlim(middle[a] - reach, middle[a] + reach)
@@ -279,6 +278,11 @@ def two_views(
         _sensors(ax, frames, middle, reach, (a, b))
         found.append((ax, (a, b)))
     return found
+
+
+def _with_room() -> ConstrainedLayoutEngine:
+    """Return a layout for figures with a title on top: printers draw letters a little higher."""
+    return ConstrainedLayoutEngine(h_pad=0.1)
 
 
 def sensor_entries(frames: dict[str, FloatArray]) -> list[Line2D]:
