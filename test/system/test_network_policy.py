@@ -5,6 +5,7 @@ import xml.etree.ElementTree as ElementTree
 from fnmatch import fnmatch
 
 import pytest
+import viewer_configs
 from ros_rig import ROOT, node_arguments, wait_until
 
 from remaster_ros.collection.plan_confirmation import service_name
@@ -86,6 +87,10 @@ def test_the_policy_is_what_the_nodes_use(start, client, tmp_path):
         own -= {('reply', PLANS), ('request', PLANS)}
         assert shown - own == set(), f'{name} uses what the policy does not allow'
         assert own - shown == set(), f'{name} is allowed what it does not use'
+    # While all of them run: RViz and Foxglove find what they are told to show.
+    types = dict(client.get_topic_names_and_types())
+    for topic, kind in viewer_configs.topics().items():
+        assert types.get(topic) == [kind], topic
 
 
 def test_plans_are_confirmed_to_the_planner_by_the_page_and_the_person():
