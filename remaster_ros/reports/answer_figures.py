@@ -232,7 +232,7 @@ def planned(subject: Subject) -> Figure:
         axis=1,
     )
     frames = registrations(subject.inputs)
-    figure = Figure(figsize=(WIDE_IN, 4.3), layout=_with_room())
+    figure = Figure(figsize=(WIDE_IN, 4.9), layout=_with_room())
     everything = np.concatenate((*map(np.array, kinds.values()), arms.reshape(-1, 3)))
     for ax, (a, b) in two_views(figure, everything, frames):
         for arm in arms:

@@ -19,7 +19,8 @@ PLAN_FILE = 'plan.html'
 RECORDED = ('recorded', 'partial')
 NOT_VISITED = 'not visited'
 AS_EXPECTED = 1.5
-"""Standard deviations up to so many times the expected ones, in the middle, are as expected."""
+"""Standard deviations that are, in the middle, no more than so many times larger or smaller than
+the expected ones are as expected."""
 
 
 class PlannedRow(NamedTuple):
@@ -84,8 +85,14 @@ class PlanFacts:
         """What the standard deviations tell of the readings; '' where nothing is known."""
         if self.ratio is None:
             return ''
+        if self.ratio < 1.0 / AS_EXPECTED:
+            return (
+                f'The fit states the offsets {1.0 / self.ratio:.1f} times better than was '
+                'expected: the readings scatter less than noise_m and pose_noise_m of the cell '
+                'file state.'
+            )
         if self.ratio <= AS_EXPECTED:
-            return 'The fit states the offsets about as well as was expected, or better.'
+            return 'The fit states the offsets about as well as was expected.'
         return (
             f'The fit states the offsets {self.ratio:.1f} times less well than was expected: the '
             'readings scatter more than noise_m and pose_noise_m of the cell file state, or '

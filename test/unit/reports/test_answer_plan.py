@@ -73,7 +73,10 @@ def test_what_was_planned_and_what_became_of_it(inputs):
     assert plan_to_dict(facts)['dropped_configurations'] == {'unseen': 10, 'self-collision': 2}
 
 
-@pytest.mark.parametrize(('factor', 'words'), [(0.8, 'or better'), (3.0, '3.0 times less well')])
+@pytest.mark.parametrize(
+    ('factor', 'words'),
+    [(0.8, 'about as well'), (3.0, '3.0 times less well'), (0.25, '4.0 times better')],
+)
 def test_what_was_expected_stands_beside_what_came_out(inputs, factor, words):
     assert plan_facts(inputs).verdict == ''
     facts = plan_facts(expected(inputs, factor))
