@@ -132,6 +132,14 @@ class Browser:
         for kind in ('mousePressed', 'mouseReleased'):
             self.send('Input.dispatchMouseEvent', type=kind, x=x, y=y, button='left', clickCount=1)
 
+    def look_elsewhere(self, link):
+        """Click a link that opens a tab of its own, and come back to this one.
+
+        A tab that is not in front draws nothing, and its timers come once a second.
+        """
+        self.click(link)
+        self.send('Page.bringToFront')
+
     def network(self, *, connected):
         """Cut the network of the page, or connect it again."""
         self.send(

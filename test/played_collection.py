@@ -28,6 +28,8 @@ class PlayedCollection:
         self.view = LiveView(CHAIN, MARKERS)
         self.rng, self.of, self.done = np.random.default_rng(seed), of, 0
         self.state, self.halted, self.why, self.changed = 'idle', '', '', ''
+        # A plan that waits for a person, and the one that was confirmed.
+        self.plan, self.confirmed = '', ''
         self.commands = []
         self.q = np.zeros(len(CHAIN))
 
@@ -37,6 +39,8 @@ class PlayedCollection:
         if name == 'collect' and self.halted:
             done(False, f'the arm is halted: {self.halted}')
             return
+        if name.startswith('confirm/'):
+            self.confirmed = name.removeprefix('confirm/')
         self.state = {'collect': 'running', 'pause': 'paused', 'stop': 'stopped'}.get(
             name, self.state
         )
@@ -61,6 +65,9 @@ class PlayedCollection:
             'poses_done': str(self.done // PER_POSE),
             'poses': str(self.of // PER_POSE),
         }
+        if self.plan:
+            values |= {'plan_page': '/elsewhere/s.plan.html', 'plan_shown': self.plan}
+            values['confirmed'] = 'yes' if self.plan == self.confirmed else 'no'
         self.view.take(events.PlannerState(state=self.state, run='r'), now)
         self.view.take_summary('pose_planner', 'ok', self.why or self.state, values, now)
         self.view.take(events.BridgeState(halted=self.halted), now)

@@ -12,10 +12,13 @@ import numpy as np
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.answer import Answer
 from remaster_ros.reports.answer_inputs import parts, read_inputs
+from remaster_ros.reports.answer_plan import PlanFacts, plan_facts, plan_to_dict
 from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE, prepare_folder, save_fit
 from remaster_ros.session.reader import read_session
+from remaster_ros.session.recorded_plan import read_plan
 
 FIT_FOLDER = 'fit'
 
@@ -45,6 +48,8 @@ def run(args: argparse.Namespace) -> int:
     """Read or fit, write the page, print the answer in a few lines."""
     fit_path, found_path = parts(args.results)
     session = read_session(args.session)
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    plan = read_plan(args.session, chain)
     out = args.out or Path(f'{args.session.resolve().name}-report')
     # Matplotlib takes a second to import: after what may be refused at once.
     from remaster_ros.reports.answer_report import require_ready, write_answer
@@ -62,13 +67,13 @@ def run(args: argparse.Namespace) -> int:
             )
             save_fit(result, fit_path.parent, figures=not args.no_figures)
         progress('writing', 0.0)
-        inputs = read_inputs(session, fit_path, found_path)
+        inputs = read_inputs(session, fit_path, found_path, plan)
         found_folder = None if found_path is None else found_path.parent
         answer = write_answer(
             inputs, fit_path.parent, found_folder, out, not args.no_figures, args.pdf
         )
     if args.json:
-        print(json.dumps(as_dict(answer, out)))
+        print(json.dumps(as_dict(answer, out, plan_facts(inputs))))
     else:
         show(args.quiet, summary(answer))
         show(args.quiet, f'written: {out / REPORT_FILE}')
@@ -81,7 +86,7 @@ def summary(answer: Answer) -> str:
     return '\n'.join([answer.headline, *remains])
 
 
-def as_dict(answer: Answer, out: Path) -> dict[str, Any]:
+def as_dict(answer: Answer, out: Path, plan: PlanFacts | None) -> dict[str, Any]:
     """Return what ``remaster report --json`` prints."""
     return {
         'report': str(out / REPORT_FILE),
@@ -101,4 +106,5 @@ def as_dict(answer: Answer, out: Path) -> dict[str, Any]:
         'brings': answer.brings,
         'noise_mm': {row.sensor: row.reading_mm for row in answer.noise},
         'remains': [row._asdict() for row in answer.remains],
+        'plan': None if plan is None else plan_to_dict(plan),
     }

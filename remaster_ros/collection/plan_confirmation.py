@@ -27,6 +27,11 @@ def fingerprint(tour: Tour) -> str:
     return found.hexdigest()[:8]
 
 
+def service_name(plan: str) -> str:
+    """Return the name below /remaster/confirm of the service that confirms this plan alone."""
+    return f'plan_{plan}'
+
+
 class PlanConfirmation:
     """Which plan is shown, and which was confirmed.
 
@@ -52,6 +57,8 @@ class PlanConfirmation:
     def __init__(self, required: bool, page: str) -> None:
         self.required, self._page = required, page
         self.shown = self.confirmed = self.trouble = ''
+        # Shown and never confirmed: a person may be looking at one of them still.
+        self._pending: set[str] = set()
 
     def withdraw(self) -> None:
         """Take it that the page is out of date: another plan is to be shown."""
@@ -60,6 +67,8 @@ class PlanConfirmation:
     def show(self, plan: str) -> None:
         """Take it that the page shows this plan."""
         self.shown, self.trouble = plan, ''
+        if plan != self.confirmed:
+            self._pending.add(plan)
 
     def allows(self, tour: Tour | None) -> bool:
         """Whether the arm may follow a tour."""
@@ -85,11 +94,26 @@ class PlanConfirmation:
             )
         return ''
 
-    def confirm(self) -> tuple[bool, str]:
-        """Confirm the plan that is shown; return whether there is one, and the answer."""
+    def confirm(self, plan: str = '') -> tuple[bool, str]:
+        """Confirm the plan that is shown; return whether there is one, and the answer.
+
+        Parameters
+        ----------
+        plan
+            Which one the person has seen: no other is confirmed, however late the request comes.
+            '' for the one that is shown, which is refused where it has taken the place of another.
+        """
         if not self.required:
             return False, 'no plan waits for that; confirm: true in the cell file asks for it'
+        if plan and plan != self.shown:
+            return False, f'plan {plan} is not the one that is next; {self.refusal()}'.rstrip('; ')
         if not self.shown:
             return False, self.refusal()
+        if not plan and self._pending - {self.shown}:
+            return False, (
+                f'plan {self.shown} has taken the place of another one: look at {self._page} '
+                f'again, then call {CONFIRM}/{service_name(self.shown)} and {COLLECT}'
+            )
         self.confirmed = self.shown
+        self._pending.clear()
         return True, f'plan {self.shown} is confirmed; {COLLECT} begins or goes on'

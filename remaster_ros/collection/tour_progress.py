@@ -9,6 +9,7 @@ from typing import Any, Protocol, TypeVar
 from remaster_ros.collection.events import RecorderState
 from remaster_ros.collection.required_sensors import RequiredSensors
 from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.planning.collection_plan import Expected, with_expected
 from remaster_ros.planning.tour_order import FITTED, REFERENCE, REGISTRATION, PoseVisit, Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.types import FloatArray
@@ -25,8 +26,8 @@ class PlanMemory(Protocol):
     trouble: str
     outcomes: Counter[str]
 
-    def begin(self, tour: Tour) -> None:
-        """Remember a new tour."""
+    def begin(self, tour: Tour, expected: Expected | None = None) -> None:
+        """Remember a new tour, and what its fit is expected to state where that is known."""
 
     def open_stop(self, stop: PoseVisit) -> None:
         """Remember the next stop."""
@@ -183,10 +184,10 @@ class TourProgress:
         self.phase = 'collection'
         if self._memory.tour is None or REGISTRATION in self._memory.tour.plans:
             T_R_N = dict(self.T_R_N)
-            planned = self._planning.ask('plan', q, lambda: self._tours.collection(T_R_N))
+            planned = self._planning.ask('plan', q, lambda: with_expected(self._tours, T_R_N))
             if planned is None:
                 return None
-            self._memory.begin(planned[0])
+            self._memory.begin(*planned[0])
         found = self._open(q)
         self.is_complete = found == (None,)
         return found[0] if found else None

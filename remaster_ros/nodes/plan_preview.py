@@ -17,6 +17,7 @@ from remaster_ros.nodes.planning_thread import PlanningThread
 from remaster_ros.planning.collection_plan import look_ahead
 from remaster_ros.planning.tour_order import REGISTRATION, PoseVisit, Tour
 from remaster_ros.planning.tour_planner import TourPlanner
+from remaster_ros.session.recorded_plan import plan_page_path
 from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import FloatArray
 
@@ -49,7 +50,7 @@ class PlanPreview(PlanConfirmation):
         progress: TourProgress,
         session: Path,
     ) -> None:
-        self.page = session.absolute().with_name(f'{session.absolute().name}.plan.html')
+        self.page = plan_page_path(session)
         super().__init__(cell.confirm, str(self.page))
         self._cell, self._tours = cell, tours
         self._memory, self._progress = memory, progress
@@ -67,7 +68,8 @@ class PlanPreview(PlanConfirmation):
             return {}
         done = self.shown and self.shown == self.confirmed
         page = str(self.page) if self.shown else ''
-        return {'plan_page': page, 'confirmed': 'yes' if done else 'no'}
+        confirmed = 'yes' if done else 'no'
+        return {'plan_page': page, 'plan_shown': self.shown, 'confirmed': confirmed}
 
     def asked(self) -> str:
         """Return the refusal of a person's request; what could not be shown is tried again."""

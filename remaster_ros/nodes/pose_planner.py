@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from remaster_ros.collection import events
 from remaster_ros.collection.announcements import Announcements
 from remaster_ros.collection.collection_run import CollectionRun
 from remaster_ros.collection.optimizer_state import OptimizerState
+from remaster_ros.collection.plan_confirmation import service_name
 from remaster_ros.collection.preflight_facts import PreflightFacts
 from remaster_ros.collection.tour_progress import TourProgress
 from remaster_ros.errors import InputError, RemasterError
@@ -47,7 +49,8 @@ from remaster_ros.nodes.run_token import LivingRun, new_token, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.planning.tour_order import REGISTRATION, PoseVisit
-from remaster_ros.session.plan_journal import NO_FREE_PATH, PlanJournal
+from remaster_ros.session.plan_journal import PlanJournal
+from remaster_ros.session.plan_records import NO_FREE_PATH
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 
@@ -86,6 +89,7 @@ class PosePlanner(RemasterNode):
             TransformStamped, 'remaster/registration', self._on_registration, LATCHED
         )
         self.create_service(Trigger, 'remaster/confirm', self._on_confirm)
+        self._offered: set[str] = set()
         at_once = MutuallyExclusiveCallbackGroup()
         self.create_service(Trigger, 'remaster/collect', self._on_collect)
         self.create_service(Trigger, 'remaster/pause', self._on_pause, callback_group=at_once)
@@ -163,11 +167,21 @@ class PosePlanner(RemasterNode):
         response.success, response.message = True, 'collecting'
         return response
 
-    def _on_confirm(self, request: Trigger.Request, response: Trigger.Response) -> Any:
-        response.success, response.message = self._preview.confirm()
+    def _on_confirm(
+        self, request: Trigger.Request, response: Trigger.Response, plan: str = ''
+    ) -> Any:
+        response.success, response.message = self._preview.confirm(plan)
         if response.success and self.run.state != 'running':
             self.run.why = response.message
+            self.status.publish()
         return response
+
+    def _offer(self, plan: str) -> None:
+        """Offer a service that confirms this plan and no other; it stays, to refuse later on."""
+        if plan and plan not in self._offered:
+            self._offered.add(plan)
+            path = f'remaster/confirm/{service_name(plan)}'
+            self.create_service(Trigger, path, partial(self._on_confirm, plan=plan))
 
     def _on_pause(self, request: Trigger.Request, response: Trigger.Response) -> Any:
         with self._lock:
@@ -266,6 +280,7 @@ class PosePlanner(RemasterNode):
         q, recorder, now = self._q, self._announcements.recorder, time.monotonic()
         if self.run.state in ('idle', 'paused', 'stopped') and q is not None:
             self.run.why = self._preview.draw(q, self._facts) or self.run.why
+            self._offer(self._preview.shown)
         if self.run.state != 'running' or q is None:
             return
         try:

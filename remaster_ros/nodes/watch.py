@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped
+from rclpy.exceptions import InvalidHandle
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -29,6 +30,7 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.collection.events import EventRecord
+from remaster_ros.collection.plan_confirmation import service_name
 from remaster_ros.errors import RemasterError
 from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.background import Background
@@ -41,9 +43,11 @@ from remaster_ros.nodes.rviz_markers import RvizMarkers
 from remaster_ros.nodes.status import LATCHED, LEVELS, RELIABLE, TOPIC, NodeStatus, Summary, listen
 from remaster_ros.nodes.waypoints import waypoints_by_solution
 from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE, read_fit
-from remaster_ros.reports.live_facts import FitFacts
-from remaster_ros.reports.live_server import COMMANDS, Done, LiveServer, Place
+from remaster_ros.reports.live_facts import FitFacts, PlanPage
+from remaster_ros.reports.live_place import Place
+from remaster_ros.reports.live_server import COMMANDS, CONFIRM, Done, LiveServer
 from remaster_ros.reports.live_view import LiveView
+from remaster_ros.reports.plan_page import read_plan_page
 from remaster_ros.reports.robot_scene import robot_scene
 from remaster_ros.reports.scene_view import scene_to_dict
 from remaster_ros.session.workcell import read_cell
@@ -55,6 +59,7 @@ IDLE_EVERY_S = 1.0
 """How often the view is renewed while somebody looks, and while nobody does."""
 NICENESS = 5
 """The page gives way to what moves the arm."""
+OTHER_PLAN = 'another plan is next; look again'
 
 
 @dataclass(frozen=True)
@@ -104,8 +109,9 @@ class Watch(RemasterNode):
         self._background = Background(self)
         self._published_s = float('-inf')
         self._q: FloatArray | None = None
-        services = {name: f'remaster/{name}' for name in COMMANDS}
-        self._callers = {n: self.create_client(Trigger, path) for n, path in services.items()}
+        # A plan is confirmed by a service of its own, of which there is none yet.
+        self._callers = {n: self._caller(n) for n in COMMANDS if n != CONFIRM}
+        self._plan = ''
         self._subscribe({name: sensor.topics for name, sensor in cell.sensors.items()})
         scene = robot_scene(cell, cell.planning_scene(self.chain))
         self._rviz = RvizMarkers(self, scene, publish_tf=self.p.publish_tf)
@@ -153,6 +159,27 @@ class Watch(RemasterNode):
             values = {pair.key: pair.value for pair in status.values}
             level, now = words.get(status.level, 'error'), time.monotonic()
             self.view.take_summary(status.name, level, status.message, values, now)
+
+        self._look_for_plan()
+
+    def _look_for_plan(self) -> None:
+        """Have the page of the plan that is next served, and its service at hand."""
+        plan, page = self.view.plan_to_show()
+        if plan == self._plan:
+            return
+        if self._plan:
+            self.destroy_client(self._callers.pop(f'{CONFIRM}/{self._plan}'))
+        self._plan = plan
+        if plan:
+            self._callers[f'{CONFIRM}/{plan}'] = self._caller(f'{CONFIRM}/{service_name(plan)}')
+            read = partial(read_plan_page, Path(page), plan)
+            self._background.submit(read, partial(self._on_plan_page, plan))
+
+    def _on_plan_page(self, plan: str, found: bytes | Exception) -> None:
+        if isinstance(found, Exception):
+            self.view.take_plan_page(PlanPage(plan, trouble=str(found)))
+        else:
+            self.view.take_plan_page(PlanPage(plan, self.page.show_plan(found)))
 
     def _on_joint_state(self, message: JointState) -> None:
         self._q = self._order.positions(message)
@@ -213,9 +240,15 @@ class Watch(RemasterNode):
 
     # What goes out
 
+    def _caller(self, name: str) -> Any:
+        return self.create_client(Trigger, f'remaster/{name}')
+
     def _send(self, name: str, done: Done) -> None:
         """Call a service; in the thread of the page, whose executor this is not."""
-        client = self._callers[name]
+        client = self._callers.get(name)
+        if client is None:
+            done(False, OTHER_PLAN)
+            return
         if not client.service_is_ready():
             done(False, f'nobody offers {client.srv_name}')
             return
@@ -228,7 +261,10 @@ class Watch(RemasterNode):
                 return
             done(answer.success, answer.message)
 
-        client.call_async(Trigger.Request()).add_done_callback(answered)
+        try:
+            client.call_async(Trigger.Request()).add_done_callback(answered)
+        except InvalidHandle:
+            done(False, OTHER_PLAN)
 
     def _show(self) -> None:
         now = time.monotonic()

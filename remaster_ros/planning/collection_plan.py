@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from remaster_ros.errors import InsufficientDataError
+from remaster_ros.errors import InsufficientDataError, RemasterError
 from remaster_ros.motion.trajectory import Trajectory
 from remaster_ros.planning.candidates import PlannedPose
 from remaster_ros.planning.planned_design import Designed
@@ -241,6 +241,25 @@ def outlook(planner: TourPlanner) -> tuple[Tour, Expected]:
     """
     tour = planner.collection(planner.rough_places)
     return tour, expected_precision(planner, planner.rough_places, tour.plans[FITTED].poses)
+
+
+def with_expected(
+    planner: TourPlanner, T_R_N: Mapping[str, FloatArray]
+) -> tuple[Tour, Expected | None]:
+    """Return a collection, and what it is expected to state; None where that is not known.
+
+    Raises
+    ------
+    InsufficientDataError
+        No pose is left to fit on.
+    """
+    tour = planner.collection(T_R_N)
+    try:
+        expected = expected_precision(planner, T_R_N, tour.plans[FITTED].poses)
+    except (RemasterError, np.linalg.LinAlgError):
+        # A figure for people: the collection does not depend on it.
+        return tour, None
+    return tour, expected if np.isfinite(expected.tool_rms) else None
 
 
 class _Steps:

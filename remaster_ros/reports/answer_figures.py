@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
+from remaster_ros.planning.tour_order import FITTED, REFERENCE
 from remaster_ros.reports.answer import Answer, registrations
 from remaster_ros.reports.answer_inputs import Inputs
 from remaster_ros.reports.effect_words import moment, title
@@ -33,6 +35,14 @@ MODEL, ALL_CAUSES, FAINT = '#8a6fc4', '#2f9e78', '#808a96'
 NARROW_IN, WIDE_IN = 5.2, 8.4
 MOST_POINTS = 1500
 ARMS = 4
+NOT_MEASURED = 'not measured'
+# Marker, colour and words.
+PLANNED_AS = {
+    FITTED: ('o', AFTER, 'poses to fit'),
+    'validation': ('s', BEFORE, 'held out'),
+    REFERENCE: ('D', INK, 'references'),
+    NOT_MEASURED: ('x', '#c0392b', NOT_MEASURED),
+}
 LETTERS = 'ABCDEFGHIJKLMNOPQRSTUVWXYZ'
 
 
@@ -50,6 +60,8 @@ def draw_answer(subject: Subject) -> dict[str, str]:
         'session': over_session,
         'workspace': workspace,
     }
+    if subject.inputs.plan is not None:
+        figures['plan'] = planned
     return draw_stages(subject.answer) | as_svg(figures, subject)
 
 
@@ -172,14 +184,10 @@ def workspace(subject: Subject) -> Figure:
     tips = chain.forward(chosen, offsets)[:, None, :3, 3]
     arms = np.concatenate((np.zeros((len(chosen), 1, 3)), joints, tips), axis=1)
     everything = np.concatenate((points, arms.reshape(-1, 3)))
-    middle = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
-    reach = 0.55 * float(np.ptp(everything, axis=0).max())
-
-    figure = Figure(figsize=(WIDE_IN, 3.9), layout='constrained')
-    axes = figure.subplots(1, 2)
-    views = ((0, 1, 'from above'), (0, 2, 'from the side'))
+    figure = Figure(figsize=(WIDE_IN, 4.0), layout=_with_room())
     top = float(np.quantile(errors, 0.98))
-    for ax, (a, b, name) in zip(axes, views, strict=True):
+    axes = two_views(figure, everything, frames)
+    for ax, (a, b) in axes:
         for arm in arms:
             ax.plot(arm[:, a], arm[:, b], color=FAINT, linewidth=2.0, alpha=0.6)
             ax.plot(arm[:, a], arm[:, b], 'o', color=FAINT, markersize=3, alpha=0.6)
@@ -194,6 +202,72 @@ def workspace(subject: Subject) -> Figure:
             linewidths=0.3,
             edgecolors=INK,
         )
+    bar = figure.colorbar(dots, ax=[ax for ax, _ in axes], shrink=0.85, pad=0.02, extend='max')
+    bar.set_label('error after (mm)')
+    bar.outline.set_linewidth(0.5)
+    entries = sensor_entries(frames)
+    figure.legend(handles=entries, loc='outside lower center', ncols=3, handletextpad=0.2)
+    return figure
+
+
+def planned(subject: Subject) -> Figure:
+    """Draw from above and from the side where the tool was to be, and what became of that."""
+    plan, chain = subject.inputs.plan, subject.chain
+    assert plan is not None
+    kinds: dict[str, list[FloatArray]] = {}
+    solutions = []
+    for split, poses in plan.tour.plans.items():
+        for index, pose in enumerate(poses.poses):
+            results = {plan.outcomes.get((split, index, i)) for i in range(len(pose.solutions))}
+            lost = split != REFERENCE and not results & {'recorded', 'partial'}
+            kinds.setdefault(NOT_MEASURED if lost else split, []).append(pose.T_R_T[:3, 3])
+            solutions.append(pose.solutions[0])
+    chosen = np.array(solutions)[np.linspace(0, len(solutions) - 1, ARMS).round().astype(int)]
+    arms = np.concatenate(
+        (
+            np.zeros((len(chosen), 1, 3)),
+            chain.frames(chosen)[..., :3, 3],
+            chain.forward(chosen)[:, None, :3, 3],
+        ),
+        axis=1,
+    )
+    frames = registrations(subject.inputs)
+    figure = Figure(figsize=(WIDE_IN, 4.9), layout=_with_room())
+    everything = np.concatenate((*map(np.array, kinds.values()), arms.reshape(-1, 3)))
+    for ax, (a, b) in two_views(figure, everything, frames):
+        for arm in arms:
+            ax.plot(arm[:, a], arm[:, b], 'o-', color=FAINT, linewidth=2, markersize=3, alpha=0.5)
+        for kind, (marker, color, _) in PLANNED_AS.items():
+            at = np.array(kinds.get(kind, np.empty((0, 3))))
+            ax.plot(at[:, a], at[:, b], marker, color=color, markersize=4.5, mew=1.3, mfc='none')
+    entries = [
+        Line2D([], [], marker=marker, color=color, ls='', mfc='none', mew=1.3, label=words)
+        for kind, (marker, color, words) in PLANNED_AS.items()
+        if kind in kinds
+    ]
+    figure.legend(handles=entries, loc='outside upper right', ncols=4, handletextpad=0.2)
+    entries = sensor_entries(frames)
+    figure.legend(handles=entries, loc='outside lower center', ncols=3, handletextpad=0.2)
+    return figure
+
+
+def two_views(
+    figure: Figure, everything: FloatArray, frames: dict[str, FloatArray]
+) -> list[tuple[Axes, tuple[int, int]]]:
+    """Return panels from above and from the side, with the sensors, each with its two axes.
+
+    Parameters
+    ----------
+    everything
+        Points that must be in them, in the robot base, m, (n, 3).
+    frames
+        Registrations, sensor -> (4, 4).
+    """
+    middle = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
+    reach = 0.55 * float(np.ptp(everything, axis=0).max())
+    views = ((0, 1, 'from above'), (0, 2, 'from the side'))
+    found = []
+    for ax, (a, b, name) in zip(figure.subplots(1, 2), views, strict=True):
         ax.set_xlim(middle[a] - reach, middle[a] + reach)
         ax.set_ylim(middle[b] - reach, middle[b] + reach)
         # Of equal spans: one metre is as long in both.
@@ -202,16 +276,22 @@ def workspace(subject: Subject) -> Figure:
         ax.set_xlabel(f'{"xyz"[a]} (m)')
         ax.set_ylabel(f'{"xyz"[b]} (m)')
         _sensors(ax, frames, middle, reach, (a, b))
-    bar = figure.colorbar(dots, ax=axes, shrink=0.85, pad=0.02, extend='max')
-    bar.set_label('error after (mm)')
-    bar.outline.set_linewidth(0.5)
+        found.append((ax, (a, b)))
+    return found
+
+
+def _with_room() -> ConstrainedLayoutEngine:
+    """Return a layout for figures with a title on top: printers draw letters a little higher."""
+    return ConstrainedLayoutEngine(h_pad=0.1)
+
+
+def sensor_entries(frames: dict[str, FloatArray]) -> list[Line2D]:
+    """Return what the legend of `two_views` has of the sensors."""
     labels = [
         f'{letter}: {name[:24]}, {np.linalg.norm(T[:3, 3]):.1f} m from the base'
         for letter, (name, T) in zip(LETTERS, frames.items(), strict=False)
     ]
-    entries = [Line2D([], [], color=ALL_CAUSES, marker='D', ls='', label=text) for text in labels]
-    figure.legend(handles=entries, loc='outside lower center', ncols=3, handletextpad=0.2)
-    return figure
+    return [Line2D([], [], color=ALL_CAUSES, marker='D', ls='', label=text) for text in labels]
 
 
 def _sensors(

@@ -28,6 +28,7 @@ from remaster_ros.reports.predictions_csv import PREDICTED, PREDICTIONS_FILE
 from remaster_ros.reports.rows_csv import AFTER, BEFORE, RESIDUALS_FILE, read_columns
 from remaster_ros.reports.schemas import Fit, Judgement
 from remaster_ros.session.files import decode_text, read_limited
+from remaster_ros.session.recorded_plan import RecordedPlan
 from remaster_ros.types import FloatArray, Session
 
 
@@ -48,6 +49,8 @@ class Inputs:
     model_mm
         With the corrected robot model of the discovery and nothing else, (n,); None where it has
         all causes or none.
+    plan
+        Of its collection; None where the session's folder has none.
     """
 
     session: Session
@@ -57,6 +60,7 @@ class Inputs:
     after_mm: FloatArray
     causes_mm: FloatArray | None
     model_mm: FloatArray | None = None
+    plan: RecordedPlan | None = None
 
     @property
     def judgement(self) -> Judgement:
@@ -89,7 +93,9 @@ def located(path: Path) -> Path:
     return there[0]
 
 
-def read_inputs(session: Session, fit_path: Path, found_path: Path | None) -> Inputs:
+def read_inputs(
+    session: Session, fit_path: Path, found_path: Path | None, plan: RecordedPlan | None = None
+) -> Inputs:
     """Read the results of a session, and refuse those of another.
 
     Parameters
@@ -98,6 +104,8 @@ def read_inputs(session: Session, fit_path: Path, found_path: Path | None) -> In
         As read from its folder.
     fit_path, found_path
         fit.json and discovery.json; residuals.csv and predictions.csv are beside them.
+    plan
+        Of the session.
 
     Raises
     ------
@@ -109,7 +117,7 @@ def read_inputs(session: Session, fit_path: Path, found_path: Path | None) -> In
     residuals = read_columns(fit_path.parent / RESIDUALS_FILE, session, BEFORE + AFTER, 'fit')
     before_mm, after_mm = _lengths_mm(residuals[:, :3]), _lengths_mm(residuals[:, 3:])
     if found_path is None:
-        return Inputs(session, fit, None, before_mm, after_mm, None)
+        return Inputs(session, fit, None, before_mm, after_mm, None, plan=plan)
     found = msgspec.convert(read_discovery(found_path), Discovered)
     _require_same(session, found, found_path, 'discover')
     causes_mm = model_mm = None
@@ -121,7 +129,7 @@ def read_inputs(session: Session, fit_path: Path, found_path: Path | None) -> In
         path = found_path.parent / APPLY_FOLDER / URDF_FILE
         data = read_limited(path, FIT_LIMIT, 'discover again, which writes it')
         model_mm = errors_with_model_mm(session, decode_text(data, path))
-    return Inputs(session, fit, found, before_mm, after_mm, causes_mm, model_mm)
+    return Inputs(session, fit, found, before_mm, after_mm, causes_mm, model_mm, plan)
 
 
 def all_taken_out(found: Discovered) -> bool:

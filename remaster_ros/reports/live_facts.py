@@ -26,6 +26,25 @@ class Precision(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
+class PlanPage:
+    """Where the page of a plan is served.
+
+    Attributes
+    ----------
+    plan
+        Fingerprint of the plan.
+    address
+        Below that of the live page; '' where it is not served.
+    trouble
+        Why it is not; ''.
+    """
+
+    plan: str = ''
+    address: str = ''
+    trouble: str = ''
+
+
+@dataclass(frozen=True)
 class FitFacts:
     """What is known of a fit beside its offsets.
 

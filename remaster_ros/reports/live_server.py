@@ -1,4 +1,4 @@
-"""Web server of the live page: fixed files, the view as JSON, and four commands.
+"""Web server of the live page: fixed files, the view as JSON, and five commands.
 
 Whoever may command here lets an arm move, so every request is judged as if it came from somebody
 who is not meant to:
@@ -8,8 +8,10 @@ who is not meant to:
 - View, scene and commands need the token in the header Authorization. No cookie is set: browsers
   would send it with requests of other pages, and to servers on other ports of this address. The
   token stands behind the # of the page's address, which browsers never send.
-- ``collect`` also names the view that the person has seen. A request that was held up on its way,
-  or that belongs to another state of the collection, is refused.
+- ``collect`` and ``confirm`` also name the view that the person has seen. A request that was held
+  up on its way, or that belongs to another state of the collection or another plan, is refused.
+- The page of a plan, which a browser opens without a header, has an address that only the view
+  tells, and is shown as a stranger's: it reaches neither this server nor the token (sandbox).
 - Nothing is written, no path comes from a request, bodies are small, no page may frame this one,
   and no script runs here but the ones of this package.
 """
@@ -20,17 +22,13 @@ import asyncio
 import gzip
 import hmac
 import importlib.resources
-import ipaddress
 import json
-import os
 import re
-import socket
-import ssl
+import secrets
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -38,10 +36,13 @@ import msgspec
 from tornado.httpserver import HTTPServer
 from tornado.web import Application, HTTPError, RequestHandler
 
-from remaster_ros.errors import InputError
+from remaster_ros.reports.live_place import Place, hosts, listen, tls
 from remaster_ros.reports.scene_view import view_script
 
-COMMANDS = ('collect', 'pause', 'stop', 'fit')
+CONFIRM = 'confirm'
+COMMANDS = ('collect', 'pause', 'stop', 'fit', CONFIRM)
+SEEN_FIRST = ('collect', CONFIRM)
+"""What a person must have seen something of who asks for it."""
 FRESH_S = 3.0
 """A view that is older has not been seen just now."""
 ANSWER_S = 5.0
@@ -56,6 +57,11 @@ _POLICY = (
     "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
+_PLAN_POLICY = (
+    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'"
+)
 _HEADERS = {
     'Content-Security-Policy': _POLICY,
     'X-Frame-Options': 'DENY',
@@ -67,29 +73,8 @@ _HEADERS = {
 }
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where the page is served.
-
-    Attributes
-    ----------
-    address, port
-        The IP address to listen on, and the port; 0 for any free one.
-    names
-        Names of this computer by which a browser may ask besides the address.
-    certificate, key
-        PEM files for https; an address that other computers reach needs them.
-    """
-
-    address: str = '127.0.0.1'
-    port: int = 0
-    names: tuple[str, ...] = ()
-    certificate: str = ''
-    key: str = ''
-
-
 class Seen(msgspec.Struct, forbid_unknown_fields=True):
-    """What a person has seen who lets the arm move: number and mark of the view."""
+    """What a person has seen who lets the arm move or confirms: number and mark of the view."""
 
     view: int
     seen: str
@@ -107,8 +92,9 @@ class LiveServer:
     scene
         The fixed part of the 3-D view, JSON.
     send
-        Called in the server's thread with the name of a command and with what takes its outcome,
-        from any thread: whether it was done, and a line for the person.
+        Called in the server's thread with the name of a command (``confirm/NAME`` for the plan
+        of that name) and with what takes its outcome, from any thread: whether it was done, and
+        a line for the person.
 
     Raises
     ------
@@ -118,13 +104,14 @@ class LiveServer:
 
     def __init__(self, place: Place, token: str, scene: bytes, send: Send) -> None:
         self.token, self.scene, self.send = token, gzip.compress(scene), send
-        self._tls = _tls(place)
-        self._socket = _listen(place)
+        self._tls = tls(place)
+        self._socket = listen(place)
         self.port = self._socket.getsockname()[1]
         self.scheme = 'http' if self._tls is None else 'https'
-        self.hosts = _hosts(place, self.port)
+        self.hosts = hosts(place, self.port)
         self.files = _files()
-        self._seen, self._view = '', b'null'
+        self._seen, self._view, self._plan = '', b'null', ''
+        self._plan_page = '', b''
         self._issued: deque[tuple[int, float]] = deque([(0, float('-inf'))], maxlen=100)
         self._asked_s, self._used = float('-inf'), 0
         self._loop = asyncio.new_event_loop()
@@ -142,13 +129,32 @@ class LiveServer:
         return time.monotonic() - self._asked_s < WATCHED_S
 
     def publish(self, view: dict[str, Any]) -> None:
-        """Show a view from now on; its ``seen`` is the mark that `collect` has to name."""
-        content = msgspec.json.encode(view)  # NaN becomes null, which browsers read.
-        self._loop.call_soon_threadsafe(self._show, content, str(view['seen']))
+        """Show a view from now on.
 
-    def _show(self, content: bytes, seen: str) -> None:
+        Its ``seen`` is the mark that `collect` and `confirm` have to name; its ``confirmation``
+        has the plan that is confirmed with it.
+        """
+        content = msgspec.json.encode(view)  # NaN becomes null, which browsers read.
+        plan = view['confirmation']['plan'] if view['confirmation'] else ''
+        self._loop.call_soon_threadsafe(self._show, content, str(view['seen']), plan)
+
+    def _show(self, content: bytes, seen: str, plan: str) -> None:
         self._issued.append((self._issued[-1][0] + 1, time.monotonic()))
-        self._view, self._seen = content, seen
+        self._view, self._seen, self._plan = content, seen, plan
+
+    def show_plan(self, html: bytes) -> str:
+        """Serve the page of a plan in place of the one before; return its address."""
+        name = secrets.token_urlsafe(32)
+        self._loop.call_soon_threadsafe(self._take_plan, name, gzip.compress(html, 6))
+        return f'plan/{name}'
+
+    def _take_plan(self, name: str, content: bytes) -> None:
+        self._plan_page = name, content
+
+    def plan_page(self, name: str) -> bytes:
+        """Return the page of the plan, compressed, where this is its name; empty otherwise."""
+        own, content = self._plan_page
+        return content if own and hmac.compare_digest(own.encode(), name.encode()) else b''
 
     def view(self) -> bytes:
         """Return the view as JSON, with its number and age."""
@@ -158,7 +164,7 @@ class LiveServer:
         return b'{"number":%d,"age_s":%.2f,"view":%s}' % (number, age_s, self._view)
 
     def refusal(self, seen: Seen) -> str:
-        """Return why a person who has seen this must look again before the arm moves; ''."""
+        """Return why a person who has seen this must look again; ''."""
         issued = dict(self._issued).get(seen.view, float('-inf'))
         if time.monotonic() - issued > FRESH_S or seen.view <= self._used:
             return 'the page was not up to date; look again'
@@ -167,6 +173,12 @@ class LiveServer:
         # A request that comes twice counts once.
         self._used = seen.view
         return ''
+
+    def command(self, name: str) -> str:
+        """Return what `send` is asked for; '' where the view has no plan to confirm."""
+        if name != CONFIRM:
+            return name
+        return f'{CONFIRM}/{self._plan}' if self._plan else ''
 
     def close(self) -> None:
         """End the server and its thread."""
@@ -180,6 +192,7 @@ class LiveServer:
                 (r'/view', _View, {'server': self}),
                 (r'/scene', _Scene, {'server': self}),
                 (r'/command/([a-z]+)', _Command, {'server': self}),
+                (r'/plan/([\w-]+)', _Plan, {'server': self}),
                 *(('/' + re.escape(name), _File, {'server': self}) for name in self.files),
             ],
             default_handler_class=_Nothing,
@@ -244,6 +257,19 @@ class _File(_Handler):
         self._packed(*self._server.files[self.request.path.removeprefix('/')])
 
 
+class _Plan(_Handler):
+    """The page of a plan, by the address that the view tells to those who have the token."""
+
+    def get(self, name: str) -> None:
+        content = self._server.plan_page(name)
+        if not content:
+            raise HTTPError(404, reason='this plan is out of date; look at the live page')
+        self.set_header('Content-Security-Policy', _PLAN_POLICY)
+        # Browsers refuse what is both in a sandbox and has an opener policy.
+        self.clear_header('Cross-Origin-Opener-Policy')
+        self._packed(content, 'text/html; charset=utf-8')
+
+
 class _Nothing(_Handler):
     def prepare(self) -> None:
         super().prepare()
@@ -274,11 +300,14 @@ class _Command(_WithToken):
     async def post(self, name: str) -> None:
         if name not in COMMANDS:
             raise HTTPError(404, reason='there is no such command')
-        if name == 'collect':
+        command = self._server.command(name)
+        if not command:
+            raise HTTPError(409, reason='no plan waits for a confirmation')
+        if name in SEEN_FIRST:
             try:
                 seen = msgspec.json.decode(self.request.body, type=Seen)
             except msgspec.MsgspecError:
-                raise HTTPError(400, reason='collect needs view and seen') from None
+                raise HTTPError(400, reason=f'{name} needs view and seen') from None
             if refusal := self._server.refusal(seen):
                 raise HTTPError(409, reason=refusal)
         loop = asyncio.get_running_loop()
@@ -287,7 +316,7 @@ class _Command(_WithToken):
         def done(success: bool, message: str) -> None:
             loop.call_soon_threadsafe(_set, outcome, (success, message))
 
-        self._server.send(name, done)
+        self._server.send(command, done)
         try:
             success, message = await asyncio.wait_for(outcome, ANSWER_S)
         except TimeoutError:
@@ -300,54 +329,6 @@ class _Command(_WithToken):
 def _set(future: asyncio.Future[tuple[bool, str]], outcome: tuple[bool, str]) -> None:
     if not future.done():
         future.set_result(outcome)
-
-
-def _listen(place: Place) -> socket.socket:
-    try:
-        address = ipaddress.ip_address(place.address)
-    except ValueError:
-        raise InputError(
-            f'live page: address {place.address!r} is no IP address, such as 127.0.0.1'
-        ) from None
-    if not address.is_loopback and not place.certificate:
-        raise InputError(
-            f'live page: {place.address} can be reached from other computers, and without https '
-            'the token could be read on the way: give certificate and key, or leave the address '
-            'and use ssh -L PORT:127.0.0.1:PORT from there'
-        )
-    try:
-        family = socket.AF_INET6 if address.version == 6 else socket.AF_INET
-        found = socket.create_server((place.address, place.port), family=family)
-    except OSError as error:
-        raise InputError(
-            f'live page: {place.address} port {place.port}: {os.strerror(error.errno or 0)}; give '
-            'another port'
-        ) from None
-    found.setblocking(False)
-    return found
-
-
-def _tls(place: Place) -> ssl.SSLContext | None:
-    if not place.certificate:
-        return None
-    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
-    try:
-        context.load_cert_chain(place.certificate, place.key or None)
-    except (OSError, ssl.SSLError) as error:
-        raise InputError(f'live page: certificate {place.certificate}: {error}') from None
-    return context
-
-
-def _hosts(place: Place, port: int) -> tuple[str, ...]:
-    """Return what the header Host may be; the first one stands in the page's address."""
-    address = ipaddress.ip_address(place.address)
-    shown = f'[{address}]' if address.version == 6 else str(address)
-    names = [*place.names]
-    if not address.is_unspecified:
-        names.append(shown)
-    if address.is_loopback or address.is_unspecified:
-        names += ['localhost', '127.0.0.1']
-    return tuple(f'{name.lower()}:{port}' for name in dict.fromkeys(names))
 
 
 @cache

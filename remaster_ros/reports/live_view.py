@@ -7,6 +7,7 @@ Which commands a view offers is for the eye; what they do is decided by the node
 from __future__ import annotations
 
 import hashlib
+import re
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,8 @@ from remaster_ros.collection import events
 from remaster_ros.collection.live_residuals import LiveResiduals
 from remaster_ros.collection.pace import Pace, minutes_text
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports.live_facts import FitFacts, Precision
+from remaster_ros.reports.live_commands import commands
+from remaster_ros.reports.live_facts import FitFacts, PlanPage, Precision
 from remaster_ros.types import FloatArray
 
 SILENT_S = 3.0
@@ -33,12 +35,10 @@ LONGEST_WAY = 200
 UNDETERMINED_RAD = 0.0873
 """5 degrees: what the fit assumes of a zero-offset before it has seen anything."""
 SHOWN_COUNTS = ('phase', 'poses_done', 'poses', 'configurations_done', 'configurations')
+SHOWN_PLAN = ('plan_page', 'plan_shown', 'confirmed')
+_PLAN_NAME = re.compile('[0-9a-f]{8}')
 PLANNER, BRIDGE, RECORDER, OPTIMIZER = 'pose_planner', 'robot_bridge', 'recorder', 'optimizer'
 NODES = (PLANNER, BRIDGE, RECORDER, OPTIMIZER)
-STOP_LABEL = 'Stop the collection'
-STOP_NOTE = (
-    'No emergency stop: it asks the planner over the network. In danger use the red button.'
-)
 
 
 @dataclass
@@ -88,6 +88,7 @@ class LiveView:
         self._precision = Precision()
         self._offsets: Mapping[str, tuple[float, float]] = {}
         self._fit = FitFacts()
+        self._plan_page = PlanPage()
 
     # What comes in
 
@@ -99,7 +100,9 @@ class LiveView:
             return
         self._nodes[node] = _Node(level, _clip(message), now_s)
         if node == PLANNER:
-            self._values = {name: _clip(values.get(name, '')) for name in SHOWN_COUNTS}
+            self._values = {
+                name: _clip(values.get(name, '')) for name in SHOWN_COUNTS + SHOWN_PLAN
+            }
             running = self._planner is not None and self._planner.state == 'running'
             self._pace.update(self._count('configurations_done'), now_s, running=running)
 
@@ -147,6 +150,10 @@ class LiveView:
                 return
         self._messages.append((now_s, _clip(text)))
 
+    def take_plan_page(self, page: PlanPage) -> None:
+        """Take where the page of a plan is served, or why it is not."""
+        self._plan_page = page
+
     def take_joints(self, q: FloatArray) -> None:
         """Take where the arm is, rad, (k,)."""
         if np.all(np.isfinite(q)):
@@ -186,6 +193,11 @@ class LiveView:
 
     # What goes out
 
+    def plan_to_show(self) -> tuple[str, str]:
+        """Return name and page of the plan that is next; two empty texts where none is shown."""
+        plan, page = self._values.get('plan_shown', ''), self._values.get('plan_page', '')
+        return (plan, page) if page and _PLAN_NAME.fullmatch(plan) else ('', '')
+
     def view(self, now_s: float) -> dict[str, Any]:
         """Return what the page shows now, of plain types."""
         return {
@@ -199,6 +211,7 @@ class LiveView:
             'messages': [
                 {'age_s': now_s - then, 'text': text} for then, text in reversed(self._messages)
             ],
+            'confirmation': self._confirmation(),
             'commands': self._commands(now_s),
             'seen': self.seen(now_s),
             'scene': self._scene(),
@@ -207,14 +220,15 @@ class LiveView:
     def seen(self, now_s: float) -> str:
         """Return a mark of what a person must have seen who lets the arm move.
 
-        It is another one as soon as the state of the run, a halt, a change of the set-up or
-        whether the planner is heard is another.
+        It is another one as soon as the state of the run, a halt, a change of the set-up, the
+        plan that is next, whether it is confirmed or whether the planner is heard is another.
         """
         silent = self._silent(PLANNER, now_s)
         state = self._planner.state if self._planner else ''
         halted = self._bridge.halted if self._bridge else ''
         changed = self._recorder.changed if self._recorder else ''
-        what = '\0'.join((str(silent), state, halted, changed))
+        plan = self.plan_to_show()[0], self._values.get('confirmed', '')
+        what = '\0'.join((str(silent), state, halted, changed, *plan))
         return hashlib.sha256(what.encode()).hexdigest()[:16]
 
     def _silent(self, node: str, now_s: float) -> bool:
@@ -302,29 +316,30 @@ class LiveView:
             'fit': dict(self._fit.shown),
         }
 
-    def _commands(self, now_s: float) -> dict[str, dict[str, Any]]:
-        """Return what each command is called, whether it is of use now, and why not."""
-        silent = self._silent(PLANNER, now_s)
-        state = self._planner.state if self._planner else ''
-        halted = bool(self._bridge and self._bridge.halted)
-        why = 'the planner is silent' if silent else ''
-        if not why and halted:
-            why = 'the arm is halted'
-        if not why and state not in ('idle', 'paused', 'stopped'):
-            why = _clip(f'the collection is {state}')
-        begun = self._count('configurations_done') or self._count('poses_done')
-        measured = bool(self._recorder and self._recorder.observations)
-        idle = state not in ('running', 'held')
+    def _confirmation(self) -> dict[str, Any] | None:
+        """Return which plan is next, and where it can be looked at; None where none is shown."""
+        plan, page = self.plan_to_show()
+        if not plan:
+            return None
+        served = self._plan_page if self._plan_page.plan == plan else PlanPage()
         return {
-            'collect': {
-                'label': 'Go on' if begun else 'Begin the collection',
-                'on': not why,
-                'note': why or 'the arm moves',
-            },
-            'pause': {'label': 'Pause', 'on': not silent and not idle, 'note': ''},
-            'stop': {'label': STOP_LABEL, 'on': True, 'note': STOP_NOTE},
-            'fit': {'label': 'Fit', 'on': idle and measured, 'note': ''},
+            'plan': plan,
+            'confirmed': self._values['confirmed'] == 'yes',
+            'page': page,
+            'address': served.address,
+            'trouble': _clip(served.trouble),
         }
+
+    def _commands(self, now_s: float) -> dict[str, dict[str, Any]]:
+        return commands(
+            state=self._planner.state if self._planner else '',
+            silent=self._silent(PLANNER, now_s),
+            halted=bool(self._bridge and self._bridge.halted),
+            begun=bool(self._count('configurations_done') or self._count('poses_done')),
+            measured=bool(self._recorder and self._recorder.observations),
+            unconfirmed=self._values.get('confirmed') == 'no',
+            confirmation=self._confirmation(),
+        )
 
     def _scene(self) -> dict[str, Any]:
         q, target = self._q, self._target

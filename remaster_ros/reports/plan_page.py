@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from remaster_ros.collection.plan_confirmation import service_name
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.trajectory import RAMP_S, REST_S
@@ -23,6 +24,10 @@ from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.version import __version__
 
 GENERATOR = 'remaster plan'
+HEAD_BYTES = 2000
+"""So far the page tells what it is."""
+LARGEST_PAGE = 50_000_000
+_MARK = f'<meta name="generator" content="{GENERATOR}">'.encode()
 WORDS = {
     REGISTRATION: ('for the registration', 'the first three that are seen register the sensors'),
     FITTED: ('to fit', 'the offsets are fitted on these'),
@@ -68,6 +73,7 @@ def plan_page(
         cell=cell,
         registered=registered,
         confirm=confirm,
+        confirm_service=service_name(confirm),
         mood='caution' if missed_goal(plan) or plan.undetermined else 'good',
         headline=(
             f'{len(plan.visits)} configurations at {poses} poses in {minutes} of robot time; no '
@@ -102,9 +108,36 @@ def check_plan_page(path: Path) -> None:
         return
     if path.is_file():
         with path.open('rb') as file:
-            if f'content="{GENERATOR}"'.encode() in file.read(2000):
+            if _MARK in file.read(HEAD_BYTES):
                 return
     raise InputError(f'{path}: already there, and no page of {GENERATOR}; give another name')
+
+
+def read_plan_page(path: Path, plan: str) -> bytes:
+    """Return the page of a plan that waits for a confirmation.
+
+    Parameters
+    ----------
+    path
+        Whoever publishes on the network may have chosen it: nothing but such a page is returned.
+    plan
+        Its fingerprint.
+
+    Raises
+    ------
+    InputError
+        There is no such page, or it shows another plan.
+    """
+    try:
+        if not path.is_file() or path.stat().st_size > LARGEST_PAGE:
+            raise InputError(f'{path} is not on this computer')
+        html = path.read_bytes()
+    except OSError as error:
+        raise InputError(f'{path}: {error.strerror}') from None
+    head = html[:HEAD_BYTES]
+    if _MARK not in head or f'<meta name="plan" content="{plan}">'.encode() not in head:
+        raise InputError(f'{path} shows another plan')
+    return html
 
 
 def write_plan_page(path: Path, html: str) -> None:

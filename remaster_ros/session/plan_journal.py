@@ -14,88 +14,37 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
-import numpy as np
-
 from remaster_ros.errors import DiskError, InputError
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.planning.candidates import Plan
+from remaster_ros.planning.collection_plan import Expected
 from remaster_ros.planning.tour_order import (
     FITTED,
     REFERENCE,
     REGISTRATION,
     PoseVisit,
-    Route,
     Tour,
 )
 from remaster_ros.session.files import make_folder
 from remaster_ros.session.journal import Journal, Record
 from remaster_ros.session.plain_data import from_plain, to_plain
+from remaster_ros.session.plan_records import (
+    NO_FREE_PATH,
+    EnoughNoted,
+    ExpectationNoted,
+    OutcomeNoted,
+    PlanBegun,
+    PlanRecord,
+    RoundNoted,
+    RouteNoted,
+    StateNoted,
+    StopNoted,
+    TourNoted,
+)
 from remaster_ros.session.session_opening import PLAN
-from remaster_ros.types import FloatArray
 
-NO_FREE_PATH = 'no_free_path'
-"""Outcome of a configuration that the arm cannot get to without hitting something."""
 ENOUGH = 'enough is known'
 """Why planned poses are not visited once the wanted precision is reached."""
-
-
-class _Begun(msgspec.Struct, tag_field='kind', tag='plan'):
-    """The first record: the plan's name, and what it depends on."""
-
-    id: str
-    settings: dict[str, Any]
-
-
-class _Tour(msgspec.Struct, tag_field='kind', tag='tour'):
-    plans: dict[str, Plan]
-    in_order: bool
-    one_solution: bool
-    # Plans of older versions have no references, and go on without them.
-    reference_every: int = 0
-    # Empty where the nearest pose is next.
-    order: tuple[tuple[str, int, int], ...] = ()
-
-
-class _Route(msgspec.Struct, tag_field='kind', tag='route'):
-    """Solutions in the order of their visits, by number; `paths` has those that go around."""
-
-    ids: tuple[int, ...]
-    paths: dict[str, FloatArray] = {}
-    unreached: tuple[int, ...] = ()
-
-    def route(self, joints: int) -> Route:
-        """Return it as a tour has it, for an arm with so many joints."""
-        straight = np.empty((0, joints))
-        paths = tuple(self.paths.get(str(number), straight) for number in self.ids)
-        return Route(self.ids, paths, self.unreached)
-
-
-class _Stop(_Route, kw_only=True, tag='stop'):
-    split: str
-    index: int
-
-
-class _Round(msgspec.Struct, tag_field='kind', tag='round'):
-    """A round of the references is next, by request."""
-
-
-class _Enough(msgspec.Struct, tag_field='kind', tag='enough'):
-    """Enough is known: no more poses to fit are visited."""
-
-
-class _Outcome(msgspec.Struct, tag_field='kind', tag='outcome'):
-    id: int
-    result: str
-
-
-class _State(msgspec.Struct, tag_field='kind', tag='state'):
-    state: str
-    run: str = ''
-
-
-_Record = _Begun | _Tour | _Route | _Stop | _Round | _Enough | _Outcome | _State
 
 
 class PlanJournal:
@@ -166,11 +115,11 @@ class PlanJournal:
         self.lost = self._journal.lost
         if not self._journal.records:
             self.id = uuid.uuid4().hex[:12]
-            self._journal.append(to_plain(_Begun(self.id, self._settings)))
+            self._journal.append(to_plain(PlanBegun(self.id, self._settings)))
             return self._journal
         try:
-            begun, *records = from_plain(self._journal.records, list[_Record])
-            if not isinstance(begun, _Begun):
+            begun, *records = from_plain(self._journal.records, list[PlanRecord])
+            if not isinstance(begun, PlanBegun):
                 raise ValueError('it does not begin with a plan')
             self.id = begun.id
             self._refuse_other_settings(begun.settings)
@@ -198,31 +147,23 @@ class PlanJournal:
                 'with the same to go on, or name a new session folder'
             )
 
-    def _replay(self, record: _Record) -> None:
+    def _replay(self, record: PlanRecord) -> None:
         tour, stop, joints = self.tour, self.stop, len(self._chain)
         match record:
-            case _Tour():
+            case TourNoted():
                 self.stop = None
-                self.tour = Tour(
-                    self._chain,
-                    record.plans,
-                    in_order=record.in_order,
-                    one_solution=record.one_solution,
-                    model=self._model,
-                    reference_every=record.reference_every,
-                    order=record.order,
-                )
-            case _Stop() if tour is not None:
+                self.tour = record.tour(self._chain, self._model)
+            case StopNoted() if tour is not None:
                 self._take(tour.go_to(record.split, record.index, *record.route(joints)))
-            case _Route() if tour is not None and stop is not None:
+            case RouteNoted() if tour is not None and stop is not None:
                 self._take(tour.along(stop, *record.route(joints)))
-            case _Round() if tour is not None:
+            case RoundNoted() if tour is not None:
                 tour.ask_round()
-            case _Enough() if tour is not None:
+            case EnoughNoted() if tour is not None:
                 tour.leave_out(FITTED, ENOUGH)
-            case _Outcome():
+            case OutcomeNoted():
                 self._close_solution(record.id, record.result)
-            case _State():
+            case StateNoted():
                 self.state, self.run = record.state, record.run
 
     def _take(self, stop: PoseVisit) -> None:
@@ -241,7 +182,7 @@ class PlanJournal:
         if split != REGISTRATION:
             (self.references if split == REFERENCE else self.outcomes)[result] += times
 
-    def _append(self, record: _Record) -> None:
+    def _append(self, record: PlanRecord) -> None:
         if self._journal is None:
             make_folder(self.path.parent)
             self._journal = self._open()
@@ -258,35 +199,36 @@ class PlanJournal:
         except DiskError as error:
             self.trouble = str(error)
 
-    def begin(self, tour: Tour) -> None:
-        """Note a new tour."""
-        self._append(
-            _Tour(tour.plans, tour.in_order, tour.one_solution, tour.reference_every, tour.order)
-        )
+    def begin(self, tour: Tour, expected: Expected | None = None) -> None:
+        """Note a new tour, and what its fit is expected to state where that is known."""
+        how = tour.in_order, tour.one_solution, tour.reference_every, tour.order
+        self._append(TourNoted(tour.plans, *how))
+        if expected is not None:
+            self._append(ExpectationNoted(dict(expected.joint_std), expected.tool_rms))
         # As it was set before there was a file to keep it in.
-        self._append(_State(self.state, self.run))
+        self._append(StateNoted(self.state, self.run))
         self.tour, self.stop = tour, None
 
     def ask_round(self) -> None:
         """Visit the references next, since a person has changed something; note that."""
         if self.tour is not None and self.tour.references:
-            self._append(_Round())
+            self._append(RoundNoted())
             self.tour.ask_round()
 
     def leave_rest(self) -> None:
         """Visit no more poses to fit, since enough is known; note that."""
         if self.tour is not None:
-            self._append(_Enough())
+            self._append(EnoughNoted())
             self.tour.leave_out(FITTED, ENOUGH)
 
     def open_stop(self, stop: PoseVisit) -> None:
         """Note the next stop, before the arm is sent there."""
-        self._append(_Stop(**_route(stop), split=stop.split, index=stop.index))
+        self._append(StopNoted(**_route(stop), split=stop.split, index=stop.index))
         self._take(stop)
 
     def reroute(self, stop: PoseVisit) -> None:
         """Note other ways to what is left of the open stop, before the arm is sent there."""
-        self._append(_Route(**_route(stop)))
+        self._append(RouteNoted(**_route(stop)))
         self._take(stop)
 
     def outcome(self, solution: int, result: str) -> None:
@@ -302,14 +244,14 @@ class PlanJournal:
         """
         if self.stop is None or solution not in self.stop.ids:
             return
-        self._append(_Outcome(solution, result))
+        self._append(OutcomeNoted(solution, result))
         self._close_solution(solution, result)
 
     def say_state(self, state: str, run: str = '') -> None:
         """Note the planner's state and run, once there is a plan."""
         before, (self.state, self.run) = (self.state, self.run), (state, run)
         if self._journal is not None and before != (state, run):
-            self._append(_State(state, run))
+            self._append(StateNoted(state, run))
 
     def close(self) -> None:
         """Let others go on with the plan."""

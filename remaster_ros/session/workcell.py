@@ -279,8 +279,11 @@ def read_cell(path: str | Path) -> Workcell:
         Naming the file, the key and the remedy.
     """
     path = Path(path)
-    if not path.suffix and not path.exists():
-        path = config_path(f'cells/{path}.yaml')
+    if not path.suffix and not path.is_file():
+        shipped = config_path(f'cells/{path}.yaml')
+        # A folder of that name, as `remaster demo --out demo` makes one, is no cell file.
+        if shipped.exists() or not path.exists():
+            path = shipped
     return parse_cell(read_limited(path, YAML_LIMIT, 'name a cell file'), path)
 
 

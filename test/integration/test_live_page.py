@@ -7,11 +7,17 @@ import time
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import msgspec
+import numpy as np
 import pytest
 from browser import Browser
 from played_collection import CELL, CHAIN, PlayedCollection
 
-from remaster_ros.reports.live_server import LiveServer, Place
+from remaster_ros.planning.collection_plan import look_ahead
+from remaster_ros.planning.tour_planner import TourPlanner
+from remaster_ros.reports.live_facts import PlanPage
+from remaster_ros.reports.live_place import Place
+from remaster_ros.reports.live_server import LiveServer
+from remaster_ros.reports.plan_page import plan_page, read_plan_page, write_plan_page
 from remaster_ros.reports.robot_scene import robot_scene
 from remaster_ros.reports.scene_view import scene_to_dict
 
@@ -32,13 +38,25 @@ class Empty(BaseHTTPRequestHandler):
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(120)]
 
 
+SCENE = robot_scene(CELL, CELL.planning_scene(CHAIN))
+
+
+def registration_plan(name):
+    """Return the page of a small plan that waits for a confirmation."""
+    counts = {'optimization': 3, 'validation': 2, 'registration': 6}
+    planner = TourPlanner(CELL.planning_scene(CHAIN), counts, 0, design=CELL.design_settings())
+    tours = [planner.registration(), planner.collection(planner.rough_places)]
+    start = np.deg2rad([5.0, 7.0, 0.0, 112.0, 10.0, 35.0, -20.0])
+    plan = look_ahead(planner, planner.rough_places, tours, start)
+    return plan_page(plan, SCENE, 'demo', confirm=name)
+
+
 class Played:
     """A collection that visits a configuration every so often, with its page."""
 
     def __init__(self):
         self.collection = PlayedCollection(of=24)
-        scene = robot_scene(CELL, CELL.planning_scene(CHAIN))
-        content = msgspec.json.encode(scene_to_dict(scene))
+        content = msgspec.json.encode(scene_to_dict(SCENE))
         self._lock, self._ending = threading.Lock(), threading.Event()
         self.server = LiveServer(Place(), 'T' * 43, content, self._send)
         self._thread = threading.Thread(target=self._run)
@@ -163,10 +181,78 @@ def test_without_the_token_the_page_is_empty(browser, played):
     browser.value('sessionStorage.clear()')
     browser.open(played.server.url.split('#')[0])
     browser.until(lambda: browser.text('#state') == 'no token', 'that the token is missing')
-    assert browser.value('document.querySelectorAll("button:disabled").length') == 4
+    assert browser.value('document.querySelectorAll("button:disabled").length') == 5
     browser.open(played.server.url[:-1])
     browser.until(lambda: 'by the address that' in browser.text('#link'), 'that it is wrong')
     assert browser.value('sessionStorage.clear()') is None
+
+
+def test_a_plan_is_confirmed_in_this_tab_only_after_it_was_opened_here(browser, played, tmp_path):
+    collection, plans = played.collection, ('ab12cd34', '00000002')
+    first = registration_plan(plans[0])
+
+    def show(name):
+        """Have a plan shown, as planner and node do."""
+        path = tmp_path / 's.plan.html'
+        write_plan_page(path, first.replace(plans[0], name))
+        address = played.server.show_plan(read_plan_page(path, name))
+        collection.view.take_plan_page(PlanPage(name, address))
+        played.change(plan=name)
+
+    def confirm_is_off():
+        return browser.value('document.querySelector("#confirm").disabled')
+
+    show(plans[0])
+    opened(browser, played)
+    browser.until(lambda: f'confirmation of plan {plans[0]}' in browser.text('#plan-state'), '1')
+    assert confirm_is_off()
+    assert browser.value('document.querySelector("#collect").disabled')
+    assert 'Look at the plan first' in browser.text('#plan-note')
+    browser.look_elsewhere('#plan-link')
+    browser.until(lambda: not confirm_is_off(), 'that it may be confirmed')
+    # Another plan takes its place: what was opened does not count for it.
+    show(plans[1])
+    browser.until(lambda: f'of plan {plans[1]}' in browser.text('#plan-state'), 'the other plan')
+    assert confirm_is_off()
+    browser.click('#confirm')
+    browser.look_elsewhere('#plan-link')
+    browser.until(lambda: not confirm_is_off(), 'that it may be confirmed')
+    # Cut off, the button is gone.
+    browser.network(connected=False)
+    browser.until(lambda: 'No connection' in browser.text('#link'), 'that the network is cut')
+    assert confirm_is_off()
+    browser.network(connected=True)
+    browser.until(lambda: browser.text('#link') == '' and not confirm_is_off(), 'the network')
+    assert collection.commands == []
+    browser.click('#confirm')
+    browser.until(lambda: f'{plans[1]} is confirmed' in browser.text('#plan-state'), 'it')
+    assert collection.commands == [f'confirm/{plans[1]}']
+    assert collection.state == 'idle', 'to confirm moves nothing'
+    begin(browser)
+    browser.until(lambda: browser.text('#state') == 'collecting', 'the collection')
+    assert browser.errors == []
+
+
+def test_the_page_of_a_plan_plays_and_reaches_nothing(browser, played):
+    """It is shown as a stranger's page: whatever stands in it has neither token nor commands."""
+    opened(browser, played)
+    address = played.server.show_plan(registration_plan('ab12cd34').encode())
+    own = f'http://127.0.0.1:{played.server.port}'
+    browser.open(f'{own}/{address}')
+    browser.until(lambda: browser.value('!!document.querySelector("#scene canvas")'), 'the arm')
+    browser.click('#after')
+    browser.until(lambda: '2' in browser.text('#state'), 'the second configuration')
+    assert browser.errors == []
+    assert browser.value('window.origin') == 'null'
+    for reach in (
+        'sessionStorage.getItem("token")',
+        'document.cookie',
+        f'await fetch("{own}/view")',
+        f'await fetch("{own}/command/stop", {{method: "POST"}})',
+    ):
+        tried = f'(async () => {{ try {{ return [{reach}] }} catch (e) {{ return "kept" }} }})()'
+        assert browser.value(tried) == 'kept', reach
+    assert played.collection.commands == []
 
 
 @pytest.mark.qualify

@@ -2,9 +2,13 @@
 
 import importlib.util
 import xml.etree.ElementTree as ElementTree
+from fnmatch import fnmatch
 
 import pytest
+import viewer_configs
 from ros_rig import ROOT, node_arguments, wait_until
+
+from remaster_ros.collection.plan_confirmation import service_name
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(180)]
 
@@ -18,6 +22,7 @@ NODES = (
     'optimizer',
     'watch',
 )
+PLANS = '/remaster/confirm/plan_*'
 OWN = {
     'optitrack_markers': {'start_timeout_s': 600.0},
     'laser_tracker_markers': {'start_timeout_s': 600.0},
@@ -78,8 +83,20 @@ def test_the_policy_is_what_the_nodes_use(start, client, tmp_path):
         own, shown = allowed(name), looks[-1][name]
         if importlib.util.find_spec('tf2_msgs') is None:
             own -= {('publish', '/tf_static')}
+        # There is one for each plan that waits for a confirmation; here none does.
+        own -= {('reply', PLANS), ('request', PLANS)}
         assert shown - own == set(), f'{name} uses what the policy does not allow'
         assert own - shown == set(), f'{name} is allowed what it does not use'
+    # While all of them run: RViz and Foxglove find what they are told to show.
+    types = dict(client.get_topic_names_and_types())
+    for topic, kind in viewer_configs.topics().items():
+        assert types.get(topic) == [kind], topic
+
+
+def test_plans_are_confirmed_to_the_planner_by_the_page_and_the_person():
+    assert fnmatch(f'/remaster/confirm/{service_name("1a2b3c4d")}', PLANS)
+    assert [node for node in NODES if ('reply', PLANS) in allowed(node)] == ['pose_planner']
+    assert [node for node in NODES if ('request', PLANS) in allowed(node)] == ['watch']
 
 
 @pytest.mark.parametrize('node', NODES)

@@ -12,6 +12,12 @@ from ros_rig import node_arguments, wait_until
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 
 
+PLAN_HEAD = (
+    '<!doctype html><meta name="generator" content="remaster plan">'
+    '<meta name="plan" content="{}"><p>a plan'
+)
+
+
 class Page:
     def __init__(self, start, client, tmp_path):
         self.client = client
@@ -133,6 +139,58 @@ def test_buttons_call_the_services_and_nothing_else(page, client):
     assert page.ask('/command/collect', json.dumps({**body, 'seen': 'other'}))[0] == 409
     assert page.ask('/command/clear_halt', '')[0] == 404
     assert called == ['pause', 'collect']
+
+
+def test_a_plan_is_confirmed_by_its_own_service(page, client, tmp_path):
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+    from std_srvs.srv import Trigger
+
+    from remaster_ros.nodes.status import RELIABLE, TOPIC
+
+    status, called = client.create_publisher(DiagnosticArray, TOPIC, RELIABLE), []
+    file = tmp_path / 's.plan.html'
+
+    def serve(plan):
+        def answer(request, response):
+            called.append(plan)
+            response.success, response.message = True, 'confirmed'
+            return response
+
+        client.create_service(Trigger, f'remaster/confirm/plan_{plan}', answer)
+
+    def shown(plan):
+        """Publish as the planner does; return what the page has of the plan."""
+        values = {'plan_page': str(file), 'plan_shown': plan, 'confirmed': 'no'}
+        pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+        planner = DiagnosticStatus(name='pose_planner', values=pairs)
+        status.publish(DiagnosticArray(status=[planner]))
+        client.spin_some()
+        return page.view().get('confirmation') or {}
+
+    def confirm(answer):
+        body = {'view': answer['number'], 'seen': answer['view']['seen']}
+        return page.ask('/command/confirm', json.dumps(body))
+
+    for plan in ('00000001', '00000002'):
+        serve(plan)
+    # Not there yet; then of another plan; then no page of a plan at all.
+    wait_until(lambda: shown('00000001').get('trouble'), 30.0, 'that the page is missing')
+    for text in (PLAN_HEAD.format('00000002'), '<p>00000001'):
+        file.write_text(text)
+        wait_until(lambda: not shown(''), 20.0, 'that there is none')
+        wait_until(lambda: shown('00000001').get('trouble'), 20.0, 'that it is refused')
+        assert shown('00000001')['address'] == ''
+    file.write_text(PLAN_HEAD.format('00000001'))
+    wait_until(lambda: not shown(''), 20.0, 'that there is none')
+    wait_until(lambda: shown('00000001').get('address'), 20.0, 'the page of the plan')
+    old = page.ask('/view')[1]
+    wait_until(lambda: confirm(page.ask('/view')[1])[1]['done'], 20.0, 'the confirmation')
+    assert set(called) == {'00000001'}
+    # Another one is next: what was seen before is no longer asked for, of neither plan.
+    wait_until(lambda: shown('00000002').get('plan') == '00000002', 20.0, 'the other plan')
+    called.clear()
+    assert confirm(old)[0] == 409
+    assert called == []
 
 
 def test_the_token_is_for_this_user_alone(page, client):

@@ -11,6 +11,7 @@ const token = takeToken();
 let shown = null;
 let shownAt = -Infinity;
 let asked = null;
+let lookedAt = '';
 
 // The token comes behind the # of the address and is kept for this tab alone.
 function takeToken() {
@@ -102,6 +103,7 @@ function show(view) {
     button.title = command.note;
     if (button.textContent !== command.label) button.textContent = command.label;
   }
+  showConfirmation(view.confirmation, view.commands.confirm);
   setText('stop-note', view.commands.stop.note);
   fill('sensors', view.sensors.map((s) => [
     s.name,
@@ -119,6 +121,26 @@ function show(view) {
     get('sure').close();
     banner('answer', 'The collection has changed meanwhile; look again.', 'caution');
   }
+}
+
+// A plan can be confirmed in this tab once it was opened from here; another one asks for it anew.
+function showConfirmation(confirmation, command) {
+  get('confirmation').hidden = !confirmation;
+  if (!confirmation) return;
+  const { plan, confirmed, page, address, trouble } = confirmation;
+  const looked = lookedAt === plan;
+  get('confirmation').className = `banner ${confirmed ? 'good' : 'caution'}`;
+  setText('plan-state', confirmed ? `Plan ${plan} is confirmed.` : `The arm waits for your confirmation of plan ${plan}.`);
+  const link = get('plan-link');
+  link.hidden = !address;
+  if (address && link.getAttribute('href') !== address) link.href = address;
+  link.dataset.plan = plan;
+  get('confirm').hidden = confirmed;
+  get('confirm').disabled = !command.on || !looked;
+  if (confirmed) setText('plan-note', '');
+  else if (trouble) setText('plan-note', `It cannot be shown here: ${trouble}. Open ${page} on the computer of pose_planner; it has the command that confirms it.`);
+  else if (!address) setText('plan-note', 'It is being fetched.');
+  else setText('plan-note', looked ? command.note : 'Look at the plan first: every way and every configuration.');
 }
 
 function sensorState(sensor) {
@@ -154,7 +176,7 @@ function showLink() {
   const old = age > OLD_MS;
   document.body.classList.toggle('old', old);
   if (!old) return;
-  for (const name of ['collect', 'pause', 'fit']) get(name).disabled = true;
+  for (const name of ['collect', 'pause', 'fit', 'confirm']) get(name).disabled = true;
   if (get('sure').open) get('sure').close();
   const since = Number.isFinite(age) ? ` What is shown is ${Math.round(age / 1000)} s old.` : '';
   banner('link', `${lastError || 'No answer from remaster watch.'}${since} Stop may not get through: use the red button.`);
@@ -199,6 +221,8 @@ get('collect').addEventListener('click', () => {
   setText('sure-what', shown.view.commands.collect.label);
   get('sure').showModal();
 });
+get('plan-link').addEventListener('click', () => { lookedAt = get('plan-link').dataset.plan; });
+get('confirm').addEventListener('click', () => command('confirm', { view: shown.number, seen: shown.view.seen }));
 get('sure-yes').addEventListener('click', () => {
   if (asked) command('collect', { view: shown.number, seen: asked.seen });
   asked = null;

@@ -44,6 +44,10 @@ class Tours:
         return Tour(CHAIN, plans, reference_every=100 * bool(self.references))
 
     @property
+    def design(self):
+        raise InsufficientDataError('of so few poses nothing is expected')
+
+    @property
     def model(self):
         return SimpleNamespace(trouble=lambda q: self.standing)
 

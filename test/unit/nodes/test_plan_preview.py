@@ -69,7 +69,7 @@ def test_the_plan_is_shown_and_followed_only_once_it_is_confirmed(bench):
     html = bench.page.read_text(encoding='utf-8')
     assert f'confirmation of plan {name}' in html
     assert 'for the registration' in html
-    assert 'ros2 service call /remaster/confirm' in html
+    assert f'ros2 service call /remaster/confirm/plan_{name} std_srvs' in html
     assert not preview.allows(registration)
     assert preview.confirm()[0]
     assert preview.asked() == ''
@@ -130,6 +130,39 @@ def test_a_planner_started_again_has_no_confirmation(bench, tmp_path):
     assert f'<p>{total - 1} configurations at ' in again.page.read_text(encoding='utf-8')
     assert not again.preview.allows(again.journal.tour)
     again.journal.close()
+
+
+def test_only_the_plan_that_a_person_has_seen_is_confirmed(bench):
+    """Its name says which; without a name, none that has taken the place of another."""
+    preview = bench.preview
+    bench.draw()
+    first = fingerprint(bench.tours.registration())
+    assert preview.values() == {
+        'plan_page': str(bench.page),
+        'plan_shown': first,
+        'confirmed': 'no',
+    }
+    done, why = preview.confirm('00000000')
+    assert not done
+    assert why.startswith('plan 00000000 is not the one that is next; plan ')
+    bench.registered()
+    preview.draw(START, bench.facts)
+    # While the next one is drawn, no name is right.
+    assert not preview.confirm(first)[0]
+    bench.draw()
+    second = fingerprint(bench.tours.collection(bench.tours.rough_places))
+    assert preview.shown == second
+    assert not preview.confirm(first)[0]
+    done, why = preview.confirm()
+    assert not done
+    assert f'look at {bench.page} again, then call /remaster/confirm/plan_{second}' in why
+    assert preview.confirmed == ''
+    assert preview.confirm(second)[0]
+    assert preview.values()['confirmed'] == 'yes'
+    # A request for the first one that was held up on its way changes nothing.
+    assert not preview.confirm(first)[0]
+    assert preview.confirmed == second
+    assert preview.confirm()[0]
 
 
 def test_a_page_that_cannot_be_written_holds_the_arm_and_is_tried_again(bench):

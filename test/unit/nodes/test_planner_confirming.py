@@ -63,6 +63,11 @@ class Planner:
         assert self.call('confirm')[0]
         assert self.call('collect') == (True, 'collecting')
 
+    def services(self):
+        """Return the names of the services that confirm a plan."""
+        names = {service.service_name for service in self.node.services}
+        return {name for name in names if '/remaster/confirm' in name}
+
     def done(self):
         """Have every solution of the open pose recorded."""
         for number in self.announced[-1].ids:
@@ -109,6 +114,8 @@ def test_a_pose_is_announced_only_where_its_own_plan_was_confirmed(begin, tmp_pa
     planner.confirm()
     planner.step_until(lambda: planner.announced, 'the first pose')
     assert [stop.split for stop in planner.announced] == ['registration']
+    registration, confirming = node._preview.shown, planner.services()
+    assert f'/remaster/confirm/plan_{registration}' in confirming
     # The registration leads to another plan, which nobody has seen.
     planner.done()
     node.progress.T_R_N.update(node._tours.rough_places)
@@ -117,6 +124,12 @@ def test_a_pose_is_announced_only_where_its_own_plan_was_confirmed(begin, tmp_pa
     planner.step_until(lambda: node._preview.shown, 'the page')
     assert node.run.why == planner.call('collect')[1]
     assert len(planner.announced) == 1
+    # A request for the plan before, however late, confirms nothing; its service refuses it.
+    assert len(planner.services()) == len(confirming) + 1
+    response = node._on_confirm(Trigger.Request(), Trigger.Response(), plan=registration)
+    assert not response.success
+    assert f'plan {registration} is not the one that is next' in response.message
+    assert not planner.call('collect')[0]
     planner.confirm()
     planner.step_until(lambda: len(planner.announced) > 1, 'the first pose to fit')
     assert planner.announced[1].split in ('optimization', 'validation')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import http.client
 import json
 import socket
@@ -13,7 +14,8 @@ import pytest
 
 from remaster_ros.errors import InputError
 from remaster_ros.reports import live_server
-from remaster_ros.reports.live_server import COMMANDS, LiveServer, Place
+from remaster_ros.reports.live_place import Place
+from remaster_ros.reports.live_server import COMMANDS, SEEN_FIRST, LiveServer
 
 TOKEN = 'T' * 43
 
@@ -36,8 +38,10 @@ class Page:
         if self.answer is not None:
             done(*self.answer)
 
-    def show(self, seen):
-        self.server.publish({'seen': seen, 'text': '<script>', 'none': float('nan')})
+    def show(self, seen, plan='ab12cd34'):
+        confirmation = {'plan': plan} if plan else None
+        view = {'seen': seen, 'text': '<script>', 'none': float('nan')}
+        self.server.publish({**view, 'confirmation': confirmation})
 
     def ask(self, method, path, body=None, *, token=TOKEN, **headers):
         """Return status, headers and content; a header that is None is left out."""
@@ -63,10 +67,11 @@ class Page:
     def view(self):
         return json.loads(self.ask('GET', '/view')[2])
 
-    def collect(self, **changes):
+    def decide(self, name, **changes):
+        """Ask for what a person must have seen something of."""
         shown = self.view()
         body = {'view': shown['number'], 'seen': shown['view']['seen'], **changes}
-        return self.ask('POST', '/command/collect', json.dumps(body).encode())
+        return self.ask('POST', f'/command/{name}', json.dumps(body).encode())
 
 
 @pytest.fixture
@@ -93,13 +98,16 @@ def test_the_page_and_its_files_are_served_without_secrets(page):
 
 def test_view_and_commands_with_the_token(page):
     shown = page.view()
-    assert shown['view'] == {'seen': 'a', 'text': '<script>', 'none': None}
+    plan = {'plan': 'ab12cd34'}
+    assert shown['view'] == {'seen': 'a', 'text': '<script>', 'none': None, 'confirmation': plan}
     assert shown['age_s'] < 5.0
     for name in ('pause', 'stop', 'fit'):
         status, _, content = page.ask('POST', f'/command/{name}')
         assert (status, json.loads(content)) == (200, {'done': True, 'message': 'done'})
-    assert page.collect()[0] == 200
-    assert page.sent == ['pause', 'stop', 'fit', 'collect']
+    assert page.decide('collect')[0] == 200
+    page.show('a')
+    assert page.decide('confirm')[0] == 200
+    assert page.sent == ['pause', 'stop', 'fit', 'collect', 'confirm/ab12cd34']
 
 
 @pytest.mark.parametrize('path', ['/view', '/scene', *(f'/command/{name}' for name in COMMANDS)])
@@ -192,7 +200,7 @@ def test_no_preflight_is_answered_and_no_other_method(page):
 @pytest.mark.parametrize(
     'name', ['clear_halt', 'register', 'discover', 'COLLECT', 'stop/../collect', 'stop%00']
 )
-def test_there_are_four_commands_and_no_other(page, name):
+def test_there_are_five_commands_and_no_other(page, name):
     assert page.ask('POST', f'/command/{name}')[0] in (400, 404, 405)
     assert page.sent == []
 
@@ -205,6 +213,7 @@ def test_no_other_file_is_served(page, path):
     assert page.ask('GET', path)[0] == 404
 
 
+@pytest.mark.parametrize('name', SEEN_FIRST)
 @pytest.mark.parametrize(
     'body',
     [
@@ -219,18 +228,19 @@ def test_no_other_file_is_served(page, path):
         b'[' * 900,
     ],
 )
-def test_collect_without_what_was_seen_is_refused(page, body):
-    assert page.ask('POST', '/command/collect', body)[0] == 400
+def test_what_needs_a_look_is_refused_without_one(page, name, body):
+    assert page.ask('POST', f'/command/{name}', body)[0] == 400
     assert page.sent == []
 
 
-def test_collect_of_another_state_or_of_an_old_view_is_refused(page, monkeypatch):
-    assert page.collect(view=10_000)[0] == 409
-    assert page.collect(seen='é')[0] == 409
+@pytest.mark.parametrize('name', SEEN_FIRST)
+def test_what_was_seen_of_another_state_or_in_an_old_view_is_refused(page, name, monkeypatch):
+    assert page.decide(name, view=10_000)[0] == 409
+    assert page.decide(name, seen='é')[0] == 409
     shown = page.view()
     page.show('b')
     body = json.dumps({'view': shown['number'], 'seen': 'a'}).encode()
-    status, _, content = page.ask('POST', '/command/collect', body)
+    status, _, content = page.ask('POST', f'/command/{name}', body)
     assert status == 409
     assert b'changed meanwhile' in content
     # What was held up on its way: the view that it names was shown too long ago.
@@ -238,17 +248,50 @@ def test_collect_of_another_state_or_of_an_old_view_is_refused(page, monkeypatch
     old = page.view()
     time.sleep(0.1)
     body = json.dumps({'view': old['number'], 'seen': 'b'}).encode()
-    status, _, content = page.ask('POST', '/command/collect', body)
+    status, _, content = page.ask('POST', f'/command/{name}', body)
     assert status == 409
     assert b'not up to date' in content
     assert page.sent == []
 
 
-def test_collect_that_comes_twice_counts_once(page):
+@pytest.mark.parametrize('name', SEEN_FIRST)
+def test_what_comes_twice_counts_once(page, name):
     shown = page.view()
     body = json.dumps({'view': shown['number'], 'seen': 'a'}).encode()
-    assert [page.ask('POST', '/command/collect', body)[0] for _ in range(2)] == [200, 409]
-    assert page.sent == ['collect']
+    assert [page.ask('POST', f'/command/{name}', body)[0] for _ in range(2)] == [200, 409]
+    assert len(page.sent) == 1
+
+
+def test_a_plan_is_confirmed_only_while_the_view_has_it(page):
+    shown = page.view()
+    page.show('b', plan='')
+    body = json.dumps({'view': shown['number'], 'seen': 'a'}).encode()
+    status, _, content = page.ask('POST', '/command/confirm', body)
+    assert status == 409
+    assert b'no plan waits' in content
+    page.show('c', plan='00000001')
+    assert page.ask('POST', '/command/confirm', body)[0] == 409
+    assert page.decide('confirm')[0] == 200
+    assert page.sent == ['confirm/00000001']
+
+
+def test_the_page_of_a_plan_has_a_secret_address_and_is_kept_away_from_the_live_page(page):
+    assert page.ask('GET', '/plan/', token=None)[0] == 404
+    assert page.ask('GET', '/plan/x', token=None)[0] == 404
+    first, second = (page.server.show_plan(f'<p>{i}'.encode()) for i in range(2))
+    assert len(first) > 40
+    # It opens in a tab of its own, whose request has no header of ours.
+    status, headers, content = page.ask('GET', f'/{second}', token=None)
+    assert (status, gzip.decompress(content)) == (200, b'<p>1')
+    policy = headers['Content-Security-Policy']
+    assert policy.startswith('sandbox allow-scripts;')
+    assert 'allow-same-origin' not in policy
+    assert 'connect-src' not in policy.replace("default-src 'none'", '')
+    # Browsers show nothing of a page that has both.
+    assert headers['Cross-Origin-Opener-Policy'] is None
+    assert page.ask('GET', f'/{first}', token=None)[0] == 404
+    assert page.ask('GET', f'/{second}', token=None, Host='evil.example')[0] == 421
+    assert page.ask('GET', f'/{second}', Origin='http://evil.example')[0] == 403
 
 
 def test_a_large_body_is_refused(page):

@@ -12,7 +12,7 @@ from played_collection import CHAIN, MARKERS, T_R_N, PlayedCollection
 from remaster_ros import simulate
 from remaster_ros.collection import events
 from remaster_ros.collection.stopping_rule import StoppingGoal, StoppingRule
-from remaster_ros.reports.live_facts import FitFacts
+from remaster_ros.reports.live_facts import FitFacts, PlanPage
 from remaster_ros.reports.live_view import (
     LONGEST_TEXT,
     MOST_NODES,
@@ -108,7 +108,8 @@ def test_a_halt_is_shown_and_nothing_goes_on(played, state):
     view = played.view.view(2.0)
     assert view['halted'] == 'the emergency stop was pressed'
     assert not view['commands']['collect']['on']
-    assert set(view['commands']) == {'collect', 'pause', 'stop', 'fit'}, 'none clears a halt'
+    assert 'clear_halt' not in view['commands']
+    assert set(view['commands']) == {'collect', 'pause', 'stop', 'fit', 'confirm'}
 
 
 def test_stop_is_labelled_as_no_emergency_stop(played):
@@ -129,6 +130,55 @@ def test_the_mark_of_what_was_seen_changes_with_what_a_person_decides_by(played,
     played.beat(3.0)
     assert played.view.seen(3.0) != before
     assert played.view.seen(3.0) != played.view.seen(3.0 + SILENT_S + 1.0)
+
+
+def test_a_plan_is_offered_for_confirmation_only_where_it_can_be_looked_at(played):
+    played.beat(1.0)
+    before = played.view.view(1.0)
+    assert before['confirmation'] is None
+    assert not before['commands']['confirm']['on']
+    played.plan = 'ab12cd34'
+    played.beat(2.0)
+    view = played.view.view(2.0)
+    assert view['seen'] != before['seen']
+    assert view['commands']['collect']['note'] == 'plan ab12cd34 is not confirmed'
+    assert not view['commands']['collect']['on']
+    # Its page is not read yet; that of another plan does not count.
+    played.view.take_plan_page(PlanPage('00000001', 'plan/other'))
+    assert view['confirmation'] == played.view.view(2.0)['confirmation']
+    assert view['confirmation']['address'] == ''
+    assert not played.view.view(2.0)['commands']['confirm']['on']
+    played.view.take_plan_page(PlanPage('ab12cd34', '', 'it is elsewhere'))
+    assert played.view.view(2.0)['confirmation']['trouble'] == 'it is elsewhere'
+    assert not played.view.view(2.0)['commands']['confirm']['on']
+    played.view.take_plan_page(PlanPage('ab12cd34', 'plan/x'))
+    view = played.view.view(2.0)
+    assert view['commands']['confirm']['on']
+    assert view['commands']['confirm']['label'] == 'Confirm plan ab12cd34'
+    # A silent planner confirms nothing.
+    assert not played.view.view(2.0 + SILENT_S + 1.0)['commands']['confirm']['on']
+    played.confirmed = 'ab12cd34'
+    played.beat(3.0)
+    after_it = played.view.view(3.0)
+    assert after_it['confirmation']['confirmed']
+    assert not after_it['commands']['confirm']['on']
+    assert after_it['commands']['collect']['on']
+    assert after_it['seen'] != view['seen']
+    # Another plan takes its place: what was seen of the first does not count for it.
+    played.plan = '00000002'
+    played.beat(4.0)
+    another = played.view.view(4.0)
+    assert another['seen'] not in (view['seen'], after_it['seen'])
+    assert another['confirmation']['address'] == ''
+    assert not another['commands']['collect']['on']
+
+
+@pytest.mark.parametrize('name', ['', 'x' * 8, '../../a1', 'ab12cd34/../stop', 'AB12CD34'])
+def test_a_name_that_no_plan_has_is_no_plan(played, name):
+    values = {'plan_page': '/page', 'plan_shown': name, 'confirmed': 'no'}
+    played.view.take_summary('pose_planner', 'ok', '', values, 1.0)
+    assert played.view.plan_to_show() == ('', '')
+    assert played.view.view(1.0)['confirmation'] is None
 
 
 def looks(*stds):

@@ -104,3 +104,13 @@ def test_what_ends_a_collection_is_what_counts_and_is_stated(tmp_path, poses, jo
     assert goal.joint_std_rad == (joint if joint is None else pytest.approx(joint, rel=1e-3))
     assert goal.tool_std_m == tool
     assert goal.stated == (joint is not None or tool is not None)
+
+
+def test_a_folder_of_the_name_of_a_shipped_cell_hides_it_not(tmp_path, monkeypatch):
+    """`remaster demo --out demo` makes one where its nodes look for the cell."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'demo').mkdir()
+    assert read_cell('demo').fingerprint().startswith('d9d9704393f6')
+    for folder in (tmp_path / 'demo', tmp_path):
+        with pytest.raises(InputError, match='not a regular file'):
+            read_cell(folder)
