@@ -30,13 +30,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import known, machine, progress, table
+from common import known, machine, progress
 from design_methods import compared
+from design_tables import share_held, side_by_side, table_of
 from designed_sessions import MARKER_STD, measured
 from robot_descriptions import ur5e
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.stats import binomtest
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.kinematics.free_paths import is_straight_free
@@ -49,7 +49,7 @@ from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.session.workcell import Workcell, read_cell
 from remaster_ros.simulation.simulated_workcell import choose_robot
-from remaster_ros.types import IntArray
+from remaster_ros.types import FloatArray, IntArray
 
 PAPER = 173
 """Configurations of the paper's session."""
@@ -66,6 +66,8 @@ SPARE = 1.25
 TRIES = 5
 LIMITS = (np.inf, 0.25)
 START_DEG = (5.0, 7.0, 0.0, 112.0, 10.0, 35.0, -20.0)
+Walk = tuple[tuple[int, ...], tuple[tuple[str, int, int], ...]]
+"""What is visited, and in which order."""
 TWO, LATIN, DESIGNED = (
     'two sensors: Latin hypercube',
     'one bar, one marker: Latin hypercube',
@@ -140,7 +142,7 @@ def main() -> None:
         for robot in args.robots
         for seed in args.seeds
     }
-    print(side_by_side(lines))
+    print(side_by_side(lines, LIMITS))
     for name, place in ((LATIN, 0), (DESIGNED, 1)):
         held = sum(pair[place]['held'] for pair in lines.values())
         intervals = sum(pair[place]['intervals'] for pair in lines.values())
@@ -158,57 +160,6 @@ def main() -> None:
 
 def line_name(robot: str, seed: int, row: str) -> str:
     return f'{robot} {seed} {row}'
-
-
-def table_of(lines: Sequence[dict[str, Any]]) -> str:
-    """Return the table of an arm."""
-    header = (
-        'row', 'poses', 'configurations', 'nearest, s', 'fastest, s',
-        '… at 0.25 m/s: configurations', 'nearest, s', 'fastest, s', 'expected RMS std, deg',
-        'RMS error of the fits, deg', '95 % intervals that hold it', 'choice, s',
-    )  # fmt: skip
-    rows = []
-    for line in lines:
-        free, slow = line['limits']
-        std, error = (f'{value:.5f}' for value in (free['joint_rms_deg'], line['rms_error_deg']))
-        held, choice_s = share_held(line['held'], line['intervals']), f'{line["choice_s"]:.1f}'
-        rows.append(
-            (line['row'], free['poses'], *cost(free), *cost(slow), std, error, held, choice_s)
-        )
-    return table(header, rows)
-
-
-def side_by_side(lines: dict[tuple[str, int], list[dict[str, Any]]]) -> str:
-    """Return what the design saves, arm by arm and seed by seed."""
-    header = (
-        'arm', 'seed', 'limit, m/s', 'Latin hypercube: configurations', 'nearest, s', 'fastest, s',
-        'A-optimal: configurations', 'nearest, s', 'fastest, s', 'configurations, 1/…',
-        'time, nearest to fastest, 1/…', 'both nearest, 1/…', 'both fastest, 1/…',
-    )  # fmt: skip
-    rows = []
-    for place, limit in enumerate(LIMITS):
-        for (robot, seed), pair in lines.items():
-            latin, best = (line['limits'][place] for line in pair)
-            count, near, fast = 'configurations', 'nearest_s', 'fastest_s'
-            shares = ((count, count), (near, fast), (near, near), (fast, fast))
-            saved = [f'{latin[before] / best[after]:.1f}' for before, after in shares]
-            name = 'none' if np.isinf(limit) else f'{limit:g}'
-            rows.append((robot, seed, name, *cost(latin), *cost(best), *saved))
-    return table(header, rows)
-
-
-def cost(found: dict[str, Any]) -> tuple[str, ...]:
-    """Return configurations, and time in both orders."""
-    times = [
-        f'{found[f"{order}_s"]:.0f}' + f' ({lost} without a way)' * bool(lost)
-        for order in ('nearest', 'fastest')
-        for lost in [found[f'{order}_lost']]
-    ]
-    return (str(found['configurations']), *times)
-
-
-def share_held(held: int, intervals: int) -> str:
-    return f'{held} of {intervals} (p {binomtest(held, intervals, 0.95).pvalue:.2f})'
 
 
 @lru_cache(maxsize=2)
@@ -303,6 +254,7 @@ def measured_row(
     chain = where.scene.model.chain
     information = DesignInformation.of(chain, poses, sensors, MARKER_STD)
     limits, choices, rows = [], [], []
+    walks: dict[Walk, tuple[list[FloatArray], list[int]]] = {}
     for limit in LIMITS:
         travel = TravelTime.of(where.scene.model, tool_speed=limit)
         left = np.arange(min(len(information), MOST_CANDIDATES))
@@ -312,11 +264,11 @@ def measured_row(
             chosen = choice(information.only(left), travel, goal, rng, designed=designed)
             choices.append(time.process_time() - started)
             row = Row(poses, sensors, information, left[chosen])
-            fastest_s, lost = tour(where, row, travel, in_order=True)
+            fastest_s, lost = tour(where, row, travel, walks, in_order=True)
             if not lost:
                 break
             left = np.setdiff1d(left, lost)
-        nearest_s, not_nearest = tour(where, row, travel, in_order=False)
+        nearest_s, not_nearest = tour(where, row, travel, walks, in_order=False)
         rows.append(row)
         limits.append(
             {
@@ -363,10 +315,18 @@ def choice(
     return np.arange(next(n for n in count if information.joint_rms(range(n)) <= goal))
 
 
-def tour(where: Stage, row: Row, travel: TravelTime, *, in_order: bool) -> tuple[float, list[int]]:
+def tour(
+    where: Stage,
+    row: Row,
+    travel: TravelTime,
+    walks: dict[Walk, tuple[list[FloatArray], list[int]]],
+    *,
+    in_order: bool,
+) -> tuple[float, list[int]]:
     """Return the robot's time on free ways, s, and what was not reached.
 
-    In the order of least travel with ``in_order``, else as the nodes do by default.
+    In the order of least travel with ``in_order``, else as the nodes do by default. A walk that
+    was made already is only timed.
     """
     chain, model = where.scene.model.chain, where.scene.model
     pose = row.information.pose[row.chosen]
@@ -378,18 +338,21 @@ def tour(where: Stage, row: Row, travel: TravelTime, *, in_order: bool) -> tuple
         )
     )
     plans = {'optimization': plan}
-    order = visit_order(plans, model, travel) if in_order else ()
-    walked = Tour(chain, plans, model=model, order=order)
-    here = np.deg2rad(START_DEG)[: len(chain)]
-    if len(chain) == 6:
-        here = row.information.q[row.chosen[0]]
-    spent, lost = 0.0, []
-    while (stop := walked.next(here)) is not None:
-        lost += [int(members[stop.index][number]) for number in stop.unreached]
-        for q, way in zip(stop.solutions, stop.paths, strict=True):
-            spent += travel.along(np.vstack((here, way, q))) + travel.measuring_s
-            here = q
-    return spent, lost
+    order = tuple(visit_order(plans, model, travel)) if in_order else ()
+    walk = tuple(row.chosen.tolist()), order
+    if walk not in walks:
+        legs, lost = walks[walk] = [], []
+        walked = Tour(chain, plans, model=model, order=order)
+        here = np.deg2rad(START_DEG)[: len(chain)]
+        if len(chain) == 6:
+            here = row.information.q[row.chosen[0]]
+        while (stop := walked.next(here)) is not None:
+            lost += [int(members[stop.index][number]) for number in stop.unreached]
+            for q, way in zip(stop.solutions, stop.paths, strict=True):
+                legs.append(np.vstack((here, way, q)))
+                here = q
+    legs, lost = walks[walk]
+    return sum(travel.along(leg) + travel.measuring_s for leg in legs), lost
 
 
 def fitted(where: Stage, row: Row, fits: int, rng: np.random.Generator) -> tuple[float, int, int]:

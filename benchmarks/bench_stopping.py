@@ -18,7 +18,7 @@ structure in the residuals, with the rule's error rate spent over the looks, and
 
 A look fits as `remaster_ros.collection.stopping_rule` does, but begins at the truth: the search
 for a start and for gross errors, most of the time of a fit, would find nothing. `--whole 20`
-compares.
+compares, and times looks at three markers and up to 482 configurations.
 
     OMP_NUM_THREADS=1 python benchmarks/bench_stopping.py --out stopping.jsonl [--cover 5000] …
 
@@ -49,11 +49,13 @@ from remaster_ros.calibration.precision import NoiseMixture
 from remaster_ros.calibration.residual_structure import FAMILY_WISE_ERROR, residual_structure
 from remaster_ros.collection.stopping_rule import Look, StoppingGoal, StoppingRule, so_far
 from remaster_ros.planning.expected_sensors import nominal_model
+from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray, Priors, Session
 
 LOOK_EVERY, TEST_EVERY = 6, 5
 FRAME_NOISE = (0.02e-3, 0.1e-3)
 LARGEST_LEVEL = 2.0
+LARGE_PLAN, COUNTS = 220, (60, 173, 482)
 KINDS = {'cover': 5000, 'frames': 5000, 'levels': 2000, 'claims': 1000, 'frame claims': 1000}
 # Of a bundle of sessions, one line of the file.
 BUNDLE = 50
@@ -230,6 +232,26 @@ def compare(count: int) -> None:
     )
 
 
+def show_looks(repeats: int = 5) -> None:
+    """Print what the rule's looks take, of three markers in frames."""
+    of = world(3, FRAME_NOISE[0])
+    scene = read_cell('demo').planning_scene(of.chain)
+    planned = scene.plan(LARGE_PLAN, scene.rough_R, np.random.default_rng(3)).poses
+    q = np.concatenate([pose.solutions for pose in planned])
+    pose = np.repeat(np.arange(len(planned)), [len(one.solutions) for one in planned])
+    for count in COUNTS:
+        rng = np.random.default_rng(count)
+        session, _ = measured(of.chain, of.urdf, (q[:count], pose[:count]), of.sensors, rng)
+        rule = StoppingRule(StoppingGoal(joint_std_rad=1e-9), count, count)
+        spent = []
+        for _ in range(repeats):
+            begun = time.process_time(), time.perf_counter()
+            look = rule.look(session, count, None, rng)
+            spent.append((time.process_time() - begun[0], time.perf_counter() - begun[1]))
+        cpu, wall = np.median(spent, axis=0)
+        print(f'look at {look.configurations} configurations: {cpu:.3f} s of CPU, {wall:.2f} s')
+
+
 def main() -> None:
     """Run what the file does not hold yet, and print."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
@@ -244,6 +266,7 @@ def main() -> None:
     print(machine())
     if args.whole:
         compare(args.whole)
+        show_looks()
     todo = {}
     for kind in KINDS:
         start = args.first if kind.endswith('claims') else 0
