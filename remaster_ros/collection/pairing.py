@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from remaster_ros.kinematics.transforms import mean_quaternion_xyzw
 from remaster_ros.types import FloatArray, MarkerReading
 
 
@@ -62,6 +63,8 @@ class PairedReading:
         Mean marker position and sample standard deviation (None for a single shot), m, (3,).
     samples
         Samples in the mean.
+    orientation
+        Of the measured body, mean as x, y, z, w, (4,); None where no sample has one.
     """
 
     sensor: str
@@ -71,6 +74,7 @@ class PairedReading:
     position: FloatArray
     std: FloatArray | None = None
     samples: int = 1
+    orientation: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -276,9 +280,8 @@ class Pairing:
             detail = f'{count} usable samples in {allowed:.1f} s (at least {rules.min_samples})'
             return Rejection(rules.sensor, 'too_few', detail)
         what = 'no joint state followed the reading' if count else 'no reading'
-        return Rejection(
-            rules.sensor, 'stale', f'{what} within {allowed:.1f} s after the arm settled'
-        )
+        detail = f'{what} within {allowed:.1f} s after the arm settled'
+        return Rejection(rules.sensor, 'stale', detail)
 
     def _decide(self) -> None:
         for name, rules in self.rules.items():
@@ -377,9 +380,8 @@ class Pairing:
         inside = q[stamps <= end]
         q_mean = inside.mean(axis=0) if len(inside) else q[0]
         positions = np.array([reading.position for reading in used]).reshape(-1, 3)
-        if rules.single_shot:
-            std = None
-        else:
+        std = None
+        if not rules.single_shot:
             std = positions.std(axis=0, ddof=1) if len(used) > 1 else np.zeros(3)
             if not np.all(std <= rules.max_std_m):
                 detail = f'std {1e3 * std.max():.3f} mm (allowed {1e3 * rules.max_std_m:.3f} mm)'
@@ -387,9 +389,10 @@ class Pairing:
             if len(used) > 1 and not np.any(np.ptp(positions, axis=0)):
                 detail = f'{len(used)} readings are the same to the last bit'
                 return Rejection(rules.sensor, 'frozen', detail)
-        return PairedReading(
-            rules.sensor, marker, end, q_mean, positions.mean(axis=0), std, len(used)
-        )
+        turns = [reading.orientation for reading in used if reading.orientation is not None]
+        turn = mean_quaternion_xyzw(turns) if turns else None
+        mean, count = positions.mean(axis=0), len(used)
+        return PairedReading(rules.sensor, marker, end, q_mean, mean, std, count, turn)
 
 
 def _seen(readings: list[MarkerReading]) -> list[MarkerReading]:

@@ -13,7 +13,7 @@ import numpy as np
 from remaster_ros.collection.plausibility import SMALLEST_M
 from remaster_ros.errors import did_you_mean
 from remaster_ros.planning.expected_sensors import POSE_SIGMA_M, SIGMA_M
-from remaster_ros.session.source_topics import source_problem
+from remaster_ros.session.source_topics import POSE, source_problem
 from remaster_ros.session.yaml_records import Bounds, Triple
 from remaster_ros.types import FARTHEST_M
 
@@ -89,6 +89,14 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
         """Marker -> where its readings are published."""
         further = {name: f'{self.topic}/{name}' for name in self.further_markers}
         return {self.marker: self.topic, **further}
+
+    @property
+    def pose_topic(self) -> str:
+        """Where its full poses are published beside the positions; '' where it has none.
+
+        The recorder takes these: position and orientation then come in one message.
+        """
+        return f'{self.topic}/pose' if self.message_type == POSE else ''
 
     def problem(self, where: str, markers: Mapping[str, Triple]) -> str:
         """Return what is wrong with it, being at `where` in the file; '' where nothing is."""

@@ -40,6 +40,20 @@ def test_the_mean_has_exactly_the_samples_of_the_dwell():
     np.testing.assert_allclose(reading.q, Q)
 
 
+def test_orientations_are_averaged_over_the_readings_that_have_one():
+    pairing = Pairing(10.0, Q, (STREAM,))
+    for i, stamp in enumerate(np.arange(9.8, 10.8, 0.01)):
+        pairing.add_joint_state(stamp, Q)
+        # Turned far elsewhere before the arm has settled; to and fro about z after it.
+        half = 1.0 if stamp < 10.0 else 0.01 * (-1) ** i
+        turn = np.array([0.0, 0.0, np.sin(half), np.cos(half)]) if i % 5 > 1 else None
+        position = np.array([stamp, 0.0, 0.0]) * 1e-6
+        pairing.add_reading('mocap', MarkerReading(stamp, position, orientation=turn))
+    reading = pairing.decided['mocap']
+    np.testing.assert_allclose(reading.orientation, [0.0, 0.0, 0.0, 1.0], atol=2e-3)
+    assert run(Pairing(10.0, Q, (STREAM,))).decided['mocap'].orientation is None
+
+
 def test_it_is_not_decided_before_something_later_than_the_dwell_has_come():
     assert not run(Pairing(10.0, Q, (STREAM,)), until=0.5).decided
     assert run(Pairing(10.0, Q, (STREAM,)), until=0.56).complete
