@@ -36,7 +36,8 @@ class SensorRules:
     timeout_s
         How long after the dwell (stream) or settling (single shot) a reading may stay out, s.
     further
-        Further markers that come in the same frames (streams).
+        Further markers: of a stream in the same frames; else measured one by one, with a message
+        (NaN) where that failed.
     """
 
     sensor: str
@@ -222,11 +223,8 @@ class Pairing:
     ) -> None:
         """Add up how long each sensor's node has sent nothing, as far as not excused yet."""
         for name in self.rules:
-            if (
-                name in counts
-                and counts[name] == self._message_counts.get(name)
-                and name not in absent
-            ):
+            same = name in counts and counts[name] == self._message_counts.get(name)
+            if same and name not in absent:
                 self._silent_s[name] += passed_s
             else:
                 self._silent_s[name] = 0.0
@@ -329,11 +327,12 @@ class Pairing:
         if not self._readings[rules.sensor]:
             return None
         parts = self._by_marker(rules)
-        if rules.single_shot:
-            readings = parts[rules.marker]
-            return readings[0].stamp_s, {rules.marker: readings[:1]}
-
         seen = {name: _seen(part) for name, part in parts.items()}
+        if rules.single_shot:
+            shots = {name: part[:1] for name, part in seen.items() if part}
+            if not shots or (waits and not all(parts.values())):
+                return None
+            return max(part[0].stamp_s for part in shots.values()), shots
 
         def within(end: float) -> dict[str, list[MarkerReading]]:
             used = {
@@ -365,6 +364,8 @@ class Pairing:
     def _judge(
         self, rules: SensorRules, end: float, marker: str, used: list[MarkerReading]
     ) -> PairedReading | Rejection:
+        if rules.single_shot:
+            end = used[0].stamp_s
         stamps = np.array([stamp for stamp, _ in self._joints])
         q = np.array([joints for _, joints in self._joints])
         # The first report at or after the end is part of the proof of stillness, not of the mean.

@@ -89,7 +89,7 @@ class SensorNode(RemasterNode):
         if described.further_markers and not driver.several_markers:
             raise InputError(
                 f'{self.get_name()}: sensor {self.sensor} of {p.cell} has further_markers, but a '
-                f'{driver.device} measures one marker at a time; leave them out'
+                f'{driver.device} measures one marker alone; leave them out'
             )
         p = replace(p, further_markers=described.further_markers)
         self._readings = {

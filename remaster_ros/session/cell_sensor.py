@@ -35,8 +35,8 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     marker
         The marker it follows.
     further_markers
-        Further markers that it measures in the same frame, by name, each with its number in the
-        rigid body.
+        Further markers that it measures, by name: in the same frame, each with its number in the
+        rigid body; or, where it is `single_shot`, one after another while the arm stands.
     topic
         Where its readings are published (geometry_msgs/PointStamped, sensor frame); relative to
         the nodes' namespace, unless it begins with ``/``. Further markers have topics of their
@@ -124,11 +124,6 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
                 return f'{where}.{name} is {number}; markers of a body have the numbers 1 to 65535'
             if list(self.further_markers.values()).count(number) > 1:
                 return f'{where}: two markers have the number {number}; give each its own'
-        if self.further_markers and self.single_shot:
-            return (
-                f'{where}: an instrument with single_shot measures one target after the other, '
-                'not several in a frame; leave further_markers out'
-            )
         for one, other in itertools.combinations(self.markers, 2):
             apart = float(np.linalg.norm(np.subtract(markers[one], markers[other])))
             if apart < LEAST_APART_M:
