@@ -12,6 +12,8 @@ html_title = f'remaster_ros {version}'
 html_show_copyright = False
 html_show_sphinx = False
 html_copy_source = False
+html_static_path = ['_static']
+html_css_files = ['site.css']
 html_theme_options = {'footer_icons': []}
 # Links such as safety.md#a-halt work as they do on the code host.
 myst_heading_anchors = 3
