@@ -22,35 +22,10 @@ from typing import Any
 import common  # noqa: F401  its folder of helpers
 import numpy as np
 from common import known, machine, progress, resumed, table
-from hidden_judge import judge
-from hidden_pairs import PAIRS, PairSession, measured_further, pair_session, scene
-from hidden_world import MARKER_STD_M, HiddenTruth, HiddenWorld, Visits
+from hidden_pairs import PAIRS, measured_further, pair_session, separating, verdict, visits_of
 
 from remaster_ros.discovery.discover import Discovery, discover_session
-from remaster_ros.planning.expected_sensors import ExpectedSensor
-from remaster_ros.planning.planned_design import POOL_CANDIDATES
 from remaster_ros.planning.rival_causes import FoundCause
-from remaster_ros.planning.separating_design import (
-    SeparatingDesign,
-    further_scene,
-    measured_so_far,
-    separate,
-)
-from remaster_ros.types import Priors
-
-BAR = ExpectedSensor('mocap', np.array([1.9, 0, 1.3]), {'sir': np.array([0.1, 0.0, 0.0])})
-
-
-def verdict(found: Discovery, pair: PairSession, world: HiddenWorld, truth: HiddenTruth) -> str:
-    """Return whether a search is right, wrong, open, or finds nothing."""
-    if not found.effects:
-        return 'none'
-    if found.verdict == 'undetermined':
-        return 'open'
-    judged = judge(world, truth, found)
-    named = [(effect.name, effect.joints) for effect in found.effects]
-    # A look-alike may stand for the truth where nothing distinguishes them, but not the other one.
-    return 'right' if judged.named_right and pair.other not in named else 'wrong'
 
 
 def words(found: Discovery) -> list[list[Any]]:
@@ -85,10 +60,7 @@ def one(task: tuple[str, int]) -> dict[str, Any]:
         'after': outcome,
     }
     if causes:
-        chain, places = scene().model.chain, scene().rough_R
-        planned, so_far = measured_so_far(pair.session.measurements)
-        pool = further_scene(scene()).plan(POOL_CANDIDATES, places, pair.rng).poses
-        design = separate(chain, planned, pool, [BAR], MARKER_STD_M, causes, Priors(), so_far)
+        design = separating(pair, causes)
         line['apart'] = [[p.before, p.after] for p in design.pairs]
         if design.order:
             session, world, truth = measured_further(pair, visits_of(pair, design))
@@ -99,13 +71,6 @@ def one(task: tuple[str, int]) -> dict[str, Any]:
                 'second': words(after),
             }
     return {**line, 'seconds': time.process_time() - started}
-
-
-def visits_of(pair: PairSession, design: SeparatingDesign) -> Visits:
-    """Return what is added, in the order of the choice."""
-    q = np.array([design.poses[pose].solutions[place] for pose, place in design.order])
-    pose = np.array([pose for pose, _ in design.order])
-    return Visits(q, pose, np.zeros(len(q), bool), pair.world.visits.q[-1])
 
 
 def main() -> None:

@@ -6,22 +6,34 @@ in a real cell. What is measured there is that of `HiddenWorld`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from hidden_judge import judge
 from hidden_oracle import Oracle
 from hidden_sessions import NOISES
 from hidden_tours import REPEATABILITY_RAD, facing_sensor
-from hidden_world import HiddenTruth, HiddenWorld, Visits
+from hidden_world import MARKER_STD_M, HiddenTruth, HiddenWorld, Visits
 
+from remaster_ros.discovery.discover import Discovery
 from remaster_ros.planning.candidates import PlanningScene
+from remaster_ros.planning.expected_sensors import ExpectedSensor
+from remaster_ros.planning.planned_design import POOL_CANDIDATES
+from remaster_ros.planning.rival_causes import FoundCause
+from remaster_ros.planning.separating_design import (
+    SeparatingDesign,
+    further_scene,
+    measured_so_far,
+    separate,
+)
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.effect_sampling import draw_effect
 from remaster_ros.simulation.hidden_effect import HiddenEffect
 from remaster_ros.simulation.world_model import Round
-from remaster_ros.types import Session
+from remaster_ros.types import Priors, Session
 
 Name = tuple[str, tuple[int, ...]]
 PAIRS: tuple[tuple[Name, Name], ...] = (
@@ -36,6 +48,7 @@ MULTIPLES = 2.0, 8.0
 """Sizes, as multiples of the one at which the best possible test finds the effect in 90 %."""
 CANDIDATES = 60
 """Of each split, as the planner has it by default."""
+BAR = ExpectedSensor('mocap', np.array([1.9, 0, 1.3]), {'sir': np.array([0.1, 0.0, 0.0])})
 # A break between the two, and how fast the arm cools and warms, s.
 BREAK_S = 120.0, 600.0
 COOLING_S = 2500.0
@@ -172,3 +185,30 @@ def measured_further(
     rows = session.measurements
     position = np.concatenate((pair.session.measurements.position, rows.position[m:]))
     return replace(session, measurements=replace(rows, position=position)), world, truth
+
+
+def separating(pair: PairSession, causes: Sequence[FoundCause]) -> SeparatingDesign:
+    """Return what separates causes that were found in a session from their look-alikes."""
+    planned_poses, so_far = measured_so_far(pair.session.measurements)
+    pool = further_scene(scene()).plan(POOL_CANDIDATES, scene().rough_R, pair.rng).poses
+    chain = scene().model.chain
+    return separate(chain, planned_poses, pool, [BAR], MARKER_STD_M, causes, Priors(), so_far)
+
+
+def visits_of(pair: PairSession, design: SeparatingDesign) -> Visits:
+    """Return what is added, in the order of the choice."""
+    q = np.array([design.poses[pose].solutions[place] for pose, place in design.order])
+    pose = np.array([pose for pose, _ in design.order])
+    return Visits(q, pose, np.zeros(len(q), bool), pair.world.visits.q[-1])
+
+
+def verdict(found: Discovery, pair: PairSession, world: HiddenWorld, truth: HiddenTruth) -> str:
+    """Return whether a search is right, wrong, open, or finds nothing."""
+    if not found.effects:
+        return 'none'
+    if found.verdict == 'undetermined':
+        return 'open'
+    judged = judge(world, truth, found)
+    named = [(effect.name, effect.joints) for effect in found.effects]
+    # A look-alike may stand for the truth where nothing distinguishes them, but not the other one.
+    return 'right' if judged.named_right and pair.other not in named else 'wrong'

@@ -114,4 +114,4 @@ class FurtherMeasuring:
             for pair in design.pairs
         ]
         words += [f'no poses of this cell separate {sentence}' for sentence in design.otherwise]
-        return '; '.join(words)
+        return ('' if design.order else 'nothing to measure: ') + '; '.join(words)
