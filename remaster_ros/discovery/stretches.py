@@ -14,7 +14,8 @@ Where the model is right, Σ m_b m_b' is on average the part of their covariance
 noise: the cluster-robust covariance with bias reduction (Bell & McCaffrey 2002, Survey Methodology
 28; Pustejovsky & Tipton 2018, J. Bus. Econ. Stat. 36). The ratio of the two, the mean over joints
 and causes, is compared with simulated noise. Only where it is credibly above 1 the moves, in part,
-are added to the posterior, as those of causes outside the model (`undetected`).
+are added to the posterior, as those of causes outside the model (`undetected`). What is wrong in
+the same way in all stretches does not show.
 
 *Predictions.* Their 95 % regions are multiplied by what puts 95 % of the rows of left-out
 stretches inside, at least by 1.
