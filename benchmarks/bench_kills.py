@@ -50,7 +50,8 @@ class Run:
         command = [
             *(sys.executable, '-m', 'remaster_ros.cli.main', 'demo', '--no-figures'),
             *('--out', str(out), '--seed', str(seed)),
-            *('--candidates', str(candidates), '--rate', str(rate)),
+            *('--rate', str(rate)),
+            *(('--candidates', str(candidates)) if candidates else ()),
         ]
         self.log = (out.parent / f'{out.name}.log').open('w')
         self.process = subprocess.Popen(command, stdout=self.log, stderr=subprocess.STDOUT)
@@ -115,7 +116,12 @@ def main() -> int:
     parser.add_argument('--kills', type=int, default=200, help='in all')
     parser.add_argument('--per-run', type=int, default=8, help='kills in a run, if it lasts')
     parser.add_argument('--turns', type=int, default=5, help='disturbed runs of each seed')
-    parser.add_argument('--candidates', type=int, default=10)
+    parser.add_argument(
+        '--candidates',
+        type=int,
+        default=10,
+        help='of the Latin hypercube with one marker; 0: the demo with three markers',
+    )
     parser.add_argument('--rate', type=float, default=20.0, help='world time over wall time')
     parser.add_argument('--mean-s', type=float, default=4.0, help='wall time between kills')
     parser.add_argument('--timeout-s', type=float, default=600.0, help='wall time of a run')

@@ -4,32 +4,39 @@ For each arm 173 configurations of a Latin hypercube set the precision, the RMS 
 deviations of the identifiable joints; designs reach the same, held-out poses apart, with the
 floors that a search for causes needs. Times are those of the bridge's trajectories on free ways,
 with 3 s of standstill and 0.5 s of dwell, at `speed_share` 0.3, without a Cartesian limit and with
-0.25 m/s (chosen anew). Simulated sessions are then fitted: the RMS error against the truth, and
-how many of the 95 % intervals hold it.
+0.25 m/s (chosen anew). What no free way leads to in the order of least travel is replaced, by the
+next ones of the Latin hypercube or by another choice; "without a way" counts what is left of that.
+Simulated sessions are then fitted: the RMS error against the truth, and how many of the 95 %
+intervals hold it.
 
 For the first arm a second table has the same number of configurations from the same candidates by
 criteria and algorithms of the literature (`design_methods`).
 
-    OMP_NUM_THREADS=1 python benchmarks/bench_pose_design.py [--robots lwr4plus …] [--fits N]
+    OMP_NUM_THREADS=1 python benchmarks/bench_pose_design.py --out poses.jsonl [--robots ur5e …]
+
+Begun again with the same file it goes on where it was, row by row.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from common import machine, progress, table
+from common import known, machine, progress
 from design_methods import compared
+from design_tables import share_held, side_by_side, table_of
 from designed_sessions import MARKER_STD, measured
 from robot_descriptions import ur5e
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.stats import binomtest
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.kinematics.free_paths import is_straight_free
@@ -42,6 +49,7 @@ from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.session.workcell import Workcell, read_cell
 from remaster_ros.simulation.simulated_workcell import choose_robot
+from remaster_ros.types import FloatArray, IntArray
 
 PAPER = 173
 """Configurations of the paper's session."""
@@ -53,8 +61,29 @@ MARKERS = {
 }
 UR_RADIUS = 0.05
 NEIGHBOURS = 8
+SPARE = 1.25
+"""So many times 173 configurations are drawn for the UR5e: not all can be reached."""
+TRIES = 5
 LIMITS = (np.inf, 0.25)
 START_DEG = (5.0, 7.0, 0.0, 112.0, 10.0, 35.0, -20.0)
+Walk = tuple[tuple[int, ...], tuple[tuple[str, int, int], ...]]
+"""What is visited, and in which order."""
+TWO, LATIN, DESIGNED = (
+    'two sensors: Latin hypercube',
+    'one bar, one marker: Latin hypercube',
+    'A-optimal, four markers, one out of plane',
+)
+# Row -> how many markers the bar sees (None: both sensors see one each), and whose precision is
+# reached: None where the row sets it.
+ROWS: dict[str, tuple[int | None, str | None]] = {
+    TWO: (None, None),
+    'two sensors: A-optimal': (None, TWO),
+    LATIN: (1, None),
+    'Latin hypercube, four markers': (4, LATIN),
+    'A-optimal, one marker': (1, LATIN),
+    'A-optimal, three markers': (3, LATIN),
+    DESIGNED: (4, LATIN),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,43 +101,68 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Chosen configurations, with what they are expected to tell and what fits found."""
+    """Configurations to choose from, what is expected of them, and those that were chosen."""
 
-    name: str
     poses: tuple[PlannedPose, ...]
     sensors: tuple[ExpectedSensor, ...]
     information: DesignInformation
-    chosen: tuple[int, ...]
-    choice_s: float
+    chosen: IntArray
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--out', type=Path, required=True, help='results so far, JSON lines')
     parser.add_argument('--robots', nargs='+', default=['lwr4plus', 'iiwa14', 'ur5e'])
+    parser.add_argument('--seeds', nargs='+', type=int, default=[0])
+    parser.add_argument(
+        '--rows', choices=['all', 'main'], default='all', help='main: one marker against four'
+    )
     parser.add_argument('--fits', type=int, default=20)
-    parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--count', type=int, default=30, help='of the second table; 0 for none')
     args = parser.parse_args()
     print(machine())
+    wanted = list(ROWS) if args.rows == 'all' else [LATIN, DESIGNED]
+    done = known(args.out)
     for robot in args.robots:
-        print(f'\n**{robot}**, seed {args.seed}\n')
-        header = (
-            'row', 'configurations', 'poses', 'nearest, s', 'fastest, s',
-            '… at 0.25 m/s: configurations', 'nearest, s', 'fastest, s', 'expected RMS std, deg',
-            f'RMS error of {args.fits} fits, deg', '95 % intervals that hold it', 'choice, s',
-        )  # fmt: skip
-        print(table(header, rows_of(robot, args.fits, args.seed)), flush=True)
+        for seed in args.seeds:
+            for name in wanted:
+                if line_name(robot, seed, name) not in done:
+                    progress(f'{robot}, seed {seed}: {name}')
+                    line = measured_row(robot, seed, name, args.fits, done)
+                    done[line['name']] = line
+                    with args.out.open('a', encoding='utf-8') as file:
+                        file.write(json.dumps(line) + '\n')
+    for robot in args.robots:
+        for seed in args.seeds if args.rows == 'all' else ():
+            print(f'\n**{robot}**, seed {seed}\n')
+            print(table_of([done[line_name(robot, seed, name)] for name in wanted]))
+    print('\n**One marker, Latin hypercube, against four markers, A-optimal**\n')
+    lines = {
+        (robot, seed): [done[line_name(robot, seed, name)] for name in (LATIN, DESIGNED)]
+        for robot in args.robots
+        for seed in args.seeds
+    }
+    print(side_by_side(lines, LIMITS))
+    for name, place in ((LATIN, 0), (DESIGNED, 1)):
+        held = sum(pair[place]['held'] for pair in lines.values())
+        intervals = sum(pair[place]['intervals'] for pair in lines.values())
+        print(f'\n{name}: {share_held(held, intervals)} of the 95 % intervals hold the truth')
     if not args.count:
         return
     print(f'\n**{args.robots[0]}, one bar, four markers, 100 candidate poses: criteria**\n')
-    bar = stage(args.robots[0], 'mocap', args.seed)
+    bar = stage(args.robots[0], 'mocap', args.seeds[0])
     information = DesignInformation.of(
         bar.scene.model.chain, bar.pool[:100], (expected_bar(bar, 4),), MARKER_STD
     )
     travel = TravelTime.of(bar.scene.model)
-    print(compared(information, travel, args.count, np.random.default_rng(args.seed)))
+    print(compared(information, travel, args.count, np.random.default_rng(args.seeds[0])))
 
 
+def line_name(robot: str, seed: int, row: str) -> str:
+    return f'{robot} {seed} {row}'
+
+
+@lru_cache(maxsize=2)
 def stage(robot: str, only: str | None, seed: int) -> Stage:
     """Put an arm before both sensors, or one; the bar sees all four markers."""
     cell = read_cell('demo')
@@ -132,13 +186,15 @@ def stage(robot: str, only: str | None, seed: int) -> Stage:
 
 
 def latin_hypercube(scene: PlanningScene, seed: int) -> tuple[PlannedPose, ...]:
-    """Return poses of one Latin hypercube, 173 configurations in all."""
-    for count in range(30, 400, 5):
+    """Return poses of one Latin hypercube, 173 configurations in all, or some more."""
+    spare = len(scene.model.chain) <= 6
+    wanted = int(SPARE * PAPER) if spare else PAPER
+    for count in range(30, 400, 20 if spare else 5):
         plan = scene.plan(count, scene.rough_R, np.random.default_rng([seed, 1]))
         poses = connected(scene, plan.poses)
-        if sum(len(pose.solutions) for pose in poses) >= PAPER:
+        if sum(len(pose.solutions) for pose in poses) >= wanted:
             break
-    kept, left = [], PAPER
+    kept, left = [], wanted
     for pose in poses:
         if left > 0:
             kept.append(PlannedPose(pose.T_R_T, pose.solutions[:left]))
@@ -178,118 +234,132 @@ def expected_bar(found: Stage, markers: int) -> ExpectedSensor:
     return ExpectedSensor('mocap', sight.sensor_R, places)
 
 
-def rows_of(robot: str, fits: int, seed: int) -> list[tuple[object, ...]]:
-    """Return the table of an arm."""
-    both, bar = stage(robot, None, seed), stage(robot, 'mocap', seed)
-    two = tuple(
-        ExpectedSensor(s.sensor, s.sensor_R, {s.marker: s.marker_T}) for s in both.scene.sights
+def measured_row(
+    robot: str, seed: int, name: str, fits: int, done: dict[str, dict[str, Any]]
+) -> dict[str, Any]:
+    """Return a row of an arm's table as a line of the results file."""
+    markers, reference = ROWS[name]
+    where = stage(robot, None if markers is None else 'mocap', seed)
+    sensors = tuple(
+        ExpectedSensor(s.sensor, s.sensor_R, {s.marker: s.marker_T}) for s in where.scene.sights
     )
-    one = (expected_bar(bar, 1),)
-    jobs = [
-        ('two sensors: Latin hypercube', both, two, two),
-        ('two sensors: A-optimal', both, two, None),
-        ('one bar, one marker: Latin hypercube', bar, one, one),
-        ('Latin hypercube, four markers', bar, (expected_bar(bar, 4),), 'needed'),
-        ('A-optimal, one marker', bar, one, None),
-        ('A-optimal, three markers', bar, (expected_bar(bar, 3),), None),
-        ('A-optimal, four markers, one out of plane', bar, (expected_bar(bar, 4),), None),
-    ]
-    goal, lines = 0.0, []
-    for name, where, sensors, reference in jobs:
-        progress(f'{robot}: {name}')
-        results = []
-        for limit in LIMITS:
-            travel = TravelTime.of(where.scene.model, tool_speed=limit)
-            wanted = None if reference == sensors else goal
-            row = chosen(name, where, sensors, travel, wanted, seed, prefix=reference == 'needed')
-            if reference == sensors:
-                goal = row.information.joint_rms(row.chosen)
-            results.append((row, times(where, row, travel)))
-        (row, free), (slow, limited) = results
-        rms, held, intervals = fitted(where, row, fits, np.random.default_rng([seed, 3]))
-        p = binomtest(held, intervals, 0.95).pvalue if intervals else 1.0
-        lines.append(
-            (
-                name,
-                len(row.chosen),
-                len(np.unique(row.information.pose[list(row.chosen)])),
-                free[0],
-                free[1],
-                len(slow.chosen),
-                limited[0],
-                limited[1],
-                f'{np.degrees(row.information.joint_rms(row.chosen)):.5f}',
-                f'{np.degrees(rms):.5f}',
-                f'{held} of {intervals} (p {p:.2f})',
-                f'{row.choice_s:.1f}',
-            )
-        )
-    return lines
-
-
-def chosen(
-    name: str,
-    where: Stage,
-    sensors: tuple[ExpectedSensor, ...],
-    travel: TravelTime,
-    goal: float | None,
-    seed: int,
-    *,
-    prefix: bool = False,
-) -> Row:
-    """Choose the configurations of a row; all of the Latin hypercube without a goal.
-
-    With `prefix` as many of the Latin hypercube as reach the goal.
-    """
-    poses = where.lhs if goal is None or prefix else (*where.lhs, *where.pool)
+    if markers is not None:
+        sensors = (expected_bar(where, markers),)
+    goal = None
+    if reference is not None:
+        before = done[line_name(robot, seed, reference)]
+        goal = float(np.radians(before['limits'][0]['joint_rms_deg']))
+    designed = reference is not None and not name.startswith('Latin')
+    poses = (*where.lhs, *where.pool) if designed else where.lhs
     chain = where.scene.model.chain
     information = DesignInformation.of(chain, poses, sensors, MARKER_STD)
+    limits, choices, rows = [], [], []
+    walks: dict[Walk, tuple[list[FloatArray], list[int]]] = {}
+    for limit in LIMITS:
+        travel = TravelTime.of(where.scene.model, tool_speed=limit)
+        left = np.arange(min(len(information), MOST_CANDIDATES))
+        for _ in range(TRIES):
+            started = time.process_time()
+            rng = np.random.default_rng([seed, 4])
+            chosen = choice(information.only(left), travel, goal, rng, designed=designed)
+            choices.append(time.process_time() - started)
+            row = Row(poses, sensors, information, left[chosen])
+            fastest_s, lost = tour(where, row, travel, walks, in_order=True)
+            if not lost:
+                break
+            left = np.setdiff1d(left, lost)
+        nearest_s, not_nearest = tour(where, row, travel, walks, in_order=False)
+        rows.append(row)
+        limits.append(
+            {
+                'configurations': len(row.chosen),
+                'poses': len(np.unique(information.pose[row.chosen])),
+                'joint_rms_deg': float(np.degrees(information.joint_rms(row.chosen.tolist()))),
+                'nearest_s': nearest_s,
+                'nearest_lost': len(not_nearest),
+                'fastest_s': fastest_s,
+                'fastest_lost': len(lost),
+            }
+        )
+    rms, held, intervals = fitted(where, rows[0], fits, np.random.default_rng([seed, 3]))
+    return {
+        'name': line_name(robot, seed, name),
+        'row': name,
+        'limits': limits,
+        'rms_error_deg': float(np.degrees(rms)),
+        'held': held,
+        'intervals': intervals,
+        'choice_s': choices[0],
+    }
+
+
+def choice(
+    information: DesignInformation,
+    travel: TravelTime,
+    goal: float | None,
+    rng: np.random.Generator,
+    *,
+    designed: bool,
+) -> IntArray:
+    """Choose the configurations of a row.
+
+    Without a goal the first 173; without a design as many of the first as reach the goal.
+    """
     if goal is None:
-        return Row(name, poses, sensors, information, tuple(range(PAPER)), 0.0)
-    if goal is not None and prefix:
-        enough = (n for n in range(1, PAPER + 1) if information.joint_rms(range(n)) <= goal)
-        return Row(name, poses, sensors, information, tuple(range(next(enough))), 0.0)
-    started = time.process_time()
-    among = information.only(np.arange(min(len(information), MOST_CANDIDATES)))
-    design = choose(among, travel, Goal(goal, 1.0), np.random.default_rng([seed, 4]))
-    assert design.reached, name
-    return Row(name, poses, sensors, information, design.chosen, time.process_time() - started)
+        return np.arange(min(PAPER, len(information)))
+    if designed:
+        design = choose(information, travel, Goal(goal, 1.0), rng)
+        assert design.reached
+        return np.array(design.chosen, dtype=np.int64)
+    count = np.arange(1, len(information) + 1)
+    return np.arange(next(n for n in count if information.joint_rms(range(n)) <= goal))
 
 
-def times(where: Stage, row: Row, travel: TravelTime) -> tuple[str, str]:
-    """Return the robot's time in both orders, s, on free ways."""
+def tour(
+    where: Stage,
+    row: Row,
+    travel: TravelTime,
+    walks: dict[Walk, tuple[list[FloatArray], list[int]]],
+    *,
+    in_order: bool,
+) -> tuple[float, list[int]]:
+    """Return the robot's time on free ways, s, and what was not reached.
+
+    In the order of least travel with ``in_order``, else as the nodes do by default. A walk that
+    was made already is only timed.
+    """
     chain, model = where.scene.model.chain, where.scene.model
-    which = np.array(row.chosen)
-    pose = row.information.pose[which]
+    pose = row.information.pose[row.chosen]
+    members = [row.chosen[pose == index] for index in np.unique(pose)]
     plan = Plan(
         tuple(
-            PlannedPose(row.poses[i].T_R_T, row.information.q[which[pose == i]])
-            for i in np.unique(pose)
+            PlannedPose(row.poses[row.information.pose[own[0]]].T_R_T, row.information.q[own])
+            for own in members
         )
     )
     plans = {'optimization': plan}
-    found = []
-    for order in ((), visit_order(plans, model, travel)):
-        tour = Tour(chain, plans, model=model, order=order)
+    order = tuple(visit_order(plans, model, travel)) if in_order else ()
+    walk = tuple(row.chosen.tolist()), order
+    if walk not in walks:
+        legs, lost = walks[walk] = [], []
+        walked = Tour(chain, plans, model=model, order=order)
         here = np.deg2rad(START_DEG)[: len(chain)]
         if len(chain) == 6:
-            here = row.information.q[which[0]]
-        spent, visited = 0.0, 0
-        while (stop := tour.next(here)) is not None:
+            here = row.information.q[row.chosen[0]]
+        while (stop := walked.next(here)) is not None:
+            lost += [int(members[stop.index][number]) for number in stop.unreached]
             for q, way in zip(stop.solutions, stop.paths, strict=True):
-                spent += travel.along(np.vstack((here, way, q))) + travel.measuring_s
-                here, visited = q, visited + 1
-        lost = len(row.chosen) - visited
-        found.append(f'{spent:.0f}' + f' ({lost} without a way)' * bool(lost))
-    return found[0], found[1]
+                legs.append(np.vstack((here, way, q)))
+                here = q
+    legs, lost = walks[walk]
+    return sum(travel.along(leg) + travel.measuring_s for leg in legs), lost
 
 
 def fitted(where: Stage, row: Row, fits: int, rng: np.random.Generator) -> tuple[float, int, int]:
     """Return the RMS error of the identifiable joints, rad, and how many intervals hold them."""
     joints = sorted(row.information.identifiable)
     errors, held = [], 0
-    which = np.array(row.chosen)
-    configurations = row.information.q[which], row.information.pose[which]
+    configurations = row.information.q[row.chosen], row.information.pose[row.chosen]
     for _ in range(fits):
         session, offsets = measured(
             where.scene.model.chain, where.cell.urdf_text, configurations, row.sensors, rng

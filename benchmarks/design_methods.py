@@ -6,7 +6,11 @@ and Hayward 1994; Nahvi and Hollerbach 1996; Sun and Hollerbach 2008), here of w
 of the identifiable joints with all other parameters eliminated, so that all are in rad. DETMAX:
 exchanges with excursions (Mitchell 1974). The convex relaxation is A-optimal: every subset of the
 solutions of a pose has a weight from 0 to 1, one in all for a pose (Frank and Wolfe 1956, whose
-tangents are lower bounds); then the configurations with the largest weights are taken.
+tangents are lower bounds); then the configurations with the largest weights are taken. The
+D-optimal relaxation weighs single configurations as if their errors were independent, as others
+do by second-order cone programs (Sagnol 2011, doi:10.1016/j.jspi.2010.11.031); here by the
+multiplicative algorithm, which ends at the same weights (Silvey, Titterington and Torsney 1978,
+doi:10.1080/03610927808827719).
 """
 
 from __future__ import annotations
@@ -28,6 +32,7 @@ Criterion = Callable[[FloatArray], FloatArray]
 MOST_SUBSETS = 4
 """Subsets of a pose's solutions of so many, and all of them, have weights."""
 FRANK_WOLFE = 400
+MULTIPLICATIVE = 2000
 
 
 def compared(
@@ -70,6 +75,10 @@ def compared(
     d_optimal = marginal.criteria()['D']
     timed(
         'D, DETMAX', lambda: detmax(information, greedy(information, d_optimal, count), d_optimal)
+    )
+    timed(
+        'D, convex relaxation of single configurations, rounded',
+        lambda: np.argsort(-d_weights(information, count))[:count].tolist(),
     )
     started = time.process_time()
     weights, subsets, bound = relaxed(information, count)
@@ -202,6 +211,17 @@ def at_count(
         else:
             low = goal
     return found
+
+
+def d_weights(information: DesignInformation, count: int) -> FloatArray:
+    """Return D-optimal weights of single configurations, sum 1, (n,)."""
+    alone = np.array([information.total([i]) - information.prior for i in range(len(information))])
+    w = np.full(len(alone), 1.0 / len(alone))
+    for _ in range(MULTIPLICATIVE):
+        M = information.finite(information.prior + count * np.tensordot(w, alone, axes=1))
+        w = w * (alone.reshape(len(alone), -1) @ np.linalg.inv(M).ravel())
+        w /= w.sum()
+    return w
 
 
 def relaxed(

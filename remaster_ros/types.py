@@ -37,12 +37,16 @@ class MarkerReading:
     marker
         Name of the marker, where the sensor measures several; '' for the one it follows. Those
         of one frame have equal stamps.
+    orientation
+        Of the body whose origin the marker is, in N: unit quaternion x, y, z, w, (4,). None where
+        the sensor measures positions alone, or had none this time.
     """
 
     stamp_s: float
     position: FloatArray
     temperature_c: float = nan
     marker: str = ''
+    orientation: FloatArray | None = None
 
     @property
     def seen(self) -> bool:
@@ -66,6 +70,9 @@ class Observation:
     frame
         Observations of one sensor with the same number come from one frame of it and share its
         error; None where this one shares none.
+    orientation
+        Mean orientation of the measured body in N over the dwell, unit quaternion x, y, z, w,
+        (4,); None where it was not measured.
     """
 
     observation: int
@@ -82,6 +89,7 @@ class Observation:
     samples: int | None = None
     temperature_c: float | None = None
     frame: int | None = None
+    orientation: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -152,6 +160,9 @@ class Measurements:
     frame
         Rows of one sensor with the same number come from one frame of it and share its error,
         (n,); -1 where a row shares none. None where the file has no such column.
+    orientation
+        Of the measured body in N, unit quaternions x, y, z, w, (n, 4); NaN where it was not
+        measured. None where the file has no such columns.
     """
 
     observation: IntArray
@@ -170,6 +181,7 @@ class Measurements:
     effort: FloatArray | None = None
     is_reference: BoolArray | None = None
     frame: IntArray | None = None
+    orientation: FloatArray | None = None
 
     def __len__(self) -> int:
         """Return the number of observations."""
@@ -219,6 +231,8 @@ class Session:
         Sensor name -> the marker it follows while collecting.
     further_markers
         Sensor name -> further markers that it measures in the same frame, where it does.
+    oriented
+        Sensors that measure the orientation of a body, too.
     measurements
         What is fitted and what is held out: no row of them is a reference.
     references
@@ -258,6 +272,7 @@ class Session:
     extra: Mapping[str, Any] = field(default_factory=dict)
     references: Measurements | None = None
     further_markers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    oriented: frozenset[str] = frozenset()
     observations_sha256: str = ''
 
     @property

@@ -17,7 +17,11 @@ SEED = 11
 
 
 class Cell:
-    """A small collection of real nodes on fake devices, and what they publish."""
+    """A small collection of real nodes on fake devices, and what they publish.
+
+    `foreign` gives sensors that are read from the topic of a node of another package: sensor ->
+    (message type, topic), as in the cell file.
+    """
 
     def __init__(
         self,
@@ -32,6 +36,7 @@ class Cell:
         held_out=1,
         collect=True,
         rate=10.0,
+        foreign=None,
     ):
         from remaster_ros.nodes.status import listen
 
@@ -62,17 +67,31 @@ class Cell:
         if 'tracker' in sensors:
             own['fake_laser_tracker'] = {'world': folder / 'world', 'port': tracker}
             own['laser_tracker_markers'] = {'port': tracker}
+        for sensor in foreign or {}:
+            # Of a world that runs ten times as fast as its messages travel.
+            values = {'sensor': sensor, 'max_age_s': 20.0, 'always_sends': sensor == 'mocap'}
+            own[f'topic_markers_{sensor}'] = values
         for name in own.keys() - {'fake_robot', 'fake_optitrack', 'fake_laser_tracker'}:
             own[name]['cell'] = cell
         common = ROOT / 'config' / 'fake.yaml'
 
         def begin(name):
+            if name.startswith('vendor_'):
+                sensor = name.removeprefix('vendor_')
+                where = folder / 'world', sensor, *foreign[sensor]
+                return start('foreign_source', *where, cwd=ROOT / 'test')
             # By the node's name, which in the file counts more than none.
             values = {f'{name}:{key}': value for key, value in own[name].items()}
-            return start(f'remaster_ros.nodes.{name}', *node_arguments(common, **values))
+            arguments = node_arguments(common, **values)
+            if name.startswith('topic_markers'):
+                return start(
+                    'remaster_ros.nodes.sensor_markers', *arguments, '-r', f'__node:={name}'
+                )
+            return start(f'remaster_ros.nodes.{name}', *arguments)
 
         self._begin = begin
         self.nodes = {name: begin(name) for name in own}
+        self.nodes |= {f'vendor_{name}': begin(f'vendor_{name}') for name in foreign or {}}
         self.until(lambda: self.said.get('pose_planner', {}).get('robot') == 'heard', 'the robot')
         if collect:
             response = call(client, '/remaster/collect')

@@ -49,20 +49,16 @@ def judge(out: Path, seen: set[str], truth: SessionTruth | None = None) -> dict[
         return {**dict.fromkeys(COUNTS, -1), 'exit_status': str(error)}
     m = session.measurements
     rows = (folder / 'observations.csv').read_text().splitlines()[1:]
-    pairs = Counter(zip(m.configuration.tolist(), m.sensor.tolist()))
+    readings = Counter(zip(m.configuration.tolist(), m.sensor.tolist(), m.marker.tolist()))
     records = [r for r in read_journal(folder / 'journal.jsonl').records if 'rows' in r]
     decided = Counter((record['pose'], record['solution']) for record in records)
-    tours = [r for r in read_journal(folder / 'plan.jsonl').records if r['kind'] == 'tour']
-    # Visits of the references are rows of their own, and none of the measurements.
-    plans = [plan for split, plan in tours[-1]['plans'].items() if split != 'reference']
-    planned = sum(len(pose['solutions']) for plan in plans for pose in plan['poses'])
     result: dict[str, Any] = {
         'exit_status': session.exit_status,
         'rows': len(m),
-        'planned_configurations': planned,
+        'planned_configurations': planned(read_journal(folder / 'plan.jsonl').records),
         'configurations': len(set(m.configuration.tolist())),
         'lost': len(seen - set(rows)),
-        'twice': sum(n - 1 for n in pairs.values()) + sum(n - 1 for n in decided.values()),
+        'twice': sum(n - 1 for n in readings.values()) + sum(n - 1 for n in decided.values()),
         'closest_rad': closest(m),
         'wrong': 0,
     }
@@ -82,12 +78,37 @@ def judge(out: Path, seen: set[str], truth: SessionTruth | None = None) -> dict[
     return result
 
 
+def planned(records: list[dict[str, Any]]) -> int:
+    """Return how many configurations the plan has, by its journal.
+
+    Where it ended since enough was known: of poses to fit, those of the ones that were begun.
+    """
+    plans = [record for record in records if record['kind'] == 'tour'][-1]['plans']
+    # Visits of the references are rows of their own, and none of the measurements.
+    counts = {
+        split: sum(len(pose['solutions']) for pose in plan['poses'])
+        for split, plan in plans.items()
+        if split != 'reference'
+    }
+    if any(record['kind'] == 'enough' for record in records):
+        begun = {
+            record['index']
+            for record in records
+            if record['kind'] == 'stop' and record['split'] == 'optimization'
+        }
+        poses = plans['optimization']['poses']
+        counts['optimization'] = sum(len(poses[index]['solutions']) for index in begun)
+    return sum(counts.values())
+
+
 def closest(m: Any) -> float:
     """Return how near two configurations of one pose are, as one sensor saw them, rad."""
     nearest = np.inf
     for sensor in set(m.sensor.tolist()):
         for pose in set(m.pose.tolist()):
-            q = m.q[(m.sensor == sensor) & (m.pose == pose)]
+            mine = (m.sensor == sensor) & (m.pose == pose)
+            # Markers of one frame are of one configuration.
+            q = m.q[np.flatnonzero(mine)[np.unique(m.configuration[mine], return_index=True)[1]]]
             if len(q) > 1:
                 distance = np.max(np.abs(q[:, None] - q), axis=-1) + 10.0 * np.eye(len(q))
                 nearest = min(nearest, float(distance.min()))
@@ -98,9 +119,9 @@ def wrong_pairs(session: Any, truth: SessionTruth) -> int:
     """Count the rows whose marker is not where the truth has it at these joint positions."""
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     m, wrong = session.measurements, 0
-    for index, name in enumerate(session.sensor_names):
-        mine = m.sensor == index
-        expected = truth.without_noise(chain, name, m.q[mine])
+    for index, marker in np.unique(np.stack((m.sensor, m.marker)), axis=1).T:
+        mine, name = (m.sensor == index) & (m.marker == marker), session.sensor_names[index]
+        expected = truth.without_noise(chain, name, m.q[mine], session.marker_names[marker])
         error = np.linalg.norm(m.position[mine] - expected, axis=1)
         wrong += int(np.sum(error > LARGEST_ERROR_M[name]))
     return wrong

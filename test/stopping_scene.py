@@ -31,8 +31,8 @@ class World(NamedTuple):
 
 
 @lru_cache
-def world(markers: int) -> World:
-    """Return the arm before a bar that sees so many markers."""
+def world(markers: int, frame_sigma_m: float = 0.0) -> World:
+    """Return the arm before a bar that sees so many markers, whose frames share noise, m."""
     cell = read_cell('demo')
     chain = cell.chain()
     scene = cell.planning_scene(chain)
@@ -49,7 +49,7 @@ def world(markers: int) -> World:
         'c': np.array([-0.05, -0.08, 0.06]),
     }
     seen = dict(list(places.items())[:markers])
-    sensors = (ExpectedSensor('bar', np.array([1.9, 0.0, 1.3]), seen, 1e-4, 2e-4),)
+    sensors = (ExpectedSensor('bar', np.array([1.9, 0.0, 1.3]), seen, 1e-4, 2e-4, frame_sigma_m),)
     information = DesignInformation.of(chain, chosen, sensors, 0.5e-3)
     goals = tuple(information.joint_rms(range(count)) for count in GOALS_AT)
     return World(chain, cell.urdf_text, information.q, information.pose, sensors, goals)

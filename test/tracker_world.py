@@ -8,6 +8,8 @@ from collections.abc import Callable
 import numpy as np
 
 MARKER = np.array([2.0, 0.5, -0.3])
+OTHER_BESIDE = np.array([0.0, 0.03, 0.14])
+"""Another reflector of the tool, from the first one."""
 RATE = 10.0
 
 
@@ -26,8 +28,8 @@ class ReflectorWorld:
     def sleep(self, seconds: float) -> None:
         time.sleep(max(seconds, 0.0) / RATE)
 
-    def marker_in_sensor(self, sensor: str, t: float) -> np.ndarray:
-        return np.asarray(self.path(t), float)
+    def marker_in_sensor(self, sensor: str, t: float, marker: str = '') -> np.ndarray:
+        return np.asarray(self.path(t), float) + (OTHER_BESIDE if marker else 0.0)
 
     def is_moving(self, t: float) -> bool:
         return self.joint_speed(t) > 1e-4
@@ -35,7 +37,7 @@ class ReflectorWorld:
     def joint_speed(self, t: float) -> float:
         return self.speed(t)
 
-    def line_of_sight(self, sensor: str, t: float) -> bool:
+    def line_of_sight(self, sensor: str, t: float, name: str = '') -> bool:
         return self.visible
 
     def faults(self, device: str) -> dict[str, float]:

@@ -13,6 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from remaster_ros.calibration.orientation_accuracy import (
+    ToolOrientations,
+    orientation_accuracy,
+)
 from remaster_ros.calibration.predictive_accuracy import (
     RANDOM_CONFIGURATIONS,
     Distances,
@@ -94,6 +98,7 @@ def accuracy_of(
     predicted_after: FloatArray,
     predictive: Predictive | None,
     rng: np.random.Generator,
+    modelled: ToolOrientations | None = None,
 ) -> dict[str, Any]:
     """Return the three metrics before and after, as fit.json has them.
 
@@ -110,6 +115,9 @@ def accuracy_of(
         For the theoretical metric; None where no posterior is at hand.
     rng
         For the theoretical metric.
+    modelled
+        Where full poses were measured, the modelled orientations: then their errors stand beside
+        those of the positions.
     """
     at_random: dict[str, Any] = {}
     if predictive is not None:
@@ -124,9 +132,10 @@ def accuracy_of(
         if len(chosen) == 0:
             result[name] = None
             continue
-        result[name] = _measured(
-            measurements.select(chosen), predicted_before[chosen], predicted_after[chosen], rng
-        )
+        pairs = chosen[solution_pairs(measurements.select(chosen), rng)]
+        result[name] = _measured(measurements, predicted_before, predicted_after, chosen, pairs)
+        if modelled is not None:
+            result[name] |= orientation_accuracy(measurements, modelled, fitted, chosen, pairs)
         if predictive is None:
             missing = unavailable(Distances._fields, 'it needs draws of the posterior')
             result[name] |= {key + s: missing for s in ('', '_random') for key in THEORETICAL}
@@ -140,11 +149,11 @@ def _measured(
     measurements: Measurements,
     predicted_before: FloatArray,
     predicted_after: FloatArray,
-    rng: np.random.Generator,
+    chosen: IntArray,
+    pairs: IntArray,
 ) -> dict[str, Any]:
-    """Return the two metrics that need no posterior."""
+    """Return the two metrics that need no posterior, of the chosen rows and pairs of them."""
     predicted = {'before': predicted_before, 'after': predicted_after}
-    pairs = solution_pairs(measurements, rng)
     if len(pairs) > 0:
         relative = {
             side: summary(relative_errors(measurements, points, pairs))
@@ -156,7 +165,7 @@ def _measured(
             'no pose has two joint solutions seen by the same sensor on the same marker',
         )
     absolute = {
-        side: summary(np.linalg.norm(measurements.position - points, axis=1))
+        side: summary(np.linalg.norm((measurements.position - points)[chosen], axis=1))
         for side, points in predicted.items()
     }
     return {'relative': relative, 'post_registration': absolute}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -198,8 +199,8 @@ class Estimate:
         What was fitted.
     gauge
         What the data do not determine.
-    mode, before
-        With offsets, and with all of them at zero (registrations and markers fitted).
+    mode
+        With offsets.
     left_out
         (row of the measurements, reason) of the gross errors.
     kept
@@ -210,7 +211,6 @@ class Estimate:
     model: Model
     gauge: Gauge
     mode: Mode
-    before: Mode
     left_out: tuple[tuple[int, str], ...]
     kept: IntArray
 
@@ -218,6 +218,11 @@ class Estimate:
     def posterior(self) -> Posterior:
         """The posterior that `mode` is the mode of."""
         return self.mode.linearisation.posterior
+
+    @cached_property
+    def before(self) -> Mode:
+        """With all offsets at zero, registrations and markers fitted; errors as of `find_mode`."""
+        return hold_offsets(self.mode, np.zeros(self.model.joints))
 
 
 def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
@@ -275,7 +280,6 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
         model,
         gauge,
         mode,
-        hold_offsets(mode, np.zeros(model.joints)),
         tuple(sorted(left_out)),
         np.sort(rows.source[~judgement.gross]),
     )

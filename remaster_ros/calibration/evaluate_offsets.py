@@ -10,6 +10,7 @@ import numpy as np
 from remaster_ros.calibration.accuracy import accuracy_of
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate, hold_offsets
 from remaster_ros.calibration.laplace import Mode, linearise
+from remaster_ros.calibration.orientation_accuracy import tool_orientations
 from remaster_ros.calibration.predictive_accuracy import Predictive
 from remaster_ros.calibration.result import predicted_rows
 from remaster_ros.errors import InputError
@@ -99,7 +100,13 @@ def accuracy_with_offsets(
             ),
         )
     accuracy = accuracy_of(
-        problem.measurements, found.kept, predicted_before, predicted_after, predictive, rng
+        problem.measurements,
+        found.kept,
+        predicted_before,
+        predicted_after,
+        predictive,
+        rng,
+        tool_orientations(model, problem.measurements, found.before.z, given.z),
     )
     observation = problem.measurements.observation
     left_out = tuple((int(observation[row]), why) for row, why in found.left_out)

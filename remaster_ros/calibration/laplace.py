@@ -28,6 +28,9 @@ FIRST_STEPS, MOST_STEPS = 12, 60
 # rises, so many times at most.
 TRUSTED = 0.1
 HALVINGS = 10
+# The density of the noise is even in a shared part's coordinate: at zero it has no slope, whether
+# it rises or falls from there, and a search that begins at zero would stay.
+OFF_ZERO = 0.1
 
 
 def linearise(posterior: Posterior, z: FloatArray) -> Linearisation:
@@ -286,7 +289,8 @@ def _noise_peak(linearisation: Linearisation, start: FloatArray, shortest: float
 
     They end below the shortest length that counts.
     """
-    peak = start
+    count = len(linearisation.posterior.noise_model.channels)
+    peak = np.concatenate((start[:count], np.maximum(start[count:], OFF_ZERO)))
     for _ in range(100):
         value, gradient, precision = _noise_curvature(linearisation, peak)
         values, vectors = np.linalg.eigh(precision)
@@ -303,7 +307,6 @@ def _noise_peak(linearisation: Linearisation, start: FloatArray, shortest: float
         else:
             break
         peak = tries[np.argmax(heights)]
-    count = len(linearisation.posterior.noise_model.channels)
     return np.concatenate((peak[:count], np.abs(peak[count:])))
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import beta
@@ -169,7 +170,59 @@ def _explained(
 
     None where there are too many of them for the rows.
     """
-    family = columns[driver]
+    found = _f_test(columns[driver], rest, basis, lost)
+    return None if found is None else StructureTest(driver, lost == 0, found.p_value)
+
+
+class Explained(NamedTuple):
+    """What a family of functions explains of the means of the poses.
+
+    Attributes
+    ----------
+    p_value
+        Of so much or more by chance.
+    share
+        Of the sum of squares that the model leaves in the rows where the functions are not zero,
+        less what they explain of noise.
+    """
+
+    p_value: float
+    share: float
+
+
+def explained_of_poses(
+    rows: Rows, model: FloatArray, family: FloatArray, errors: FloatArray
+) -> Explained | None:
+    """Test whether functions explain the means of the poses beside the model's columns.
+
+    Parameters
+    ----------
+    rows
+        n rows.
+    model, family, errors
+        In units of the noise, (n, 3, c), (n, 3, f) and (n, 3).
+
+    Returns
+    -------
+    Explained or None
+        None where there are too many functions for the poses.
+    """
+
+    def of_poses(columns: FloatArray) -> FloatArray:
+        size = rows.group_size[:, None, None]
+        return _flat(rows.group_sum(columns, axis=0) / np.sqrt(size))
+
+    basis = _basis(of_poses(model))
+    return _f_test(of_poses(family), _without(basis, of_poses(errors[:, :, None])), basis)
+
+
+def _f_test(
+    family: FloatArray, rest: FloatArray, basis: FloatArray, lost: int = 0
+) -> Explained | None:
+    """Test whether columns (n, c) explain the rest (n, 1) beside a basis (n, b).
+
+    ``lost`` of the n numbers are not independent of the others.
+    """
     length = np.linalg.norm(family, axis=0)
     left, singular, _ = np.linalg.svd(
         _without(basis, family / np.where(length > 0.0, length, 1.0)), full_matrices=False
@@ -179,9 +232,11 @@ def _explained(
     if own.shape[1] == 0 or freedom < LEAST_REST * own.shape[1]:
         return None
     explained, total = float(np.sum((own.T @ rest) ** 2)), float(np.sum(rest**2))
-    ratio = explained / own.shape[1] / ((total - explained) / freedom)
-    p_value = float(f_distribution.sf(ratio, own.shape[1], freedom))
-    return StructureTest(driver, lost == 0, p_value)
+    variance = (total - explained) / freedom
+    ratio = explained / own.shape[1] / variance
+    concerned = float(np.sum(rest[np.any(family != 0.0, axis=1)] ** 2))
+    share = max(0.0, explained - own.shape[1] * variance) / concerned
+    return Explained(float(f_distribution.sf(ratio, own.shape[1], freedom)), share)
 
 
 def _from_pose_to_pose(

@@ -18,6 +18,7 @@ from remaster_ros.calibration.metropolis import Chains
 from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.noise_check import NoiseCheck, check_noise
 from remaster_ros.calibration.noise_estimate import NoiseEstimate, noise_estimates
+from remaster_ros.calibration.orientation_accuracy import tool_orientations
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.predictive_accuracy import Predictive
 from remaster_ros.calibration.residual_structure import (
@@ -338,6 +339,7 @@ def build_result(
             predicted_after,
             predictive,
             rng,
+            tool_orientations(model, measurements, sampled.z_before, sampled.z_mean),
         ),
         left_out=tuple(zip(left_out.tolist(), (why for _, why in sampled.left_out), strict=True)),
         noise_checks=noise_checks,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.calibration.evaluate_offsets import OffsetsJudgement, accuracy_with_offsets
+from remaster_ros.calibration.orientation_accuracy import METRICS as ORIENTATION
 from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit, require_own
@@ -32,7 +33,9 @@ DESCRIPTION = (
 SIDES = ('before', 'after')
 METRICS = {
     'relative': 'relative (eq. 17)',
+    'relative_orientation': '… orientation',
     'post_registration': 'absolute, after registration',
+    'post_registration_orientation': '… orientation',
     'theoretical': 'theoretical (section V-C)',
     'paper_theoretical': 'theoretical, in the base frame',
     'theoretical_random': 'theoretical, 1,000 random places',
@@ -127,6 +130,8 @@ def table(judged: OffsetsJudgement) -> str:
             continue
         lines.append(split)
         for key, name in METRICS.items():
+            if key in ORIENTATION and key not in metrics:
+                continue
             values = metrics[key]
             if values['after'] is None:
                 lines.append(f'  {name:42s} {values["why"]}')
@@ -143,5 +148,8 @@ def table(judged: OffsetsJudgement) -> str:
 
 def interval(metric: dict[str, Any]) -> str:
     """Return mean and interval as text."""
+    if 'mean_deg' in metric:
+        low, high = metric['interval95_deg']
+        return f'{metric["mean_deg"]:.4f} [{low:.4f}, {high:.4f}] deg'
     low, high = metric['interval95_mm']
     return f'{metric["mean_mm"]:.3f} [{low:.3f}, {high:.3f}]'

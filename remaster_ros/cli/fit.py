@@ -113,6 +113,10 @@ def summary(result: FitResult) -> str:
             if sides['before'] and sides['after']:
                 before, after = sides['before']['mean_mm'], sides['after']['mean_mm']
                 lines.append(f'{split}, {metric}: {before:.3f} mm before, {after:.3f} mm after')
+            turned = metrics.get(f'{metric}_orientation', {})
+            if turned.get('after'):
+                before, after = turned['before']['mean_deg'], turned['after']['mean_deg']
+                lines.append(f'… orientation: {before:.4f} deg before, {after:.4f} deg after')
     for check in result.noise_checks:
         left = f'{1e3 * check.error_m:.3f} mm that are left'
         if check.noise_error_m is None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from remaster_ros.kinematics.transforms import mean_quaternion_xyzw
 from remaster_ros.types import FloatArray, MarkerReading
 
 
@@ -35,7 +36,8 @@ class SensorRules:
     timeout_s
         How long after the dwell (stream) or settling (single shot) a reading may stay out, s.
     further
-        Further markers that come in the same frames (streams).
+        Further markers: of a stream in the same frames; else measured one by one, with a message
+        (NaN) where that failed.
     """
 
     sensor: str
@@ -62,6 +64,8 @@ class PairedReading:
         Mean marker position and sample standard deviation (None for a single shot), m, (3,).
     samples
         Samples in the mean.
+    orientation
+        Of the measured body, mean as x, y, z, w, (4,); None where no sample has one.
     """
 
     sensor: str
@@ -71,6 +75,7 @@ class PairedReading:
     position: FloatArray
     std: FloatArray | None = None
     samples: int = 1
+    orientation: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -218,11 +223,8 @@ class Pairing:
     ) -> None:
         """Add up how long each sensor's node has sent nothing, as far as not excused yet."""
         for name in self.rules:
-            if (
-                name in counts
-                and counts[name] == self._message_counts.get(name)
-                and name not in absent
-            ):
+            same = name in counts and counts[name] == self._message_counts.get(name)
+            if same and name not in absent:
                 self._silent_s[name] += passed_s
             else:
                 self._silent_s[name] = 0.0
@@ -276,9 +278,8 @@ class Pairing:
             detail = f'{count} usable samples in {allowed:.1f} s (at least {rules.min_samples})'
             return Rejection(rules.sensor, 'too_few', detail)
         what = 'no joint state followed the reading' if count else 'no reading'
-        return Rejection(
-            rules.sensor, 'stale', f'{what} within {allowed:.1f} s after the arm settled'
-        )
+        detail = f'{what} within {allowed:.1f} s after the arm settled'
+        return Rejection(rules.sensor, 'stale', detail)
 
     def _decide(self) -> None:
         for name, rules in self.rules.items():
@@ -326,11 +327,12 @@ class Pairing:
         if not self._readings[rules.sensor]:
             return None
         parts = self._by_marker(rules)
-        if rules.single_shot:
-            readings = parts[rules.marker]
-            return readings[0].stamp_s, {rules.marker: readings[:1]}
-
         seen = {name: _seen(part) for name, part in parts.items()}
+        if rules.single_shot:
+            shots = {name: part[:1] for name, part in seen.items() if part}
+            if not shots or (waits and not all(parts.values())):
+                return None
+            return max(part[0].stamp_s for part in shots.values()), shots
 
         def within(end: float) -> dict[str, list[MarkerReading]]:
             used = {
@@ -362,6 +364,8 @@ class Pairing:
     def _judge(
         self, rules: SensorRules, end: float, marker: str, used: list[MarkerReading]
     ) -> PairedReading | Rejection:
+        if rules.single_shot:
+            end = used[0].stamp_s
         stamps = np.array([stamp for stamp, _ in self._joints])
         q = np.array([joints for _, joints in self._joints])
         # The first report at or after the end is part of the proof of stillness, not of the mean.
@@ -377,9 +381,8 @@ class Pairing:
         inside = q[stamps <= end]
         q_mean = inside.mean(axis=0) if len(inside) else q[0]
         positions = np.array([reading.position for reading in used]).reshape(-1, 3)
-        if rules.single_shot:
-            std = None
-        else:
+        std = None
+        if not rules.single_shot:
             std = positions.std(axis=0, ddof=1) if len(used) > 1 else np.zeros(3)
             if not np.all(std <= rules.max_std_m):
                 detail = f'std {1e3 * std.max():.3f} mm (allowed {1e3 * rules.max_std_m:.3f} mm)'
@@ -387,9 +390,10 @@ class Pairing:
             if len(used) > 1 and not np.any(np.ptp(positions, axis=0)):
                 detail = f'{len(used)} readings are the same to the last bit'
                 return Rejection(rules.sensor, 'frozen', detail)
-        return PairedReading(
-            rules.sensor, marker, end, q_mean, positions.mean(axis=0), std, len(used)
-        )
+        turns = [reading.orientation for reading in used if reading.orientation is not None]
+        turn = mean_quaternion_xyzw(turns) if turns else None
+        mean, count = positions.mean(axis=0), len(used)
+        return PairedReading(rules.sensor, marker, end, q_mean, mean, std, count, turn)
 
 
 def _seen(readings: list[MarkerReading]) -> list[MarkerReading]:

@@ -18,7 +18,7 @@ from remaster_ros.calibration.estimate import Estimate, Problem, estimate, hold_
 from remaster_ros.discovery.common_range import Split, split
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.base import Cell
-from remaster_ros.discovery.evidence import Solution, solve
+from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.gain import rms
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.side_by_side import (
@@ -27,6 +27,7 @@ from remaster_ros.discovery.side_by_side import (
     compare_offsets,
     rms_sigmas,
 )
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.undetected import undetected
 from remaster_ros.errors import InputError
 from remaster_ros.types import BoolArray, FloatArray, Session

@@ -6,8 +6,8 @@ import numpy as np
 
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
-from remaster_ros.discovery.evidence import Solution
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray, IntArray
 
 

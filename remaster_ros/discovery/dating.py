@@ -10,7 +10,7 @@ import numpy as np
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import Solution
+from remaster_ros.discovery.solution import Solution
 
 
 def refine_moments(

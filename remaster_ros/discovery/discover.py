@@ -21,7 +21,7 @@ from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import Solution, solve
+from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.explain import FoundEffect, describe
 from remaster_ros.discovery.gain import (
     Gain,
@@ -33,7 +33,9 @@ from remaster_ros.discovery.gain import (
 from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, unfitted
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
 from remaster_ros.discovery.omnibus import structure_left
+from remaster_ros.discovery.plain_forms import plainest
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stepwise_selection import Search, Selection
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
 from remaster_ros.discovery.to_extension import extension_of
@@ -159,8 +161,10 @@ def discover_session(
         if isinstance(effect, FoundEffect)
     )
     verdict: Verdict = 'effects' if effects else 'unexplained' if unexplained else 'none'
-    # A tie over a small remainder does not put the rest in doubt.
-    if any(effect.tied and (effect.share or 0.0) > LEADING_SHARE for effect in effects):
+    # A tie over a small remainder does not put the rest in doubt. The largest leads in any case:
+    # where held-out poses gain nothing no share is known.
+    leading = [effect for effect in effects if (effect.share or 0.0) > LEADING_SHARE]
+    if any(effect.tied for effect in (*effects[:1], *leading)):
         verdict = 'undetermined'
     return Discovery(
         verdict=verdict,
@@ -271,6 +275,7 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         lambda share: progress('searching causes', share),
     )
     selection = search.run()
+    selection = replace(selection, solution=plainest(selection.solution, search.cells, search.fit))
     residuals = search.data
     groups, described = describe(
         residuals, selection, cells, lambda share: progress('comparing look-alikes', share)

@@ -26,6 +26,7 @@ from scipy.optimize import minimize
 from remaster_ros.calibration.noise import RESOLUTION_M, Noise, NoiseModel
 from remaster_ros.discovery.effects.base import LARGEST_M, Cell
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray
 
 # Columns whose norm falls below this share when the others are projected out add nothing.
@@ -33,62 +34,8 @@ ABSORBED = 1e-4
 # Of the noise and smoothness coordinates, which are logarithms.
 STEPS = 60
 # Where the slope in these units falls below this, L is within its square of the maximum.
-SLOPE = 0.03
+SLOPE = 0.1
 _LARGE = 18.0
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """A set of cells fitted to the residuals.
-
-    Attributes
-    ----------
-    cells
-        The set.
-    parameters, covariance
-        Of all the cells in order, SI, (m,) and (m, m).
-    base, base_covariance
-        Of the offsets model's columns, (p,); and of everything together, (p + m, p + m).
-    noise
-        Re-estimated.
-    smoothness
-        Precision factor of each penalised cell, in order of the cells (NaN for the others).
-    ridge
-        Prior precision of each unpenalised parameter (0 for the others), (m,).
-    log_evidence
-        With the prior probability of the cells.
-    """
-
-    cells: tuple[Cell, ...]
-    parameters: FloatArray
-    covariance: FloatArray
-    base: FloatArray
-    full_covariance: FloatArray
-    noise: Noise
-    smoothness: FloatArray
-    ridge: FloatArray
-    log_evidence: float
-
-    def slices(self) -> list[slice]:
-        """Return where each cell's parameters are."""
-        edges = np.cumsum([0, *(cell.size for cell in self.cells)])
-        return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
-
-    def unphysical(self) -> set[int]:
-        """Return the indices of the cells with a parameter of the sign that physics excludes."""
-        return {
-            index
-            for index, (cell, where) in enumerate(zip(self.cells, self.slices(), strict=True))
-            if np.any(cell.sign * self.parameters[where] < 0.0)
-        }
-
-    def prior_precision(self) -> FloatArray:
-        """Return the precision of the Gaussian prior on the parameters, (m, m)."""
-        precision = np.diag(self.ridge)
-        for cell, factor, where in zip(self.cells, self.smoothness, self.slices(), strict=True):
-            if cell.penalty is not None:
-                precision[where, where] += factor * cell.penalty
-        return precision
 
 
 def log_prior_one_by_one(cells: Sequence[Cell]) -> float:
@@ -102,6 +49,7 @@ def solve(
     start: Solution | None = None,
     *,
     prior: float | None = None,
+    settled: bool = True,
 ) -> Solution | None:
     """Fit a set of cells; None where one of them adds nothing to the others.
 
@@ -115,10 +63,16 @@ def solve(
         A fit whose noise and smoothness are near.
     prior
         Log prior probability of the set; by default that of its cells one by one.
+    settled
+        False: with noise and smoothness as they are at the start, which costs one evaluation in
+        place of half a dozen; the evidence is too low then, if anything.
     """
-    cells = tuple(cells)
-    columns = data.columns(cells)
-    scale = np.sqrt(np.einsum('nim,nim->m', columns, columns))
+    # Penalised ones last: one Cholesky factor holds all determinants.
+    order = sorted(range(len(cells)), key=lambda index: cells[index].penalty is not None)
+    cells = tuple(cells[index] for index in order)
+    norms, grams = data.gram_matrices(cells)
+    p = data.base.shape[2]
+    scale = norms[p:-1]
     free = np.array([cell.penalty is None for cell in cells for _ in cell.parameters], dtype=bool)
     if np.any(scale[free] == 0.0):
         return None
@@ -131,7 +85,6 @@ def solve(
     largest = np.array([cell.largest or np.nan for cell in cells for _ in cell.parameters])
     typical = LARGEST_M * np.sqrt(len(data)) / scale
     std = np.where(np.isnan(largest), typical, largest)
-    p = data.base.shape[2]
     # Of free forms the heights of a curve have a plausible size, weights of kernels have none.
     sized = np.array(
         [
@@ -143,13 +96,15 @@ def solve(
     )
     ridge = np.concatenate((np.zeros(p), np.where(sized, (std * scale) ** -2.0, 0.0)))
     unit = np.concatenate((np.ones(p), scale))
-    joined = np.concatenate((data.base, columns / scale, data.errors[:, :, None]), axis=2)
-    grams = data.noise_model.gram(lambda _, where: joined[where], joined.shape[2])
+    inverse_unit = 1.0 / np.append(unit, 1.0)
+    grams = grams * (inverse_unit[:, None] * inverse_unit)
     system = _System(data.noise_model, grams, data.noise, cells, p, unit, ridge)
     if not system.visible():
         return None
     try:
-        return system.solution(start, log_prior_one_by_one(cells) if prior is None else prior)
+        if prior is None:
+            prior = log_prior_one_by_one(cells)
+        return system.solution(start, prior, settled).reordered(np.argsort(order))
     except np.linalg.LinAlgError:
         # The columns agree up to rounding: they cannot be distinguished.
         return None
@@ -183,20 +138,16 @@ class _System:
         # Of each, for the determinant beside the ridge, which is the same for all of a cell.
         self.spectra = [np.linalg.eigvalsh(penalty) for penalty in self.penalties]
         self.ridges = [float(self.ridge[self.where[i].start]) for i in self.penalised]
-        free = np.ones(self.size, dtype=bool)
-        for i in self.penalised:
-            free[self.where[i]] = False
-        # Base first, then unpenalised, then penalised: one Cholesky holds all determinants.
-        self.order = np.concatenate((np.flatnonzero(free), np.flatnonzero(~free)))
-        self.unpenalised = int(free.sum())
+        # Base first, then unpenalised, then penalised.
+        self.unpenalised = self.where[self.penalised[0]].start if self.penalised else self.size
         self.shares = self.model.shares
         # Each group's matrix as one row: sums and traces over groups are then products.
         self.flat = self.grams.reshape(len(self.grams), -1)
+        self._last: tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray]] | None = None
 
     def visible(self) -> bool:
         """Return whether the unpenalised columns add something to the others and to the base."""
-        gram = self.grams.sum(axis=0)[:-1, :-1][np.ix_(self.order, self.order)]
-        part = gram[: self.unpenalised, : self.unpenalised]
+        part = self.grams[:, : self.unpenalised, : self.unpenalised].sum(axis=0)
         try:
             root = np.linalg.cholesky(part + 1e-14 * np.eye(len(part)))
         except np.linalg.LinAlgError:
@@ -209,15 +160,17 @@ class _System:
 
     def evaluate(self, eta: FloatArray) -> tuple[float, FloatArray]:
         """Return −L and its gradient by eta: log sigmas, what rows share, smoothness."""
-        noise = self.noise(eta)
-        weights = 1.0 / self.model.variances(noise)
-        factors = np.exp(eta[len(eta) - len(self.penalised) :])
-        _, root, beta = self._solve(weights, factors)
-        inverse = self._inverse(root)
-        rss = self._squares(beta)
-        padded = np.zeros((self.size + 1, self.size + 1))
-        padded[:-1, :-1] = inverse
-        trace = self.flat @ padded.ravel()
+        noise, weights, factors = self._precisions(eta)
+        root, beta, lower = self._solved(eta)
+        # Below the diagonal twice: products with symmetric matrices are then those of the whole.
+        inverse = 2.0 * lower
+        np.fill_diagonal(inverse, np.diag(lower))
+        error = np.append(-beta, 1.0)
+        factorised = np.zeros((2, self.size + 1, self.size + 1))
+        factorised[0, :-1, :-1] = inverse
+        np.outer(error, error, out=factorised[1])
+        # Of every error group in one pass over the matrices, which are most of the work.
+        trace, rss = (self.flat @ factorised.reshape(2, -1).T).T
         n = self.model.freedom
         value = 0.5 * n @ np.log(weights) - np.sum(np.log(np.diag(root))) - 0.5 * weights @ rss
         value -= 0.5 * self.ridge @ beta**2
@@ -249,52 +202,42 @@ class _System:
             slope[len(eta) - len(self.penalised) + i] = 0.5 * (smooth - spread - quadratic)
         return -value, -slope
 
-    def _solve(
-        self, weights: FloatArray, factors: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return H, its lower Cholesky factor (natural order) and the estimate."""
+    def _precisions(self, eta: FloatArray) -> tuple[Noise, FloatArray, FloatArray]:
+        """Return the noise, the weight of each error group, the factor of each penalty."""
+        noise = self.noise(eta)
+        weights = 1.0 / self.model.variances(noise)
+        return noise, weights, np.exp(eta[len(eta) - len(self.penalised) :])
+
+    def _solved(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the lower Cholesky factor of H, the estimate, and H⁻¹ with zeros above."""
+        if self._last is not None and np.array_equal(self._last[0], eta):
+            return self._last[1]
+        _, weights, factors = self._precisions(eta)
         total = (weights @ self.flat).reshape(self.size + 1, self.size + 1)
         H = total[:-1, :-1] + np.diag(self.ridge)
         for index, penalty, factor in zip(self.penalised, self.penalties, factors, strict=True):
             where = self.where[index]
             H[where, where] += factor * penalty
-        root: FloatArray = np.linalg.cholesky(H).astype(float)
-        return H, root, cho_solve((root, True), total[:-1, -1], check_finite=False)
-
-    def _inverse(self, root: FloatArray) -> FloatArray:
-        """Return the inverse of the matrix with this lower Cholesky factor."""
-        lower, _ = dpotri(root, lower=1)
-        return np.tril(lower) + np.tril(lower, -1).T
+        root = np.linalg.cholesky(H).astype(float, copy=False)
+        beta = cho_solve((root, True), total[:-1, -1], check_finite=False)
+        # The transpose is the same memory in LAPACK's order.
+        upper, _ = dpotri(root.T, lower=0)
+        self._last = eta.copy(), (root, beta, upper.T)
+        return self._last[1]
 
     def _squares(self, beta: FloatArray) -> FloatArray:
         """Return the sum of squared errors in each error group, m², (groups,)."""
         error = np.append(-beta, 1.0)
         return self.flat @ np.outer(error, error).ravel()
 
-    def solution(self, start: Solution | None, prior: float) -> Solution:
+    def solution(self, start: Solution | None, prior: float, settled: bool) -> Solution:
         eta, bounds = self._start(start)
-        # In units of about their own standard deviations: L has a curvature near 1 everywhere.
-        unit = self._curvature() ** -0.5
-
-        def scaled(x: FloatArray) -> tuple[float, FloatArray]:
-            value, gradient = self.evaluate(unit * x)
-            return value, unit * gradient
-
-        best = minimize(
-            scaled,
-            eta / unit,
-            jac=True,
-            method='L-BFGS-B',
-            bounds=np.array(bounds) / unit[:, None],
-            options={'maxiter': STEPS, 'ftol': 1e-9, 'gtol': SLOPE},
-        )
-        eta = unit * best.x
-        noise = self.noise(eta)
-        weights = 1.0 / self.model.variances(noise)
-        factors = np.exp(eta[len(eta) - len(self.penalised) :])
-        H, root, beta = self._solve(weights, factors)
-        evidence = self._evidence(H, weights, factors, beta)
-        covariance = self._inverse(root) / np.outer(self.unit, self.unit)
+        if settled:
+            eta = self._most_likely(eta, bounds)
+        noise, weights, factors = self._precisions(eta)
+        root, beta, lower = self._solved(eta)
+        evidence = self._evidence(root, weights, factors, beta)
+        covariance = (lower + np.tril(lower, -1).T) / np.outer(self.unit, self.unit)
         beta = beta / self.unit
         smoothness = np.full(len(self.cells), np.nan)
         smoothness[self.penalised] = factors
@@ -310,12 +253,31 @@ class _System:
             evidence + prior,
         )
 
+    def _most_likely(self, eta: FloatArray, bounds: list[tuple[float, float]]) -> FloatArray:
+        """Return the noise and smoothness, as logarithms, that maximise L."""
+        # In units of about their own standard deviations: L has a curvature near 1 everywhere.
+        unit = self._curvature() ** -0.5
+
+        def scaled(x: FloatArray) -> tuple[float, FloatArray]:
+            value, gradient = self.evaluate(unit * x)
+            return value, unit * gradient
+
+        best = minimize(
+            scaled,
+            eta / unit,
+            jac=True,
+            method='L-BFGS-B',
+            bounds=np.array(bounds) / unit[:, None],
+            options={'maxiter': STEPS, 'ftol': 1e-9, 'gtol': SLOPE},
+        )
+        most_likely: FloatArray = unit * best.x
+        return most_likely
+
     def _evidence(
-        self, H: FloatArray, weights: FloatArray, factors: FloatArray, beta: FloatArray
+        self, root: FloatArray, weights: FloatArray, factors: FloatArray, beta: FloatArray
     ) -> float:
         """Return L with ½ log N for each unpenalised parameter in place of its determinant."""
-        ordered = np.linalg.cholesky(H[np.ix_(self.order, self.order)])
-        logs = np.log(np.diag(ordered))
+        logs = np.log(np.diag(root))
         rss = self._squares(beta)
         n = self.model.freedom
         value = 0.5 * n @ np.log(weights) - 0.5 * weights @ rss - logs[: self.p].sum()

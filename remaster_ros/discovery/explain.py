@@ -12,18 +12,20 @@ from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import Solution, solve
+from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.families import family_log_prior, grouped
 from remaster_ros.discovery.gain import shares
+from remaster_ros.discovery.plain_forms import AS_WELL, is_special_case
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, screen
-from remaster_ros.discovery.stepwise_selection import Selection
+from remaster_ros.discovery.solution import Solution
+from remaster_ros.discovery.stepwise_selection import WHOLE, Selection
 from remaster_ros.discovery.words import clock_time
 
 # Look-alikes within this of the evidence are named; within the other, the leaders tie.
 CONFUSABLE = 5.0
 # Odds of exp(3), twenty to one, do not decide between two causes.
-TIED = 3.0
+TIED = AS_WELL
 SHORTLIST = 10
 # The screening keeps the noise fixed, which costs it this much of the evidence.
 SCREENING_ERROR = 5.0
@@ -55,6 +57,8 @@ class LookAlike:
         Which measurements would decide.
     same
         No measurement of these markers could: the two displace every pose alike.
+    general
+        It is a free form, and the effect one of the shapes that it can have.
     """
 
     name: str
@@ -62,6 +66,7 @@ class LookAlike:
     log_evidence_gain: float
     separate_by: str
     same: bool = False
+    general: bool = False
 
 
 @dataclass(frozen=True)
@@ -195,8 +200,8 @@ def _described(
         # It came in exchange for what had passed.
         p_values = [max(step.p_value for step in selection.steps)]
     alike: tuple[LookAlike, ...] = ()
-    if without is not None and len(group) == 1:
-        alike = _look_alikes(data, solution, without, catalogue, first)
+    if without is not None and len(group) < WHOLE:
+        alike = _look_alikes(data, solution, without, catalogue, group)
     effect = FoundEffect(
         name=EFFECTS[first.name].reported_as or first.name,
         joints=_joints(group),
@@ -211,7 +216,10 @@ def _described(
         size_m=_size(data, solution, group),
         share=share,
         remedy=EFFECTS[first.name].remedy,
-        tied=any(not other.same and other.log_evidence_gain > gain - TIED for other in alike),
+        tied=any(
+            not (other.same or other.general) and other.log_evidence_gain > gain - TIED
+            for other in alike
+        ),
     )
     return effect
 
@@ -244,18 +252,24 @@ def _look_alikes(
     solution: Solution,
     without: Solution,
     catalogue: Catalogue,
-    cell: Cell,
+    group: tuple[Cell, ...],
 ) -> tuple[LookAlike, ...]:
-    """Return the other causes that explain nearly as much in a cell's place."""
+    """Return the other causes that explain nearly as much in a group's place.
+
+    Of one cell; those of two cells may be one of the two alone.
+    """
     score = screen(data, catalogue, replace(without, noise=solution.noise)).score
     best: dict[tuple[str, tuple[int, ...]], LookAlike] = {}
-    own = [i for i, other in enumerate(catalogue.cells) if other.key == cell.key]
-    least = score[own[0]] - SCREENING_ERROR - CONFUSABLE if own else -np.inf
+    cell, own = group[0], solution.log_evidence - without.log_evidence
+    if len(group) == 1:
+        mine = [i for i, other in enumerate(catalogue.cells) if other.key == cell.key]
+        own = score[mine[0]] if mine else -np.inf
+    least = own - SCREENING_ERROR - CONFUSABLE
     for index in np.argsort(-score)[:SHORTLIST]:
         other = catalogue.cells[index]
         if score[index] < least or not np.isfinite(score[index]):
             break
-        if (other.name, other.joints) == (cell.name, cell.joints):
+        if (other.name, other.joints) == (cell.name, _joints(group)):
             continue
         cells = (*without.cells, other)
         fit = solve(data, cells, solution, prior=family_log_prior(cells, catalogue.cells))
@@ -265,9 +279,14 @@ def _look_alikes(
         key = (other.name, other.joints)
         if key in best and best[key].log_evidence_gain >= gain:
             continue
-        same = _same(data, solution, cell, other)
+        same = len(group) == 1 and _same(data, solution, cell, other)
         best[key] = LookAlike(
-            other.name, other.joints, float(gain), separate_by(cell, other, same), same
+            other.name,
+            other.joints,
+            float(gain),
+            separate_by(cell, other, same),
+            same,
+            len(group) == 1 and is_special_case(cell, other),
         )
     return tuple(sorted(best.values(), key=lambda alike: -alike.log_evidence_gain))
 

@@ -14,8 +14,9 @@ from remaster_ros.calibration.accuracy import accuracy_of
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.result import FitResult, predicted_rows
 from remaster_ros.discovery.effects.base import Cell
-from remaster_ros.discovery.evidence import Solution, solve
+from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray
 
 

@@ -15,9 +15,9 @@ from scipy.stats import chi2
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.discovery.effects.marker_offset import EFFECT as MARKER_OFFSET
 from remaster_ros.discovery.effects.sizes import number
-from remaster_ros.discovery.evidence import Solution
 from remaster_ros.discovery.explain import FoundEffect, Parameter
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray, Priors, Session
 
 # The prior pulls the fitted marker back: its true place may be this many times further off.

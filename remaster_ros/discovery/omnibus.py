@@ -1,9 +1,11 @@
 """Is any structure left? Checks after the search, of what no cause explains.
 
 Smooth structure over the place in a sensor's volume and over time competes in the search itself
-(the effects without a cause). Here follow readings of another configuration, held-out poses with
-larger errors than poses left out of the fit in turn, and errors beyond the accuracy that a sensor
-states. Single gross errors are no structure: they are listed.
+(the effects without a cause), against all that is tried there; what is too weak to win may still
+be more than chance where the place alone is asked for (`errors_by_place`). Then follow readings of
+another configuration, held-out poses with larger errors than poses left out of the fit in turn,
+and errors beyond the accuracy that a sensor states. Single gross errors are no structure: they are
+listed.
 """
 
 from __future__ import annotations
@@ -17,12 +19,13 @@ from scipy.stats import binom, mannwhitneyu
 
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.cross_validation import held_out_error
-from remaster_ros.discovery.evidence import Solution
+from remaster_ros.discovery.errors_by_place import errors_by_place
 from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.gain import rms
 from remaster_ros.discovery.guard import Unexplained
 from remaster_ros.discovery.moved_meanwhile import far_off, moved_text
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 # Of one check where nothing is wrong.
@@ -66,6 +69,7 @@ def structure_left(
             Unexplained(found.place, found.driver, found.size_m, found.p_value, found.cause)
             for found in located
         ),
+        *errors_by_place(data, solution, SIGNIFICANCE),
         *checks.pairing(),
         *far_off(data.context, checks.errors, checks.gross & ~checks.mispaired),
         *checks.held_out(),

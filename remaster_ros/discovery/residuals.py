@@ -26,6 +26,8 @@ from remaster_ros.types import FloatArray, IntArray
 ROUNDING = 1e-8
 # Bytes of displacements that are kept for the next fit; only those of large sessions are more.
 KEPT_BYTES = 1 << 28
+# Gram matrices of so many sets are kept: of the set so far, and of families beside it.
+KEPT_GRAMS = 4
 
 
 class Fit(Protocol):
@@ -190,6 +192,36 @@ class Residuals:
         while len(kept) > 1 and sum(values.nbytes for values in kept.values()) > KEPT_BYTES:
             del kept[next(iter(kept))]
         return joined
+
+    @cached_property
+    def _grams(self) -> list[tuple[tuple[Cell, ...], FloatArray, FloatArray]]:
+        """The last results of `gram_matrices`: most sets that a search fits are parts of one."""
+        return []
+
+    def gram_matrices(self, cells: Sequence[Cell]) -> tuple[FloatArray, FloatArray]:
+        """Return norms and Gram matrices of the base columns, of cells, and of the errors.
+
+        Returns
+        -------
+        norms
+            Of the columns over all rows, (p + c + 1,).
+        grams
+            In each error group of the noise model, (groups, p + c + 1, p + c + 1).
+        """
+        p = self.base.shape[2]
+        for known, norms, grams in self._grams:
+            if set(cells) <= set(known):
+                edges = np.cumsum([p, *(cell.size for cell in known)])
+                first = dict(zip(known, edges, strict=False))
+                parts = [np.arange(first[cell], first[cell] + cell.size) for cell in cells]
+                chosen = np.concatenate((np.arange(p), *parts, [len(norms) - 1]))
+                return norms[chosen], grams.take(chosen, axis=1).take(chosen, axis=2)
+        joined = np.concatenate((self.base, self.columns(cells), self.errors[:, :, None]), axis=2)
+        norms = np.sqrt(np.einsum('nim,nim->m', joined, joined))
+        grams = self.noise_model.gram(lambda _, where: joined[where], joined.shape[2])
+        self._grams.insert(0, (tuple(cells), norms, grams))
+        del self._grams[KEPT_GRAMS:]
+        return norms.copy(), grams
 
     def displaced(self, cells: Sequence[Cell], parameters: FloatArray) -> FloatArray:
         """Return what cells with these parameters displace in every row, m, (all rows, 3)."""

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
-from remaster_ros.discovery.evidence import Solution
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 CHUNK = 1024

@@ -19,8 +19,8 @@ from remaster_ros.discovery.common_range import Split
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import driver_named
-from remaster_ros.discovery.evidence import Solution
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray
 
 # Fewer places leave nothing of a curve less its mean.

@@ -21,7 +21,7 @@ from remaster_ros.discovery.cross_validation import held_out_error, worth_of
 from remaster_ros.discovery.dating import refine_moments
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import Solution, solve
+from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.families import (
     FAMILIES,
     family_log_prior,
@@ -31,6 +31,7 @@ from remaster_ros.discovery.families import (
 )
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, Screening, screen
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.substitutes import named_instead
 
 # Family-wise error of one round.
@@ -184,12 +185,15 @@ class Search:
         again = self.fit(solution.cells, solution)
         return solution if again is None else self.prune(again)
 
-    def fit(self, cells: Sequence[Cell], start: Solution | None = None) -> Solution | None:
+    def fit(
+        self, cells: Sequence[Cell], start: Solution | None = None, settled: bool = True
+    ) -> Solution | None:
         """Fit a set with its prior probability; None for two cells of the same parameters."""
         names = [name for cell in cells for name in cell.parameters]
         if len(set(names)) < len(names):
             return None
-        return solve(self.data, cells, start, prior=family_log_prior(cells, self.catalogue.cells))
+        prior = family_log_prior(cells, self.catalogue.cells)
+        return solve(self.data, cells, start, prior=prior, settled=settled)
 
     def propose(self, solution: Solution, screening: Screening) -> list[Proposal]:
         """Return sets one step on that raise the evidence, the best first."""
@@ -241,6 +245,7 @@ class Search:
         Those of a sign that physics excludes go first, whatever they explain.
         """
         price = np.log(3.0 * len(self.data))
+        settled = True
         while solution.cells:
             unphysical = solution.unphysical()
             worth = []
@@ -253,21 +258,37 @@ class Search:
                     worth.append(np.inf)
                 else:
                     worth.append(worth_of(solution, cell, where, price))
-            order = np.argsort(worth)
-            for index in order[:2]:
-                # Wald's estimate of the loss chooses; the evidence itself decides.
+            # Wald's estimate of the loss chooses; the evidence itself decides.
+            for index in np.argsort(worth)[:2]:
                 if worth[index] > 2.0:
-                    return solution
-                rest = (*solution.cells[:index], *solution.cells[index + 1 :])
-                smaller = self.fit(rest, solution)
-                if smaller is not None and (
-                    index in unphysical or smaller.log_evidence > solution.log_evidence
-                ):
-                    solution = smaller
+                    continue
+                smaller = self._without(solution, index, index in unphysical, settled)
+                if smaller is not None:
+                    solution, settled = smaller
                     break
             else:
-                return solution
-        return solution
+                if settled:
+                    return solution
+                # Noise and smoothness follow what was dropped; then it is looked at again.
+                solution, settled = self.fit(solution.cells, solution) or solution, True
+        return solution if settled else self.fit(solution.cells, solution) or solution
+
+    def _without(
+        self, solution: Solution, index: int, unphysical: bool, settled: bool
+    ) -> tuple[Solution, bool] | None:
+        """Return a solution less a cell, and whether its noise is settled; None if that is worse.
+
+        Where the evidence rises with the noise as it is, the best noise for the smaller set can
+        wait; the cell is kept only by settled evidences.
+        """
+        rest = (*solution.cells[:index], *solution.cells[index + 1 :])
+        for settle in (False, True) if settled else (False,):
+            smaller = self.fit(rest, solution, settled=settle)
+            if smaller is not None and (
+                unphysical or smaller.log_evidence > solution.log_evidence
+            ):
+                return smaller, settle
+        return None
 
     def swap(self, solution: Solution) -> Solution:
         """Replace cells, one at a time, by what explains more in their place."""

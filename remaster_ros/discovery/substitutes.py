@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import Solution
 from remaster_ros.discovery.families import FAMILIES
+from remaster_ros.discovery.solution import Solution
 
 # Families join one after another: this often at most.
 JOINS = 6

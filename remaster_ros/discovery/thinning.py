@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from remaster_ros.discovery.evidence import Solution
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
 MOST_ROWS = 5_000

@@ -7,8 +7,8 @@ import numpy as np
 from remaster_ros.calibration.extension import Extension, Term
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.evidence import Solution
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray
 
 

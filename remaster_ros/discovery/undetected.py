@@ -17,8 +17,8 @@ from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.priors import prior_rows
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import Solution
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray
 
 # A cause is found from about so many standard deviations on; the others lie anywhere below.

@@ -86,6 +86,17 @@ def matrix_from_quaternion_xyzw(quaternion: ArrayLike) -> FloatArray:
     return np.asarray(Rotation.from_quat(quaternion).as_matrix())
 
 
+def mean_quaternion_xyzw(quaternions: ArrayLike) -> FloatArray:
+    """Return the mean of unit quaternions x, y, z, w (n, 4), n >= 1, whatever their signs, (4,).
+
+    The rotation nearest to all of them in the chordal distance: the largest eigenvector of the
+    sum of their outer products (Markley et al., "Averaging quaternions", J. Guidance 30, 2007).
+    """
+    values = np.asarray(quaternions, dtype=float)
+    vector = np.linalg.eigh(values.T @ values)[1][:, -1]
+    return np.asarray(Rotation.from_quat(vector).as_quat(canonical=True))
+
+
 def matrix_from_rpy(rpy: ArrayLike) -> FloatArray:
     """Turn roll, pitch, yaw (3,) in rad, URDF's Rz(yaw) Ry(pitch) Rx(roll), into a matrix."""
     return np.asarray(Rotation.from_euler('xyz', rpy).as_matrix())

@@ -7,8 +7,9 @@ from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
-from geometry_msgs.msg import PointStamped
+from geometry_msgs.msg import Point, PointStamped, PoseStamped
 from sensor_msgs.msg import Temperature
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from remaster_ros.collection.events import EventRecord, SensorReport
@@ -21,8 +22,9 @@ from remaster_ros.nodes.messages import seconds, temperature_topic
 from remaster_ros.nodes.recorder_parameters import Parameters
 from remaster_ros.nodes.running import RemasterNode
 from remaster_ros.nodes.triggered_sensors import TriggeredSensors
+from remaster_ros.sensors.topic.messages import unit_quaternion
 from remaster_ros.session.workcell import Workcell
-from remaster_ros.types import MarkerReading
+from remaster_ros.types import FloatArray, MarkerReading
 
 
 class CellSensors:
@@ -80,7 +82,10 @@ class CellSensors:
         """Subscribe to the readings, through the bag."""
         for name, sensor in self._sensors.items():
             for marker, topic in sensor.topics.items():
-                bag.subscribe(PointStamped, topic, self._on_point(name, marker))
+                take = self._on_point(name, marker)
+                bag.subscribe(PointStamped, topic, None if sensor.pose_topic else take)
+            if sensor.pose_topic:
+                bag.subscribe(PoseStamped, sensor.pose_topic, self._on_pose(name, sensor.marker))
             bag.subscribe(Temperature, temperature_topic(sensor.topic), self._on_temperature)
 
     def take(self, record: EventRecord, report: SensorReport) -> None:
@@ -117,10 +122,23 @@ class CellSensors:
         return self._liveness.absent(time.monotonic(), self.required.names)
 
     def _on_point(self, sensor: str, marker: str) -> Callable[[PointStamped], None]:
-        def receive(message: PointStamped) -> None:
-            point = message.point
+        take = self._taker(sensor, marker)
+        return lambda message: take(message.header, message.point, None)
+
+    def _on_pose(self, sensor: str, marker: str) -> Callable[[PoseStamped], None]:
+        take = self._taker(sensor, marker)
+        return lambda message: take(
+            message.header, message.pose.position, unit_quaternion(message.pose.orientation)
+        )
+
+    def _taker(
+        self, sensor: str, marker: str
+    ) -> Callable[[Header, Point, FloatArray | None], None]:
+        def receive(header: Header, point: Point, orientation: FloatArray | None) -> None:
             position = np.array([point.x, point.y, point.z])
-            reading = MarkerReading(seconds(message.header.stamp), position, marker=marker)
+            reading = MarkerReading(
+                seconds(header.stamp), position, marker=marker, orientation=orientation
+            )
             hidden = bool(np.all(np.isnan(position))) and len(self._sensors[sensor].markers) > 1
             # Hidden, while others of the frame are seen on topics of their own.
             if not (hidden or np.all(np.isfinite(position))):

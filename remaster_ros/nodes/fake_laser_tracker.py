@@ -40,6 +40,9 @@ class FakeLaserTrackerNode(RemasterNode):
             host=p.host,
             port=p.port,
             behaviour=TrackerBehaviour(warm_up_s=p.warm_up_s),
+            further=world.truth.sensors[p.sensor].further
+            if p.sensor in world.truth.sensors
+            else {},
         )
         self.tracker.start()
 

@@ -1,27 +1,36 @@
 """Measurements on request: the service, where the marker should be, and when the arm arrives.
 
 Between requests the driver may find a lost marker again: `prepare` is called as soon as the arm
-has arrived, so that a search falls into the settle time.
+has arrived, so that a search falls into the settle time. Several markers are measured one after
+another, once the sensor is registered: before, it is not known where the others are.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from sensor_msgs.msg import Temperature
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.collection.events import ShotMeasured
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.kinematics import transforms
-from remaster_ros.nodes.messages import stamp_of, temperature_topic, transform_array
+from remaster_ros.nodes.messages import (
+    JointOrder,
+    stamp_of,
+    temperature_topic,
+    transform_array,
+)
 from remaster_ros.nodes.status import LATCHED, RELIABLE
 from remaster_ros.sensors.driver import TriggeredDriver
 from remaster_ros.sensors.registry import kind_of
@@ -30,6 +39,9 @@ from remaster_ros.types import FloatArray, MarkerReading
 
 if TYPE_CHECKING:
     from remaster_ros.nodes.sensor_node import SensorNode
+
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Of joint states only the last counts."""
 
 
 class MeasureService:
@@ -58,15 +70,27 @@ class MeasureService:
     ) -> None:
         self._node, self._driver, self._ending = node, driver, ending
         sensor = cell.sensors[node.sensor]
-        self._marker_T = np.array(cell.markers[sensor.marker])
+        self._markers_T = {
+            '' if name == sensor.marker else name: np.array(cell.markers[name])
+            for name in sensor.markers
+        }
+        # The one that was measured last is measured first: the beam may be on it still.
+        self._last = ''
         self._T_N_R: FloatArray | None = None
-        self._marker_R: FloatArray | None = None
+        self._T_R_T: FloatArray | None = None
         self._arrival_s = 0.0
         self._commanded = threading.Event()
         self._temperatures = node.create_publisher(
             Temperature, temperature_topic(sensor.topic), RELIABLE
         )
-        node.create_subscription(PoseStamped, 'remaster/target_pose', self._on_pose, RELIABLE)
+        if len(self._markers_T) > 1:
+            # Which of them the beam is on shows by their places alone, and a node that was
+            # started again in the middle of a pose has not heard of the pose.
+            self._chain = cell.chain()
+            self._joint_order = JointOrder(self._chain.joint_names)
+            node.create_subscription(JointState, 'joint_states', self._on_joints, NEWEST)
+        else:
+            node.create_subscription(PoseStamped, 'remaster/target_pose', self._on_pose, RELIABLE)
         node.create_subscription(
             TransformStamped, 'remaster/registration', self._on_registration, LATCHED
         )
@@ -92,13 +116,19 @@ class MeasureService:
 
     def _on_pose(self, message: PoseStamped) -> None:
         position, quaternion = message.pose.position, message.pose.orientation
-        T_R_T = transforms.transform(
+        self._T_R_T = transforms.transform(
             transforms.matrix_from_quaternion_xyzw(
                 np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w])
             ),
             np.array([position.x, position.y, position.z]),
         )
-        self._marker_R = transforms.apply(T_R_T, self._marker_T)
+
+    def _on_joints(self, message: JointState) -> None:
+        # What is wrong with joint states, the bridge reports.
+        with contextlib.suppress(InputError):
+            q = self._joint_order.positions(message)
+            if np.all(np.isfinite(q)):
+                self._T_R_T = self._chain.forward(q)
 
     def _on_registration(self, message: TransformStamped) -> None:
         if message.child_frame_id == self._node.sensor:
@@ -111,11 +141,11 @@ class MeasureService:
             self._arrival_s = self._node.now_s() + duration.sec + 1e-9 * duration.nanosec
             self._commanded.set()
 
-    def _expected(self) -> FloatArray | None:
-        """Where the marker should be in the sensor's frame; None before registration."""
-        if self._T_N_R is None or self._marker_R is None:
+    def _expected(self, marker: str = '') -> FloatArray | None:
+        """Where a marker should be in the sensor's frame; None before registration."""
+        if self._T_N_R is None or self._T_R_T is None:
             return None
-        return transforms.apply(self._T_N_R, self._marker_R)
+        return transforms.apply(self._T_N_R @ self._T_R_T, self._markers_T[marker])
 
     def step(self) -> None:
         """Wait half a second for a command of the arm; prepare the driver when it has arrived."""
@@ -133,7 +163,7 @@ class MeasureService:
                 self._node.trouble = str(error)
 
     def _on_measure(self, request: Trigger.Request, response: Trigger.Response) -> Any:
-        """One measurement; the point is published before the answer goes out."""
+        """Measure each marker once; the points are published before the answer goes out."""
         node = self._node
         if node.clock_trouble:
             response.message = node.clock_trouble
@@ -142,20 +172,43 @@ class MeasureService:
             response.message = f'the {self._driver.device} is {self._driver.phase}: {node.trouble}'
             return response
         began = time.monotonic()
+        failures: list[str] = []
+        stamps_s: dict[str, float] = {}
         with node.in_use:
-            try:
-                reading = self._driver.measure(self._expected())
-            except DeviceError as error:
-                node.trouble = response.message = str(error)
-                return response
-        took = time.monotonic() - began
-        node.trouble = ''
-        self._publish_temperature(reading)
+            for marker in self._order():
+                try:
+                    stamps_s[marker] = self._measure(marker)
+                except DeviceError as error:
+                    failures.append(str(error))
+        node.trouble = '; '.join(failures)
+        if not stamps_s:
+            response.message = node.trouble
+            return response
+        for marker in self._markers_T.keys() - stamps_s:
+            # Who waits for all of them learns that this one does not come.
+            none = MarkerReading(max(stamps_s.values()), np.full(3, np.nan), marker=marker)
+            node.publish_reading(none)
         # For the report of times: what the instrument took is not the software's.
-        node.status.event(ShotMeasured(took))
-        node.publish_reading(reading)
-        response.success, response.message = True, 'measured'
+        node.status.event(ShotMeasured(time.monotonic() - began))
+        response.success, response.message = True, node.trouble or 'measured'
         return response
+
+    def _order(self) -> list[str]:
+        """Return the markers that can be measured now, that of the last reading first."""
+        if self._expected() is None:
+            return ['']
+        return [self._last, *(name for name in self._markers_T if name != self._last)]
+
+    def _measure(self, marker: str) -> float:
+        """Measure a marker once and publish it; return its stamp, s."""
+        expected = self._expected(marker)
+        if len(self._markers_T) > 1 and expected is not None:
+            self._driver.turn_to(marker, expected)
+        reading = replace(self._driver.measure(expected), marker=marker)
+        self._last = marker
+        self._publish_temperature(reading)
+        self._node.publish_reading(reading)
+        return reading.stamp_s
 
     def _publish_temperature(self, reading: MarkerReading) -> None:
         """Publish it under the reading's stamp, before the point."""

@@ -79,7 +79,15 @@ class Recorder(RemasterNode):
         )
         self.sensors = CellSensors(self, self.p, self.cell, self.recording, self._end_reading)
         self.registration = FirstRegistration(
-            self.chain, markers, self.cell.sensors, self.p.max_deviation_m / 2
+            self.chain,
+            markers,
+            self.cell.sensors,
+            self.p.max_deviation_m / 2,
+            {
+                name: sensor.markers
+                for name, sensor in self.cell.sensors.items()
+                if sensor.single_shot and sensor.further_markers
+            },
         )
         self._registrations = self.create_publisher(
             TransformStamped, 'remaster/registration', LATCHED

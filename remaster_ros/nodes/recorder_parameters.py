@@ -96,6 +96,7 @@ def session_header(cell: Workcell, settle_s: float) -> Session:
             for name, sensor in cell.sensors.items()
             if sensor.further_markers
         },
+        oriented=frozenset(name for name, sensor in cell.sensors.items() if sensor.pose_topic),
         measurements=Measurements.empty(len(chain)),
         marker_std_m=cell.marker_std_m,
         settle_s=settle_s,

@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from geometry_msgs.msg import PointStamped
+from geometry_msgs.msg import PointStamped, PoseStamped
 
 from remaster_ros.collection.events import SensorReport
 from remaster_ros.errors import DeviceError, InputError, RemasterError
@@ -89,7 +89,7 @@ class SensorNode(RemasterNode):
         if described.further_markers and not driver.several_markers:
             raise InputError(
                 f'{self.get_name()}: sensor {self.sensor} of {p.cell} has further_markers, but a '
-                f'{driver.device} measures one marker at a time; leave them out'
+                f'{driver.device} measures one marker alone; leave them out'
             )
         p = replace(p, further_markers=described.further_markers)
         self._readings = {
@@ -98,6 +98,11 @@ class SensorNode(RemasterNode):
             )
             for marker, topic in described.topics.items()
         }
+        self._poses = (
+            self.create_publisher(PoseStamped, described.pose_topic, RELIABLE)
+            if described.pose_topic
+            else None
+        )
         self.published = 0
         self.trouble = ''
         self.in_use = threading.Lock()
@@ -182,6 +187,12 @@ class SensorNode(RemasterNode):
         position = np.asarray(reading.position, float)
         message.point.x, message.point.y, message.point.z = map(float, position)
         self._readings[reading.marker].publish(message)
+        if self._poses is not None:
+            pose = PoseStamped(header=message.header)
+            pose.pose.position = message.point
+            turn, xyzw = pose.pose.orientation, reading.orientation
+            turn.x, turn.y, turn.z, turn.w = map(float, (np.nan,) * 4 if xyzw is None else xyzw)
+            self._poses.publish(pose)
         self.published += reading.seen
 
     def _summary(self) -> Summary:

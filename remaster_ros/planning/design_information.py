@@ -188,8 +188,9 @@ class DesignInformation:
             inside = box.holds(chain.positions(q, np.zeros(3)))
             if not inside.any():
                 raise InputError(
-                    f'no configuration has the tool in the box of {np.round(box.size_m, 3)} m '
-                    f'about {np.round(box.center_m, 3)} m; move or enlarge it'
+                    'no configuration has the tool in poses.tool_box, '
+                    f'{np.round(box.size_m, 3)} m about {np.round(box.center_m, 3)} m; move or '
+                    'enlarge it'
                 )
         seen = derivative[inside[measurements.configuration[rows.source]]]
         prior = by_x.T @ by_x

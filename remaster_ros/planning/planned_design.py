@@ -111,14 +111,7 @@ class Designed:
 
     def describe(self) -> str:
         """Return what is expected, in a line."""
-        goal = (
-            ''
-            if self.reached
-            else (
-                f'; not reached: {np.degrees(self.goal.joint_std_rad):.4f} deg for the offsets or '
-                f'{self.goal.tool_std_m * 1e3:.3f} mm for the tool'
-            )
-        )
+        goal = '' if self.reached else f'; not reached: {self.goal.describe()}'
         return (
             f'expected std of the offsets {np.degrees(self.joint_rms):.4f} deg (RMS), '
             f'error of the predicted markers {self.tool_rms * 1e3:.3f} mm (RMS), with the noise '

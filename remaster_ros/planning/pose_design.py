@@ -115,6 +115,13 @@ class Goal:
         tool = self.tool_share == 0.0 or information.tool_rms(chosen) <= self.tool_std_m
         return joints and tool
 
+    def describe(self) -> str:
+        """Return what is to be reached, for people."""
+        joints = f'{np.degrees(self.joint_std_rad):.3g} deg for the offsets'
+        tool = f'{self.tool_std_m * 1e3:.3g} mm for the tool'
+        counting = [joints] * (self.tool_share < 1.0) + [tool] * (self.tool_share > 0.0)
+        return ' and '.join(counting)
+
 
 @dataclass(frozen=True)
 class Design:

@@ -29,12 +29,18 @@ class EffectParameter(Struct):
 
 
 class LookAlike(Struct):
-    """What could be mistaken for an effect, and what would separate the two."""
+    """What could be mistaken for an effect, and what would separate the two.
+
+    ``same``: nothing can, the two displace every pose alike. ``general``: it is a free form, and
+    the effect one of the shapes that it can have.
+    """
 
     name: str
     joints: list[int]
     log_evidence_gain: float
     separate_by: str
+    same: bool = False
+    general: bool = False
 
 
 class Effect(Struct):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from remaster_ros.calibration.orientation_accuracy import METRICS as ORIENTATION
 from remaster_ros.reports.schemas import Accuracy
 from remaster_ros.types import Session
 
@@ -15,7 +16,9 @@ def accuracy_rows(accuracy: Accuracy) -> list[dict[str, Any]]:
     """Return one row per split and metric, and the reason where there is no number."""
     titles = {
         'post_registration': 'Position, sensor registered (eq.\u00a018)',
+        'post_registration_orientation': '… orientation',
         'relative': 'Distances between solutions of a pose (eq.\u00a017)',
+        'relative_orientation': '… angles',
         'theoretical': 'What the posterior predicts (section V-C)',
         'paper_theoretical': '… in the robot base, offsets alone, as the paper has it',
         'theoretical_random': 'The same predicted at 1,000 random configurations',
@@ -30,11 +33,14 @@ def accuracy_rows(accuracy: Accuracy) -> list[dict[str, Any]]:
             at_random = metric.endswith('_random')
             if at_random and split == 'validation':
                 continue  # They are the same for both.
+            if metric in ORIENTATION and metric not in metrics:
+                continue
             sides = metrics[metric]
             rows.append(
                 {
                     'split': 'any' if at_random else split,
                     'title': title,
+                    'angular': metric in ORIENTATION,
                     'cells': [sides.get(side) for side in ('before', 'after')],
                     'offsets_only': sides.get('after_offsets_only'),
                     'why': sides.get('why', ''),

@@ -165,10 +165,8 @@ def missed_goal(plan: CollectionPlan) -> str:
     """Return which goal an optimal design does not reach, and what would help; '' for none."""
     if plan.designed is None or plan.designed.reached:
         return ''
-    goal = plan.designed.goal
     return (
-        f'not reached: {np.degrees(goal.joint_std_rad):.4f} deg for the offsets or '
-        f'{goal.tool_std_m * 1e3:.3f} mm for the tool, with the poses that a search for causes '
+        f'not reached: {plan.designed.goal.describe()}, with the poses that a search for causes '
         'needs; wider ranges under poses, further values in held_values_deg or a longer lever of '
         'the marker would help'
     )

@@ -94,7 +94,7 @@ class Driver(ABC):
     device: ClassVar[str]
     """What it is, for messages."""
     several_markers: ClassVar[bool] = False
-    """Whether it measures several markers in one frame."""
+    """Whether it measures several markers: in one frame, or one after another on request."""
     phase: str = 'connecting'
     """``connecting`` until `open` has returned, then ``ready``; set by the node. `open` may set
     another text while it takes long."""
@@ -156,6 +156,26 @@ class TriggeredDriver(Driver):
         DeviceError
             Why there is no reading, with the remedy. A moving target is refused.
         """
+
+    def turn_to(self, marker: str, expected: FloatArray) -> None:
+        """Turn to the marker that is measured next, unless it is on it already.
+
+        Of drivers that are `several_markers` alone, before each `measure` once the sensor is
+        registered.
+
+        Parameters
+        ----------
+        marker
+            One of `further_markers` of the parameters; '' for the one that the sensor follows.
+        expected
+            As of `measure`.
+
+        Raises
+        ------
+        DeviceError
+            It was not found. Another one is not measured in its place.
+        """
+        raise NotImplementedError(f'{self.device} has several_markers, and no turn_to')
 
     def prepare(self, expected: FloatArray | None) -> None:
         """Get ready for the request that follows; called when the arm has arrived.

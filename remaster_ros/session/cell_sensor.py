@@ -13,7 +13,7 @@ import numpy as np
 from remaster_ros.collection.plausibility import SMALLEST_M
 from remaster_ros.errors import did_you_mean
 from remaster_ros.planning.expected_sensors import POSE_SIGMA_M, SIGMA_M
-from remaster_ros.session.source_topics import source_problem
+from remaster_ros.session.source_topics import POSE, source_problem
 from remaster_ros.session.yaml_records import Bounds, Triple
 from remaster_ros.types import FARTHEST_M
 
@@ -35,8 +35,8 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     marker
         The marker it follows.
     further_markers
-        Further markers that it measures in the same frame, by name, each with its number in the
-        rigid body.
+        Further markers that it measures, by name: in the same frame, each with its number in the
+        rigid body; or, where it is `single_shot`, one after another while the arm stands.
     topic
         Where its readings are published (geometry_msgs/PointStamped, sensor frame); relative to
         the nodes' namespace, unless it begins with ``/``. Further markers have topics of their
@@ -90,6 +90,14 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
         further = {name: f'{self.topic}/{name}' for name in self.further_markers}
         return {self.marker: self.topic, **further}
 
+    @property
+    def pose_topic(self) -> str:
+        """Where its full poses are published beside the positions; '' where it has none.
+
+        The recorder takes these: position and orientation then come in one message.
+        """
+        return f'{self.topic}/pose' if self.message_type == POSE else ''
+
     def problem(self, where: str, markers: Mapping[str, Triple]) -> str:
         """Return what is wrong with it, being at `where` in the file; '' where nothing is."""
         return self._marker_problem(where, markers) or source_problem(
@@ -116,11 +124,6 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
                 return f'{where}.{name} is {number}; markers of a body have the numbers 1 to 65535'
             if list(self.further_markers.values()).count(number) > 1:
                 return f'{where}: two markers have the number {number}; give each its own'
-        if self.further_markers and self.single_shot:
-            return (
-                f'{where}: an instrument with single_shot measures one target after the other, '
-                'not several in a frame; leave further_markers out'
-            )
         for one, other in itertools.combinations(self.markers, 2):
             apart = float(np.linalg.norm(np.subtract(markers[one], markers[other])))
             if apart < LEAST_APART_M:

@@ -28,6 +28,10 @@ log = logging.getLogger('remaster_ros')
 LIMIT_TOLERANCE_RAD = math.radians(1.0)
 FRAME = 'frame'
 """The column that names the rows of one sensor which come from one frame."""
+ORIENTATION = ('orientation_x', 'orientation_y', 'orientation_z', 'orientation_w')
+"""Columns of the orientation of the measured body, a unit quaternion."""
+LENGTH_TOLERANCE = 1e-3
+"""By so much the length of a quaternion may differ from 1."""
 
 
 class ColumnNames:
@@ -38,7 +42,7 @@ class ColumnNames:
     q, from_q
         Reported joint positions, and those that the arm came from.
     effort
-        Measured joint torques; these columns are optional, and so is `FRAME`.
+        Measured joint torques; these columns are optional, and so are `FRAME` and `ORIENTATION`.
     """
 
     position = ('x_m', 'y_m', 'z_m')
@@ -56,12 +60,15 @@ class ColumnNames:
         """Columns that a file may leave out where every field of them would be empty."""
         return (*self.from_q, *self.std, 'samples', 'temperature_c')
 
-    def names(self, with_effort: bool = False, with_frame: bool = False) -> list[str]:
+    def names(
+        self, with_effort: bool = False, with_frame: bool = False, with_orientation: bool = False
+    ) -> list[str]:
         """Return every column's name."""
         return [
             *('observation', 'pose', 'configuration', 'split', 'stamp_s', 'sensor', 'marker'),
             *(*self.q, *self.from_q, *self.position, *self.std, 'samples', 'temperature_c'),
             *([FRAME] if with_frame else ()),
+            *(ORIENTATION if with_orientation else ()),
             *(self.effort if with_effort else ()),
         ]
 
@@ -77,8 +84,8 @@ class RowFormat:
         The robot, for the number of joints and their limits.
     sensors, markers
         The names in session.yaml, in their order.
-    with_frame
-        Whether the rows that are to be written have the column `FRAME`.
+    with_frame, with_orientation
+        Whether the rows that are to be written have the columns `FRAME` and `ORIENTATION`.
     """
 
     def __init__(
@@ -88,9 +95,11 @@ class RowFormat:
         sensors: Sequence[str],
         markers: Sequence[str],
         with_frame: bool = False,
+        with_orientation: bool = False,
     ) -> None:
         self._path, self._chain = path, chain
-        self._sensors, self._markers, self._with_frame = sensors, markers, with_frame
+        self._sensors, self._markers = sensors, markers
+        self._with_frame, self._with_orientation = with_frame, with_orientation
         self._columns = ColumnNames(len(chain))
 
     def parse(self, data: bytes) -> Measurements:
@@ -147,7 +156,7 @@ class RowFormat:
         """
         if not rows:
             return []
-        names = self._columns.names(with_frame=self._with_frame)
+        names = self._columns.names(False, self._with_frame, self._with_orientation)
         table = Table(self._path, names, list(rows), first_line)
         return self._accept(self._convert(table), first_line, rules)
 
@@ -182,7 +191,20 @@ class RowFormat:
             effort=table.numbers(columns.effort, optional=True) if with_effort else None,
             is_reference=is_reference if is_reference.any() else None,
             frame=table.integers(FRAME, least=0) if FRAME in table.cells else None,
+            orientation=table.whole_or_empty(ORIENTATION)
+            if ORIENTATION[0] in table.cells
+            else None,
         )
+        if measurements.orientation is not None:
+            length = np.linalg.norm(measurements.orientation, axis=1, keepdims=True)
+            table.refuse(
+                np.abs(length - 1.0) > LENGTH_TOLERANCE,
+                {
+                    ORIENTATION[
+                        0
+                    ]: 'and the three beside it are no quaternion of length 1; correct them'
+                },
+            )
         table.refuse(measurements.std < 0, dict.fromkeys(columns.std, 'is negative; correct it'))
         problems = [
             f'rad is more than 1 degree outside the limits of {joint} ({lower:.6g} to {upper:.6g} '
@@ -223,12 +245,20 @@ def _whole_lines(data: bytes, most: int) -> int:
     return data.rfind(b'\n', 0, zero) + 1
 
 
-def format_header(joints: int, with_effort: bool = False, with_frame: bool = False) -> str:
+def format_header(
+    joints: int,
+    with_effort: bool = False,
+    with_frame: bool = False,
+    with_orientation: bool = False,
+) -> str:
     """Return the header line of observations.csv."""
-    return ','.join(ColumnNames(joints).names(with_effort, with_frame)) + '\n'
+    names = ColumnNames(joints).names(with_effort, with_frame, with_orientation)
+    return ','.join(names) + '\n'
 
 
-def format_observation(observation: Observation, with_frame: bool = False) -> str:
+def format_observation(
+    observation: Observation, with_frame: bool = False, with_orientation: bool = False
+) -> str:
     """Return one observation as a line without its end; numbers survive the round trip exactly."""
     o = observation
     unknown = [''] * len(o.q)
@@ -243,6 +273,8 @@ def format_observation(observation: Observation, with_frame: bool = False) -> st
         '' if o.temperature_c is None else _text(o.temperature_c),
         *(['' if o.frame is None else str(int(o.frame))] if with_frame else ()),
     ]
+    if with_orientation:
+        cells += [''] * 4 if o.orientation is None else map(_text, o.orientation)
     return ','.join(cells)
 
 
@@ -269,10 +301,13 @@ def format_measurements(m: Measurements, sensors: Sequence[str], markers: Sequen
             if m.frame is not None
             else ()
         ),
+        *(numbers(m.orientation) if m.orientation is not None else ()),
         *(numbers(m.effort) if m.effort is not None else ()),
     ]
     lines = map(','.join, zip(*cells, strict=True))
-    header = format_header(m.q.shape[1], m.effort is not None, m.frame is not None)
+    header = format_header(
+        m.q.shape[1], m.effort is not None, m.frame is not None, m.orientation is not None
+    )
     return header + ''.join(f'{row}\n' for row in lines)
 
 
@@ -282,6 +317,12 @@ def _check_names(names: list[str], columns: ColumnNames, path: Path) -> None:
     for name in names:
         if names.count(name) > 1:
             raise InputError(f'{where}: column {name[:40]!r} is given twice; keep one')
+    turned = [name for name in ORIENTATION if name in names]
+    if turned and len(turned) < len(ORIENTATION):
+        raise InputError(
+            f'{where}: of the columns {", ".join(ORIENTATION)} only {", ".join(turned)} are '
+            'there; give all or none'
+        )
     for wanted in (columns.q, columns.from_q, columns.effort):
         prefix, suffix = wanted[0].split('1')
         pattern = re.compile(f'{prefix}[0-9]+{suffix}')
@@ -298,7 +339,7 @@ def _check_names(names: list[str], columns: ColumnNames, path: Path) -> None:
             f'{where}: column {", ".join(missing)} is missing; add it (docs/session-format.md), '
             'or let "remaster import" make a session of this table'
         )
-    unknown = [name for name in names if name not in columns.names(True, True)]
+    unknown = [name for name in names if name not in columns.names(True, True, True)]
     if unknown:
         log.warning('%s: unknown columns are not used: %s', where, ', '.join(map(repr, unknown)))
 

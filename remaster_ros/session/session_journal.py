@@ -230,8 +230,10 @@ class SessionJournal:
                 split=_split(split),
                 from_q=from_q,
                 temperature_c=temperature_c,
-                # Every sensor has one frame in a configuration.
-                frame=writer.configurations if markers[reading.sensor] > 1 else None,
+                # Every stream has one frame in a configuration, single shots share none.
+                frame=writer.configurations
+                if markers[reading.sensor] > 1 and reading.std is not None
+                else None,
                 **vars(replace(reading, stamp_s=reading.stamp_s + self._shift_s)),
             )
             for number, (reading, temperature_c) in enumerate(pairs)

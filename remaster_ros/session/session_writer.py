@@ -94,9 +94,10 @@ class SessionWriter:
         self._rows_path = self.folder / ROWS
         chain = read_chain(header.urdf, self.folder / URDF, header.base_link, header.tip_link)
         names = header.sensor_names, header.marker_names
-        self._with_frame = bool(header.further_markers)
-        self._format = RowFormat(self._rows_path, chain, *names, self._with_frame)
-        self._empty_rows = format_header(len(chain), with_frame=self._with_frame).encode()
+        # Columns for what may come: of frames with several markers, of bodies' orientations.
+        self._columns = bool(header.further_markers), bool(header.oriented)
+        self._format = RowFormat(self._rows_path, chain, *names, *self._columns)
+        self._empty_rows = format_header(len(chain), False, *self._columns).encode()
         self._text = write_header(header, URDF, 'aborted')
         self._urdf = header.urdf.encode()
         files = {URDF: self._urdf, ROWS: self._empty_rows, HEADER: self._text.encode()}
@@ -188,7 +189,7 @@ class SessionWriter:
         if self._closed:
             raise InputError(f'{self.folder}: the session is closed; start a new one')
         self.check()
-        rows = [format_observation(row, self._with_frame) for row in observations]
+        rows = [format_observation(row, *self._columns) for row in observations]
         keys = self._format.check(rows, self._line, self._rules.branch())
         if rows:
             record = {**record, 'rows': rows}

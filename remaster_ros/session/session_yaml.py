@@ -34,6 +34,7 @@ class _Robot(msgspec.Struct):
 class _Sensor(msgspec.Struct):
     marker: str
     further_markers: tuple[str, ...] = ()
+    orientation: bool = False
 
 
 class SessionHeader(msgspec.Struct):
@@ -72,6 +73,9 @@ class SessionHeader(msgspec.Struct):
                 for name, sensor in self.sensors.items()
                 if sensor.further_markers
             },
+            oriented=frozenset(
+                name for name, sensor in self.sensors.items() if sensor.orientation
+            ),
             measurements=measurements,
             marker_std_m=self.marker_std_m,
             settle_s=self.settle_s,
@@ -130,7 +134,11 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
         },
         'markers': session.markers,
         'sensors': {
-            name: {'marker': marker, 'further_markers': session.further_markers.get(name, ())}
+            name: {
+                'marker': marker,
+                'further_markers': session.further_markers.get(name, ()),
+                'orientation': name in session.oriented,
+            }
             for name, marker in session.sensors.items()
         },
         'settle_s': session.settle_s,
@@ -146,8 +154,9 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
     header = _checked(to_plain(content), 'session to be written: ')
     given = {key: value for key, value in to_plain(header).items() if value not in ('', {}, None)}
     for sensor in given['sensors'].values():
-        if not sensor['further_markers']:
-            del sensor['further_markers']
+        for key in ('further_markers', 'orientation'):
+            if not sensor[key]:
+                del sensor[key]
     return dump_yaml(_merge(given, session.extra))
 
 

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from remaster_ros.errors import did_you_mean
 
-MESSAGE_TYPES = (
-    'geometry_msgs/msg/PointStamped',
-    'geometry_msgs/msg/PoseStamped',
-    'mocap4r2_msgs/msg/Markers',
-)
+POSE = 'geometry_msgs/msg/PoseStamped'
+MESSAGE_TYPES = ('geometry_msgs/msg/PointStamped', POSE, 'mocap4r2_msgs/msg/Markers')
 """`sensors.topic.messages.READERS` reads them."""
 
 

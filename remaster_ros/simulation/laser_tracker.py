@@ -6,7 +6,7 @@ import contextlib
 import selectors
 import socket
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,6 +55,8 @@ class FakeLaserTracker:
         See `TrackerBehaviour`.
     aim
         Where it points at first, in its own frame, m, (3,); None: at the reflector.
+    further
+        Further reflectors of the tool by name, with their numbers.
     """
 
     def __init__(
@@ -67,12 +69,15 @@ class FakeLaserTracker:
         port: int = 0,
         behaviour: TrackerBehaviour | None = None,
         aim: FloatArray | None = None,
+        further: Mapping[str, int] | None = None,
     ) -> None:
-        self._world = world
+        self._world, self._further = world, further
         self._sensor, self._rng = sensor, rng
         self._behaviour, self._restarted, self._lost_s = behaviour, False, 0.0
         self._looked_at = world.now()
-        self._instrument = TrackerInstrument(world, sensor, rng, self._looked_at, behaviour, aim)
+        self._instrument = TrackerInstrument(
+            world, sensor, rng, self._looked_at, behaviour, aim, further
+        )
         self._wanted = (host, port)
         self._lock = threading.Lock()
         self._closing = threading.Event()
@@ -176,7 +181,12 @@ class FakeLaserTracker:
             self._drop_client()
             time_s = self._world.now() - self._lost_s
             self._instrument = TrackerInstrument(
-                self._world, self._sensor, self._rng, time_s, self._behaviour
+                self._world,
+                self._sensor,
+                self._rng,
+                time_s,
+                self._behaviour,
+                further=self._further,
             )
         self._restarted = 'renumbered' in faults
         if 'cut' in faults:

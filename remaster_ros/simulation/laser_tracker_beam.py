@@ -1,4 +1,4 @@
-"""The beam of the fake laser tracker: it follows the reflector, or loses it; its errors.
+"""The beam of the fake laser tracker: it follows a reflector, or loses it; its errors.
 
 The beam follows while nothing is in its way, the reflector faces it and does not outrun it. Large
 moves of the arm lose it now and then even so. Errors are those of a data sheet, in range and
@@ -8,6 +8,7 @@ deviations.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,6 +40,9 @@ class Beam:
         World time, s.
     aim
         Where it points at first, in its own frame, m, (3,); None: at the reflector.
+    further
+        Further reflectors of the tool by name, with the numbers of the fault ``hidden``; the
+        first has the name '' and the number 1.
     """
 
     def __init__(
@@ -49,9 +53,13 @@ class Beam:
         behaviour: TrackerBehaviour,
         t: float,
         aim: FloatArray | None,
+        further: Mapping[str, int] | None = None,
     ) -> None:
         self._world, self._sensor, self._rng = world, sensor, rng
         self._behaviour = behaviour
+        self._numbers = {'': 1, **(further or {})}
+        # The reflector that it is locked on.
+        self._on = ''
         self.locked = False
         self.home = self.reflector(t) if aim is None else np.asarray(aim, float)
         self.aim = self.home
@@ -60,15 +68,28 @@ class Beam:
         self._move_judged = False
 
     def reflector(self, t: float) -> FloatArray:
-        """True position of the reflector at time t, m, (3,)."""
-        return self._world.marker_in_sensor(self._sensor, t)
+        """True position of the reflector that it is on at time t, m, (3,)."""
+        return self._world.marker_in_sensor(self._sensor, t, self._on)
 
     def sees(self, t: float) -> bool:
-        """Whether the line of sight to the reflector is free at time t."""
-        return self._world.line_of_sight(self._sensor, t)
+        """Whether the line of sight to this reflector is free at time t."""
+        if self._world.faults(self._sensor).get('hidden') == self._numbers[self._on]:
+            return False
+        return self._world.line_of_sight(self._sensor, t, self._on)
+
+    def find(self, target: FloatArray, largest_rad: float, t: float) -> bool:
+        """Find the reflector in sight nearest to a direction; False where none is so near."""
+        before, near = self._on, {}
+        for name in self._numbers:
+            self._on = name
+            angle = angle_between(target, self.reflector(t))
+            if angle <= largest_rad and self.sees(t):
+                near[name] = angle
+        self._on = min(near, key=near.__getitem__, default=before)
+        return bool(near)
 
     def lock(self, t: float) -> None:
-        """Lock on the reflector at time t."""
+        """Lock on the reflector that was found, at time t."""
         self.locked, self.aim, self._sight_at = True, self.reflector(t), t
         self._swept_rad, self._move_judged = 0.0, False
 

@@ -6,7 +6,7 @@ points to. The ADM averages over the integration time and refuses a target that 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -64,6 +64,8 @@ class TrackerInstrument:
     aim
         Where it points at first, in its own frame, m, (3,); None: where the reflector is, as
         a person who sets up the instrument leaves it.
+    further
+        Further reflectors of the tool, as of `Beam`.
     """
 
     def __init__(
@@ -74,10 +76,11 @@ class TrackerInstrument:
         switched_on_s: float,
         behaviour: TrackerBehaviour | None = None,
         aim: FloatArray | None = None,
+        further: Mapping[str, int] | None = None,
     ) -> None:
         self.behaviour = behaviour or TrackerBehaviour()
         self._world, self._rng = world, rng
-        self._beam = Beam(world, sensor, rng, self.behaviour, switched_on_s, aim)
+        self._beam = Beam(world, sensor, rng, self.behaviour, switched_on_s, aim, further)
         self._warm_at = switched_on_s + self.behaviour.warm_up_s
         self._time = switched_on_s
         self._initialized = False
@@ -300,8 +303,8 @@ class TrackerInstrument:
             yield
             area = b.spiral_pitch_m * b.spiral_speed_m_s * (self._time - start)
             reached = np.sqrt(area / np.pi)
-            offset = angle_between(target, self._beam.reflector(self._time)) * distance
-            found = not blind and offset <= min(reached, radius) and self._beam.sees(self._time)
+            within = min(reached, radius) / distance
+            found = not blind and self._beam.find(target, within, self._time)
         if found:
             yield from self._wait(b.acquire_s)
             found = self._beam.sees(self._time)

@@ -105,7 +105,7 @@ def simulate_session(
         common = sensor.pose_sigma_m * rng.standard_normal((len(solutions), 3))
         for place in np.flatnonzero(np.equal(seen_by, s)):
             points[:, place] += common[pose] + sensor.sigma_m * rng.standard_normal((len(q), 3))
-        if sensor.further:
+        if sensor.further and not sensor.single_shot:
             shared = sensor.frame_sigma_m * rng.standard_normal((len(q), 1, 3))
             points[:, np.equal(seen_by, s)] += shared
     # Row order as recorded: configuration by configuration, sensor by sensor, marker by marker.
@@ -117,6 +117,8 @@ def simulate_session(
     n, names = len(position), list(markers)
     row = np.repeat(np.arange(len(q)), len(seen_by))
     several = len(seen_by) > len(sensors)
+    one_by_one = [sensor.single_shot for sensor in sensors.values()]
+    frame = np.where(np.tile(np.array(one_by_one)[seen_by], len(q)), -1, row)
     came_from = np.concatenate((np.full((1, len(chain)), np.nan), q[:-1]))
     measurements = Measurements(
         observation=np.arange(n),
@@ -138,7 +140,7 @@ def simulate_session(
         temperature_c=(
             np.full(n, np.nan) if warming is None else AMBIENT_C + model.visited.warming_k[row]
         ),
-        frame=row if several else None,
+        frame=frame if several else None,
     )
     session = Session(
         urdf=urdf,

@@ -87,6 +87,7 @@ def simulate_workcell(
             pose_sigma_m,
             further=sensor.further_markers,
             frame_sigma_m=sensor.frame_noise_m,
+            single_shot=sensor.single_shot,
         )
         for name, sensor in cell.sensors.items()
     }

@@ -47,7 +47,7 @@ class SimulatedSensor:
     marker
         Name of the marker that it measures.
     further
-        Further markers that it measures in the same frame, with their numbers in the rigid body.
+        Further markers that it measures, with their numbers in the rigid body.
     T_R_N
         Its true frame in the robot base, (4, 4).
     sigma_m, pose_sigma_m, frame_sigma_m
@@ -57,6 +57,8 @@ class SimulatedSensor:
     acceptance_rad
         Largest angle between the tool's z axis and the line to the sensor at which a fake device
         sees the marker (a retroreflector takes about 30 degrees, a sphere more).
+    single_shot
+        Whether it measures its markers one after another, in frames of their own.
     """
 
     marker: str
@@ -66,6 +68,7 @@ class SimulatedSensor:
     acceptance_rad: float = np.pi
     further: Mapping[str, int] = field(default_factory=dict)
     frame_sigma_m: float = 0.0
+    single_shot: bool = False
 
     @property
     def markers(self) -> tuple[str, ...]:

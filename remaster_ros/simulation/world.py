@@ -206,13 +206,13 @@ class World:
         """How much warmer than at the beginning it is at time t, K."""
         return float(self.truth.warming.at(np.array(t)))
 
-    def line_of_sight(self, sensor: str, t: float) -> bool:
-        """Whether the sensor sees its marker at time t: turned to it, and no link between."""
+    def line_of_sight(self, sensor: str, t: float, name: str = '') -> bool:
+        """Whether the sensor sees a marker, '' for the first, at time t: no link is between."""
         placed, faults = self._sensor(sensor), self.faults(sensor)
         if 'occluded' in faults or is_out(faults.get('intermittent'), t):
             return False
         q = self.reported(t)[0] + self.truth.joint_offsets
-        marker, origin = self.truth.markers[placed.marker], placed.T_R_N[:3, 3]
+        marker, origin = self.truth.markers[name or placed.marker], placed.T_R_N[:3, 3]
         T_R_T = self.chain.forward(q)
         line = origin - transforms.apply(T_R_T, marker)
         cosine = T_R_T[:3, 2] @ line / np.linalg.norm(line)

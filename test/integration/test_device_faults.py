@@ -269,12 +269,12 @@ class FaultyReflectorWorld(tracker_world.ReflectorWorld):
     def faults(self, device):
         return self.numbers
 
-    def line_of_sight(self, sensor, t):
+    def line_of_sight(self, sensor, t, name=''):
         return 'occluded' not in self.numbers
 
-    def marker_in_sensor(self, sensor, t):
+    def marker_in_sensor(self, sensor, t, marker=''):
         beside = np.array([self.numbers.get('swapped', 0.0), 0.0, 0.0])
-        return super().marker_in_sensor(sensor, t) + beside
+        return super().marker_in_sensor(sensor, t, marker) + beside
 
 
 def measured(client: LaserTrackerClient) -> tuple[str, np.ndarray | None]:

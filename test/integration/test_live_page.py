@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -142,6 +143,30 @@ def test_from_begin_to_result(browser, played):
     own = f'http://127.0.0.1:{played.server.port}/'
     asked = {r['url'] for r in browser.requests if not r['url'].startswith(('data:', 'about:'))}
     assert all(url.startswith(own) for url in asked), 'nothing is fetched from elsewhere'
+
+
+def test_std_stands_against_configurations_and_minutes(browser, played):
+    opened(browser, played)
+    looks = [
+        {
+            'configurations': 5 * i,
+            'minutes': 1.5 * i,
+            'joint_std_deg': dict.fromkeys(CHAIN.joint_names, 0.01 / i),
+            'joint_rms_deg': 0.01 / i,
+        }
+        for i in (1, 2)
+    ]
+    for timed, minutes in (('true', ['1.5 min', '3.0 min']), ('false', [])):
+        message = {'format': 'remaster-precision/1', 'message': timed, 'looks': looks}
+        played.collection.view.take_precision(json.dumps(message))
+        drawn = f'document.querySelector("#precision").layout?.xaxis2?.visible === {timed}'
+        browser.until(lambda drawn=drawn: browser.value(drawn), f'with times: {timed}')
+        layout = 'document.querySelector("#precision").layout.xaxis2'
+        assert browser.value(f'{layout}.ticktext') == minutes
+        for look in looks:
+            look['minutes'] = None
+    assert browser.value('document.querySelector("#precision").data[0].x') == [5, 10]
+    assert browser.errors == []
 
 
 def test_stop_with_the_network_cut(browser, played):

@@ -125,5 +125,25 @@ function drawPrecision(precision) {
   setText('precision-note', made.length
     ? `Of each zero-offset, by fits of what was recorded up to then; the last: ${precision.message}`
     : 'The optimizer fits what is recorded after every few configurations to fit.');
-  flat('precision', made, { xaxis: axis('configurations to fit'), yaxis: axis('std (°)', { type: 'log', tickformat: '~g' }), showlegend: true });
+  flat('precision', made.concat(made.length ? minutesTrace(precision) : []), {
+    xaxis: axis('configurations to fit'), xaxis2: minutesAxis(precision), margin: { l: 52, r: 24, t: 24, b: 40 },
+    yaxis: axis('std (°)', { type: 'log', tickformat: '~g' }), legend: { orientation: 'h', y: 1.14, yanchor: 'bottom' }, showlegend: true,
+  });
+}
+
+// Minutes stand above the configurations after which they had passed; without times there is no such axis.
+function minutesAxis(precision) {
+  const timed = precision.minutes.map((_, i) => i).filter((i) => precision.minutes[i] !== null);
+  const every = Math.max(1, Math.ceil(timed.length / 6));
+  const shown = timed.filter((_, i) => (timed.length - 1 - i) % every === 0);
+  return axis('', {
+    side: 'top', overlaying: 'x', matches: 'x', showgrid: false, visible: timed.length > 0,
+    tickmode: 'array', tickvals: shown.map((i) => precision.configurations[i]), ticktext: shown.map((i) => `${precision.minutes[i].toFixed(1)} min`),
+  });
+}
+
+// An axis is drawn where it has a trace.
+function minutesTrace(precision) {
+  const std = Object.values(precision.std_deg).find((values) => values.some((value) => value !== null));
+  return [{ x: precision.configurations, y: std, xaxis: 'x2', mode: 'markers', opacity: 0, hoverinfo: 'skip', showlegend: false }];
 }

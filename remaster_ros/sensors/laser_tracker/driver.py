@@ -1,7 +1,8 @@
 """A laser tracker as the sensor of a node: one ADM measurement on request, the reflector kept.
 
 The reflector is found again when the beam has broken. Once the tracker is registered, the search
-begins where the reflector should be and is narrow.
+begins where the reflector should be and is narrow. A tracker measures one reflector at a time: of
+several it is turned to one after another while the arm stands.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ class LaserTrackerDriver(TriggeredDriver):
 
     parameters_type = Parameters
     device = 'laser tracker'
+    several_markers = True
 
     def __init__(self, parameters: Parameters, clock: SensorClock) -> None:
         self.p = parameters
@@ -61,6 +63,8 @@ class LaserTrackerDriver(TriggeredDriver):
             self.p.host, self.p.port, settings=settings, now=clock.now, sleep=clock.sleep
         )
         self._narrow = False
+        # Which reflector the beam is on; None where that is not known.
+        self._on: str | None = None
         self._temperature_c: float | None = None
 
     @property
@@ -70,6 +74,7 @@ class LaserTrackerDriver(TriggeredDriver):
 
     def open(self) -> None:
         """Connect and initialise, which takes as long as the instrument warms up."""
+        self._on = None
         self.tracker.connect()
         self.phase = 'initialising'
         self.tracker.initialise()
@@ -81,13 +86,37 @@ class LaserTrackerDriver(TriggeredDriver):
     def prepare(self, expected: FloatArray | None) -> None:
         """Search once where the beam is broken."""
         if self.tracker.status is not TrackerStatus.READY:
-            self._lock(expected)
+            before, self._on = self._on, None
+            searches = self._lock(expected)
+            found = None if expected is None else ''
+            self._on = found if searches else before
 
-    def _lock(self, expected: FloatArray | None) -> None:
-        if expected is not None and not self._narrow:
+    def turn_to(self, marker: str, expected: FloatArray) -> None:
+        """Search where the marker should be, unless the beam is on it; see `TriggeredDriver`."""
+        if marker == self._on:
+            return
+        self._on = None
+        self._search_narrowly()
+        for attempt in range(1, self.p.attempts + 1):
+            try:
+                self.tracker.go_position(expected)
+            except LaserTrackerError:
+                if attempt == self.p.attempts or not self.tracker.connected:
+                    raise
+            else:
+                self._on = marker
+                return
+
+    def _search_narrowly(self) -> None:
+        if not self._narrow:
             self.tracker.set_search_radius(self.p.search_radius_m)
             self._narrow = True
-        self.tracker.ensure_locked(expected, attempts=1)
+
+    def _lock(self, expected: FloatArray | None) -> int:
+        """Lock the reflector if the beam is broken; return how many searches it took."""
+        if expected is not None:
+            self._search_narrowly()
+        return self.tracker.ensure_locked(expected, attempts=1)
 
     def measure(self, expected: FloatArray | None) -> TrackerReading:
         """Measure the reflector that is where it should be; see `TriggeredDriver.measure`."""

@@ -30,7 +30,8 @@ JUDGED = 200
 JUDGED_S = 1.0
 """and how far they go back, by their stamps."""
 EARLY_S = 0.1
-"""A stamp further in the future is of another clock."""
+"""A stamp further in the future is of another clock. A simulated clock advances in steps, and a
+message may come before the step: there it may be as early as it may be late."""
 FROZEN = 10
 """So many messages with the same position to the last bit are no measurements."""
 
@@ -51,6 +52,11 @@ class Parameters(SensorParameters):
     max_age_s: float = parameter(
         1.0, 'an older message, by its stamp, is left out', unit='s', low=0.01, high=60.0
     )
+    always_sends: bool = parameter(
+        False,
+        'the other node sends messages also while the marker is hidden: the arm waits where none '
+        'come; false for one that sends only what it sees',
+    )
     min_rate_hz: float = parameter(
         5.0, 'fewer messages are reported as too few', unit='Hz', low=0.1, high=1000.0
     )
@@ -64,6 +70,7 @@ class TopicDriver(StreamDriver):
 
     def __init__(self, parameters: Parameters, clock: SensorClock) -> None:
         self.p, self._clock = parameters, clock
+        self._early_s = parameters.max_age_s if clock.simulated else EARLY_S
         self._readings: queue.SimpleQueue[MarkerReading] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._recent: deque[MarkerReading] = deque(maxlen=JUDGED)
@@ -131,7 +138,7 @@ class TopicDriver(StreamDriver):
                 self._counts[reason or 'occluded'] += 1
                 return
             self._stamp_s = stamp_s
-            reading = MarkerReading(stamp_s, found.position)
+            reading = MarkerReading(stamp_s, found.position, orientation=found.orientation)
             self._recent.append(reading)
         self._readings.put(reading)
 
@@ -142,7 +149,7 @@ class TopicDriver(StreamDriver):
                 f'{self.topic} was in frame {self._frame!r} and is in {frame!r} now; one marker '
                 'needs one frame: start this node again where the new one is meant'
             )
-        if not -EARLY_S <= self._age_s <= self.p.max_age_s:
+        if not -self._early_s <= self._age_s <= self.p.max_age_s:
             way = 'behind' if self._age_s > 0.0 else 'ahead of'
             return 'other_clock', (
                 f'stamps of {self.topic} are {abs(self._age_s):.2f} s {way} the clock of this '
@@ -173,9 +180,10 @@ class TopicDriver(StreamDriver):
         if silent_s > SILENT_S:
             trouble = self._unpublished()
             # A detector that sends only what it sees: the next configuration may show it again.
-            ready, hidden = not trouble, not trouble
+            ready = hidden = not (trouble or self.p.always_sends)
             ago = 'yet' if came is None else f'for {silent_s:.1f} s'
-            trouble = trouble or f'nothing on {self.topic} {ago}: is the marker in view?'
+            remedy = 'is the marker in view?' if hidden else 'look at its driver'
+            trouble = trouble or f'nothing on {self.topic} {ago}: {remedy}'
         elif trouble:
             ready = False
         elif len(same) == FROZEN and not np.any(np.ptp(same, axis=0)):

@@ -21,21 +21,41 @@ class Sighting(NamedTuple):
         Of its header.
     position
         m, (3,); None where the message has the marker without a measured place, or not at all.
+    orientation
+        Unit quaternion x, y, z, w, (4,); None where the message has none, or one of another
+        length, as drivers send that do not measure it.
     """
 
     stamp_s: float
     frame: str
     position: FloatArray | None
+    orientation: FloatArray | None = None
 
 
-def _sighting(message: Any, place: Any) -> Sighting:
+LENGTH_TOLERANCE = 1e-3
+"""By so much the length of a quaternion may differ from 1: some drivers send single precision."""
+
+
+def unit_quaternion(turn: Any) -> FloatArray | None:
+    """Return a geometry_msgs/Quaternion as x, y, z, w of length 1, (4,); None where it is none."""
+    xyzw = np.array([turn.x, turn.y, turn.z, turn.w], dtype=float)
+    length = np.linalg.norm(xyzw)
+    return xyzw / length if abs(length - 1.0) < LENGTH_TOLERANCE else None
+
+
+def _sighting(message: Any, place: Any, turn: Any = None) -> Sighting:
     stamp = message.header.stamp
     position = None
     if place is not None:
         measured = np.array([place.x, place.y, place.z], dtype=float)
         # What is out of sight is sent as no number, or as exactly the origin.
         position = measured if np.all(np.isfinite(measured)) and np.any(measured) else None
-    return Sighting(stamp.sec + 1e-9 * stamp.nanosec, message.header.frame_id, position)
+    return Sighting(
+        stamp.sec + 1e-9 * stamp.nanosec,
+        message.header.frame_id,
+        position,
+        None if turn is None else unit_quaternion(turn),
+    )
 
 
 def _marker(message: Any, marker: str) -> Any:
@@ -52,7 +72,9 @@ POINT, POSE, MARKERS = (
 )
 READERS: dict[str, Callable[[Any, str], Sighting]] = {
     POINT: lambda message, marker: _sighting(message, message.point),
-    POSE: lambda message, marker: _sighting(message, message.pose.position),
+    POSE: lambda message, marker: _sighting(
+        message, message.pose.position, message.pose.orientation
+    ),
     MARKERS: lambda message, marker: _sighting(message, _marker(message, marker)),
 }
 """Message type -> what reads it; the second argument is the name or the number of the marker."""

@@ -103,6 +103,15 @@ def test_mode_is_where_the_exact_density_peaks(found) -> None:
             assert posterior.log_density(beside[None])[0] < value
 
 
+def test_a_search_of_the_noise_that_begins_at_zero_does_not_stay_there(found) -> None:
+    """The density is even in a ratio: it has no slope at zero, where it may well be lowest."""
+    begun = found.mode.eta.copy()
+    begun[2:] = 0.0
+    assert np.all(found.mode.eta[2:] > 0.5)
+    again = find_mode(found.posterior, begun)
+    np.testing.assert_allclose(again.eta, found.mode.eta, atol=1e-3)
+
+
 @pytest.mark.parametrize('seed', [60, 61])
 def test_few_poses_do_not_take_long_chains(seed) -> None:
     """Five poses, two sensors, noise by direction: the part common to a pose reaches far up."""

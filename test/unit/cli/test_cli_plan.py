@@ -90,7 +90,7 @@ def test_the_time_is_that_of_the_stated_speeds(capsys):
         (
             '  design: optimal\n  tool_box: {center_m: [3, 0, 0], size_m: [1, 1, 1]}\n',
             2,
-            'no configuration has the tool in the box',
+            'no configuration has the tool in poses.tool_box',
         ),
     ],
 )

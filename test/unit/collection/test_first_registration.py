@@ -1,5 +1,7 @@
 """Three points register a sensor; further ones refine it; those that do not agree tell so."""
 
+import itertools
+
 import numpy as np
 
 from remaster_ros.collection.first_registration import FirstRegistration
@@ -48,6 +50,37 @@ def test_points_that_do_not_agree_register_nothing_until_enough_do():
     assert registration.add([reading(PLACES[3])]) == ['mocap']
     assert not registration.troubles
     np.testing.assert_allclose(registration.T_R_N['mocap'], T_R_N, atol=1e-6)
+
+
+def test_which_reflector_a_search_has_found_is_told_by_how_the_points_agree():
+    both = {'smr': MARKERS['sir'], 'smr_2': np.array([0.0, -0.09, 0.03])}
+    for found in itertools.product(both, repeat=3):
+        registration = FirstRegistration(CHAIN, both, ['tracker'], 0.025, {'tracker': tuple(both)})
+        for q, name in zip(PLACES, found):
+            # The arm's own error: some millimetres, as before a calibration.
+            seen = apply(inverse(T_R_N), CHAIN.positions(q + 3e-3, both[name]))
+            done = registration.add([PairedReading('tracker', 'smr', 1.0, q, seen)])
+        assert done == ['tracker'], (found, registration.troubles)
+        np.testing.assert_allclose(registration.T_R_N['tracker'], T_R_N, atol=0.02)
+
+
+def test_reflectors_that_cannot_be_told_apart_register_nothing():
+    """On one circle about joint 1, which alone moves: either fits, with the tracker turned."""
+    T_R_T, beside = CHAIN.forward(PLACES[0]), rotation_vector_to_matrix(np.array([0.0, 0.0, 0.3]))
+    other = apply(inverse(T_R_T), beside @ apply(T_R_T, MARKERS['sir']))
+    both = {'smr': MARKERS['sir'], 'smr_2': other}
+    registration = FirstRegistration(CHAIN, both, ['tracker'], 0.025, {'tracker': tuple(both)})
+
+    def add(q):
+        seen = apply(inverse(T_R_N), CHAIN.positions(q, both['smr']))
+        return registration.add([PairedReading('tracker', 'smr', 1.0, q, seen)])
+
+    turns = [PLACES[0] + np.eye(len(CHAIN))[0] * angle for angle in (0.0, 0.4, 0.8)]
+    assert [add(q) for q in turns] == [[], [], []]
+    assert 'cannot be told apart' in registration.troubles['tracker']
+    # A pose of another kind tells.
+    assert add(PLACES[1]) == ['tracker']
+    np.testing.assert_allclose(registration.T_R_N['tracker'], T_R_N, atol=1e-9)
 
 
 def test_the_markers_of_one_frame_are_one_place():

@@ -40,6 +40,20 @@ def test_the_mean_has_exactly_the_samples_of_the_dwell():
     np.testing.assert_allclose(reading.q, Q)
 
 
+def test_orientations_are_averaged_over_the_readings_that_have_one():
+    pairing = Pairing(10.0, Q, (STREAM,))
+    for i, stamp in enumerate(np.arange(9.8, 10.8, 0.01)):
+        pairing.add_joint_state(stamp, Q)
+        # Turned far elsewhere before the arm has settled; to and fro about z after it.
+        half = 1.0 if stamp < 10.0 else 0.01 * (-1) ** i
+        turn = np.array([0.0, 0.0, np.sin(half), np.cos(half)]) if i % 5 > 1 else None
+        position = np.array([stamp, 0.0, 0.0]) * 1e-6
+        pairing.add_reading('mocap', MarkerReading(stamp, position, orientation=turn))
+    reading = pairing.decided['mocap']
+    np.testing.assert_allclose(reading.orientation, [0.0, 0.0, 0.0, 1.0], atol=2e-3)
+    assert run(Pairing(10.0, Q, (STREAM,))).decided['mocap'].orientation is None
+
+
 def test_it_is_not_decided_before_something_later_than_the_dwell_has_come():
     assert not run(Pairing(10.0, Q, (STREAM,)), until=0.5).decided
     assert run(Pairing(10.0, Q, (STREAM,)), until=0.56).complete
@@ -124,6 +138,40 @@ def test_of_two_shots_the_first_counts():
     reading = pairing.decided['tracker']
     np.testing.assert_array_equal(reading.position, [2.0, 2.0, 2.0])
     assert (reading.samples, reading.stamp_s) == (1, 11.0)
+
+
+def test_several_reflectors_are_one_shot_each_with_a_time_of_its_own():
+    rules = SensorRules('tracker', 'smr', single_shot=True, timeout_s=10.0, further=('b', 'c'))
+    pairing = Pairing(10.0, Q, (rules,))
+
+    def at(stamp, marker, x=1.0):
+        pairing.add_reading('tracker', MarkerReading(stamp, np.full(3, x), marker=marker))
+        pairing.add_joint_state(stamp + 0.1, Q)
+
+    at(11.0, 'b')
+    # Measured again, as after a kill of its node: the first one counts.
+    at(12.0, 'b', 2.0)
+    at(13.0, 'smr')
+    assert not pairing.complete
+    # One that was not found.
+    at(13.0, 'c', np.nan)
+    readings = [pairing.decided['tracker'], *pairing.further['tracker']]
+    assert [(r.marker, r.stamp_s, r.position[0]) for r in readings] == [
+        ('smr', 13.0, 1.0),
+        ('b', 11.0, 1.0),
+    ]
+    assert [(r.reason, r.detail) for r in pairing.left_out] == [('hidden', 'c was not seen')]
+
+
+def test_reflectors_that_never_come_cost_the_others_nothing():
+    rules = SensorRules('tracker', 'smr', single_shot=True, timeout_s=10.0, further=('b',))
+    pairing = Pairing(10.0, Q, (rules,))
+    pairing.add_reading('tracker', MarkerReading(11.0, np.ones(3), marker='smr'))
+    for t in np.arange(10.0, 21.0, 0.5):
+        pairing.add_joint_state(t, Q)
+        pairing.give_up(t)
+    assert pairing.decided['tracker'].marker == 'smr'
+    assert pairing.left_out[0].reason == 'hidden'
 
 
 def test_the_joints_of_a_reading_are_the_mean_of_its_dwell():

@@ -92,6 +92,17 @@ def test_quaternion_order_is_x_y_z_w():
     np.testing.assert_allclose(transforms.quaternion_xyzw(quarter_turn_about_z), [0, 0, s, s])
 
 
+def test_the_mean_of_quaternions_lies_in_the_middle_whatever_their_signs(rng):
+    middle = transforms.rotation_vector_to_matrix([0.3, -2.0, 1.1])
+    turns = transforms.rotation_vector_to_matrix(rng.normal(0, 0.05, (40, 3)))
+    # With each turn its inverse: their mean is none, to any order.
+    both = [middle @ turn for turn in (*turns, *np.swapaxes(turns, 1, 2))]
+    quaternions = np.array([transforms.quaternion_xyzw(R) for R in both])
+    quaternions *= rng.choice([-1.0, 1.0], size=(len(both), 1))
+    mean = transforms.mean_quaternion_xyzw(quaternions)
+    np.testing.assert_allclose(mean, transforms.quaternion_xyzw(middle), atol=1e-12)
+
+
 def test_rpy_is_yaw_times_pitch_times_roll():
     roll, pitch, yaw = 0.3, -0.4, 1.2
 

@@ -14,16 +14,18 @@ pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 import rclpy
 from geometry_msgs.msg import PointStamped, PoseStamped, TransformStamped
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
-from sensor_msgs.msg import Temperature
+from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
 
 from remaster_ros.errors import DeviceError, InputError
-from remaster_ros.nodes.messages import seconds
+from remaster_ros.kinematics.transforms import transform
+from remaster_ros.nodes.messages import seconds, transform_message
 from remaster_ros.nodes.sensor_node import SensorNode
 from remaster_ros.nodes.status import LATCHED, pairs
 from remaster_ros.parameters import parameter
 from remaster_ros.sensors import registry
 from remaster_ros.sensors.driver import SensorParameters, StreamDriver, TriggeredDriver
+from remaster_ros.session.workcell import config_path, read_cell
 from remaster_ros.types import MarkerReading
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
@@ -86,6 +88,28 @@ class Probe(Device, TriggeredDriver):
         if self.fault is not None:
             raise self.fault
         return MarkerReading(12.5, PLACE, temperature_c=21.5)
+
+
+class Turret(Probe):
+    """The same, of several markers, one after another; one of them may be out of its sight."""
+
+    several_markers = True
+    hidden = 'none'
+
+    def __init__(self, parameters, clock):
+        super().__init__(parameters, clock)
+        self.turns = []
+        self.time_s = 20.0
+
+    def turn_to(self, marker, expected):
+        self.turns.append((marker, expected))
+        if marker == self.hidden:
+            raise DeviceError('gauge: it is not there')
+
+    def measure(self, expected):
+        super().measure(expected)
+        self.time_s += 1.0
+        return MarkerReading(self.time_s, PLACE if expected is None else expected)
 
 
 class LookingProbe(Probe):
@@ -204,6 +228,60 @@ def test_markers_of_a_frame_have_topics_of_their_own_and_one_stamp(rig):
     assert r.points[0].header == further[0].header
     assert further[0].point.x == PLACE[0] + 0.05
     assert len(r.points) == len(further) == 1
+
+
+def test_markers_are_measured_one_after_another_once_the_sensor_is_registered(rig, tmp_path):
+    text = config_path('cells/demo.yaml').read_text(encoding='utf-8')
+    text = text.replace('../robots', str(config_path('robots')))
+    text = text.replace('  smr: [-0.1', '  smr_2: [0.0, 0.1, 0.0]\n  smr: [-0.1')
+    path = tmp_path / 'cell.yaml'
+    path.write_text(text.replace('marker: smr', 'marker: smr\n    further_markers: {smr_2: 2}'))
+    r = rig(Turret, cell=path)
+    second, chain = [], read_cell(path).chain()
+    r.peer.create_subscription(PointStamped, 'laser_tracker/marker/smr_2', second.append, 10)
+    registration = r.peer.create_publisher(TransformStamped, 'remaster/registration', LATCHED)
+    joints = r.peer.create_publisher(JointState, 'joint_states', 10)
+    r.wait(
+        lambda: (
+            r.node._readings['smr_2'].get_subscription_count() and joints.get_subscription_count()
+        ),
+        'the match',
+    )
+    assert r.measure().success
+    r.wait(lambda: r.points and second, 'both points')
+    # Where the other is, nobody knows yet.
+    assert (r.driver.turns, np.isnan(second[0].point.x)) == ([], True)
+
+    T_R_N = transform(np.eye(3), [1.0, 2.0, 3.0])
+    registration.publish(transform_message('base_link', 'tracker', T_R_N))
+    q = np.linspace(0.1, 0.7, len(chain))
+    message = JointState(name=list(chain.joint_names), position=q.tolist())
+
+    def expects():
+        joints.publish(message)
+        return r.node._step.__self__._expected() is not None
+
+    r.wait(expects, 'registration and joints')
+    places = {
+        name: chain.positions(q, np.array(at)) - T_R_N[:3, 3]
+        for name, at in (('', [-0.1, 0.0, 0.0]), ('smr_2', [0.0, 0.1, 0.0]))
+    }
+    assert r.measure().success
+    assert r.measure().success
+    # The second time the last one first: the beam is on it.
+    assert [marker for marker, _ in r.driver.turns] == ['', 'smr_2', 'smr_2', '']
+    for marker, expected in r.driver.turns:
+        np.testing.assert_allclose(expected, places[marker], atol=1e-9)
+    r.wait(lambda: len(r.points) == len(second) == 3, 'all points')
+    stamps = [seconds(point.header.stamp) for point in (*r.points, *second)]
+    assert stamps == [21.0, 22.0, 25.0, 21.0, 23.0, 24.0]
+
+    r.driver.hidden = ''
+    answer = r.measure()
+    assert (answer.success, answer.message) == (True, 'gauge: it is not there')
+    r.wait(lambda: len(r.points) == len(second) == 4, 'a message of each')
+    assert np.isnan(r.points[3].point.x)
+    assert r.node._summary()[:2] == ('warn', 'gauge: it is not there')
 
 
 def test_a_stream_that_is_lost_is_opened_again(rig):

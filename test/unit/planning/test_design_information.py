@@ -159,7 +159,7 @@ def test_the_tool_s_box_holds_what_counts_and_an_empty_one_is_refused():
     here = DesignInformation.of(CHAIN, POSES, sensors(), MARKER_STD, box=corner)
     assert here.tool_rms(range(20)) != pytest.approx(WHOLE.tool_rms(range(20)))
     nowhere = ToolBox(np.array([5.0, 0, 0]), np.ones(3))
-    with pytest.raises(InputError, match='no configuration has the tool in the box'):
+    with pytest.raises(InputError, match='has the tool in poses'):
         DesignInformation.of(CHAIN, POSES, sensors(), MARKER_STD, box=nowhere)
     with pytest.raises(InputError, match='no configuration to choose from'):
         DesignInformation.of(CHAIN, [], sensors(), MARKER_STD)

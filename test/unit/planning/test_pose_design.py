@@ -76,3 +76,15 @@ def test_few_candidates_are_all_there_is(count):
     design = choose(few, TRAVEL, Goal(JOINTS, TOOL), np.random.default_rng(0))
     assert not design.reached
     assert sorted(design.chosen) == list(range(count))
+
+
+@pytest.mark.parametrize(
+    ('share', 'words'),
+    [
+        (0.0, '1e-07 deg for the offsets'),
+        (0.5, '1e-07 deg for the offsets and 0.15 mm for the tool'),
+        (1.0, '0.15 mm for the tool'),
+    ],
+)
+def test_a_goal_names_what_counts(share, words):
+    assert Goal(np.radians(1e-7), 0.15e-3, share).describe() == words

@@ -30,6 +30,13 @@ def point(values=PLACE, stamp_s=10.0, frame='world'):
     return SimpleNamespace(header=header(stamp_s, frame), point=xyz(values))
 
 
+def pose(xyzw):
+    turn = SimpleNamespace(**dict(zip('xyzw', xyzw, strict=True)))
+    return SimpleNamespace(
+        header=header(), pose=SimpleNamespace(position=xyz(PLACE), orientation=turn)
+    )
+
+
 def markers(**places):
     """Fields as in Marker.msg and Markers.msg of mocap4r2_msgs."""
     found = [
@@ -46,8 +53,11 @@ def test_a_cell_file_may_name_what_can_be_read():
 def test_each_message_gives_stamp_frame_and_place():
     found = READERS[POINT](point(stamp_s=3.5), 'sir')
     assert (found.stamp_s, found.frame, tuple(found.position)) == (3.5, 'world', PLACE)
-    pose = SimpleNamespace(header=header(), pose=SimpleNamespace(position=xyz(PLACE)))
-    assert tuple(READERS[POSE](pose, 'sir').position) == PLACE
+    found = READERS[POSE](pose((0.0, 0.6, 0.0, 0.8)), 'sir')
+    assert (tuple(found.position), tuple(found.orientation)) == (PLACE, (0.0, 0.6, 0.0, 0.8))
+    # Of drivers that do not measure it.
+    for xyzw in ((0, 0, 0, 0), (np.nan,) * 4, (0, 0, 0, 2)):
+        assert READERS[POSE](pose(xyzw), 'sir').orientation is None
     several = markers(other=(1, 1, 1), sir=PLACE)
     assert tuple(READERS[MARKERS](several, 'sir').position) == PLACE
     assert tuple(READERS[MARKERS](several, '1').position) == PLACE

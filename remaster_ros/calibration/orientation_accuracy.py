@@ -1,0 +1,127 @@
+"""Errors of a measured body's orientation, beside the position errors of eq. 17 and 18.
+
+Where a sensor measures full poses. Eq. 17 of Van Wyk et al. compares the distances between
+joint solutions of a pose as measured and as modelled; here the angles between them are compared,
+which need neither registration nor the place of the body on the tool. Eq. 18 compares points after
+registration; here orientations are compared. How the body stands on the tool, R_T_B, is taken from
+the fitted rows, as its origin is: an offset of the last joint is taken up by it, one of the first
+by the registration. Orientations are not fitted: they test what positions have determined.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from remaster_ros.calibration.model import Model
+from remaster_ros.kinematics.transforms import mean_quaternion_xyzw
+from remaster_ros.types import FloatArray, IntArray, Measurements
+
+METRICS = ('relative_orientation', 'post_registration_orientation')
+
+
+class ToolOrientations(NamedTuple):
+    """Modelled R_N_T of every row with offsets at zero and as estimated, (n, 3, 3) each."""
+
+    before: FloatArray
+    after: FloatArray
+
+
+def tool_orientations(
+    model: Model, measurements: Measurements, before: FloatArray, after: FloatArray
+) -> ToolOrientations | None:
+    """Return how the sensors should see the tool; None where no orientation was measured.
+
+    Parameters
+    ----------
+    model
+        Without an extension, whose effects are known as displacements of points alone; with one
+        the answer is None.
+    measurements
+        n observations.
+    before, after
+        Pinned parameters with offsets at zero and as estimated, (size,).
+    """
+    if measurements.orientation is None or model.extension is not None:
+        return None
+    return ToolOrientations(*(_modelled(model, measurements, z) for z in (before, after)))
+
+
+def _modelled(model: Model, measurements: Measurements, z: FloatArray) -> FloatArray:
+    x = model.natural(z)
+    R_R_T = model.chain.forward(measurements.q, model.offsets(x))[:, :3, :3]
+    R_R_N = model.T_R_N(x)[measurements.sensor, :3, :3]
+    turned: FloatArray = np.swapaxes(R_R_N, 1, 2) @ R_R_T
+    return turned
+
+
+def orientation_accuracy(
+    measurements: Measurements,
+    modelled: ToolOrientations,
+    fitted: IntArray,
+    chosen: IntArray,
+    pairs: IntArray,
+) -> dict[str, Any]:
+    """Return both errors before and after; {} where the chosen rows have no orientation.
+
+    Parameters
+    ----------
+    measurements
+        n observations.
+    modelled
+        Of the same rows.
+    fitted
+        Rows from which R_T_B of every sensor and marker is taken.
+    chosen
+        Rows that are judged.
+    pairs
+        Joint solutions of the same pose, (m, 2).
+    """
+    assert measurements.orientation is not None
+    seen = np.all(np.isfinite(measurements.orientation), axis=1)
+    body = np.stack((measurements.sensor, measurements.marker))
+    sides: dict[str, dict[str, Any]] = {name: {} for name in METRICS}
+    both = pairs[seen[pairs].all(axis=1)]
+    for side, R_N_T in modelled._asdict().items():
+        absolute: list[FloatArray] = []
+        for which in np.unique(body[:, chosen], axis=1).T:
+            mine = seen & np.all(body == which[:, None], axis=0)
+            known, judged = fitted[mine[fitted]], chosen[mine[chosen]]
+            if len(known) == 0 or len(judged) == 0:
+                continue
+            turns = _inverse_of(R_N_T[known]) * _measured(measurements, known)
+            R_T_B = Rotation.from_quat(mean_quaternion_xyzw(turns.as_quat()))
+            expected = Rotation.from_matrix(R_N_T[judged]) * R_T_B
+            absolute.append((expected.inv() * _measured(measurements, judged)).magnitude())
+        if not absolute:
+            return {}
+        sides['post_registration_orientation'][side] = _summary(np.concatenate(absolute))
+        if len(both) > 0:
+            i, j = both.T
+            measured = (_measured(measurements, i).inv() * _measured(measurements, j)).magnitude()
+            turned = (_inverse_of(R_N_T[i]) * Rotation.from_matrix(R_N_T[j])).magnitude()
+            sides['relative_orientation'][side] = _summary(np.abs(measured - turned))
+    if len(both) == 0:
+        why = 'no pose has two joint solutions at which the same sensor measured the orientation'
+        sides['relative_orientation'] = {'before': None, 'after': None, 'why': why}
+    return sides
+
+
+def _measured(measurements: Measurements, rows: IntArray) -> Rotation:
+    assert measurements.orientation is not None
+    return Rotation.from_quat(measurements.orientation[rows])
+
+
+def _inverse_of(matrices: FloatArray) -> Rotation:
+    return Rotation.from_matrix(matrices).inv()
+
+
+def _summary(angles: FloatArray) -> dict[str, Any]:
+    """Return mean and 95 % interval of angles in rad as ``mean_deg`` and ``interval95_deg``."""
+    low, high = np.rad2deg(np.quantile(angles, (0.025, 0.975)))
+    return {
+        'mean_deg': float(np.rad2deg(angles.mean())),
+        'interval95_deg': [float(low), float(high)],
+    }

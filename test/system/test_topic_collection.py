@@ -1,0 +1,18 @@
+"""Collections whose sensors are topics of nodes of other packages: faults and kills."""
+
+import pytest
+from topic_rig import Collection
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
+
+
+def test_sensors_of_other_packages_lose_nothing_to_faults_and_kills(start, client, tmp_path):
+    """test/qualification/test_topic_sensors.py has further faults."""
+    c = Collection(start, client, tmp_path)
+    # Of another clock: the arm waits.
+    c.spoil('tracker', c.waits_for('synchronise the clocks'), late=60.0)
+    c.spoil('mocap', c.refused('mocap: unsteady'), jumping=1)
+    # The driver of the bar sends all the time: that it is gone is no hidden marker.
+    c.kill_source('mocap', c.waits_for('nothing on /vrpn_mocap/tool/pose'))
+    c.kill('recorder')
+    c.finish()

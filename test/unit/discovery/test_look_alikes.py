@@ -1,0 +1,110 @@
+"""The decision between look-alikes: of two cells, of one of them, and of a free form."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from discovery_scenes import at_joint, residuals_of, session_with
+
+from remaster_ros.discovery import discover
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.evidence import Solution, solve
+from remaster_ros.discovery.explain import TIED, describe
+from remaster_ros.discovery.plain_forms import is_special_case, plainest
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.stepwise_selection import Selection, Step
+
+ARC_MINUTE = np.radians(1.0 / 60.0)
+
+
+@cache
+def eccentric() -> Residuals:
+    """Return what an eccentric encoder of joint 2 leaves."""
+    return residuals_of(
+        session_with(41, lambda s: at_joint(2, 3 * ARC_MINUTE * np.sin(s.measurements.q[:, 1])))
+    )
+
+
+def cells_of(data: Residuals, name: str, *joints: int):
+    return [
+        cell for cell in EFFECTS[name].cells(data.context) if cell.joints in [(j,) for j in joints]
+    ]
+
+
+def fitted(data: Residuals, cells) -> Solution:
+    found = solve(data, tuple(cells))
+    assert found is not None
+    return found
+
+
+def selected(data: Residuals, cells) -> Selection:
+    solution = fitted(data, cells)
+    gain = solution.log_evidence - fitted(data, ()).log_evidence
+    return Selection(fitted(data, ()), solution, (Step(tuple(cells), 0.003, 0.5, gain),), None)
+
+
+def test_a_free_form_gives_way_to_the_shape_that_explains_as_much():
+    data = eccentric()
+    named = [*cells_of(data, 'encoder_eccentricity', 2, 4), *cells_of(data, 'joint_compliance', 2)]
+    (curve,) = cells_of(data, 'joint_error_curve', 2)
+    cells = [*named, curve]
+    assert [is_special_case(cell, curve) for cell in named] == [
+        (cell.name, cell.joints) == ('encoder_eccentricity', (2,)) for cell in named
+    ]
+    assert not is_special_case(curve, named[0])
+    before = fitted(data, [curve])
+    found = plainest(before, cells, lambda chosen, start: solve(data, tuple(chosen), start))
+    assert [(cell.name, cell.joints) for cell in found.cells] == [('encoder_eccentricity', (2,))]
+    assert found.log_evidence > before.log_evidence - TIED
+
+
+def test_a_free_form_that_is_better_stays():
+    data = residuals_of(
+        session_with(
+            42, lambda s: at_joint(2, 3 * ARC_MINUTE * np.cos(7 * s.measurements.q[:, 1]))
+        )
+    )
+    cells = [*cells_of(data, 'encoder_eccentricity', 2), *cells_of(data, 'joint_error_curve', 2)]
+    before = fitted(data, cells[-1:])
+    assert (
+        plainest(before, cells, lambda chosen, start: solve(data, tuple(chosen), start)) is before
+    )
+
+
+def test_a_free_form_leaves_the_shape_that_was_found_in_no_doubt():
+    data = eccentric()
+    (curve,) = cells_of(data, 'joint_error_curve', 2)
+    shapes = cells_of(data, 'encoder_eccentricity', 2)
+    _, (effect,) = describe(data, selected(data, shapes[:1]), [*shapes, curve], lambda share: None)
+    listed = {other.name: other for other in effect.confusable_with}
+    if curve.name in listed:
+        assert listed[curve.name].general
+    assert not effect.tied
+
+
+def test_what_two_cells_explain_may_be_one_other_or_one_of_them():
+    """A link's length that two scales imitate, the second of which is there by chance alone."""
+    data = eccentric()
+    both = cells_of(data, 'encoder_scale', 2, 6)
+    others = [*both, *cells_of(data, 'encoder_eccentricity', 2)]
+    _, (effect,) = describe(data, selected(data, both), others, lambda share: None)
+    assert effect.joints == (2, 6)
+    listed = {(other.name, other.joints) for other in effect.confusable_with}
+    assert ('encoder_scale', (2,)) in listed
+    assert ('encoder_eccentricity', (2,)) in listed
+    assert effect.tied
+
+
+def test_the_largest_cause_is_in_doubt_also_where_held_out_poses_gain_nothing(monkeypatch):
+    session = session_with(41, lambda s: at_joint(2, ARC_MINUTE * np.sin(s.measurements.q[:, 1])))
+    find = discover.find_causes
+
+    def tied(*args, **options):
+        found = find(*args, **options)
+        assert found.effects
+        first = replace(found.effects[0], tied=True, share=0.0)
+        return replace(found, effects=(first, *found.effects[1:]))
+
+    monkeypatch.setattr(discover, 'find_causes', tied)
+    found = discover.discover_session(session, rng=np.random.default_rng(0))
+    assert found.verdict == 'undetermined'
