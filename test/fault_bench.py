@@ -79,6 +79,19 @@ class Relay:
         self._send(self._last)
 
 
+def cell_of_several_markers(folder: Path) -> Path:
+    """Write the cell of the demo, with two reflectors of the tracker and every pose visited."""
+    text = config_path('cells/quick.yaml').read_text(encoding='utf-8')
+    text = text.replace('../robots', str(config_path('robots')))
+    text = text.replace('marker: smr\n', 'marker: smr\n    further_markers: {smr_2: 2}\n')
+    text = text.replace('  smr: [-0.1', '  smr_2: [0.0, -0.09, 0.03]\n  smr: [-0.1')
+    designed = ('  design', '  joint_std', '  order')
+    path = folder / 'cell.yaml'
+    lines = [line for line in text.splitlines() if not line.startswith(designed)]
+    path.write_text('\n'.join(lines), encoding='utf-8')
+    return path
+
+
 class Bench:
     """One collection of real nodes.
 
@@ -98,14 +111,17 @@ class Bench:
         Candidate poses for optimization.
     reference_every
         Of the planner; 0 for a collection without references.
+    several_markers
+        Whether the bar measures three markers, and the tracker two reflectors.
     """
 
     def __init__(
         self, folder: Path, domain: int, *, relays=False, emergency=False, require='all',
-        candidates=32, reference_every=0,
+        candidates=32, reference_every=0, several_markers=False,
     ) -> None:  # fmt: skip
         self.folder, self.session = folder, folder / 'session'
-        self.world = make_world(folder / 'world', read_cell('demo'), SEED, RATE)
+        self._cell = str(cell_of_several_markers(folder)) if several_markers else 'demo'
+        self.world = make_world(folder / 'world', read_cell(self._cell), SEED, RATE)
         (folder / 'log').mkdir()
         path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get('PYTHONPATH'))))
         self._environment = {
@@ -199,7 +215,8 @@ class Bench:
         """Start a node (again)."""
         command = [sys.executable, '-m', 'remaster_ros.nodes', name, '--ros-args']
         command += ['--params-file', str(config_path('fake.yaml'))]
-        for key, value in self._values[name].items():
+        own = {} if name in FAKES else {'cell': self._cell}
+        for key, value in {**own, **self._values[name]}.items():
             command += ['-p', f'{name}:{key}:={json.dumps(value)}']
         if name in self.relays:
             topic = RELAYED[name]
@@ -378,13 +395,14 @@ class Bench:
         """Assert that each row is where the truth has its marker, once, and none is missing."""
         session, truth = read_session(self.session), self.world.truth
         m, chain = session.measurements, self.world.chain
-        for index, name in enumerate(session.sensor_names):
-            mine = m.sensor == index
-            expected = truth.without_noise(chain, name, m.q[mine])
+        for index, number in np.unique(np.stack((m.sensor, m.marker)), axis=1).T:
+            mine = (m.sensor == index) & (m.marker == number)
+            name, marker = session.sensor_names[index], session.marker_names[number]
+            expected = truth.without_noise(chain, name, m.q[mine], marker)
             wrong = np.linalg.norm(m.position[mine] - expected, axis=1)
-            assert np.all(wrong < 1e-3), (name, wrong.max())
-        pairs = list(zip(m.configuration.tolist(), m.sensor.tolist()))
-        assert len(set(pairs)) == len(pairs), 'recorded twice'
+            assert np.all(wrong < 1e-3), (name, marker, wrong.max())
+        readings = list(zip(m.configuration.tolist(), m.sensor.tolist(), m.marker.tolist()))
+        assert len(set(readings)) == len(readings), 'recorded twice'
         poses = {
             event.stamp: event
             for _, event in self.observer.find(PoseAnnounced)

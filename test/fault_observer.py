@@ -246,4 +246,5 @@ def plain(text: str) -> str:
     text = re.sub(r'((?:other_)?joint …)(, \1)+', r'\1', text)
     text = text.replace(UNNAMED, '…')
     text = re.sub(r'-?\d+\.\d+|\b(inf|nan)\b|\d+(?= mm| usable| readings| s old)', '…', text)
+    text = re.sub(r'at the last \d+', 'at the last …', text)
     return re.sub(r'solutions? \d+', 'a solution', text)

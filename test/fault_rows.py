@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from fault_bench import RATE, SENSOR_OF, Bench
+from fault_observer import plain
 
 from remaster_ros.collection.events import (
     VERSION,
@@ -39,6 +40,7 @@ BENCHES = {
     'emergency': {'emergency': True},
     'bar alone': {'require': 'mocap'},
     'any sensor': {'require': 'any'},
+    'several markers': {'several_markers': True},
 }
 """Set of nodes -> what the bench is given for it."""
 REFUSED = {
@@ -154,8 +156,14 @@ def _observe(bench: Bench, row: Row) -> Seen:
     else:
         commanded = 'the planned moves'
     refused = [kind for kind in REFUSED if _refused(bench, kind, began) > 0]
+    unseen = [
+        message
+        for at, node, message, _ in list(observer.summaries)
+        if node == 'recorder' and at > began and 'was not seen' in message
+    ]
     said = [
         *observer.reasons(began),
+        *map(plain, unseen[:1]),
         *(f'a report of the joints is refused ({REFUSED[kind]})' for kind in refused),
     ]
     numbers = (0.0, 0.0)
@@ -413,6 +421,11 @@ def intermittent(name: str) -> Callable[[Bench], None]:
     return twice
 
 
+def over(bench: Bench) -> None:
+    """End the faults of the devices."""
+    bench.inject()
+
+
 def nothing(bench: Bench) -> None:
     """Be over already."""
 
@@ -590,6 +603,18 @@ DEVICES = (
         killed('laser_tracker_markers'), nothing, lasts_s=6.0, bench='bar alone'),
     Row('laser_tracker_markers', 'killed for good, and `require` is any',
         killed('laser_tracker_markers'), nothing, lasts_s=6.0, bench='any sensor'),
+    *(Row(who, fault, lambda bench, faults=faults: bench.inject(**faults), end, lasts_s=lasts_s,
+          bench='several markers')
+      for who, fault, faults, end, lasts_s in (
+          ('optitrack_markers', 'one of its three markers is hidden',
+           {'mocap': {'hidden': 2}}, over, 4.0),
+          ('optitrack_markers', 'two of its three markers are taken for each other',
+           {'mocap': {'exchanged': 2}}, over, 8.0),
+          ('laser_tracker_markers', 'one of its two reflectors is hidden',
+           {'tracker': {'hidden': 2}}, over, 4.0),
+          ('optitrack_markers', 'one of its three markers is gone for good',
+           {'mocap': {'hidden': 3}}, nothing, 30.0),
+      )),
 )  # fmt: skip
 
 ROWS = (*FIVE, *ROBOT, *(row for name in (

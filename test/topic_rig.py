@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from remaster_ros import fit
 from remaster_ros.collection.events import ConfigurationEnded
+from remaster_ros.session.reader import read_session
 from remaster_ros.session.workcell import config_path
 from remaster_ros.simulation.faults import inject
 
@@ -34,25 +35,43 @@ def cell_of(folder):
 class Collection:
     """A collection under way, and what is done to it."""
 
-    def __init__(self, start, client, folder, candidates=5):
+    def __init__(self, start, client, folder, candidates=5, rate=10.0):
         self.world = folder / 'world'
         self.cell = Cell(
             start, client, folder, 'all', [], candidates=candidates, cell=cell_of(folder),
-            foreign=FOREIGN,
+            foreign=FOREIGN, rate=rate,
         )  # fmt: skip
         # Registration is over, and the first configurations are.
-        self.cell.until(lambda: self.cell.results.count('recorded') > 4, 'the first ones')
+        self.until(lambda: self.cell.results.count('recorded') > 4, 'the first ones')
+
+    def until(self, condition, what, timeout_s=120):
+        """Wait, and see to what does not go on by itself, as a person does.
+
+        On a machine that is far too busy for so fast a world joint_states come late and planners
+        take long to start: the arm is then halted, or its run is over.
+        """
+        said = self.cell.said
+
+        def turn():
+            planner = said.get('pose_planner', {})
+            if said.get('robot_bridge', {}).get('halted'):
+                call(self.cell.client, '/remaster/clear_halt')
+            elif planner.get('resuming') == 'no' and planner['state'] in ('idle', 'paused'):
+                call(self.cell.client, '/remaster/collect')
+            return condition()
+
+        self.cell.until(turn, what, timeout_s)
 
     def spoil(self, sensor, shows, **fault):
         """Inject a fault until `shows` holds; then end it, and see the next one recorded."""
         inject(self.world, {sensor: fault})
-        self.cell.until(shows, f'{sensor} {fault}')
+        self.until(shows, f'{sensor} {fault}')
         inject(self.world, {})
         self.goes_on()
 
     def goes_on(self):
         count = self.cell.results.count('recorded')
-        self.cell.until(lambda: self.cell.results.count('recorded') > count, 'the next')
+        self.until(lambda: self.cell.results.count('recorded') > count, 'the next')
 
     def refused(self, reason):
         """Return a condition: one more reading is refused for this reason."""
@@ -75,37 +94,28 @@ class Collection:
         process = self.cell.nodes.pop(name)
         process.kill()
         process.wait()
-        self.cell.until(shows, f'the end of {name}')
+        self.until(shows, f'the end of {name}')
         self.cell.nodes[name] = self.cell._begin(name)
         self.goes_on()
 
     def kill(self, node):
-        """Kill a node and start it again; a person sees to what does not go on by itself."""
+        """Kill a node and start it again."""
         self.cell.said.pop(node)
         self.cell.kill_and_start(node)
-        said, count = self.cell.said, self.cell.results.count('recorded')
-
-        def again():
-            # A planner that takes long to start on a busy machine: the arm was stopped.
-            if said['robot_bridge']['halted']:
-                call(self.cell.client, '/remaster/clear_halt')
-            planner = said.get('pose_planner', {})
-            stands = planner.get('resuming') == 'no' and planner['state'] in ('idle', 'paused')
-            if stands and not said['robot_bridge']['halted']:
-                call(self.cell.client, '/remaster/collect')
-            return self.cell.results.count('recorded') > count
-
-        self.cell.until(again, f'what follows the kill of {node}')
+        self.goes_on()
 
     def finish(self):
         """See that nothing is lost, twice or wrong, and that the session can be fitted."""
         cell = self.cell
-        session = cell.complete()
+        self.until(lambda: cell.recorder('exit_status') == 'complete', 'the end', 300)
+        session = read_session(cell.session)
         cell.check(session)
         partial = {
             (e.stamp, e.solution)
             for e in cell.events
-            if isinstance(e, ConfigurationEnded) and e.result == 'partial'
+            if isinstance(e, ConfigurationEnded)
+            and e.result == 'partial'
+            and e.reason != 'recorded before'
         }
         assert 2 * cell.planned() - len(session.measurements) == len(partial)
         found = fit(session)

@@ -11,8 +11,9 @@ Mahalanobis distance is below the quantile of chi-squared with three degrees of 
 A model is never quite right, and its errors on poses that it was fitted to are smaller than on
 others. So C is multiplied by one factor, at least 1, such that 95 % of the fitted rows lie in
 their regions when their whole pose is left out (cross-validation; Vovk et al. 2005). Gross errors
-do not count. For a pose with the errors e, the rows' noise R and M = J Σ J' these are, without
-another fit::
+do not count. `remaster discover` leaves whole stretches of a session out instead
+(`discovery.stretches`). For a pose with the errors e, the rows' noise R and M = J Σ J' the errors
+left out and their covariance are, without another fit::
 
     e_out = R (R − M)⁻¹ e,    C_out = R (R − M)⁻¹ R
 """
@@ -90,7 +91,9 @@ class Coverage:
         return cls(rows, count, count / rows, (float(interval.low), float(interval.high)))
 
 
-def predict(fit: FitResult, measurements: Measurements) -> Predictions:
+def predict(
+    fit: FitResult, measurements: Measurements, widening: float | None = None
+) -> Predictions:
     """Predict all rows of a session.
 
     Parameters
@@ -99,6 +102,8 @@ def predict(fit: FitResult, measurements: Measurements) -> Predictions:
         The posterior.
     measurements
         Those that were fitted, in the model's order of sensors and markers.
+    widening
+        The factor on standard deviations; None where poses left out one by one determine it.
     """
     model, draws = fit.predictive.model, fit.predictive.draws
     root = (draws - draws.mean(axis=0)) / np.sqrt(max(1, len(draws) - 1))
@@ -116,16 +121,17 @@ def predict(fit: FitResult, measurements: Measurements) -> Predictions:
         position[source] = apply(to_sensor, part.place)
         covariance[source] = turn @ found @ np.swapaxes(turn, 1, 2)
     limit = float(chi2.ppf(REGION, 3))
-    left_out = _left_out_distances(fit, measurements, triangle)
-    factor = 1.0
-    if len(left_out) >= FEWEST_ROWS:
-        factor = max(1.0, float(np.quantile(left_out, REGION)) / limit)
-    covariance *= factor
-    distance = _distances(measurements.position - position, covariance)
-    return Predictions(position, covariance, distance <= limit, float(np.sqrt(factor)))
+    if widening is None:
+        left_out = _left_out_distances(fit, measurements, triangle)
+        widening = 1.0
+        if len(left_out) >= FEWEST_ROWS:
+            widening = max(1.0, float(np.sqrt(np.quantile(left_out, REGION) / limit)))
+    covariance *= widening**2
+    distance = squared_distances(measurements.position - position, covariance)
+    return Predictions(position, covariance, distance <= limit, widening)
 
 
-def _distances(errors: FloatArray, covariance: FloatArray) -> FloatArray:
+def squared_distances(errors: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return squared Mahalanobis distances (n,) of errors (n, 3)."""
     solved = np.linalg.solve(covariance, errors[..., None])[..., 0]
     distances: FloatArray = np.einsum('ni,ni->n', errors, solved)
@@ -224,7 +230,7 @@ def _left_out_distances(
         error = (rows.target - part.place).ravel()
         out = R @ np.linalg.solve(R - root @ root.T, np.column_stack((error, R)))
         blocks = out[:, 1:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
-        found = _distances(out[:, 0].reshape(n, 3), blocks)
+        found = squared_distances(out[:, 0].reshape(n, 3), blocks)
         # A pose that alone determines a parameter is far out, whatever rounding makes of it.
         distances.append(np.where(found >= 0.0, found, np.inf))
     return np.concatenate(distances) if distances else np.zeros(0)

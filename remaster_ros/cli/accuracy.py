@@ -123,7 +123,7 @@ def warn_of_harm(judged: OffsetsJudgement, path: Path) -> None:
 
 def table(judged: OffsetsJudgement) -> str:
     """Return the metrics, one a line."""
-    lines = [f'{"mean error [95 % interval], mm":44s} {"before":24s} after']
+    lines = [f'{"mean error [95 % interval], mm":44s} {"before":28s} after']
     for split, metrics in judged.accuracy.items():
         if metrics is None:
             lines.append(f'{split}: no such rows')
@@ -137,10 +137,10 @@ def table(judged: OffsetsJudgement) -> str:
                 lines.append(f'  {name:42s} {values["why"]}')
                 continue
             before, after = (interval(values[side]) for side in SIDES)
-            lines.append(f'  {name:42s} {before:24s} {after}')
+            lines.append(f'  {name:42s} {before:28s} {after}')
             if values.get('after_offsets_only'):
                 before, after = (interval(values[f'{side}_offsets_only']) for side in SIDES)
-                lines.append(f'  {"… without the noise":42s} {before:24s} {after}')
+                lines.append(f'  {"… without the noise":42s} {before:28s} {after}')
     for observation, why in judged.left_out:
         lines.append(f'left out: observation {observation}: {why}')
     return '\n'.join(lines)

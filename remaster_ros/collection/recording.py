@@ -6,7 +6,7 @@ hands the messages in, takes what has ended, and writes it down.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -22,6 +22,8 @@ TEMPERATURE_S = 600.0
 """A temperature that is older than this is not used for a reading, s."""
 SET_BACK_S = 1.0
 """Stamps of joint_states that go back by more than this are those of a clock that was set, s."""
+UNSEEN = 5
+"""A marker that was not seen at so many configurations, where others were, is reported."""
 BY_HAND = PoseAnnounced(stamp='', pose=-1_000_000, split=REGISTRATION, ids=(0,))
 """Where a user has driven the arm for a registration: the number is no planner's."""
 
@@ -153,6 +155,8 @@ class Recording:
         most = max(1 + len(one.further) for one in rules)
         self._readings: deque[tuple[str, MarkerReading]] = deque(maxlen=4000 * most)
         self._temperatures: deque[tuple[float, float]] = deque(maxlen=500)
+        # At how many configurations in a row a marker was not seen, by sensor and marker.
+        self._unseen: Counter[tuple[str, str]] = Counter()
         self.q: FloatArray | None = None
         self.now_s = 0.0
         self._from_q: FloatArray | None = None
@@ -303,6 +307,8 @@ class Recording:
                 left_out += bad
             else:
                 rejected.append(bad[0])
+        if settled.pose.split != REGISTRATION:
+            self._count_unseen(accepted)
         return EndedReading(
             settled,
             self._came_from,
@@ -312,6 +318,27 @@ class Recording:
             pairing.waited_s(),
             max((reading.stamp_s for reading in accepted), default=self.now_s),
             self._temperature_c(settled.stamp_s),
+        )
+
+    def _count_unseen(self, accepted: Sequence[PairedReading]) -> None:
+        seen = {(reading.sensor, reading.marker) for reading in accepted}
+        measured = {reading.sensor for reading in accepted}
+        for rules in self._rules:
+            for marker in (rules.marker, *rules.further):
+                key = rules.sensor, marker
+                if key in seen:
+                    del self._unseen[key]
+                elif rules.sensor in measured:
+                    self._unseen[key] += 1
+
+    @property
+    def unseen(self) -> str:
+        """Which markers were not seen for long, where others of their sensor were; ''."""
+        return '; '.join(
+            f'{marker} of {sensor} was not seen at the last {count} configurations, and is left '
+            'out: is it still on the tool, and not covered?'
+            for (sensor, marker), count in self._unseen.items()
+            if count >= UNSEEN
         )
 
     def _temperature_c(self, stamp_s: float) -> float | None:

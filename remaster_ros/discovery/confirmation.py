@@ -28,6 +28,7 @@ from remaster_ros.discovery.side_by_side import (
     rms_sigmas,
 )
 from remaster_ros.discovery.solution import Solution
+from remaster_ros.discovery.stretches import compare_stretches
 from remaster_ros.discovery.undetected import undetected
 from remaster_ros.errors import InputError
 from remaster_ros.types import BoolArray, FloatArray, Session
@@ -214,7 +215,8 @@ class _OtherSession:
     own
         The fit with the causes and what lies beyond.
     unmodelled
-        How causes too small to be found move its parameters, see `undetected`.
+        How causes too small to be found, and stretches that differ, move its parameters; see
+        `undetected` and `stretches`.
     """
 
     found: Estimate
@@ -257,7 +259,8 @@ class _OtherSession:
             parts = shown
         assert own is not None
         values = dict(zip(discovery.fit.theta_names, discovery.fit.theta, strict=True))
-        unmodelled = undetected(found, data, own)
+        moves = undetected(found, data, own), compare_stretches(found, data, own).moves
+        unmodelled = np.concatenate(moves, axis=1)
         return cls(found, data, values, given, tuple(parts), tuple(beyond), known, own, unmodelled)
 
     def error(

@@ -37,6 +37,7 @@ from remaster_ros.discovery.plain_forms import plainest
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stepwise_selection import Search, Selection
+from remaster_ros.discovery.stretches import Stretches, compare_stretches
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
 from remaster_ros.discovery.to_extension import extension_of
 from remaster_ros.discovery.undetected import undetected
@@ -85,6 +86,8 @@ class Discovery:
     thinning
         Which part of a large session was searched, and how the causes hold on the rest; None where
         all of it was searched.
+    stretches
+        How stretches of the session agree with each other.
     residuals_before
         Measured minus modelled position of every row with the zero-offsets alone, in the frame of
         its sensor, m, (n, 3).
@@ -104,6 +107,7 @@ class Discovery:
     selection: Selection
     residuals: Residuals
     fit: FitResult
+    stretches: Stretches
     residuals_before: FloatArray
     thinning: Thinning | None = None
     unexplained: tuple[Unexplained, ...] = ()
@@ -140,18 +144,18 @@ def discover_session(
     findings = find_causes(session, rng=rng, progress=report)
     unexplained: tuple[Unexplained, ...] = ()
     try:
-        fit, gain = _sampled(session, findings, rng, report, clock)
+        fit, gain, stretches = _sampled(session, findings, rng, report, clock)
     except InsufficientDataError as error:
         if not findings.selection.solution.cells:
             raise
         suggested = findings.effects + findings.structure
         unexplained = (unfitted(findings.residuals.errors, suggested, error),)
         findings = findings.without_causes()
-        fit, gain = _sampled(session, findings, rng, report, clock)
+        fit, gain, stretches = _sampled(session, findings, rng, report, clock)
     if (findings.effects or findings.structure) and is_harmful(gain):
         unexplained = (harm_of(findings.before, fit, gain, findings.effects + findings.structure),)
         findings = findings.without_causes()
-        fit, gain = _sampled(session, findings, rng, report, clock)
+        fit, gain, stretches = _sampled(session, findings, rng, report, clock)
     residuals, solution = findings.residuals, findings.selection.solution
     structure, gross = structure_left(residuals, solution, fit, findings.structure)
     unexplained += structure
@@ -179,6 +183,7 @@ def discover_session(
         selection=findings.selection,
         residuals=residuals,
         fit=fit,
+        stretches=stretches,
         residuals_before=residuals_of(findings.before),
         thinning=findings.thinning,
         unexplained=unexplained,
@@ -227,9 +232,11 @@ def _sampled(
     rng: np.random.Generator,
     report: Progress,
     clock: Callable[[], float] | None,
-) -> tuple[FitResult, Gain]:
+) -> tuple[FitResult, Gain, Stretches]:
     """Sample the model with the causes found, and measure its gain on held-out rows."""
     residuals, solution = findings.residuals, findings.selection.solution
+    stretches = compare_stretches(findings.found, residuals, solution)
+    unmodelled = undetected(findings.found, residuals, solution), stretches.moves
     fit = fit_session(
         session,
         rng=rng,
@@ -237,10 +244,10 @@ def _sampled(
         priors=loosened(session, findings.effects),
         precision=PRECISION,
         extension=extension_of(residuals, solution) if solution.cells else None,
-        unmodelled=undetected(findings.found, residuals, solution),
+        unmodelled=np.concatenate(unmodelled, axis=1),
         progress=lambda _, share: report('sampling the extended model', share),
     )
-    return fit, gain_of(findings.before, residuals, solution, fit, rng)
+    return fit, gain_of(findings.before, residuals, solution, fit, rng), stretches
 
 
 def find_causes(session: Session, *, rng: np.random.Generator, progress: Progress) -> Findings:

@@ -150,7 +150,7 @@ def compare_cell(
     rows
         Those rows.
     own, unmodelled
-        The causes fitted to them, and how causes too small to be found move their parameters.
+        The causes fitted to them, and how causes outside the model move their parameters.
     """
     cell = part.cell
     where = dict(zip(own.cells, own.slices(), strict=True))[part.within]

@@ -19,7 +19,7 @@ from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.types import FloatArray
+from remaster_ros.types import FloatArray, IntArray
 
 # A cause is found from about so many standard deviations on; the others lie anywhere below.
 DETECTED = 4.5
@@ -47,36 +47,58 @@ def undetected(found: Estimate, data: Residuals, solution: Solution) -> FloatArr
         (size + m, c) for the natural parameters of the fit, the m of the solution's cells, and c
         independent undetected causes. Zeros where the gauge holds a parameter.
     """
-    model = found.model
-    free = found.posterior.free
-    own = data.columns(solution.cells)
-    fitted = np.concatenate((data.full_jacobian[data.rows.source][:, :, free], own), axis=2)
+    fitted, precision, where = fitted_columns(found, data, solution)
+    free = len(found.posterior.free)
     cells = list(_not_found(data, solution))
     columns = data.columns(cells)
-    count = columns.shape[2]
     both = np.concatenate((fitted, columns), axis=2)
     white = data.noise_model.whitened(both, solution.noise).reshape(3 * len(data), -1)
     known, unknown = white[:, : fitted.shape[2]], white[:, fitted.shape[2] :]
-    precision = np.zeros((known.shape[1],) * 2)
-    rows = prior_rows(model, found.posterior.priors, found.mode.z)[1][:, free]
-    precision[: len(free), : len(free)] = rows.T @ rows
-    precision[len(free) :, len(free) :] = solution.prior_precision()
     moved = _response(known, precision, unknown)
     left = np.linalg.norm(unknown + known @ moved, axis=0)
     # What the causes found can imitate is not undetected, and what the offsets model imitates
     # altogether is no error of it.
-    core = known[:, : len(free)]
-    alone = _response(core, precision[: len(free), : len(free)], unknown)
+    core = known[:, :free]
+    alone = _response(core, precision[:free, :free], unknown)
     left_by_core = np.linalg.norm(unknown + core @ alone, axis=0)
     whole = np.linalg.norm(unknown, axis=0)
     apart = (left > IMITATED * left_by_core) & (left_by_core > ABSORBED * whole)
     seen = DETECTED * np.sqrt(MISSED / 3.0 / max(int(apart.sum()), 1))
     largest = np.array([cell.largest or np.inf for cell in cells for _ in cell.parameters])
     std = apart * np.minimum(largest, seen / np.maximum(left, np.finfo(float).tiny))
-    spread = np.zeros((model.size + own.shape[2], count))
-    where = np.concatenate((free, model.size + np.arange(own.shape[2])))
+    spread = np.zeros((found.model.size + len(solution.parameters), columns.shape[2]))
     spread[where] = moved * std
     return spread
+
+
+def fitted_columns(
+    found: Estimate, data: Residuals, solution: Solution
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return what all parameters of the extended model do, and what is known of them beforehand.
+
+    Parameters
+    ----------
+    found, data, solution
+        As in `undetected`.
+
+    Returns
+    -------
+    columns
+        What a unit of each free parameter of the fit and of the m of the cells displaces in the
+        rows worked on, (n, 3, f + m).
+    precision
+        Of their priors, (f + m, f + m).
+    where
+        Their indices among all the natural parameters and the m, (f + m,).
+    """
+    free, size = found.posterior.free, found.model.size
+    own = data.columns(solution.cells)
+    columns = np.concatenate((data.full_jacobian[data.rows.source][:, :, free], own), axis=2)
+    rows = prior_rows(found.model, found.posterior.priors, found.mode.z)[1][:, free]
+    precision = np.zeros((columns.shape[2],) * 2)
+    precision[: len(free), : len(free)] = rows.T @ rows
+    precision[len(free) :, len(free) :] = solution.prior_precision()
+    return columns, precision, np.concatenate((free, size + np.arange(own.shape[2])))
 
 
 def _response(known: FloatArray, precision: FloatArray, unknown: FloatArray) -> FloatArray:

@@ -329,6 +329,7 @@ class Recorder(RemasterNode):
             self.journal.beyond_repair,
             self.keeper.restored,
             changed,
+            self.recording.unseen,
         )
         trouble = next(filter(None, reasons), '')
         values = {

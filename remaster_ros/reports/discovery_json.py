@@ -34,7 +34,8 @@ LEAST_P_VALUE = 1.0 / (1.0 + DRAWS)
 
 def predictions_of(discovery: Discovery) -> Predictions:
     """Return where the final model predicts every row of the session."""
-    return predict(discovery.fit, discovery.residuals.context.measurements)
+    measurements = discovery.residuals.context.measurements
+    return predict(discovery.fit, measurements, discovery.stretches.widening)
 
 
 def discovery_content(
@@ -77,6 +78,14 @@ def discovery_content(
         'least_p_value': LEAST_P_VALUE,
         'predicted_regions95': _regions(discovery, predictions),
     }
+    stretches = discovery.stretches
+    if stretches.count:
+        content['stretches'] = {
+            'count': stretches.count,
+            'ratio': stretches.ratio,
+            'p_value': stretches.p_value,
+            'widened': stretches.widened,
+        }
     if discovery.thinning is not None:
         content['rows_searched'] = discovery.thinning
     if confirmation is not None:

@@ -158,12 +158,26 @@ class Coverage(Struct):
 class PredictedRegions(Struct):
     """The 95 % regions of predictions.csv: ``widening`` is the factor on their size.
 
-    It is what the fitted rows take when their pose is left out, so that 95 % of them lie inside.
+    It is what the fitted rows take when their stretch of the session is left out, so that 95 % of
+    them lie inside; in sessions of few poses their pose.
     """
 
     widening: float
     held_out: Coverage
     fitted: Coverage
+
+
+class Stretches(Struct):
+    """How the parameters of ``count`` stretches of the session agree with each other.
+
+    ``ratio`` is the variance between them over that by the noise, ``p_value`` that of so much by
+    chance, ``widened`` whether the standard deviations contain it.
+    """
+
+    count: int
+    ratio: float
+    p_value: float
+    widened: bool
 
 
 class JointCovariance(Struct):
@@ -209,6 +223,7 @@ class Discovered(Struct):
     covariance: JointCovariance | UnsetType = UNSET
     least_p_value: float | UnsetType = UNSET
     predicted_regions95: PredictedRegions | UnsetType = UNSET
+    stretches: Stretches | UnsetType = UNSET
     rows_searched: SearchedRows | UnsetType = UNSET
     confirmation: Confirmed | UnsetType = UNSET
     judgement: Judgement | UnsetType = UNSET

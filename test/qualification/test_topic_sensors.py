@@ -10,7 +10,7 @@ REPETITIONS = 3
 
 @pytest.mark.parametrize('repetition', range(REPETITIONS))
 def test_every_fault_and_kill_in_one_collection(start, client, tmp_path, repetition):
-    c = Collection(start, client, tmp_path, candidates=12)
+    c = Collection(start, client, tmp_path, candidates=12, rate=5.0)
     # Few messages: the dwell is prolonged, and the reading is taken all the same.
     c.spoil('mocap', c.says('mocap', 'fewer than min_rate_hz'), slow=20)
     c.spoil('mocap', c.refused('mocap: unsteady'), jumping=1)

@@ -5,7 +5,7 @@ import pytest
 
 from remaster_ros.collection.events import PoseAnnounced
 from remaster_ros.collection.pairing import Rejection, SensorRules
-from remaster_ros.collection.recording import BY_HAND, Recording
+from remaster_ros.collection.recording import BY_HAND, UNSEEN, Recording
 from remaster_ros.types import MarkerReading
 
 Q = np.array([0.1, 0.2])
@@ -292,3 +292,27 @@ def test_markers_of_a_frame_end_together_and_one_that_is_none_costs_no_other():
         assert (len(end.accepted), end.result) == (left, result)
         assert [item.reason for item in end.left_out] == ['swapped'] * (refused == 'b')
         assert len(end.rejected) == (refused == 'mocap')
+
+
+def test_a_marker_that_is_not_seen_for_long_is_named_until_it_is_back():
+    rules = SensorRules('mocap', 'sir', False, 0.5, 5, 0.5e-3, 3.0, ('b', 'c'))
+    bench = Bench(rules, refused='c')
+    for number in range(UNSEEN + 1):
+        if number == UNSEEN:
+            assert 'c of mocap was not seen at the last 5 configurations' in bench.recording.unseen
+            assert 'sir' not in bench.recording.unseen
+            bench.judge.refused = ''
+        else:
+            assert not bench.recording.unseen
+        bench.announce()
+        bench.settle(Q if number % 2 else OTHER)
+        ended = []
+        while not ended:
+            bench.t += 0.02
+            for marker in ('sir', 'b', 'c'):
+                position = np.array([1.0, 1e-6 * (bench.t % 0.1), 0.0])
+                reading = MarkerReading(bench.t, position, marker=marker)
+                bench.recording.take_reading('mocap', reading)
+            bench.recording.take_joints(bench.t, Q if number % 2 else OTHER)
+            ended = [item for item in [bench.recording.end({})] if item is not None]
+    assert not bench.recording.unseen

@@ -193,6 +193,11 @@ def test_predictions_csv_has_every_row_with_its_covariance(saved):
     assert regions['held_out']['rows'] == len(held_out) == m.is_validation.sum()
     assert regions['held_out']['inside'] == sum(int(row['inside95']) for row in held_out)
     assert regions['held_out']['share'] > 0.8
+    assert regions['widening'] == pytest.approx(found.stretches.widening)
+    stretches = content['stretches']
+    assert stretches['count'] == found.stretches.count == 10
+    assert stretches['ratio'] == pytest.approx(found.stretches.ratio)
+    assert stretches['widened'] is (stretches['p_value'] <= 0.01 and stretches['ratio'] > 1.0)
     first = rows[0]
     matrix = [[float(first[f'cov_{min(a, b)}{max(a, b)}_m2']) for a in 'xyz'] for b in 'xyz']
     assert np.linalg.eigvalsh(matrix).min() > 0.0

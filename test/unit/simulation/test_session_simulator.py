@@ -95,3 +95,18 @@ def test_given_offsets_are_used() -> None:
         joint_offsets=offsets,
     )
     np.testing.assert_array_equal(truth.joint_offsets, offsets)
+
+
+def test_reflectors_that_are_measured_one_after_another_share_no_frame() -> None:
+    rng = np.random.default_rng(5)
+    two = sensors(rng, 2)
+    two['mocap'] = replace(two['mocap'], further={'smr': 2})
+    two['tracker'] = replace(two['tracker'], further={'sir': 2}, single_shot=True)
+    session, _ = simulate_session(
+        CHAIN, URDF, rng, poses=random_poses(4, rng), sensors=two, markers=MARKERS
+    )
+    rows = session.measurements
+    shot = rows.sensor == session.sensor_names.index('tracker')
+    assert np.all(rows.frame[shot] == -1)
+    np.testing.assert_array_equal(rows.frame[~shot], rows.configuration[~shot])
+    assert len(rows) == 4 * len(set(rows.configuration.tolist()))
