@@ -172,7 +172,8 @@ def workspace(subject: Subject) -> Figure:
     inputs, chain = subject.inputs, subject.chain
     m = inputs.session.measurements
     frames = registrations(inputs)
-    T_R_N = np.array([frames[name] for name in inputs.session.sensor_names])
+    # A sensor that has measured nothing has no place, and no rows either.
+    T_R_N = np.array([frames.get(name, np.eye(4)) for name in inputs.session.sensor_names])
     shown = np.linspace(0, len(m) - 1, min(len(m), MOST_POINTS)).round().astype(int)
     points = apply(T_R_N[m.sensor[shown]], m.position[shown])
     errors = subject.answer.final_mm[shown]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from remaster_ros.collection.plan_confirmation import fingerprint
 from remaster_ros.errors import InputError
 from remaster_ros.reports.answer_inputs import Inputs
 from remaster_ros.reports.plan_page import WORDS, read_plan_page
+from remaster_ros.session.files import write_atomically
 from remaster_ros.session.recorded_plan import RecordedPlan
 
 PLAN_FILE = 'plan.html'
@@ -159,6 +161,13 @@ def drawn_plan(plan: RecordedPlan) -> bytes:
         return read_plan_page(plan.page, fingerprint(plan.tour))
     except InputError:
         return b''
+
+
+def copy_plan(plan: RecordedPlan | None, folder: Path) -> None:
+    """Copy the page of the plan, so that this one can be handed on with it."""
+    (folder / PLAN_FILE).unlink(missing_ok=True)
+    if plan is not None and (html := drawn_plan(plan)):
+        write_atomically(folder / PLAN_FILE, html)
 
 
 def plan_to_dict(plan: PlanFacts) -> dict[str, Any]:

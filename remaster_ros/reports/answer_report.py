@@ -21,13 +21,12 @@ from remaster_ros.kinematics.transforms import apply
 from remaster_ros.reports.answer import ALL_FILES, Answer, answer_of, registrations
 from remaster_ros.reports.answer_figures import Subject, draw_answer
 from remaster_ros.reports.answer_inputs import Inputs
-from remaster_ros.reports.answer_plan import PLAN_FILE, drawn_plan, plan_facts
+from remaster_ros.reports.answer_plan import PLAN_FILE, copy_plan, plan_facts
 from remaster_ros.reports.fit_json import APPLY_FOLDER, REPORT_FILE
 from remaster_ros.reports.fit_tables import accuracy_rows, marker_rows
 from remaster_ros.reports.pages import inlined, page
 from remaster_ros.reports.plan_page import check_plan_page
 from remaster_ros.session.files import decode_text, make_folder, read_limited, write_atomically
-from remaster_ros.session.recorded_plan import RecordedPlan
 from remaster_ros.types import FloatArray
 
 PDF_FILE = 'report.pdf'
@@ -92,7 +91,7 @@ def write_answer(
     html = answer_html(subject, {name: inlined(name, svg) for name, svg in drawings.items()})
     source = found_folder if answer.uses_causes and found_folder else fit_folder
     _copy_apply(source / APPLY_FOLDER, answer, folder)
-    _copy_plan(inputs.plan, folder)
+    copy_plan(inputs.plan, folder)
     write_atomically(folder / REPORT_FILE, html)
     if printer is not None:
         printed = {name: as_image(svg) for name, svg in drawings.items()}
@@ -218,13 +217,6 @@ def _copy_apply(source: Path, answer: Answer, folder: Path) -> None:
     for name in answer.files:
         data = read_limited(source / name, FILE_LIMIT, 'fit or discover again, which write it')
         write_atomically(folder / APPLY_FOLDER / name, data)
-
-
-def _copy_plan(plan: RecordedPlan | None, folder: Path) -> None:
-    """Copy the page of the plan, so that this one can be handed on with it."""
-    (folder / PLAN_FILE).unlink(missing_ok=True)
-    if plan is not None and (html := drawn_plan(plan)):
-        write_atomically(folder / PLAN_FILE, html)
 
 
 def _figures_of(folder: Path, names: Sequence[str]) -> dict[str, str]:

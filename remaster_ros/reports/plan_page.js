@@ -53,6 +53,7 @@ async function playPlan(plan) {
     view = new RobotView(element('scene'), plan.scene);
     const stops = visits.map((visit) => view.tip(visit.way[visit.way.length - 1]));
     view.showPath(visits.flatMap(tips), stops, visits.map((visit) => `--${visit.split}`));
+    addEventListener('beforeprint', () => view.copyTo(element('printed')));
     for (const button of element('views').querySelectorAll('button')) {
       const from = button.dataset.from;
       button.addEventListener('click', () => view.look(/^\d+$/.test(from) ? Number(from) : from));

@@ -177,16 +177,30 @@ class RobotView {
     this.waiting = true;
     requestAnimationFrame(() => {
       this.waiting = false;
-      const {target, distance, turn, tilt} = this.eye;
-      this.camera.position.copy(this._back(turn, tilt)).multiplyScalar(distance).add(target);
-      this.camera.near = distance / 100;
-      this.camera.far = distance * 50;
-      this.camera.updateProjectionMatrix();
-      this.camera.lookAt(target);
-      this.camera.updateMatrixWorld();
-      this.renderer.render(this.world, this.camera);
+      this._render();
       this._placeLabels();
     });
+  }
+
+  // What is seen now, for paper: a 3-D canvas is empty once its frame is over.
+  copyTo(canvas) {
+    this._render();
+    [canvas.width, canvas.height] = [this.canvas.width, this.canvas.height];
+    const flat = canvas.getContext('2d');
+    flat.fillStyle = this.style.getPropertyValue('--paper').trim();
+    flat.fillRect(0, 0, canvas.width, canvas.height);
+    flat.drawImage(this.canvas, 0, 0);
+  }
+
+  _render() {
+    const {target, distance, turn, tilt} = this.eye;
+    this.camera.position.copy(this._back(turn, tilt)).multiplyScalar(distance).add(target);
+    this.camera.near = distance / 100;
+    this.camera.far = distance * 50;
+    this.camera.updateProjectionMatrix();
+    this.camera.lookAt(target);
+    this.camera.updateMatrixWorld();
+    this.renderer.render(this.world, this.camera);
   }
 
   _aspect() {

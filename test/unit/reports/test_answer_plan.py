@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from remaster_ros.collection.plan_confirmation import fingerprint
+from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import Plan, PlannedPose
 from remaster_ros.planning.tour_order import FITTED, REFERENCE, Tour
 from remaster_ros.reports.answer import answer_of
-from remaster_ros.reports.answer_figures import Subject, planned
+from remaster_ros.reports.answer_figures import Subject, draw_answer, planned
 from remaster_ros.reports.answer_inputs import Inputs
-from remaster_ros.reports.answer_plan import drawn_plan, plan_facts, plan_to_dict
-from remaster_ros.reports.answer_report import answer_html
+from remaster_ros.reports.answer_plan import copy_plan, drawn_plan, plan_facts, plan_to_dict
+from remaster_ros.reports.answer_report import answer_html, require_ready
 from remaster_ros.reports.fit_json import fit_content
 from remaster_ros.reports.schemas import Fit, Judgement
 from remaster_ros.session.plan_records import ExpectationNoted
@@ -96,6 +97,17 @@ def test_a_wider_interval_for_other_errors_is_not_compared(inputs):
     assert plan_facts(inputs).ratio == pytest.approx(1.0)
 
 
+def test_a_sensor_that_has_measured_nothing_is_in_no_picture(inputs):
+    session = inputs.session
+    sensors = {**session.sensors, 'unused': session.marker_names[0]}
+    inputs = replace(inputs, session=replace(session, sensors=sensors))
+    subject = Subject(inputs, answer_of(inputs), inputs.plan.tour._chain)
+    drawn = draw_answer(subject)
+    assert {'workspace', 'plan', 'session'} <= drawn.keys()
+    assert all('unused' not in drawn[name] for name in ('workspace', 'plan'))
+    assert 'id="plan"' in answer_html(subject, {})
+
+
 def test_the_page_has_the_plan_its_picture_and_a_link_where_it_was_drawn(inputs):
     subject = Subject(expected(inputs, 3.0), answer_of(inputs), inputs.plan.tour._chain)
     html = answer_html(subject, {})
@@ -112,6 +124,17 @@ def test_the_page_has_the_plan_its_picture_and_a_link_where_it_was_drawn(inputs)
     assert not drawn_plan(inputs.plan), 'of another plan'
     inputs.plan.page.write_text(head)
     assert 'href="plan.html"' in answer_html(subject, {})
+    # Copied beside the page; one of an earlier report would contradict it.
+    copy_plan(inputs.plan, inputs.plan.page.parent)
+    copied = inputs.plan.page.with_name('plan.html')
+    assert copied.read_text() == head
+    require_ready(copied.parent, pdf=False)
+    copy_plan(None, copied.parent)
+    assert not copied.exists()
+    copied.write_text('my own')
+    with pytest.raises(InputError, match='no page of remaster plan'):
+        require_ready(copied.parent, pdf=False)
+    copied.unlink()
     printed = answer_html(subject, {}, printing=True)
     assert 'href="plan.html"' not in printed
     assert 'plan.html beside this report' in printed

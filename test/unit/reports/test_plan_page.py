@@ -112,7 +112,12 @@ def test_every_configuration_is_played_in_its_own_time(planned):
         const view = new RobotView(document.createElement('div'), plan.scene);
         const arm = ANGLES.map((q) => ({
             tip: view.tip(q).toArray(), frames: view.frames(q).map((T) => T.toArray())}));
+        dispatchEvent(new Event('beforeprint'));
+        const paper = document.getElementById('printed');
+        const pixels = paper.getContext('2d').getImageData(0, 0, paper.width, paper.height).data;
+        const colors = new Set(new Uint32Array(pixels.buffer)).size;
         return {arm, first, second, rows, last, linked, begun, played: Number(slider.value),
+                colors, paper: paper.checkVisibility(),
                 canvas: [canvas.clientWidth, canvas.clientHeight],
                 hidden: ['no-webgl', 'loading'].map((id) => document.getElementById(id).hidden)};
         """.replace('ANGLES', json.dumps(q.tolist())),
@@ -141,6 +146,9 @@ def test_every_configuration_is_played_in_its_own_time(planned):
     assert found['canvas'][0] > 300
     assert found['canvas'][1] > 200
     assert found['hidden'] == [True, True]
+    # On paper there is a picture, too: a copy, as what WebGL has drawn is not printed.
+    assert found['colors'] > 100
+    assert not found['paper']
 
 
 def test_without_webgl_the_page_says_so_and_has_all_else(planned):
@@ -151,7 +159,7 @@ def test_without_webgl_the_page_says_so_and_has_all_else(planned):
         document.getElementById('after').click();
         const missing = document.getElementById('no-webgl');
         return {text: missing.textContent, shown: missing.checkVisibility(),
-                canvas: document.querySelectorAll('canvas').length,
+                canvas: document.querySelectorAll('#scene canvas').length,
                 state: document.getElementById('state').textContent};
         """,
         *NO_WEBGL,
