@@ -122,13 +122,13 @@ def _covariance(discovery: Discovery) -> dict[str, Any]:
     units = {name: cell.unit for cell in solution.cells for name in cell.parameters}
     known = np.flatnonzero(fit.identifiable)
     draws = np.concatenate((fit.joint_offset_draws[..., known], fit.theta_draws), axis=-1)
-    matrix = np.atleast_2d(np.cov(draws.reshape(-1, draws.shape[-1]), rowvar=False))
+    size = draws.shape[-1]
+    # A few poses may determine no joint, and show no cause.
+    matrix = np.atleast_2d(np.cov(draws.reshape(-1, size), rowvar=False)) if size else ()
     return {
         'names': [*(fit.joint_names[i] for i in known), *fit.theta_names],
         'units': [*('rad' for _ in known), *(units[name] for name in fit.theta_names)],
-        'matrix': [[float(f'{value:.5e}') for value in row] for row in matrix]
-        if draws.shape[-1]
-        else [],
+        'matrix': [[float(f'{value:.5e}') for value in row] for row in matrix],
     }
 
 

@@ -57,6 +57,10 @@ def test_what_separates_is_measured_behind_the_session_and_decides(start, client
     content['session']['observations_sha256'] = other
     path.write_text(json.dumps(content))
     commanded = int(cell.said['robot_bridge']['commanded'])
+    # One that has seen nothing of the session but its files.
+    cell.said.pop('recorder')
+    cell.kill_and_start('recorder')
+    cell.until(lambda: cell.recorder('exit_status') == 'complete', 'the recorder')
     response = call(client, '/remaster/collect')
     assert response.success, response.message
 

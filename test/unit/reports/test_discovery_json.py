@@ -4,6 +4,7 @@ import csv
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import msgspec
@@ -21,7 +22,7 @@ from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports import discovery_figures
+from remaster_ros.reports import discovery_figures, discovery_json
 from remaster_ros.reports.discovery_apply import geometry_of
 from remaster_ros.reports.discovery_json import read_discovery, save_discovery
 
@@ -269,3 +270,16 @@ def test_lengths_and_tilts_are_in_the_robot_model(saved):
         atol=1e-12,
     )
     assert 'The robot model holds of them' in files['remaster.txt']
+
+
+def test_where_no_joint_is_determined_and_no_cause_found_there_is_no_covariance():
+    fit = SimpleNamespace(
+        identifiable=np.zeros(7, bool),
+        joint_names=('a',) * 7,
+        joint_offset_draws=np.zeros((4, 100, 7)),
+        theta_draws=np.zeros((4, 100, 0)),
+        theta_names=(),
+    )
+    nothing = SimpleNamespace(solution=SimpleNamespace(cells=()))
+    found = discovery_json._covariance(SimpleNamespace(fit=fit, selection=nothing))
+    assert found == {'names': [], 'units': [], 'matrix': []}
