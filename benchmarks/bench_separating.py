@@ -100,7 +100,7 @@ def report(lines: Sequence[dict[str, Any]]) -> None:
         rows.append([words, *_counts([s for s in lines if s['pair'] == number])])
     rows.append(['all', *_counts(lines)])
     left = [s for s in lines if s['left'] or s['before'] != 'right']
-    rows.append(['of these not decided by the first search', *_counts(left)])
+    rows.append(['of these with look-alikes left, or not right', *_counts(left)])
     header = ['pair', 'sessions', 'first search', 'with what separates', 'added at most']
     print('right, open, none, wrong:\n')
     print(table(header, rows))
