@@ -13,7 +13,7 @@ from scipy.stats import binomtest
 def table_of(lines: Sequence[dict[str, Any]]) -> str:
     """Return the table of an arm."""
     header = (
-        'row', 'poses', 'configurations', 'nearest, s', 'fastest, s',
+        'row', 'configurations', 'poses', 'nearest, s', 'fastest, s',
         '… at 0.25 m/s: configurations', 'nearest, s', 'fastest, s', 'expected RMS std, deg',
         'RMS error of the fits, deg', '95 % intervals that hold it', 'choice, s',
     )  # fmt: skip
@@ -22,8 +22,9 @@ def table_of(lines: Sequence[dict[str, Any]]) -> str:
         free, slow = line['limits']
         std, error = (f'{value:.5f}' for value in (free['joint_rms_deg'], line['rms_error_deg']))
         held, choice_s = share_held(line['held'], line['intervals']), f'{line["choice_s"]:.1f}'
+        count, *times = cost(free)
         rows.append(
-            (line['row'], free['poses'], *cost(free), *cost(slow), std, error, held, choice_s)
+            (line['row'], count, free['poses'], *times, *cost(slow), std, error, held, choice_s)
         )
     return table(header, rows)
 

@@ -37,12 +37,14 @@ class Cell:
         collect=True,
         rate=10.0,
         foreign=None,
+        discovery='',
+        hidden=(),
     ):
         from remaster_ros.nodes.status import listen
 
         self.client, self.folder, self.session = client, folder, folder / 'session'
         print('seed', SEED)
-        self.world = make_world(folder / 'world', read_cell(cell), SEED, rate)
+        self.world = make_world(folder / 'world', read_cell(cell), SEED, rate, hidden)
         self.said, self.messages, self.results, self.events = {}, {}, [], []
         listen(client, self._record, self._summary)
         command, data, tracker = free_ports(
@@ -56,6 +58,7 @@ class Cell:
                 'validation_candidates': held_out,
                 'registration_candidates': 6,
                 'reference_every': reference_every,
+                'discovery': discovery or folder / 'discovery',
             },
             'robot_bridge': {},
             'recorder': {'session': self.session, 'require': require},
@@ -144,6 +147,8 @@ class Cell:
         assert len(set(m.configuration.tolist())) == self.planned() > 3
 
     def planned(self):
-        """Return how many configurations the last plan has."""
+        """Return how many configurations the collection has, with what is measured further."""
         tours = [r for r in read_journal(self.session / 'plan.jsonl').records if 'plans' in r]
-        return sum(len(p['solutions']) for s in tours[-1]['plans'].values() for p in s['poses'])
+        collected = [tour for tour in tours if 'optimization' in tour['plans']] or tours[-1:]
+        plans = [plan for tour in collected for plan in tour['plans'].values()]
+        return sum(len(pose['solutions']) for plan in plans for pose in plan['poses'])

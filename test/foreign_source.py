@@ -19,7 +19,7 @@ from remaster_ros.kinematics.transforms import matrix_from_rpy, quaternion_xyzw
 from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.simulation.world import World
 
-RATE_HZ = 30.0
+RATE_HZ = 15.0
 SIGMA_M, SIGMA_RAD = 0.05e-3, 0.2e-3
 JUMP_M = 0.02
 R_T_B = matrix_from_rpy(np.array([0.4, -0.2, 1.1]))
@@ -41,12 +41,16 @@ def main() -> None:
         frames, faults, t = frames + 1, world.faults(sensor), world.now()
         if 'stopped' in faults or frames % int(faults.get('slow', 1)):
             continue
-        if not world.line_of_sight(sensor, t):
+        in_sight = world.line_of_sight(sensor, t)
+        # A mocap driver sends also while the marker is hidden; others send what they see.
+        if not in_sight and kind is PointStamped:
             continue
         position = world.marker_in_sensor(sensor, t) + SIGMA_M * rng.standard_normal(3)
         position[2] += JUMP_M * ('jumping' in faults and frames % 4 == 0)
         frozen = None if 'frozen' not in faults else position if frozen is None else frozen
         position = position if frozen is None else frozen
+        if not in_sight:
+            position = np.full(3, np.nan)
         message = kind()
         message.header.stamp = stamp_of(t - faults.get('late', 0.0))
         message.header.frame_id = f'{sensor}_world'

@@ -145,10 +145,14 @@ def world(
     for sensor in sensors:
         marker, place, _ = PLACES[sensor]
         origin = place + 0.05 * rng.standard_normal(3)
-        T_R_N = transform(_facing(origin, rng.uniform(-0.2, 0.2)), origin)
-        placed[sensor] = SimulatedSensor(marker, T_R_N)
+        placed[sensor] = facing_sensor(marker, origin, rng)
     markers = {PLACES[sensor][0]: MARKERS[PLACES[sensor][0]] for sensor in sensors}
     return HiddenWorld(robot(name), tour, placed, markers, rng, marker_std_m)
+
+
+def facing_sensor(marker: str, origin: FloatArray, rng: np.random.Generator) -> SimulatedSensor:
+    """Return a sensor that looks at the poses from there, turned a little about its z axis."""
+    return SimulatedSensor(marker, transform(_facing(origin, rng.uniform(-0.2, 0.2)), origin))
 
 
 def _facing(origin: FloatArray, roll: float) -> FloatArray:

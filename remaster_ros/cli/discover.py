@@ -16,6 +16,7 @@ from remaster_ros.discovery.confirmation import (
     require_other_session,
 )
 from remaster_ros.discovery.confirmation_words import in_words
+from remaster_ros.discovery.decision import decisions
 from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.side_by_side import rms_sigmas
 from remaster_ros.discovery.words import percent, shown
@@ -26,6 +27,7 @@ from remaster_ros.reports.discovery_json import (
     save_discovery,
 )
 from remaster_ros.reports.fit_json import DISCOVERY_FILE, prepare_folder
+from remaster_ros.reports.found_causes import earlier_pairs
 from remaster_ros.session.reader import read_session
 
 # Of a curve's hundred values the table has one line; discovery.json has them all.
@@ -45,6 +47,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help='another session of the same arm: do the causes hold there?',
     )
+    parser.add_argument(
+        '--decide',
+        metavar='FILE',
+        type=Path,
+        help='discovery.json of before more was measured (plan --separate): which of its causes '
+        'and their look-alikes is it?',
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -54,6 +63,7 @@ def run(args: argparse.Namespace) -> int:
     if other is not None:
         # Not after the long search.
         require_other_session(session, other)
+    pairs = () if args.decide is None else earlier_pairs(args.decide)
     prepare_folder(args.out, DISCOVERY_FILE)
     with progress_bar(args.quiet or args.json) as progress:
         found = discover_session(
@@ -72,13 +82,21 @@ def run(args: argparse.Namespace) -> int:
                 refusal = InsufficientDataError(f'the other session: {error}')
         progress('writing', 0.0)
         predictions = predictions_of(found)
+        decided = decisions(found, pairs)
         report = save_discovery(
-            found, args.out, confirmation, figures=not args.no_figures, predictions=predictions
+            found,
+            args.out,
+            confirmation,
+            figures=not args.no_figures,
+            predictions=predictions,
+            decided=decided,
         )
     if args.json:
         show_file(args.out / DISCOVERY_FILE)
     else:
         show(args.quiet, summary(found, confirmation, held_out_coverage(found, predictions)))
+        for one in decided:
+            show(args.quiet, one.describe())
         show(args.quiet, f'written: {report}')
     if refusal is not None:
         raise refusal

@@ -54,6 +54,8 @@ class Announcements:
     def matched(self, subscribers: int, now: float) -> bool:
         """Whether bridge and recorder are there for the next pose.
 
+        A recorder with a complete session has to open that again first.
+
         Parameters
         ----------
         subscribers
@@ -64,6 +66,8 @@ class Announcements:
             return False
         if self._matched_wall is None:
             self._matched_wall = now
+        if self.recorder is not None and self.recorder.exit_status == 'complete':
+            return False
         return now - self._matched_wall > MATCH_WALL_S
 
     def solution(self, stamp: str, index: int) -> int | None:

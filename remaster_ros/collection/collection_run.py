@@ -95,7 +95,12 @@ class CollectionRun:
         return True
 
     def refusal(
-        self, bridge: BridgeState | None, recorder: RecorderState | None, *, has_joints: bool
+        self,
+        bridge: BridgeState | None,
+        recorder: RecorderState | None,
+        *,
+        has_joints: bool,
+        further: str | None = None,
     ) -> str:
         """Return why /remaster/collect does not begin or go on; ''.
 
@@ -105,14 +110,19 @@ class CollectionRun:
             Their last states; None before the first.
         has_joints
             Whether it is known where the arm is.
+        further
+            Why nothing can be measured further behind a complete collection, '' where something
+            can; None where that is not asked.
         """
         if not has_joints:
             return 'no joint_states yet: is the robot running?'
-        if self.state in ('complete', 'failed'):
+        if self.state == 'complete' and further:
+            return f'the collection is complete: {further}'
+        if self.state == 'failed' or (self.state == 'complete' and further is None):
             return f'the collection is {self.state}: {self.why or "start anew"}'
         if bridge is not None and bridge.halted:
             return f'the arm is halted: {bridge.halted}; /remaster/clear_halt, then collect'
-        if recorder is not None and recorder.exit_status == 'complete':
+        if recorder is not None and recorder.exit_status == 'complete' and further is None:
             return "the recorder's session is complete; give it a new folder"
         if recorder is not None and recorder.changed_run == '':
             return 'the recorder was started just now; try again in a second'

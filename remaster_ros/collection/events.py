@@ -42,12 +42,20 @@ class PlannerState(Body, frozen=True, kw_only=True, tag='planner'):
         Token of the run under way, '' for none. Each /remaster/collect begins another one.
     planned
         Configurations to fit that were planned; 0 before.
+    further
+        The plan whose complete collection is gone on with, which its recorder's session is
+        opened again for; ''.
     """
 
     sender: ClassVar[str] = 'pose_planner'
     state: str
     run: str
     planned: int = 0
+    further: str = ''
+
+    def goes_further(self, plan: str) -> bool:
+        """Whether a run is under way behind the complete collection of a plan."""
+        return self.state == 'running' and self.further == plan != ''
 
     def run_held(self, before: str) -> str:
         """Return the token that recorder and bridge hold after this state.

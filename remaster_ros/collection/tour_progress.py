@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Collection
 from typing import Any, Protocol, TypeVar
 
-from remaster_ros.collection.events import RecorderState
+from remaster_ros.collection.events import PlannerState, RecorderState
 from remaster_ros.collection.required_sensors import RequiredSensors
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.planning.collection_plan import Expected, with_expected
@@ -25,6 +25,7 @@ class PlanMemory(Protocol):
     stop: PoseVisit | None
     trouble: str
     outcomes: Counter[str]
+    earlier: Counter[str]
 
     def begin(self, tour: Tour, expected: Expected | None = None) -> None:
         """Remember a new tour, and what its fit is expected to state where that is known."""
@@ -75,6 +76,8 @@ class TourProgress:
         Whether enough is known: from then on only what is held out, and references, are visited.
     standing
         Why the next pose cannot be planned from where the arm stands; ''.
+    further
+        Plans what is measured further, once the collection is complete; None for nothing.
     """
 
     def __init__(self, memory: PlanMemory, tours: TourPlanner, planning: Planning) -> None:
@@ -89,6 +92,7 @@ class TourProgress:
         self.is_complete = False
         self.enough = False
         self.standing = ''
+        self.further: Callable[[dict[str, FloatArray]], Tour] | None = None
 
     def describe(self) -> str:
         """Return how far the collection is, as text."""
@@ -182,7 +186,18 @@ class TourProgress:
         if self.phase == REGISTRATION and not sensors.are_among(self.T_R_N):
             return self._next_registration(q, sensors.names, words)
         self.phase = 'collection'
-        if self._memory.tour is None or REGISTRATION in self._memory.tour.plans:
+        if (plan_further := self.further) is not None:
+            self.is_complete = False
+            if not sensors.are_among(self.T_R_N):
+                self.standing = 'waiting for the registrations of the recorder'
+                return None
+            T_R_N = dict(self.T_R_N)
+            behind = self._planning.ask('further', q, lambda: plan_further(T_R_N))
+            if behind is None:
+                return None
+            self.further = None
+            self._memory.begin(behind[0])
+        elif self._memory.tour is None or REGISTRATION in self._memory.tour.plans:
             T_R_N = dict(self.T_R_N)
             planned = self._planning.ask('plan', q, lambda: with_expected(self._tours, T_R_N))
             if planned is None:
@@ -225,7 +240,7 @@ class TourProgress:
         found = self._planning.ask(what, q, lambda: tour.propose(q))
         if found is None or found[0] is None:
             return found
-        if self.enough and tour.has_left(FITTED):
+        if self.enough and tour.has_left(FITTED) and not tour.begin_at:
             # Here, as nothing is being planned; what was proposed may be one of them.
             self._memory.leave_rest()
             return None
@@ -235,26 +250,50 @@ class TourProgress:
 
     @property
     def planned(self) -> int:
-        """How many configurations to fit the collection was planned with; 0 before it is."""
+        """How many configurations to fit the collection was planned with; 0 before it is.
+
+        What is measured further is not among them.
+        """
         tour = self._memory.tour
         if tour is None or FITTED not in tour.plans:
             return 0
+        if tour.begin_at:
+            return self._memory.earlier['to_fit']
         return sum(len(pose.solutions) for pose in tour.plans[FITTED].poses)
+
+    @property
+    def planned_any(self) -> bool:
+        """Whether the tour has a configuration at all; nothing may separate two causes."""
+        tour = self._memory.tour
+        return tour is not None and any(tour.configurations.values())
+
+    @property
+    def goes_further(self) -> bool:
+        """Whether something is, or will be, measured behind a complete collection."""
+        tour = self._memory.tour
+        return self.further is not None or (tour is not None and tour.begin_at > 0)
 
     def is_last_reference(self, stop: PoseVisit) -> bool:
         """Whether a stop is the last reference of its round."""
         tour = self._memory.tour
         return tour is not None and stop.split == REFERENCE and stop.index == tour.references - 1
 
+    def state(self, state: str, run: str) -> PlannerState:
+        """Return what the other nodes act on: of the planner in this state and run."""
+        further = self._memory.id if self.goes_further else ''
+        return PlannerState(state=state, run=run, planned=self.planned, further=further)
+
     def counts(self) -> dict[str, Any]:
         """Return figures of the tour for people."""
         tour, outcomes = self._memory.tour, self._memory.outcomes
+        earlier = self._memory.earlier
         values: dict[str, Any] = {
             'phase': self.phase,
-            'poses_done': tour.poses_begun if tour else 0,
-            'poses': sum(tour.poses.values()) if tour else 0,
+            'poses_done': earlier['poses'] + (tour.poses_begun if tour else 0),
+            'poses': earlier['poses'] + (sum(tour.poses.values()) if tour else 0),
             'configurations_done': outcomes.total(),
-            'configurations': sum(tour.configurations.values()) if tour else 0,
+            'configurations': earlier['configurations']
+            + (sum(tour.configurations.values()) if tour else 0),
             'references': tour.references if tour else 0,
         }
         tables = {'outcome': outcomes}

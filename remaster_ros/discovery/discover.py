@@ -30,8 +30,8 @@ from remaster_ros.discovery.gain import (
     pose_common_fraction,
     residuals_of,
 )
-from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, unfitted
-from remaster_ros.discovery.marker_offsets import loosened, moved_markers
+from remaster_ros.discovery.guard import Unexplained, harm_of, held, is_harmful, unfitted
+from remaster_ros.discovery.marker_offsets import held_markers, loosened, moved_markers
 from remaster_ros.discovery.omnibus import structure_left
 from remaster_ros.discovery.plain_forms import plainest
 from remaster_ros.discovery.residuals import Residuals
@@ -42,7 +42,7 @@ from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
 from remaster_ros.discovery.to_extension import extension_of
 from remaster_ros.discovery.undetected import undetected
 from remaster_ros.errors import InsufficientDataError
-from remaster_ros.types import BoolArray, FloatArray, IntArray, Session
+from remaster_ros.types import BoolArray, FloatArray, IntArray, Priors, Session
 
 Verdict = Literal['effects', 'none', 'undetermined', 'unexplained']
 # Of the means, in standard deviations: 400 effective draws, enough for values of two figures.
@@ -149,9 +149,14 @@ def discover_session(
         if not findings.selection.solution.cells:
             raise
         suggested = findings.effects + findings.structure
-        unexplained = (unfitted(findings.residuals.errors, suggested, error),)
-        findings = findings.without_causes()
-        fit, gain, stretches = _sampled(session, findings, rng, report, clock)
+        try:
+            markers = held_markers(findings.found)
+            fit, gain, stretches = _sampled(session, findings, rng, report, clock, markers)
+            unexplained = (held(gain.noise_floor_m, markers, error),)
+        except InsufficientDataError:
+            unexplained = (unfitted(findings.residuals.errors, suggested, error),)
+            findings = findings.without_causes()
+            fit, gain, stretches = _sampled(session, findings, rng, report, clock)
     if (findings.effects or findings.structure) and is_harmful(gain):
         unexplained = (harm_of(findings.before, fit, gain, findings.effects + findings.structure),)
         findings = findings.without_causes()
@@ -232,8 +237,12 @@ def _sampled(
     rng: np.random.Generator,
     report: Progress,
     clock: Callable[[], float] | None,
+    priors: Priors | None = None,
 ) -> tuple[FitResult, Gain, Stretches]:
-    """Sample the model with the causes found, and measure its gain on held-out rows."""
+    """Sample the model with the causes found, and measure its gain on held-out rows.
+
+    Priors are those that let moved markers go, where none are given.
+    """
     residuals, solution = findings.residuals, findings.selection.solution
     stretches = compare_stretches(findings.found, residuals, solution)
     unmodelled = undetected(findings.found, residuals, solution), stretches.moves
@@ -241,7 +250,7 @@ def _sampled(
         session,
         rng=rng,
         clock=clock,
-        priors=loosened(session, findings.effects),
+        priors=loosened(session, findings.effects) if priors is None else priors,
         precision=PRECISION,
         extension=extension_of(residuals, solution) if solution.cells else None,
         unmodelled=np.concatenate(unmodelled, axis=1),

@@ -27,6 +27,8 @@ SIGNIFICANCE = 0.002
 # A direction counts where the data determine it so many times better than the session states it,
 # in variance.
 KNOWN_BETTER = 4.0
+# A marker that is held, since nothing determines its place, is known to this, m per axis.
+HELD_M = 1e-3
 # An axis of the tool with this share in directions that the data leave open is called hidden.
 HIDDEN = 0.1
 
@@ -85,6 +87,15 @@ def loosened(session: Session, moved: Sequence[FoundEffect]) -> Priors | None:
             std = float(np.hypot(session.marker_std_m, FURTHER * (effect.size_m or 0.0)))
             places[name] = (session.markers[name], std)
     return Priors(markers=places) if places else None
+
+
+def held_markers(found: Estimate) -> Priors:
+    """Return priors that hold all markers where a fit has them, to `HELD_M`."""
+    markers = found.model.markers(found.model.natural(found.mode.z))
+    names = found.problem.marker_names
+    return Priors(
+        markers={name: (place, HELD_M) for name, place in zip(names, markers, strict=True)}
+    )
 
 
 def _unseen(moved: FloatArray, place: FloatArray, axes: FloatArray, seen: BoolArray) -> FloatArray:

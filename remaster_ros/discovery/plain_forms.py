@@ -1,7 +1,8 @@
 """A free form, and the named shapes of few parameters that are special cases of it.
 
-An error curve of a joint can follow its encoder's eccentricity as well as that does itself. So no
-measurement decides against the curve; the plainer of two that explain as much is the answer.
+An error curve of a joint can follow its encoder's eccentricity as well as that does itself, and a
+wandering sensor one that drifts. So no measurement decides against the free form; the plainer of
+two that explain as much is the answer.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ AS_WELL = 3.0
 
 def is_special_case(cell: Cell, other: Cell) -> bool:
     """Return whether a cell is one of the shapes that another, a free form, can have."""
-    where = (cell.place, cell.driver, cell.joints)
-    free = other.curve is not None and other.penalty is not None
-    return free and cell.penalty is None and where == (other.place, other.driver, other.joints)
+    free = other.curve is not None or not EFFECTS[other.name].is_cause
+    wheres = {(one.place, one.driver, one.joints, one.subject) for one in (cell, other)}
+    return free and other.penalty is not None and cell.penalty is None and len(wheres) == 1
 
 
 def plainest(
@@ -29,6 +30,8 @@ def plainest(
     fit: Callable[[Sequence[Cell], Solution], Solution | None],
 ) -> Solution:
     """Return a solution with named shapes in place of free forms that are not better.
+
+    Only for those that are causes: structure that was located stays, as it is no claim.
 
     Parameters
     ----------
@@ -44,7 +47,9 @@ def plainest(
         named = [
             found
             for cell in cells
-            if is_special_case(cell, form) and not EFFECTS[cell.name].costly
+            if EFFECTS[form.name].is_cause
+            and is_special_case(cell, form)
+            and not EFFECTS[cell.name].costly
             if (found := fit((*rest, cell), solution)) is not None and not found.unphysical()
         ]
         best = max(named, key=lambda found: found.log_evidence, default=None)

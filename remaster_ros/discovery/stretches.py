@@ -14,7 +14,8 @@ Where the model is right, Σ m_b m_b' is on average the part of their covariance
 noise: the cluster-robust covariance with bias reduction (Bell & McCaffrey 2002, Survey Methodology
 28; Pustejovsky & Tipton 2018, J. Bus. Econ. Stat. 36). The ratio of the two, the mean over joints
 and causes, is compared with simulated noise. Only where it is credibly above 1 the moves, in part,
-are added to the posterior, as those of causes outside the model (`undetected`).
+are added to the posterior, as those of causes outside the model (`undetected`). What is wrong in
+the same way in all stretches does not show.
 
 *Predictions.* Their 95 % regions are multiplied by what puts 95 % of the rows of left-out
 stretches inside, at least by 1.
@@ -39,6 +40,8 @@ FEWEST_POSES = 20
 # Of a ratio as large where the model is right; by so many simulated ones.
 SIGNIFICANCE = 0.01
 SIMULATED = 300
+# Parameters that rows determine to less than this share, not their priors, are not compared.
+SHOWN = 1e-3
 # Directions that a stretch alone determines to this share tell nothing of the others.
 ALONE = 1.0 - 1e-6
 
@@ -91,20 +94,20 @@ def compare_stretches(found: Estimate, data: Residuals, solution: Solution) -> S
     stretch = stretch_of_row(data)
     left = data.left(solution)
     both = np.concatenate((columns, left[:, :, None]), axis=2)
-    white = data.noise_model.whitened(both, solution.noise)
-    X, errors = white[:, :, :-1], white[:, :, -1]
-    root = _root_of_inverse(np.einsum('nip,niq->pq', X, X) + precision)
+    white = data.noise_model.whitened(both, solution.noise).reshape(3 * len(data), -1)
+    X, errors = white[:, :-1], white[:, -1]
+    root = _root_of_inverse(X.T @ X + precision)
     X = X @ root
-    parts = [_Part.of(X[stretch == index], errors[stretch == index]) for index in range(STRETCHES)]
+    of_stretch = [np.repeat(stretch == index, 3) for index in range(STRETCHES)]
+    parts = [_Part.of(X[mine], errors[mine]) for mine in of_stretch]
     by_noise = np.sum([(root @ part.vectors) ** 2 @ part.values for part in parts], axis=0)
-    # What no row shows does not move.
-    by_noise = np.maximum(by_noise, np.finfo(float).tiny)
-    groups = _groups(found, solution)
+    shown = by_noise > SHOWN * np.sum(root**2, axis=1)
+    groups = [mine for group in _groups(found, solution) if len(mine := group[shown[group]])]
 
     def ratio_of(pulls: list[FloatArray]) -> FloatArray:
         """Return the ratio for the pulls X_b' e_b of each stretch, (P, s), of s sessions."""
         moved = [root @ part.moved(pull) for part, pull in zip(parts, pulls, strict=True)]
-        share = np.sum(np.square(moved), axis=0) / by_noise[:, None]
+        share = np.sum(np.square(moved), axis=0) / np.where(shown, by_noise, 1.0)[:, None]
         ratio: FloatArray = np.mean([share[group].mean(axis=0) for group in groups], axis=0)
         return ratio
 
@@ -148,9 +151,9 @@ class _Part:
 
     @classmethod
     def of(cls, X: FloatArray, errors: FloatArray) -> _Part:
-        flat = X.reshape(-1, X.shape[2])
-        values, vectors = np.linalg.eigh(flat.T @ flat)
-        return cls(np.clip(values, 0.0, 1.0), vectors, flat.T @ errors.ravel())
+        """Summarise whitened rows X (3 n, P) and errors (3 n,)."""
+        values, vectors = np.linalg.eigh(X.T @ X)
+        return cls(np.clip(values, 0.0, 1.0), vectors, X.T @ errors)
 
     def times(self, power: float, columns: FloatArray) -> FloatArray:
         """Return (I − G_b) to a negative power times columns (P, s)."""

@@ -36,6 +36,8 @@ class BagRecorder:
     folder
         The bag's folder, gone on with where there is one; None records nothing and only hands
         messages on.
+    begin
+        False to record nothing before `reopen`.
 
     Attributes
     ----------
@@ -45,14 +47,15 @@ class BagRecorder:
         Messages that found no room, neither on the disk nor in memory.
     """
 
-    def __init__(self, node: Node, folder: Path | None) -> None:
+    def __init__(self, node: Node, folder: Path | None, *, begin: bool = True) -> None:
         self._node, self._folder = node, folder
         self._writer: BagWriter | None = None
         # Received while the node's clock, a simulated one, had no time: topic, type, bytes.
         self._early: list[tuple[str, str, bytes]] = []
         self.notes: list[str] = []
         self.dropped = 0
-        self.reopen()
+        if begin:
+            self.reopen()
 
     def reopen(self) -> None:
         """Go on with the bag after it was closed."""

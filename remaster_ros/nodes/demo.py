@@ -199,6 +199,7 @@ class Demo:
             'pose_planner': {
                 'seed': self.p.seed,
                 'session': session,
+                'discovery': str(self.discovery),
                 'optimization_candidates': size,
                 'validation_candidates': size,
                 'reference_every': self.p.reference_every,

@@ -30,7 +30,7 @@ MAX_RESPAWNS = 5
 WRONG = 2
 """The exit status of a node that is configured wrongly, or whose device does not answer."""
 FOLDERS = {
-    'pose_planner': {'session': 'session', 'separate': ''},
+    'pose_planner': {'session': 'session', 'separate': '', 'discovery': 'discovery'},
     'recorder': {'session': 'session'},
     'optimizer': {'session': 'session', 'out': 'fit', 'discovery': 'discovery', 'prior': ''},
 }

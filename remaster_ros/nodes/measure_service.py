@@ -181,7 +181,8 @@ class MeasureService:
                 except DeviceError as error:
                     failures.append(str(error))
         node.trouble = '; '.join(failures)
-        if not stamps_s:
+        # A device that was lost is opened and asked again; the readings so far remain the first.
+        if not stamps_s or not self._driver.connected:
             response.message = node.trouble
             return response
         for marker in self._markers_T.keys() - stamps_s:

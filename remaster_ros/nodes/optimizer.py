@@ -156,12 +156,21 @@ class Optimizer(RemasterNode):
 
     def _discover(self) -> tuple[Path, str]:
         # Imported when it is needed, as it takes a second: the node is there at once.
+        from remaster_ros.discovery.decision import decisions
         from remaster_ros.discovery.discover import discover_session
         from remaster_ros.reports.discovery_json import save_discovery
+        from remaster_ros.reports.found_causes import earlier_pairs
 
         out = Path(self.p.discovery)
         session = read_session(self.p.session)
         prepare_folder(out, DISCOVERY_FILE)
+        # Of the same session before more was measured: what was left open then?
+        pairs: Sequence[tuple[Any, Any]] = ()
+        earlier = out / DISCOVERY_FILE
+        try:
+            pairs = earlier_pairs(earlier, session.created) if earlier.exists() else ()
+        except RemasterError as error:
+            self.get_logger().warning(f'nothing is decided of an earlier search: {error}')
         found = discover_session(
             session,
             rng=np.random.default_rng(self.p.seed),
@@ -170,7 +179,10 @@ class Optimizer(RemasterNode):
         )
         names = ', '.join(effect.name for effect in found.effects)
         names = names or ('nothing' if found.verdict == 'none' else found.verdict)
-        return save_discovery(found, out, figures=self.p.figures), f'discovered: {names}'
+        decided = decisions(found, pairs)
+        words = [f'discovered: {names}', *(one.describe() for one in decided)]
+        report = save_discovery(found, out, figures=self.p.figures, decided=decided)
+        return report, '; '.join(words)
 
     def _progress(self, stage: str, share: float) -> None:
         if self._ending:

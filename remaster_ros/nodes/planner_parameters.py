@@ -10,7 +10,7 @@ import numpy as np
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.parameters import parameter
-from remaster_ros.planning.separating_design import FoundCause
+from remaster_ros.planning.rival_causes import FoundCause
 from remaster_ros.planning.tour_order import REGISTRATION
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.planning.travel_time import SPEED_SHARE, TravelTime
@@ -46,6 +46,11 @@ class Parameters:
         '',
         'discovery.json: configurations that separate its causes from their look-alikes are '
         'added; empty for none',
+    )
+    discovery: str = parameter(
+        'discovery',
+        "folder of the optimizer's discovery: after a complete collection remaster/collect "
+        'measures further what separates its causes from their look-alikes; empty for nothing',
     )
     resume_within_s: float = parameter(
         30.0,

@@ -37,6 +37,7 @@ from remaster_ros.collection.preflight_facts import PreflightFacts
 from remaster_ros.collection.tour_progress import TourProgress
 from remaster_ros.errors import InputError, RemasterError
 from remaster_ros.motion.preflight import preflight
+from remaster_ros.nodes.further_measuring import FurtherMeasuring
 from remaster_ros.nodes.measure_calls import MeasureCalls
 from remaster_ros.nodes.messages import JointOrder, transform_array
 from remaster_ros.nodes.parameters import declare
@@ -77,6 +78,7 @@ class PosePlanner(RemasterNode):
         # Of the run, and of what may be published only while it is running.
         self._lock = threading.RLock()
         self.run = CollectionRun(self.p.resume_within_s)
+        self._further = FurtherMeasuring(self.p.discovery, folder, self.journal, self._tours)
         # Every pose passes its gate in `_announce`.
         self._preview = PlanPreview(self.cell, self._tours, self.journal, self.progress, folder)
         self._living: LivingRun | None = None
@@ -150,11 +152,15 @@ class PosePlanner(RemasterNode):
 
     def _on_collect(self, request: Trigger.Request, response: Trigger.Response) -> Any:
         bridge, recorder = self._announcements.bridge, self._announcements.recorder
+        further, plan = self._further.ask(self.run.state, under_way=self.progress.goes_further)
         has_joints = self._q is not None
-        refusal = self.run.refusal(bridge, recorder, has_joints=has_joints)
+        refusal = self.run.refusal(bridge, recorder, has_joints=has_joints, further=further)
         response.message = refusal or self._preview.asked()
         if response.message:
             return response
+        if plan is not None:
+            # What was looked at before the first motion is looked at again.
+            self.progress.further, self._described, self._cleared = plan, False, False
         if self.run.state != 'running':
             if recorder is not None and recorder.changed_run:
                 # A person has looked: how things are from now on is measured first.
@@ -208,8 +214,7 @@ class PosePlanner(RemasterNode):
         )
 
     def _listen_again(self) -> None:
-        if self._joint_states is None:
-            self._joint_states = self._listen_to_the_arm()
+        self._joint_states = self._joint_states or self._listen_to_the_arm()
 
     def _on_joint_state(self, message: JointState) -> None:
         """Learn where the arm is before the first pose; after that by /remaster/settled."""
@@ -302,7 +307,7 @@ class PosePlanner(RemasterNode):
             self.get_logger().error(str(error))
             return
         if self.progress.is_complete:
-            self._end('complete')
+            self._end('complete', '' if self.progress.planned_any else self._further.describe())
         if self.progress.standing:
             self.run.why = self.progress.standing
             self._listen_again()
@@ -336,9 +341,7 @@ class PosePlanner(RemasterNode):
             return
         if tour is not None and self.progress.phase != REGISTRATION and not self._described:
             self._described = True
-            designed = self._tours.designed
-            expected = f'; {designed.describe()}' if designed is not None else ''
-            self.status.event(events.TourPlanned(tour.describe() + expected))
+            self.status.event(events.TourPlanned(self._further.planned(tour)))
         with self._lock:
             # Paused or stopped while the pose was chosen and written: collect announces it.
             if self.run.state == 'running':
@@ -377,11 +380,8 @@ class PosePlanner(RemasterNode):
         }
         why = full or run.why
         level = 'error' if run.state == 'failed' else 'warn' if why else 'ok'
-        held = full and run.state == 'running'
-        state = events.PlannerState(
-            state='held' if held else run.state, run=run.token, planned=self.progress.planned
-        )
-        return Summary(level, why or run.state, values, state)
+        shown = 'held' if full and run.state == 'running' else run.state
+        return Summary(level, why or run.state, values, self.progress.state(shown, run.token))
 
     def close(self) -> None:
         """Publish that the planner has stopped, on which the bridge stops the arm."""

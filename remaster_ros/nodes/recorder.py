@@ -194,6 +194,20 @@ class Recorder(RemasterNode):
             self.keeper.write(partial(self._close, 'stopped'))
         elif planner.state == 'running' and self.journal.closed == 'stopped':
             self.keeper.write(self.keeper.reopen)
+        elif planner.goes_further(self.journal.plan_id) and self.journal.closed == 'complete':
+            self.keeper.write(self._go_further)
+
+    def _go_further(self) -> None:
+        """Open the complete session again, for what separates causes."""
+        try:
+            self.keeper.reopen(go_further=True)
+        except InputError as error:
+            self._trouble = str(error)
+        if not self.registration.T_R_N:
+            # This recorder was started when the session was complete already.
+            self._register(self.journal.registration)
+            self._changes.take_back(self.journal.watched, self.registration.T_R_N)
+        self.status.publish()
 
     # A configuration
 

@@ -48,8 +48,9 @@ class SessionKeeper:
     ) -> None:
         self._node = node
         self.journal = SessionJournal(folder, header)
-        recording = with_bag and not self.journal.closed
-        self.bag = BagRecorder(node, folder / 'bag' if recording else None)
+        self.bag = BagRecorder(
+            node, folder / 'bag' if with_bag else None, begin=not self.journal.closed
+        )
         self._waiting: Callable[[], object] | None = None
         self._tried_wall = self._checked_wall = time.monotonic()
         self._moved = False
@@ -98,9 +99,9 @@ class SessionKeeper:
             self.restored = line
         return bool(lines)
 
-    def reopen(self) -> None:
-        """Go on with a session that was stopped."""
-        self.journal.reopen()
+    def reopen(self, *, go_further: bool = False) -> None:
+        """Go on with a session that was stopped; with `go_further`, with one that is complete."""
+        self.journal.reopen(go_further=go_further)
         self.bag.reopen()
 
     def close(self, exit_status: ExitStatus) -> None:

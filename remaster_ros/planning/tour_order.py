@@ -123,6 +123,8 @@ class Tour:
     order
         Split, pose and solution of each visit, in order: a pose may be visited again for others of
         its solutions. Without it the nearest pose is next, in all its solutions.
+    begin_at
+        Number of the first pose: of a tour behind others of its session.
     """
 
     def __init__(
@@ -135,9 +137,10 @@ class Tour:
         model: CollisionModel | None = None,
         reference_every: int = 0,
         order: Sequence[tuple[str, int, int]] = (),
+        begin_at: int = 0,
     ) -> None:
         self._chain, self._model = chain, model
-        self.order = tuple(order)
+        self.order, self.begin_at = tuple(order), begin_at
         self.reference_every = reference_every
         self.in_order, self.one_solution = in_order, one_solution
         self.plans = dict(plans)
@@ -311,7 +314,7 @@ class Tour:
 
     def _stop(self, split: str, index: int, route: Route) -> PoseVisit:
         pose = self.plans[split].poses[index]
-        number = self.visited if split != REGISTRATION else -1 - self.visited
+        number = self.begin_at + self.visited if split != REGISTRATION else -1 - self.visited
         number = self._numbers.get((split, index), number)
         ids, paths, unreached = tuple(route.ids), tuple(route.paths), tuple(route.unreached)
         solutions = pose.solutions[list(ids)]

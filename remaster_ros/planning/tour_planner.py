@@ -20,19 +20,21 @@ from remaster_ros.planning.planned_design import (
 )
 from remaster_ros.planning.reference_choice import choose_references
 from remaster_ros.planning.registration_tour import registration_tour
+from remaster_ros.planning.rival_causes import FoundCause
 from remaster_ros.planning.separating_design import (
-    FoundCause,
     SeparatingDesign,
     further_scene,
+    measured_so_far,
     separate,
 )
 from remaster_ros.planning.tour_order import (
+    FITTED,
     REFERENCE,
     REGISTRATION,
     Tour,
 )
 from remaster_ros.planning.travel_time import TravelTime
-from remaster_ros.types import FloatArray
+from remaster_ros.types import FloatArray, Measurements
 
 MOST_TRIES = 5
 """So often references are chosen anew where one has no free way to it."""
@@ -146,6 +148,57 @@ class TourPlanner:
             self.design.priors,
         )
         return replace(plan, poses=(*plan.poses, *self.separated.poses))
+
+    def further(
+        self,
+        T_R_N: Mapping[str, FloatArray],
+        causes: Sequence[FoundCause],
+        rows: Measurements,
+        before: Tour,
+        most: int,
+    ) -> Tour:
+        """Plan what separates causes that were found in a session, to be measured behind it.
+
+        Parameters
+        ----------
+        T_R_N
+            Registrations of the sensors, (4, 4).
+        causes
+            With their look-alikes.
+        rows
+            What the session has.
+        before
+            Its last tour, whose references are visited again.
+        most
+            Configurations that may be added.
+        """
+        sensors_R = {name: T[:3, 3] for name, T in T_R_N.items()}
+        rng = np.random.default_rng([self._seed, *b'further', before.begin_at + before.visited])
+        pool = further_scene(self.scene).plan(POOL_CANDIDATES, sensors_R, rng)
+        planned, so_far = measured_so_far(rows)
+        design = self.design.before(sensors_R)
+        self.separated = separate(
+            self._chain,
+            planned,
+            pool.poses,
+            design.sensors,
+            design.marker_std_m,
+            causes,
+            design.priors,
+            so_far,
+            most,
+        )
+        plans = {FITTED: Plan(self.separated.poses)}
+        if before.references and self.separated.poses:
+            plans[REFERENCE] = before.plans[REFERENCE]
+        return Tour(
+            self._chain,
+            plans,
+            model=self.model,
+            reference_every=before.reference_every if REFERENCE in plans else 0,
+            order=[(FITTED, *visit) for visit in self.separated.order],
+            begin_at=before.begin_at + before.visited,
+        )
 
     def _references(self, plans: Mapping[str, Plan]) -> Plan:
         """Choose references among the planned configurations, each with a way from the last."""

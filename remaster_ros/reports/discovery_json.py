@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from remaster_ros.calibration.predictions import Coverage, Predictions, predict
 from remaster_ros.compensation.export import GEOMETRY_FILE
 from remaster_ros.discovery.confirmation import Confirmation
+from remaster_ros.discovery.decision import Decision
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.stepwise_selection import DRAWS
 from remaster_ros.reports import schemas
@@ -42,6 +44,7 @@ def discovery_content(
     discovery: Discovery,
     confirmation: Confirmation | None = None,
     predictions: Predictions | None = None,
+    decided: Sequence[Decision] = (),
 ) -> Discovered:
     """Return a discovery as discovery.json has it; predictions are made where none are given."""
     predictions = predictions_of(discovery) if predictions is None else predictions
@@ -88,6 +91,18 @@ def discovery_content(
         }
     if discovery.thinning is not None:
         content['rows_searched'] = discovery.thinning
+    if decided:
+        content['decided'] = [
+            {
+                'cause': one.cause._asdict(),
+                'look_alike': one.look_alike._asdict(),
+                'answer': one.answer,
+                'log_evidence': one.log_evidence if np.isfinite(one.log_evidence) else None,
+                'sigma': one.sigma,
+                'sentence': one.describe(),
+            }
+            for one in decided
+        ]
     if confirmation is not None:
         content['confirmation'] = vars(confirmation) | {
             'offsets_rms_sigmas': confirmation.offsets_rms_sigmas,
@@ -139,8 +154,11 @@ def save_discovery(
     confirmation: Confirmation | None = None,
     figures: bool = True,
     predictions: Predictions | None = None,
+    decided: Sequence[Decision] = (),
 ) -> Path:
     """Write discovery.json, predictions.csv, what to apply and, with figures, the report.
+
+    ``decided`` is what was decided between causes and look-alikes of an earlier search.
 
     Returns
     -------
@@ -155,7 +173,7 @@ def save_discovery(
     folder = Path(folder)
     make_folder(folder)
     predictions = predictions_of(discovery) if predictions is None else predictions
-    content = discovery_content(discovery, confirmation, predictions)
+    content = discovery_content(discovery, confirmation, predictions, decided)
     write_atomically(folder / DISCOVERY_FILE, schemas.encode(content))
     gross = {observation for observation, _ in discovery.fit.left_out}
     text = predictions_text(discovery.fit.session, predictions, gross)

@@ -43,6 +43,24 @@ class LookAlike(Struct):
     general: bool = False
 
 
+class NamedCause(Struct):
+    """A cause by name and joints."""
+
+    name: str
+    joints: list[int]
+
+
+class Decided(Struct):
+    """What was decided between a cause and its look-alike; see `decision.Decision`."""
+
+    cause: NamedCause
+    look_alike: NamedCause
+    answer: Literal['cause', 'look_alike', 'open', 'neither']
+    log_evidence: float | None
+    sigma: float
+    sentence: str
+
+
 class Effect(Struct):
     """A cause; ``size_m`` is the RMS at the marker after absorption, ``share`` of the gain.
 
@@ -226,4 +244,5 @@ class Discovered(Struct):
     stretches: Stretches | UnsetType = UNSET
     rows_searched: SearchedRows | UnsetType = UNSET
     confirmation: Confirmed | UnsetType = UNSET
+    decided: list[Decided] | UnsetType = UNSET
     judgement: Judgement | UnsetType = UNSET

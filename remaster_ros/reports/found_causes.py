@@ -1,22 +1,41 @@
-"""Causes and their look-alikes from a discovery.json, for a plan that separates them."""
+"""Causes and their look-alikes from a discovery.json, to be separated and decided between."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from typing import Any
 
+from remaster_ros.discovery.decision import Named
 from remaster_ros.errors import InputError
-from remaster_ros.planning.separating_design import FoundCause
+from remaster_ros.planning.rival_causes import FoundCause
 from remaster_ros.reports.discovery_json import read_discovery
 
 
-def read_causes(path: str | os.PathLike[str]) -> tuple[FoundCause, ...]:
+def read_causes(
+    path: str | os.PathLike[str], observations_sha256: str = ''
+) -> tuple[FoundCause, ...]:
     """Return the causes of a discovery.json that have look-alikes.
+
+    Parameters
+    ----------
+    path
+        The file.
+    observations_sha256
+        Of the observations that it has to be of; '' for any.
 
     Raises
     ------
     InputError
-        It is no discovery.json, or has no cause with a look-alike.
+        It is no discovery.json, is of other observations, or has no cause with a look-alike.
     """
+    found = read_discovery(path)
+    of = found.get('session', {}).get('observations_sha256')
+    if observations_sha256 and of != observations_sha256:
+        raise InputError(
+            f'{path} is not of the observations that the session has now; call /remaster/discover '
+            'first'
+        )
     causes = tuple(
         FoundCause(
             effect['name'],
@@ -24,15 +43,58 @@ def read_causes(path: str | os.PathLike[str]) -> tuple[FoundCause, ...]:
             {parameter['name']: parameter['value'] for parameter in effect['parameters']},
             tuple(
                 (other['name'], tuple(other['joints']), other['separate_by'])
-                for other in effect['confusable_with']
+                for other in _separable(effect)
             ),
+            effect['driver'],
         )
-        for effect in read_discovery(path)['effects']
-        if effect['confusable_with']
+        for effect in found['effects']
+        if _separable(effect)
     )
     if not causes:
         raise InputError(
-            f'{path}: none of its causes has a look-alike (confusable_with); there is nothing to '
-            'separate, plan without it'
+            f'{path}: none of its causes has a look-alike (confusable_with) that can be '
+            'separated from it; there is nothing to separate, plan without it'
         )
     return causes
+
+
+def earlier_pairs(
+    path: str | os.PathLike[str], created: str = ''
+) -> tuple[tuple[Named, Named], ...]:
+    """Return causes and look-alikes of a discovery.json, and those that it has decided between.
+
+    Parameters
+    ----------
+    path
+        The file.
+    created
+        When the session was begun that it has to be of; of another there are none. '' for any.
+
+    Raises
+    ------
+    InputError
+        It is no discovery.json.
+    """
+    found = read_discovery(path)
+    if created and found.get('session', {}).get('created') != created:
+        return ()
+    pairs = [(_named(one['cause']), _named(one['look_alike'])) for one in found.get('decided', ())]
+    pairs += [
+        (_named(effect), _named(other))
+        for effect in found['effects']
+        for other in _separable(effect)
+    ]
+    return tuple(pairs)
+
+
+def _named(cause: Mapping[str, Any]) -> Named:
+    return Named(cause['name'], tuple(cause['joints']))
+
+
+def _separable(effect: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the look-alikes of an effect that are neither another name nor a free form of it."""
+    return [
+        other
+        for other in effect['confusable_with']
+        if not other.get('same') and not other.get('general')
+    ]

@@ -75,6 +75,9 @@ class PlanJournal:
         How many configurations of the collection came to which end, references not counted.
     references
         The same for visits to the references.
+    earlier
+        Of the collection's tours before this one: ``poses`` and ``configurations``; ``to_fit``,
+        configurations to fit of the first; ``further``, of those behind it.
     state
         The planner's last state, '' before the first.
     run
@@ -107,6 +110,7 @@ class PlanJournal:
         self.stop: PoseVisit | None = None
         self.outcomes: Counter[str] = Counter()
         self.references: Counter[str] = Counter()
+        self.earlier: Counter[str] = Counter()
         if self.path.exists():
             self._open()
 
@@ -151,6 +155,7 @@ class PlanJournal:
         tour, stop, joints = self.tour, self.stop, len(self._chain)
         match record:
             case TourNoted():
+                self._count_earlier()
                 self.stop = None
                 self.tour = record.tour(self._chain, self._model)
             case StopNoted() if tour is not None:
@@ -165,6 +170,18 @@ class PlanJournal:
                 self._close_solution(record.id, record.result)
             case StateNoted():
                 self.state, self.run = record.state, record.run
+
+    def _count_earlier(self) -> None:
+        """Count the tour that another one of the collection follows."""
+        tour = self.tour
+        if tour is not None and FITTED in tour.plans:
+            count = sum(len(pose.solutions) for pose in tour.plans[FITTED].poses)
+            self.earlier += Counter(
+                poses=sum(tour.poses.values()),
+                configurations=sum(tour.configurations.values()),
+                to_fit=0 if tour.begin_at else count,
+                further=count if tour.begin_at else 0,
+            )
 
     def _take(self, stop: PoseVisit) -> None:
         """Go to a stop; the solutions that nothing leads to have their outcome with it."""
@@ -201,10 +218,11 @@ class PlanJournal:
 
     def begin(self, tour: Tour, expected: Expected | None = None) -> None:
         """Note a new tour, and what its fit is expected to state where that is known."""
-        how = tour.in_order, tour.one_solution, tour.reference_every, tour.order
+        how = tour.in_order, tour.one_solution, tour.reference_every, tour.order, tour.begin_at
         self._append(TourNoted(tour.plans, *how))
         if expected is not None:
             self._append(ExpectationNoted(dict(expected.joint_std), expected.tool_rms))
+        self._count_earlier()
         # As it was set before there was a file to keep it in.
         self._append(StateNoted(self.state, self.run))
         self.tour, self.stop = tour, None

@@ -34,6 +34,8 @@ class TourNoted(msgspec.Struct, tag_field='kind', tag='tour'):
     reference_every: int = 0
     # Empty where the nearest pose is next.
     order: tuple[tuple[str, int, int], ...] = ()
+    # Above 0 behind another tour of the collection.
+    begin_at: int = 0
 
     def tour(self, chain: SerialChain, model: CollisionModel | None = None) -> Tour:
         """Return the tour of this arm, at its beginning; the model is what it must not hit."""
@@ -45,6 +47,7 @@ class TourNoted(msgspec.Struct, tag_field='kind', tag='tour'):
             model=model,
             reference_every=self.reference_every,
             order=self.order,
+            begin_at=self.begin_at,
         )
 
 

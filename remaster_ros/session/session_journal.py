@@ -16,9 +16,10 @@ from remaster_ros.collection.events import Decided, Outcome
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.session.files import read_limited
-from remaster_ros.session.journal import Record
+from remaster_ros.session.journal import Record, read_journal
 from remaster_ros.session.plain_data import from_plain, to_plain
 from remaster_ros.session.reader import HEADER, OBSERVATIONS_LIMIT, ROWS, read_header
+from remaster_ros.session.session_opening import JOURNAL
 from remaster_ros.session.session_writer import SessionWriter
 from remaster_ros.session.session_yaml import ExitStatus
 from remaster_ros.types import FloatArray, Observation, Session, Split
@@ -36,6 +37,7 @@ class SessionJournal:
     ----------
     folder
         The session's. A complete session is not written to; `closed` is set from the start.
+        `reopen` may go further with it.
     header
         Everything but the observations.
 
@@ -75,15 +77,16 @@ class SessionJournal:
         self._shift_s = 0.0
         self.reopen()
 
-    def reopen(self) -> None:
-        """Go on with a session that was stopped."""
-        if is_complete(self.folder):
+    def reopen(self, *, go_further: bool = False) -> None:
+        """Go on with a session that was stopped; with `go_further`, with one that is complete."""
+        if is_complete(self.folder) and not go_further:
             rows = read_limited(self.folder / ROWS, OBSERVATIONS_LIMIT, 'it is part of a session')
             self.observations = rows.count(b'\n') - 1
             self.closed = 'complete'
+            self.plan_id = _plan_of(self.folder / JOURNAL)
             self.notes = [f'{self.folder}: this session is complete; name a new folder to record']
             return
-        self._writer = SessionWriter(self.folder, self._header, resume=True)
+        self._writer = SessionWriter(self.folder, self._header, resume=True, go_further=go_further)
         self.closed, self.notes = '', []
         self.observations = self._writer.observations
         if self._writer.resumed:
@@ -279,6 +282,14 @@ class SessionJournal:
 def is_complete(folder: Path) -> bool:
     """Whether a folder holds a session that is complete; `InputError` where it is none."""
     return (folder / HEADER).exists() and read_header(folder).exit_status == 'complete'
+
+
+def _plan_of(path: Path) -> str:
+    """Return the plan that the journal of a session follows; '' where there is none."""
+    if not path.exists():
+        return ''
+    plans = [record['id'] for record in read_journal(path).records if record['kind'] == 'plan']
+    return plans[-1] if plans else ''
 
 
 def _split(name: str) -> Split:

@@ -56,6 +56,8 @@ class SessionWriter:
         Go on with what the folder holds.
     even_complete
         Open a complete session too, which remains complete until it is closed (recovery).
+    go_further
+        Go on with a complete session, which is unfinished until it is closed again.
 
     Attributes
     ----------
@@ -89,6 +91,7 @@ class SessionWriter:
         *,
         resume: bool = False,
         even_complete: bool = False,
+        go_further: bool = False,
     ) -> None:
         self.folder = Path(folder)
         self._rows_path = self.folder / ROWS
@@ -106,7 +109,7 @@ class SessionWriter:
             remove_beginnings(self.folder, self._empty_rows)
         self.resumed = resume and (self.folder / HEADER).exists()
         if self.resumed:
-            refuse_another(self.folder, files, even_complete)
+            refuse_another(self.folder, files, even_complete or go_further)
         else:
             begin(self.folder, files)
         self._closed = False

@@ -22,13 +22,16 @@ SEED = 5
 SENSOR_NODES = ('optitrack_markers', 'laser_tracker_markers')
 
 
-def test_killed_nodes_cost_nothing(start, tmp_path):
-    """Recorder, planner, bridge and a random sensor node, one after the other."""
+@pytest.mark.parametrize(
+    ('cell', 'options'), [('demo', ('--candidates', '4')), ('quick', ())], ids=['one', 'three']
+)
+def test_killed_nodes_cost_nothing(start, tmp_path, cell, options):
+    """Recorder, planner, bridge and a random sensor node; with one marker, and with three."""
     print('seed', SEED)
     chooser = random.Random(SEED)
     out = tmp_path / 'out'
     demo = start(
-        'remaster_ros.cli.main', 'demo', '--out', out, '--candidates', '4', '--no-figures',
+        'remaster_ros.cli.main', 'demo', '--out', out, *options, '--no-figures',
         '--seed', SEED, '--rate', '20',
     )  # fmt: skip
     path = out / 'session' / 'observations.csv'
@@ -61,7 +64,7 @@ def test_killed_nodes_cost_nothing(start, tmp_path):
     demo.send_signal(signal.SIGINT)
     demo.communicate(timeout=30)
     rows()
-    truth = make_world(tmp_path / 'world', read_cell('demo'), SEED, 20.0).truth
+    truth = make_world(tmp_path / 'world', read_cell(cell), SEED, 20.0).truth
     result = judge(out, seen, truth)
     assert result['exit_status'] == 'complete'
     assert (result['lost'], result['twice'], result['wrong']) == (0, 0, 0)

@@ -11,6 +11,7 @@ from remaster_ros.simulation.faults import inject
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 
 
+@pytest.mark.qualify
 def test_reflectors_are_measured_one_after_another(start, client, tmp_path):
     text = config_path('cells/demo.yaml').read_text(encoding='utf-8')
     for old, new in (

@@ -65,6 +65,8 @@ class LaserTrackerDriver(TriggeredDriver):
         self._narrow = False
         # Which reflector the beam is on; None where that is not known.
         self._on: str | None = None
+        # Those that were not found last time: they are not worth several searches any more.
+        self._missed: set[str] = set()
         self._temperature_c: float | None = None
 
     @property
@@ -97,14 +99,17 @@ class LaserTrackerDriver(TriggeredDriver):
             return
         self._on = None
         self._search_narrowly()
-        for attempt in range(1, self.p.attempts + 1):
+        attempts = 1 if marker in self._missed else self.p.attempts
+        for attempt in range(1, attempts + 1):
             try:
                 self.tracker.go_position(expected)
             except LaserTrackerError:
-                if attempt == self.p.attempts or not self.tracker.connected:
+                if attempt == attempts or not self.tracker.connected:
+                    self._missed.add(marker)
                     raise
             else:
                 self._on = marker
+                self._missed.discard(marker)
                 return
 
     def _search_narrowly(self) -> None:

@@ -182,7 +182,12 @@ class TopicDriver(StreamDriver):
             # A detector that sends only what it sees: the next configuration may show it again.
             ready = hidden = not (trouble or self.p.always_sends)
             ago = 'yet' if came is None else f'for {silent_s:.1f} s'
-            remedy = 'is the marker in view?' if hidden else 'look at its driver'
+            remedy = 'is the marker in view?'
+            if not hidden:
+                remedy = (
+                    'look at its driver (or set always_sends to false, where it sends only what '
+                    'it sees)'
+                )
             trouble = trouble or f'nothing on {self.topic} {ago}: {remedy}'
         elif trouble:
             ready = False

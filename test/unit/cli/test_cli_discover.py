@@ -1,10 +1,12 @@
 """What `remaster discover` prints."""
 
+import json
 import re
 import types
 from dataclasses import replace
 
 from remaster_ros.cli.discover import summary
+from remaster_ros.cli.main import main
 from remaster_ros.discovery.confirmation import Confirmation, ConfirmedCause
 from remaster_ros.discovery.explain import FoundEffect, LookAlike
 from remaster_ros.discovery.gain import Gain
@@ -119,3 +121,39 @@ def test_why_nothing_can_be_compared_is_said():
     text = summary(session, nothing)
     assert text.endswith('other session: Too few rows.')
     assert 'nan' not in text
+
+
+def test_what_was_left_open_before_is_decided(tmp_path, capsys):
+    simulated, out = tmp_path / 'session', tmp_path / 'causes'
+    options = (
+        '--poses',
+        '20',
+        '--validation',
+        '6',
+        '--sensors',
+        'mocap',
+        '--seed',
+        '1',
+        '--quiet',
+    )
+    assert main(['simulate', str(simulated), *options, '--effect', 'joint_compliance@2:1']) == 0
+    quick = ('--no-figures', '--seed', '1')
+    assert main(['discover', str(simulated), '--out', str(out), *quick, '--quiet']) == 0
+    content = json.loads((out / 'discovery.json').read_text())
+    assert 'decided' not in content
+    (effect,) = content['effects']
+    effect['confusable_with'] = [
+        {'name': 'base_compliance', 'joints': [], 'log_evidence_gain': 1.0, 'separate_by': 'poses'}
+    ]
+    earlier = tmp_path / 'earlier.json'
+    earlier.write_text(json.dumps(content))
+    capsys.readouterr()
+    again = ['discover', str(simulated), '--out', str(out), *quick, '--decide', str(earlier)]
+    assert main(again) == 0
+    said = capsys.readouterr().out
+    (decided,) = json.loads((out / 'discovery.json').read_text())['decided']
+    assert decided['answer'] == 'cause'
+    assert decided['sentence'] in said
+    assert f'not base compliance; {decided["sigma"]:.1f} sigma' in decided['sentence']
+    missing = ['discover', str(simulated), '--out', str(out), '--decide', str(tmp_path / 'none')]
+    assert main(missing) == 2

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from remaster_ros.collection.collection_run import NOT_LIVING, CollectionRun
-from remaster_ros.collection.events import BridgeState, RecorderState
+from remaster_ros.collection.events import BridgeState, PlannerState, RecorderState
 
 BRIDGE = BridgeState(halted='', run='a')
 RECORDER = RecorderState(waiting_for='', run='a')
@@ -224,3 +224,26 @@ def test_only_a_person_or_a_living_run_makes_it_run(steps, was_running):
             assert run.token not in used, 'a run that has ended is another one'
             used.add(run.token)
         assert not (run.left and run.state == 'running')
+
+
+def test_a_complete_collection_is_gone_further_with_where_that_can_be_measured():
+    run = CollectionRun(30.0)
+    run.end('complete')
+    recorder = RecorderState(waiting_for='', run='', exit_status='complete')
+    assert 'start anew' in run.refusal(BRIDGE, recorder, has_joints=True)
+    why = run.refusal(BRIDGE, recorder, has_joints=True, further='no look-alikes')
+    assert why == 'the collection is complete: no look-alikes'
+    assert run.refusal(BRIDGE, recorder, has_joints=True, further='') == ''
+    run.end('failed')
+    assert 'failed' in run.refusal(BRIDGE, recorder, has_joints=True, further='')
+    # Of another plan, or with nothing to go further with.
+    other = CollectionRun(30.0)
+    assert 'give it a new folder' in other.refusal(BRIDGE, recorder, has_joints=True)
+
+
+def test_only_a_running_planner_of_the_same_plan_opens_a_complete_session():
+    state = PlannerState(state='running', run='a', further='p')
+    assert state.goes_further('p')
+    assert not state.goes_further('q')
+    assert not PlannerState(state='complete', run='', further='p').goes_further('p')
+    assert not PlannerState(state='running', run='a').goes_further('')

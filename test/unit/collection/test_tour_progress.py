@@ -290,3 +290,50 @@ def test_enough_at_the_last_pose_changes_nothing(bench):
     assert b.next() is None
     assert b.progress.is_complete
     assert 'dropped_solutions_enough is known' not in b.progress.counts()
+
+
+def test_what_is_measured_further_follows_a_complete_collection_also_after_a_restart(bench):
+    b = bench(references=2)
+    b.register()
+    while (stop := b.next()) is not None:
+        b.visit(stop)
+    assert b.progress.is_complete
+    assert not b.progress.goes_further
+    before = b.journal.tour
+    planned, done = b.progress.planned, b.journal.outcomes.total()
+    plan = plan_of(9, 2, 2)
+
+    def further(T_R_N):
+        b.tours.seen.append(T_R_N)
+        order = [('optimization', *visit) for visit in ((1, 0), (0, 1), (1, 1), (0, 0))]
+        plans = {'optimization': plan, REFERENCE: before.plans[REFERENCE]}
+        return Tour(CHAIN, plans, reference_every=100, order=order, begin_at=before.visited)
+
+    b.progress.further = further
+    places, b.progress.T_R_N = b.progress.T_R_N, {}
+    assert b.next() is None
+    assert b.progress.standing == 'waiting for the registrations of the recorder'
+    assert not b.progress.is_complete
+    b.progress.T_R_N = places
+    # That enough was known of the offsets ends no search for what separates causes.
+    b.progress.enough = True
+    splits, numbers, visits = [], [], []
+    while (stop := b.next()) is not None:
+        splits.append(stop.split)
+        numbers.append(stop.pose)
+        visits += [(stop.index, i) for i in stop.ids if stop.split == 'optimization']
+        b.visit(stop)
+        b.restart()
+    assert b.progress.is_complete
+    assert b.progress.goes_further
+    assert b.progress.planned_any
+    assert splits[:4] == [REFERENCE] * 4
+    assert min(numbers) == before.visited
+    assert visits == [(1, 0), (0, 1), (1, 1), (0, 0)]
+    assert b.tours.seen[-1].keys() == {'mocap'}
+    assert b.progress.planned == planned
+    counts = b.progress.counts()
+    assert (counts['configurations_done'], counts['configurations']) == (done + 4, done + 4)
+    assert (counts['poses_done'], counts['poses']) == (4, 4)
+    assert b.journal.earlier['to_fit'] == planned
+    assert b.journal.earlier['further'] == 0

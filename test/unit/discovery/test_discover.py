@@ -161,6 +161,23 @@ def test_causes_that_the_poses_do_not_determine_are_left_out_with_the_reason(mon
         discover_session(sagging_session(), rng=np.random.default_rng(3))
 
 
+def test_causes_that_settle_with_the_markers_held_are_kept_and_that_is_stated(monkeypatch):
+    def particular(session, *, priors, extension, **options):
+        if extension is not None and priors is None:
+            raise InsufficientDataError('the observations hardly determine marker.sir.z; more')
+        return fit_session(session, priors=priors, extension=extension, **options)
+
+    monkeypatch.setattr(discover, 'fit_session', particular)
+    found = discover_session(sagging_session(), rng=np.random.default_rng(3))
+    assert found.verdict == 'effects'
+    assert found.fit.theta_names == ('compliance_2', 'compliance_4')
+    assert found.gain.held_out_rms_after_m < found.gain.held_out_rms_before_m
+    (left,) = found.unexplained
+    assert (left.where, left.driver) == ('marker', 'registration')
+    assert 'hardly determine marker.sir.z)' in left.next
+    assert 'sir at (' in left.next
+
+
 def test_the_extended_model_is_sampled_and_gains_on_held_out_poses():
     found = discover_session(sagging_session(), rng=np.random.default_rng(0))
     assert found.verdict == 'effects'

@@ -63,7 +63,8 @@ def test_folders_are_beside_the_parameter_file_wherever_launch_was_started(tmp_p
     nodes = {node.name: node for node in real_nodes(CELL, f'../{params.name}')}
     session = {'session': str(tmp_path / 'session')}
     assert nodes['recorder'].parameters[1] == {'cell': CELL, **session}
-    assert nodes['pose_planner'].parameters[1] == {'cell': CELL, **session}
+    discovery = {'discovery': str(tmp_path / 'discovery')}
+    assert nodes['pose_planner'].parameters[1] == {'cell': CELL, **session, **discovery}
     assert nodes['optimizer'].parameters[1] == {
         'cell': CELL,
         **session,

@@ -14,6 +14,7 @@ from discovery_scenes import at_joint, session_with
 from remaster_ros.calibration.noise import Noise, NoiseModel
 from remaster_ros.compensation.export import exports
 from remaster_ros.discovery.confirmation import confirm
+from remaster_ros.discovery.decision import Named, decisions
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.discovery.effects.base import Design
 from remaster_ros.discovery.effects.registry import EFFECTS
@@ -36,7 +37,10 @@ def saved(tmp_path_factory):
     folder = tmp_path_factory.mktemp('discovery')
     # Arm and poses are drawn from the seed, in turn: the same arm needs as many poses.
     again = session_with(41, bent, poses=25, validation=15, pose_sigma_m=0.3e-3)
-    assert save_discovery(found, folder, confirm(found, again)) == folder / 'report.html'
+    pair = (Named('joint_compliance', (2,)), Named('encoder_eccentricity', (2,)))
+    decided = decisions(found, [pair])
+    report = save_discovery(found, folder, confirm(found, again), decided=decided)
+    assert report == folder / 'report.html'
     return found, folder
 
 
@@ -50,7 +54,8 @@ def test_discovery_json_keeps_its_contract(saved):
     assert (effect['place'], effect['form']) == ('joint_angle', 'sin/cos')
     assert effect['parameters'][0].keys() == {'name', 'value', 'std', 'unit'}
     for other in effect['confusable_with']:
-        assert other.keys() == {'name', 'joints', 'log_evidence_gain', 'separate_by'}
+        keys = {'name', 'joints', 'log_evidence_gain', 'separate_by', 'same', 'general'}
+        assert other.keys() == keys
         assert other['separate_by']
     assert re.search(r'joint 2 errs by up to [45]\.\d+′ ± 0\.\d+′', effect['cause'])
     assert effect['sizes'][0] in effect['cause']
@@ -59,6 +64,10 @@ def test_discovery_json_keeps_its_contract(saved):
     assert content['gain']['held_out_rms_after_m'] < content['gain']['held_out_rms_before_m']
     assert content['joint_offsets_after'][1].keys() >= {'joint', 'mean_deg', 'std_deg'}
     assert content['confirmation']['confirmed'] is True
+    (decided,) = content['decided']
+    assert decided['answer'] == 'look_alike'
+    assert decided['cause'] == {'name': 'joint_compliance', 'joints': [2]}
+    assert decided['log_evidence'] < -3.0
     assert read_discovery(folder / 'discovery.json') == content
 
 
@@ -67,6 +76,7 @@ def test_the_report_needs_nothing_else_and_names_the_cause(saved):
     page = (folder / 'report.html').read_text()
     assert not re.findall(r'(?:src|href)="(?!#)[^"]', page)
     assert found.effects[0].cause in page
+    assert 'decided: encoder eccentricity of joint 2, not joint compliance of joint 2; ' in page
     assert f'What to do: {found.effects[0].remedy}' in page
     assert 'p &lt; 0.0033 over all causes' in page
     assert 'sin2_2' in page

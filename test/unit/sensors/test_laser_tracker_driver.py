@@ -61,8 +61,13 @@ def test_one_that_is_hidden_is_not_replaced_by_the_other(scene):
     driver.turn_to('', MARKER)
     driver.measure(MARKER)
     world.numbers = {'hidden': 2}
-    with pytest.raises(DeviceError):
-        driver.turn_to('b', MARKER + OTHER_BESIDE)
+    searches = [driver.tracker.counts['searches']]
+    for _ in range(2):
+        with pytest.raises(DeviceError):
+            driver.turn_to('b', MARKER + OTHER_BESIDE)
+        searches.append(driver.tracker.counts['searches'])
+    # Two attempts, and no more than one at the next standstill.
+    assert np.diff(searches).tolist() == [2, 1]
     # Nor is the other one taken for it afterwards, and it is found again where it is.
     driver.turn_to('', MARKER)
     assert off(driver.measure(MARKER), MARKER) < NEAR_M

@@ -123,6 +123,31 @@ def test_a_slow_stream_is_reported_and_read(rig):
     assert len(r.read()) == 8
 
 
+@pytest.mark.parametrize('always_sends', [False, True])
+def test_silence_is_a_hidden_marker_or_a_fault(rig, always_sends):
+    r = rig(always_sends=always_sends)
+    r.stream(20)
+    r.clock.wall += 1.5
+    state = r.driver.state()
+    assert (state.ready, state.values['fault']) == (
+        (False, 'none') if always_sends else (True, 'marker')
+    )
+    assert ('look at its driver' in state.trouble) == always_sends
+    # A hidden marker is none where messages come.
+    r.driver.take(point((np.nan,) * 3, r.clock.now))
+    state = r.driver.state()
+    assert (state.ready, state.trouble) == (True, 'the marker is not in view (/tool)')
+
+
+def test_a_simulated_clock_may_lag_behind_the_messages(rig):
+    rig()
+    for simulated in (True, False):
+        driver = TopicDriver(Parameters(), SensorClock(lambda: 10.0, simulated=simulated))
+        driver.follow('/tool', POINT, 'sir', lambda: (OURS,))
+        driver.take(point(stamp_s=10.5))
+        assert (driver.read() is not None) == simulated
+
+
 def test_what_was_measured_once_is_read_once(rig):
     r = rig()
     r.stream(5)

@@ -124,3 +124,45 @@ def test_references_are_rows_of_their_own_and_are_remembered(session, tmp_path):
     assert found.measurements.is_validation.tolist() == [True, False]
     assert found.references.observation.tolist() == [0, 1, 3]
     assert found.references.configuration.tolist() == [0, 0, 2]
+
+
+def test_a_complete_session_is_gone_further_with_on_request_alone(session, tmp_path):
+    book = SessionJournal(tmp_path, session)
+    assert book.follow('plan a')
+    write(book, -1, 0, [reading('mocap', 1.0)], split='registration')
+    write(book, 0, 0, [reading('mocap', 9.0)])
+    book.close('complete')
+    before = (tmp_path / 'observations.csv').read_bytes()
+    for again in (SessionJournal(tmp_path, session), book):
+        again.reopen()
+        assert (again.closed, again.plan_id) == ('complete', 'plan a')
+
+    book.reopen(go_further=True)
+    assert book.closed == ''
+    assert read_session(tmp_path).exit_status == 'aborted'
+    assert book.follow('plan a')
+    assert book.result(0, 0) == 'recorded'
+    assert len(book.registration) == 1
+    write(book, 5, 0, [reading('mocap', 20.0)])
+    book._writer.release()  # killed
+
+    book = SessionJournal(tmp_path, session)
+    assert book.closed == ''
+    write(book, 6, 0, [reading('mocap', 30.0)])
+    book.close('complete')
+    found = read_session(tmp_path)
+    assert found.exit_status == 'complete'
+    assert found.measurements.pose.tolist() == [0, 5, 6]
+    assert (tmp_path / 'observations.csv').read_bytes().startswith(before)
+
+
+def test_a_complete_session_that_was_changed_is_not_gone_further_with(session, tmp_path):
+    book = SessionJournal(tmp_path, session)
+    book.follow('plan a')
+    write(book, 0, 0, [reading('mocap', 9.0)])
+    book.close('complete')
+    path = tmp_path / 'observations.csv'
+    path.write_text(path.read_text().replace('9.0', '9.5'))
+    with pytest.raises(InputError, match=r'observations\.csv'):
+        book.reopen(go_further=True)
+    assert book.closed == 'complete'

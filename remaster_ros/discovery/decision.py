@@ -1,0 +1,167 @@
+"""What further measurements have decided between two causes that could be mistaken for each other.
+
+Both are fitted beside everything else that was found, one in the place of the other. The
+difference of their log evidence are the odds; with both as likely beforehand, they are also stated
+as the standard deviations that a normal error has to have for it to be as rare (one-sided).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.special import ndtri_exp
+
+from remaster_ros.discovery.discover import Discovery
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.evidence import solve
+from remaster_ros.discovery.explain import TIED
+from remaster_ros.discovery.families import family_log_prior
+
+
+class Named(NamedTuple):
+    """A cause: name and joints (1-based)."""
+
+    name: str
+    joints: tuple[int, ...]
+
+    def __str__(self) -> str:
+        """Return it in a few words."""
+        several = 's' * (len(self.joints) > 1)
+        at = f' of joint{several} {", ".join(map(str, self.joints))}' if self.joints else ''
+        return f'{self.name.replace("_", " ")}{at}'
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Which of two causes it is.
+
+    Attributes
+    ----------
+    cause, look_alike
+        As they were before.
+    answer
+        ``cause`` or ``look_alike``; ``open`` where odds of twenty to one are not reached;
+        ``neither`` where the search names none of the two.
+    log_evidence
+        Of the cause less that of its look-alike; NaN where they cannot be compared.
+    sigma
+        How sure the answer is, in standard deviations.
+    """
+
+    cause: Named
+    look_alike: Named
+    answer: Literal['cause', 'look_alike', 'open', 'neither']
+    log_evidence: float
+    sigma: float
+
+    def describe(self) -> str:
+        """Return it in a line."""
+        if self.answer == 'neither':
+            return f'decided: neither {self.cause} nor {self.look_alike}'
+        first, second = self.cause, self.look_alike
+        if self.log_evidence < 0.0:
+            first, second = second, first
+        if self.answer == 'open':
+            return f'still open: {first} or {second}; {self.sigma:.1f} sigma for the first'
+        return f'decided: {first}, not {second}; {self.sigma:.1f} sigma'
+
+
+def sigma_of(log_odds: float) -> float:
+    """Return the standard deviations that are as rare as an error at these odds, one-sided."""
+    return max(0.0, float(-ndtri_exp(-np.logaddexp(0.0, abs(log_odds)))))
+
+
+def decisions(found: Discovery, pairs: Sequence[tuple[Named, Named]]) -> tuple[Decision, ...]:
+    """Compare two causes of each pair by what was measured since.
+
+    Parameters
+    ----------
+    found
+        The search of all that was measured.
+    pairs
+        A cause and its look-alike of an earlier search.
+    """
+    return tuple(_decision(found, *pair) for pair in dict.fromkeys(pairs))
+
+
+def _decision(found: Discovery, cause: Named, look_alike: Named) -> Decision:
+    # Named are causes that the search has found now; part of a solution may be located structure.
+    named = [Named(effect.name, effect.joints) for effect in found.effects]
+    if cause not in named and look_alike not in named:
+        return Decision(cause, look_alike, 'neither', float('nan'), 0.0)
+    first, second = _evidence(found, cause, look_alike), _evidence(found, look_alike, cause)
+    if first is None and second is None:
+        return Decision(cause, look_alike, 'neither', float('nan'), 0.0)
+    # What cannot be fitted beside the rest explains nothing.
+    bare = _without(found, cause, look_alike)
+    first, second = (bare if one is None else max(one, bare) for one in (first, second))
+    difference = first - second
+    winner = cause if difference > 0.0 else look_alike
+    decided = abs(difference) > TIED and winner in named
+    answer: Literal['cause', 'look_alike', 'open'] = 'open'
+    if decided:
+        answer = 'cause' if difference > 0.0 else 'look_alike'
+    return Decision(cause, look_alike, answer, difference, sigma_of(difference))
+
+
+def _rest(found: Discovery, *causes: Named) -> tuple[Cell, ...]:
+    cells = found.selection.solution.cells
+    return tuple(cell for cell in cells if not any(_belongs(cell, one) for one in causes))
+
+
+def _belongs(cell: Cell, cause: Named) -> bool:
+    parts = [(joint,) for joint in cause.joints]
+    return cell.name == cause.name and (cell.joints == cause.joints or cell.joints in parts)
+
+
+def _without(found: Discovery, *causes: Named) -> float:
+    solution = found.selection.solution
+    rest = _rest(found, *causes)
+    bare = solve(found.residuals, rest, solution, prior=family_log_prior(rest, _cells(found)))
+    return -np.inf if bare is None else bare.log_evidence
+
+
+def _evidence(found: Discovery, cause: Named, other: Named) -> float | None:
+    """Return the log evidence with a cause in place of another; None where it cannot be fitted."""
+    solution, every = found.selection.solution, _cells(found)
+    rest = _rest(found, cause, other)
+    present = tuple(cell for cell in solution.cells if _belongs(cell, cause))
+    whole = {joint for cell in present for joint in cell.joints} == {*cause.joints}
+    sets = [present] if present and whole else _variants(every, cause)
+    best = None
+    for cells in sets:
+        together = (*rest, *cells)
+        prior = family_log_prior(together, every)
+        fit = solve(found.residuals, together, solution, prior=prior)
+        if fit is None or fit.unphysical():
+            continue
+        if best is None or fit.log_evidence > best:
+            best = fit.log_evidence
+    return best
+
+
+def _variants(every: Sequence[Cell], cause: Named) -> list[tuple[Cell, ...]]:
+    """Return the sets of cells that a cause can be: one cell, or one for each of its joints."""
+    mine = [cell for cell in every if cell.name == cause.name]
+    one: list[tuple[Cell, ...]] = [(cell,) for cell in mine if cell.joints == cause.joints]
+    each = [
+        [c for c in mine if c.joints == (joint,) and EFFECTS[c.name].in_family(c)][:1]
+        for joint in cause.joints
+    ]
+    if one or not all(each):
+        return one
+    return [tuple(cell for cells in each for cell in cells)]
+
+
+def _cells(found: Discovery) -> list[Cell]:
+    context = found.residuals.context
+    return [
+        cell
+        for effect in EFFECTS.values()
+        if not effect.needs(context) and not effect.moves_the_fit and not effect.costly
+        for cell in effect.cells(context)
+    ]

@@ -1,0 +1,76 @@
+"""Causes and look-alikes of an earlier search, as plans and decisions take them."""
+
+import json
+
+import pytest
+
+from remaster_ros.errors import InputError
+from remaster_ros.reports.found_causes import earlier_pairs, read_causes
+
+
+def alike(name, joints=(), **more):
+    plain = {'log_evidence_gain': 9.0, 'separate_by': 'poses'}
+    return {'name': name, 'joints': list(joints), **plain, **more}
+
+
+def written(folder, *look_alikes, **more):
+    effect = {
+        'name': 'joint_compliance', 'joints': [2], 'place': 'joint_angle',
+        'driver': 'gravity_torque', 'form': 'linear',
+        'parameters': [{'name': 'compliance_2', 'value': 1e-5, 'std': 1e-6, 'unit': 'rad/(N m)'}],
+        'p_value': 0.003, 'log_evidence_gain': 10.0, 'confusable_with': list(look_alikes),
+        'cause': 'It sags.',
+    }  # fmt: skip
+    session = {
+        'optimization': {'observations': 1, 'configurations': 1, 'poses': 1},
+        'validation': {'observations': 0, 'configurations': 0, 'poses': 0},
+        'sensors': {'mocap': 'sir'}, 'created': '2026-01-01', 'exit_status': 'complete',
+        'observations_sha256': 'ab',
+    }  # fmt: skip
+    content = {
+        'format': 'remaster-discovery/1', 'verdict': 'undetermined', 'effects': [effect],
+        'gain': {
+            'held_out_rms_before_m': 1e-3, 'held_out_rms_after_m': 1e-4, 'noise_floor_m': 1e-4,
+        },
+        'noise': {'pose_common_fraction': 0.5, 'outliers': [], 'heteroscedastic': {}},
+        'joint_offsets_after': [], 'session': session, **more,
+    }  # fmt: skip
+    path = folder / 'discovery.json'
+    path.write_text(json.dumps(content), encoding='utf-8')
+    return path
+
+
+def test_what_nothing_separates_is_left_out(tmp_path):
+    path = written(
+        tmp_path,
+        alike('base_compliance'),
+        alike('link_length', (3,), same=True),
+        alike('joint_error_curve', (2,), general=True),
+    )
+    (cause,) = read_causes(path, 'ab')
+    assert cause.look_alikes == (('base_compliance', (), 'poses'),)
+    assert cause.driver == 'gravity_torque'
+    assert earlier_pairs(path) == ((('joint_compliance', (2,)), ('base_compliance', ())),)
+    with pytest.raises(InputError, match='nothing to separate'):
+        read_causes(written(tmp_path, alike('link_length', (3,), same=True)))
+
+
+def test_a_search_of_other_observations_or_of_another_session_does_not_count(tmp_path):
+    path = written(tmp_path, alike('base_compliance'))
+    with pytest.raises(InputError, match='not of the observations that the session has now'):
+        read_causes(path, 'cd')
+    assert len(earlier_pairs(path, '2026-01-01')) == 1
+    assert earlier_pairs(path, '2026-02-01') == ()
+
+
+def test_what_was_decided_is_looked_at_again(tmp_path):
+    decided = {
+        'cause': {'name': 'backlash', 'joints': [4]},
+        'look_alike': {'name': 'settling', 'joints': [4]},
+        'answer': 'open', 'log_evidence': None, 'sigma': 0.0, 'sentence': 'still open',
+    }  # fmt: skip
+    path = written(tmp_path, alike('base_compliance'), decided=[decided])
+    assert earlier_pairs(path) == (
+        (('backlash', (4,)), ('settling', (4,))),
+        (('joint_compliance', (2,)), ('base_compliance', ())),
+    )
