@@ -268,6 +268,8 @@ class Watch(RemasterNode):
 
     def _show(self) -> None:
         now = time.monotonic()
+        confirming = self._callers.get(f'{CONFIRM}/{self._plan}')
+        self.view.plan_offered = confirming is not None and confirming.service_is_ready()
         watched = self.page.watched or self._rviz.wanted
         if now - self._published_s >= (EVERY_S if watched else IDLE_EVERY_S) - 0.01:
             self._published_s = now

@@ -46,7 +46,7 @@ def commands(
     if not why and unconfirmed:
         why = f'plan {plan} is not confirmed' if plan else 'the plan is not shown yet'
     idle = state not in ('running', 'held')
-    served = bool(confirmation and confirmation['address'])
+    ready = bool(confirmation and confirmation['address'] and confirmation['offered'])
     return {
         'collect': {
             'label': 'Go on' if begun else 'Begin the collection',
@@ -58,7 +58,7 @@ def commands(
         'fit': {'label': 'Fit', 'on': idle and measured, 'note': ''},
         'confirm': {
             'label': f'Confirm plan {plan}',
-            'on': served and unconfirmed and idle and not silent,
+            'on': ready and unconfirmed and idle and not silent,
             'note': 'Nothing moves before you begin the collection or go on.',
         },
     }

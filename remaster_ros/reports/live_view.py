@@ -64,6 +64,8 @@ class LiveView:
         Where registered sensors stand, sensor -> (4, 4).
     residuals
         Of the markers.
+    plan_offered
+        Whether the planner offers the service that confirms the plan which is next.
     """
 
     def __init__(
@@ -88,7 +90,7 @@ class LiveView:
         self._precision = Precision()
         self._offsets: Mapping[str, tuple[float, float]] = {}
         self._fit = FitFacts()
-        self._plan_page = PlanPage()
+        self._plan_page, self.plan_offered = PlanPage(), False
 
     # What comes in
 
@@ -327,6 +329,7 @@ class LiveView:
             'confirmed': self._values['confirmed'] == 'yes',
             'page': page,
             'address': served.address,
+            'offered': self.plan_offered,
             'trouble': _clip(served.trouble),
         }
 

@@ -222,6 +222,7 @@ def test_a_plan_is_confirmed_in_this_tab_only_after_it_was_opened_here(browser, 
         write_plan_page(path, first.replace(plans[0], name))
         address = played.server.show_plan(read_plan_page(path, name))
         collection.view.take_plan_page(PlanPage(name, address))
+        collection.view.plan_offered = True
         played.change(plan=name)
 
     def confirm_is_off():

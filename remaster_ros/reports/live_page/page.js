@@ -140,6 +140,7 @@ function showConfirmation(confirmation, command) {
   if (confirmed) setText('plan-note', '');
   else if (trouble) setText('plan-note', `It cannot be shown here: ${trouble}. Open ${page} on the computer of pose_planner; it has the command that confirms it.`);
   else if (!address) setText('plan-note', 'It is being fetched.');
+  else if (!confirmation.offered) setText('plan-note', `The service of pose_planner that confirms plan ${plan} is not there yet.`);
   else setText('plan-note', looked ? command.note : 'Look at the plan first: every way and every configuration.');
 }
 

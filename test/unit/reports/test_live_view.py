@@ -152,6 +152,8 @@ def test_a_plan_is_offered_for_confirmation_only_where_it_can_be_looked_at(playe
     assert played.view.view(2.0)['confirmation']['trouble'] == 'it is elsewhere'
     assert not played.view.view(2.0)['commands']['confirm']['on']
     played.view.take_plan_page(PlanPage('ab12cd34', 'plan/x'))
+    assert not played.view.view(2.0)['commands']['confirm']['on'], 'nobody offers it yet'
+    played.view.plan_offered = True
     view = played.view.view(2.0)
     assert view['commands']['confirm']['on']
     assert view['commands']['confirm']['label'] == 'Confirm plan ab12cd34'
