@@ -224,10 +224,8 @@ class Pairing:
         """Add up how long each sensor's node has sent nothing, as far as not excused yet."""
         for name in self.rules:
             same = name in counts and counts[name] == self._message_counts.get(name)
-            if same and name not in absent:
-                self._silent_s[name] += passed_s
-            else:
-                self._silent_s[name] = 0.0
+            silent = same and name not in absent
+            self._silent_s[name] = self._silent_s[name] + passed_s if silent else 0.0
         self._message_counts = dict(counts)
 
     def has_reading(self, sensor: str) -> bool:

@@ -248,16 +248,14 @@ class Search:
         settled = True
         while solution.cells:
             unphysical = solution.unphysical()
-            worth = []
-            for index, (cell, where) in enumerate(
-                zip(solution.cells, solution.slices(), strict=True)
-            ):
-                if index in unphysical:
-                    worth.append(-np.inf)
-                elif among is not None and cell not in among:
-                    worth.append(np.inf)
-                else:
-                    worth.append(worth_of(solution, cell, where, price))
+            worth = [
+                worth_of(solution, cell, where, price)
+                if among is None or cell in among
+                else np.inf
+                for cell, where in zip(solution.cells, solution.slices(), strict=True)
+            ]
+            for index in unphysical:
+                worth[index] = -np.inf
             # Wald's estimate of the loss chooses; the evidence itself decides.
             for index in np.argsort(worth)[:2]:
                 if worth[index] > 2.0:
@@ -284,9 +282,7 @@ class Search:
         rest = (*solution.cells[:index], *solution.cells[index + 1 :])
         for settle in (False, True) if settled else (False,):
             smaller = self.fit(rest, solution, settled=settle)
-            if smaller is not None and (
-                unphysical or smaller.log_evidence > solution.log_evidence
-            ):
+            if smaller and (unphysical or smaller.log_evidence > solution.log_evidence):
                 return smaller, settle
         return None
 
