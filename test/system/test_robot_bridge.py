@@ -77,6 +77,17 @@ def settle(bench, seconds):
     bench.until(lambda: time.monotonic() > end, seconds + 1)
 
 
+def collect_again(bench, condition):
+    """Pause and collect as a person does; once more where a busy bridge has not met the run."""
+    for _ in range(3):
+        bench.plan_state('paused')
+        settle(bench, 0.5)
+        bench.plan_state('running')
+        if bench.until(condition, 12):
+            return
+    pytest.fail(bench.log.read_text()[-2000:])
+
+
 def test_nothing_outside_the_limits_is_ever_commanded(bridge):
     """Outside by 0.1 degree, far outside, not a number: refused by name; the good one is not."""
     bench = bridge()
@@ -242,10 +253,7 @@ def test_an_arm_in_a_margin_leaves_slowly_and_only_after_clear_halt(bridge, tmp_
     assert not bench.commands_since(0.0)
     assert bench.clear_halt()
     cleared = time.monotonic()
-    bench.plan_state('paused')
-    settle(bench, 0.5)
-    bench.plan_state('running')
-    wait(bench, lambda: bench.commands_since(cleared))
+    collect_again(bench, lambda: bench.commands_since(cleared))
     way_out = bench.commands_since(cleared)[0]
     _, speeds, _ = way_out.spline().sample()
     assert np.all(np.abs(speeds) <= 0.1 * CHAIN.velocity_limits + 1e-9)
