@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from fault_observer import Observer
+from fault_relay import Relay
 
 from remaster_ros.collection.events import ConfigurationEnded, PoseAnnounced
 from remaster_ros.nodes.demo import free_ports
@@ -41,42 +42,6 @@ RELAYED = {
     'laser_tracker_markers': 'laser_tracker/marker',
 }
 """Node -> the topic between it and the others, where relays are wanted."""
-
-
-class Relay:
-    """Hand messages on, as they are or spoiled.
-
-    Attributes
-    ----------
-    spoil
-        Returns what becomes of a message; None hands it on.
-    delay_s
-        How much later it is handed on, wall time.
-    """
-
-    def __init__(self, node, topic: str, kind) -> None:
-        from remaster_ros.nodes.status import LEASED, RELIABLE
-
-        self.spoil: Callable | None = None
-        self.delay_s, self._last = 0.0, None
-        self._publisher = node.create_publisher(kind, topic, LEASED)
-        # The planner counts two that listen to it: bridge and recorder.
-        for callback in (self._take, lambda message: None):
-            node.create_subscription(kind, f'bench/{topic}', callback, RELIABLE)
-
-    def _take(self, message) -> None:
-        self._last = message
-        if self.delay_s:
-            threading.Timer(self.delay_s, self._send, [message]).start()
-        else:
-            self._send(message)
-
-    def _send(self, message) -> None:
-        self._publisher.publish(self.spoil(message) if self.spoil else message)
-
-    def say_again(self) -> None:
-        """Send the last message again."""
-        self._send(self._last)
 
 
 def cell_of_several_markers(folder: Path) -> Path:

@@ -1,292 +1,40 @@
-"""The faults of docs/faults.md that are tried on real nodes, and what became of each.
+"""The faults of docs/faults.md that are tried on real nodes.
 
-A row is one fault in the middle of a running collection. `observe` injects it, ends it, lets an
-operator do what is needed, and returns the row of the page. What must hold whatever happens is
-asserted on the way: nothing commanded outside the limits or too fast, nothing at all from a halt
-until a person has cleared it, and a collection that goes on once the fault is over.
+A row is one fault in the middle of a running collection (`fault_observation`).
 """
 
 from __future__ import annotations
 
-import copy
-import json
-import signal
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
-from fault_bench import RATE, SENSOR_OF, Bench
-from fault_observer import plain
-
-from remaster_ros.collection.events import (
-    VERSION,
-    ArmHalted,
-    ArmStopped,
-    ConfigurationEnded,
-    HaltCleared,
-    SolutionSettled,
+from fault_bench import RATE, SENSOR_OF
+from fault_injections import (
+    BESIDE,
+    FAR,
+    answers,
+    frozen_points,
+    honest,
+    in_point,
+    in_settled,
+    in_solutions,
+    intermittent,
+    killed,
+    later,
+    nothing,
+    over,
+    paused,
+    paused_in_an_emergency,
+    restarted,
+    resumed,
+    robot,
+    second_publisher,
+    spoiled,
+    started,
+    stranger_on,
+    strangers_leave,
+    stutters,
+    then_pause,
 )
-
-HALT_S = 0.3
-"""A command may be on its way when a halt is published, s."""
-TRIES = 4
-"""So often at most a row is tried."""
-GOES_ON_S = 30.0
-"""Once a fault is over the next configuration is recorded within so much wall time."""
-BENCHES = {
-    'plain': {},
-    'relays': {'relays': True},
-    'emergency': {'emergency': True},
-    'bar alone': {'require': 'mocap'},
-    'any sensor': {'require': 'any'},
-    'several markers': {'several_markers': True},
-}
-"""Set of nodes -> what the bench is given for it."""
-REFUSED = {
-    'outside_limits': 'outside the limits',
-    'too_fast': 'faster than the arm can be',
-    'stamp': 'its stamp does not advance',
-    'not_finite': 'not finite',
-}
-"""What a busy machine alone never does to a report."""
-COLUMNS = 'who', 'fault', 'what is said', 'what is commanded', 'how it goes on'
-
-
-class TooBusyError(Exception):
-    """The machine was too busy to see what became of a fault."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """A fault.
-
-    Attributes
-    ----------
-    who, fault
-        Columns of the page.
-    inject, end
-        Begin and end it; by default it ends with the faults of the fakes.
-    lasts_s
-        Wall time between the two.
-    during
-        ``move`` or ``reading``: what is under way when it begins.
-    bench
-        Which set of nodes it is tried in, see `BENCHES`.
-    quick
-        Whether `make test` tries it.
-    times
-        Whether it makes joint_states late or early; only a busy machine does else.
-    """
-
-    who: str
-    fault: str
-    inject: Callable[[Bench], object]
-    end: Callable[[Bench], object] = lambda bench: bench.inject()
-    lasts_s: float = 4.0
-    during: str = 'move'
-    bench: str = 'plain'
-    quick: bool = False
-    times: bool = False
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What became of a fault: columns of the page, and what was commanded in numbers.
-
-    Attributes
-    ----------
-    travel_deg, share
-        Of the stop that followed the fault, or 0: how far it led on, and its highest speed as a
-        share of the arm's limits.
-    """
-
-    said: str
-    commanded: str
-    goes_on: str
-    travel_deg: float = 0.0
-    share: float = 0.0
-
-
-def observe(bench: Bench, row: Row) -> Seen:
-    """Try a row; return what was seen. On a machine that was too busy for it, try again.
-
-    Raises
-    ------
-    TooBusyError
-        It was too busy every time.
-    """
-    for _ in range(TRIES):
-        began = time.monotonic()
-        seen = _observe(bench, row)
-        if row.times or not any(_refused(bench, kind, began) for kind in ('late', 'early')):
-            return seen
-        print(f'{row.fault}: once more, joint_states came late without a fault: {seen.said}')
-    raise TooBusyError(f'{TRIES} times joint_states came late without a fault: {seen.said}')
-
-
-def _observe(bench: Bench, row: Row) -> Seen:
-    observer = bench.observer
-    (bench.under_way if row.during == 'move' else bench.settled)()
-    began = time.monotonic()
-    row.inject(bench)
-    _wait(bench, began + row.lasts_s)
-    row.end(bench)
-    ended = time.monotonic()
-    _wait(bench, ended + 1.2)
-    halted = bench.halted
-    if halted:
-        # What is over does not let the arm go.
-        _wait(bench, time.monotonic() + 1.0)
-    goes_on = _go_on(bench)
-    halts = observer.find(ArmHalted, since_s=began)
-    stops = observer.find(ArmStopped, since_s=began)
-    cleared = [at for at, _ in observer.find(HaltCleared, since_s=began)]
-    commands = observer.since(began)
-    observer.judge(commands)
-    stop = next((c for c in commands if c.points == 1 and c.wall_s < ended + 1.0), None)
-    if halts:
-        (halt_s, _), until = halts[0], [at for at in cleared if at > halts[0][0]]
-        after = observer.since(halt_s + HALT_S, until[0] if until else np.inf)
-        assert not after, f'{len(after)} commands after a halt: {halts}'
-        stop = stop if stop is not None and stop.wall_s < halt_s + HALT_S else None
-        commanded = 'a stop along its path, then nothing' if stop else 'nothing'
-    elif stops or _blocked(bench, began, ended):
-        commanded = 'nothing new: it stops, or stands, as long as it lasts'
-    else:
-        commanded = 'the planned moves'
-    refused = [kind for kind in REFUSED if _refused(bench, kind, began) > 0]
-    unseen = [
-        message
-        for at, node, message, _ in list(observer.summaries)
-        if node == 'recorder' and at > began and 'was not seen' in message
-    ]
-    said = [
-        *observer.reasons(began),
-        *map(plain, unseen[:1]),
-        *(f'a report of the joints is refused ({REFUSED[kind]})' for kind in refused),
-    ]
-    numbers = (0.0, 0.0)
-    if stop is not None:
-        numbers = float(np.rad2deg(stop.travel_rad)), observer.share(stop)
-    return Seen('; '.join(said) or 'nothing', commanded, goes_on, *numbers)
-
-
-def _refused(bench: Bench, kind: str, began: float) -> int:
-    """Return how many reports of the joints were refused for a reason since then."""
-    counts = [
-        (at, int(values.get(f'joints_refused_{kind}', 0)))
-        for at, node, _, values in list(bench.observer.summaries)
-        if node == 'robot_bridge'
-    ]
-    before = [count for at, count in counts if at <= began]
-    return max(count for _, count in counts) - (before[-1] if before else 0)
-
-
-def _wait(bench: Bench, until_s: float) -> None:
-    bench.until(lambda: time.monotonic() > until_s, 60, 'time')
-
-
-def _blocked(bench: Bench, began: float, ended: float) -> bool:
-    """Whether the bridge reported for most of a second that it must not move the arm."""
-    words = [
-        message
-        for at, node, message, _ in list(bench.observer.summaries)
-        if node == 'robot_bridge' and began < at < ended + 1.0
-    ]
-    idle = ('moving or measuring', 'waiting for a pose')
-    return sum(word not in idle for word in words) >= 2
-
-
-def _go_on(bench: Bench) -> str:
-    """Let the collection go on until another configuration is recorded; say who had to do what."""
-    took: list[str] = []
-    deadline = time.monotonic() + GOES_ON_S
-    since = time.monotonic()
-    while True:
-        assert time.monotonic() < deadline, f'it does not go on: {bench.halted}, {bench.planner}'
-        if bench.halted or bench.planner in ('paused', 'idle', 'stopped'):
-            # As a person does: look, and only then.
-            _wait(bench, time.monotonic() + 0.7)
-            steps = bench.operate()
-            took += [step for step in steps if step not in took]
-            since = time.monotonic()
-        done = bench.observer.find(ConfigurationEnded, since_s=since)
-        if any(event.result == 'recorded' for _, event in done):
-            break
-        _wait(bench, time.monotonic() + 0.1)
-    return f'after {" and ".join(took)}' if took else 'by itself'
-
-
-# Faults of the robot
-
-
-def robot(**numbers: float) -> Callable[[Bench], None]:
-    """Return an injection into the fake robot."""
-    return lambda bench: bench.inject(robot=numbers)
-
-
-def then_pause(inject: Callable[[Bench], object]) -> Callable[[Bench], None]:
-    """Return an injection that is followed by a person's pause."""
-
-    def both(bench: Bench) -> None:
-        inject(bench)
-        _wait(bench, time.monotonic() + 0.4)
-        bench.call('pause')
-
-    return both
-
-
-def second_publisher(bench: Bench) -> None:
-    """Report other joints beside the robot, then what is not a number."""
-    from sensor_msgs.msg import JointState
-
-    publisher = bench.foreign('joint_states', JointState)
-    names = list(bench.world.chain.joint_names)
-    until = time.monotonic() + 2.0
-    while time.monotonic() < until:
-        q, _ = bench.world.reported(bench.world.now())
-        q = q + 0.5 if until - time.monotonic() > 1.0 else q * np.nan
-        message = JointState(name=names, position=q.tolist())
-        now = bench.world.now()
-        message.header.stamp.sec, message.header.stamp.nanosec = int(now), int(now % 1 * 1e9)
-        publisher.publish(message)
-        time.sleep(0.02)
-
-
-def strangers_leave(bench: Bench) -> None:
-    """End the bench's own publishers."""
-    for publisher in bench.strangers:
-        bench.node.destroy_publisher(publisher)
-    bench.strangers.clear()
-    bench.inject()
-
-
-def stranger_on(topic: str) -> Callable[[Bench], None]:
-    """Return an injection: another publisher of poses or commands, who sends the arm elsewhere."""
-
-    def publish(bench: Bench) -> None:
-        from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
-
-        publisher = bench.foreign(topic, JointTrajectory)
-        if topic == 'remaster/joint_solutions':
-            time.sleep(0.5)
-            message = JointTrajectory(joint_names=list(bench.world.chain.joint_names))
-            point = JointTrajectoryPoint(positions=(bench.world.start_q + 0.2).tolist())
-            message.points = [point]
-            message.header.stamp.sec = 1
-            publisher.publish(message)
-
-    return publish
-
-
-def paused_in_an_emergency(bench: Bench) -> None:
-    """Stop the bridge's process; meanwhile the emergency stop is pressed."""
-    bench.send('robot_bridge', signal.SIGSTOP)
-    bench.inject(robot={'estop': 1})
-    time.sleep(1.5)
-    bench.send('robot_bridge', signal.SIGCONT)
-
+from fault_observation import Row
 
 FIVE = (
     Row('robot', 'emergency stop pressed and driver silent', robot(estop=1, off=1), quick=True),
@@ -374,62 +122,6 @@ ROBOT = (
 )  # fmt: skip
 
 
-# Faults of the nodes
-
-
-def killed(name: str) -> Callable[[Bench], None]:
-    """Return SIGKILL."""
-    return lambda bench: bench.kill(name)
-
-
-def started(name: str) -> Callable[[Bench], None]:
-    """Return a new start."""
-    return lambda bench: bench.start(name)
-
-
-def restarted(name: str) -> Callable[[Bench], None]:
-    """Return SIGKILL and a start at once, as launch does."""
-
-    def again(bench: Bench) -> None:
-        bench.kill(name)
-        bench.start(name)
-
-    return again
-
-
-def paused(name: str) -> Callable[[Bench], None]:
-    """Return SIGSTOP."""
-    return lambda bench: bench.send(name, signal.SIGSTOP)
-
-
-def resumed(name: str) -> Callable[[Bench], None]:
-    """Return SIGCONT."""
-    return lambda bench: bench.send(name, signal.SIGCONT)
-
-
-def stutters(name: str) -> Callable[[Bench], None]:
-    """Return a process that has half of the time."""
-    return lambda bench: bench.stutter(name, 4.0)
-
-
-def intermittent(name: str) -> Callable[[Bench], None]:
-    """Return a process that stands still for 4 s, twice."""
-
-    def twice(bench: Bench) -> None:
-        bench.stutter(name, 8.5, on_s=1.0, off_s=4.0)
-
-    return twice
-
-
-def over(bench: Bench) -> None:
-    """End the faults of the devices."""
-    bench.inject()
-
-
-def nothing(bench: Bench) -> None:
-    """Be over already."""
-
-
 def _common(name: str) -> tuple[Row, ...]:
     quick = {'recorder': 'stuck', 'laser_tracker_markers': 'stuck'}
     rows = (
@@ -454,104 +146,26 @@ def _common(name: str) -> tuple[Row, ...]:
     )
 
 
-# What a node tells, spoiled on its way
-
-
-def spoiled(name: str, spoil: Callable, *, now: bool = False) -> Callable[[Bench], None]:
-    """Return a relay that changes a node's messages; with `now` it repeats the last one."""
-
-    def begin(bench: Bench) -> None:
-        bench.relays[name].spoil = spoil
-        if now:
-            bench.relays[name].say_again()
-
-    return begin
-
-
-def later(name: str, seconds: float) -> Callable[[Bench], None]:
-    """Return a relay that hands on late."""
-    return lambda bench: setattr(bench.relays[name], 'delay_s', seconds)
-
-
-def honest(name: str) -> Callable[[Bench], None]:
-    """Return a relay that hands on what it gets."""
-
-    def end(bench: Bench) -> None:
-        bench.relays[name].spoil, bench.relays[name].delay_s = None, 0.0
-
-    return end
-
-
-def _solutions(change: Callable[[np.ndarray], np.ndarray]) -> Callable:
-    def spoil(message):
-        message = copy.deepcopy(message)
-        for point in message.points:
-            point.positions = change(np.array(point.positions)).tolist()
-        return message
-
-    return spoil
-
-
-def _settled(change: Callable[[np.ndarray], np.ndarray]) -> Callable:
-    def spoil(message):
-        message = copy.deepcopy(message)
-        message.position = change(np.array(message.position)).tolist()
-        return message
-
-    return spoil
-
-
-def _point(change: Callable[[np.ndarray], np.ndarray]) -> Callable:
-    def spoil(message):
-        message = copy.deepcopy(message)
-        point = message.point
-        point.x, point.y, point.z = map(float, change(np.array([point.x, point.y, point.z])))
-        return message
-
-    return spoil
-
-
-class Frozen:
-    """Repeats the first position it gets."""
-
-    def __init__(self) -> None:
-        self.seen: np.ndarray | None = None
-
-    def __call__(self, place: np.ndarray) -> np.ndarray:
-        """Return that position."""
-        self.seen = place if self.seen is None else self.seen
-        return self.seen
-
-
-FAR = np.deg2rad([0.0, 400.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-BESIDE = np.array([0.2, 0.0, 0.0])
-
-
-def frozen_points(name: str) -> Callable[[Bench], None]:
-    """Return a relay that repeats one position for ever."""
-    return lambda bench: spoiled(name, _point(Frozen()))(bench)
-
-
 def _relayed() -> tuple[Row, ...]:
     planner, bridge = 'pose_planner', 'robot_bridge'
     rows = [
-        (planner, 'solutions outside the limits', spoiled(planner, _solutions(lambda q: q + FAR),
+        (planner, 'solutions outside the limits', spoiled(planner, in_solutions(lambda q: q + FAR),
          now=True), 4.0),
         (planner, 'solutions that are not numbers',
-         spoiled(planner, _solutions(lambda q: q * np.nan), now=True), 4.0),
+         spoiled(planner, in_solutions(lambda q: q * np.nan), now=True), 4.0),
         (planner, 'its poses come 1 s late', later(planner, 1.0), 8.0),
-        (bridge, 'says that it settled elsewhere', spoiled(bridge, _settled(lambda q: q + 0.5)),
+        (bridge, 'says that it settled elsewhere', spoiled(bridge, in_settled(lambda q: q + 0.5)),
          10.0),
-        (bridge, 'says that it settled at NaN', spoiled(bridge, _settled(lambda q: q * np.nan)),
+        (bridge, 'says that it settled at NaN', spoiled(bridge, in_settled(lambda q: q * np.nan)),
          10.0),
         (bridge, 'says 1 s late that it settled', later(bridge, 1.0), 8.0),
     ]  # fmt: skip
     for name in SENSOR_OF:
         rows += [
-            (name, 'another marker: 0.2 m beside', spoiled(name, _point(lambda p: p + BESIDE)),
+            (name, 'another marker: 0.2 m beside', spoiled(name, in_point(lambda p: p + BESIDE)),
              6.0),
             (name, 'the same reading again and again', frozen_points(name), 8.0),
-            (name, 'readings that are not numbers', spoiled(name, _point(lambda p: p * np.nan)),
+            (name, 'readings that are not numbers', spoiled(name, in_point(lambda p: p * np.nan)),
              8.0),
             (name, 'readings come 1 s late', later(name, 1.0), 8.0),
         ]  # fmt: skip
@@ -559,29 +173,6 @@ def _relayed() -> tuple[Row, ...]:
         Row(who, fault, inject, honest(who), lasts_s, bench='relays')
         for who, fault, inject, lasts_s in rows
     )
-
-
-def answers(**wrong: object) -> Callable[[Bench], None]:
-    """Return answers in the recorder's name, each time the arm has settled."""
-
-    def begin(bench: Bench) -> None:
-        from std_msgs.msg import String
-
-        publisher = bench.foreign('remaster/events', String)
-        time.sleep(0.3)
-        until, answered = time.monotonic() + 6.0, 0.0
-        while time.monotonic() < until:
-            for at, event in bench.observer.find(SolutionSettled, since_s=answered):
-                answered = max(answered, at)
-                body = {
-                    'kind': 'configuration', 'stamp': event.stamp, 'solution': event.solution,
-                    'result': 'recorded', **wrong,
-                }  # fmt: skip
-                record = {'version': VERSION, 'node': '/recorder', 'body': body}
-                publisher.publish(String(data=json.dumps(record)))
-            time.sleep(0.01)
-
-    return begin
 
 
 RECORDER = (

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 from hostile_bench import Bench
-from hostile_injections import INJECTIONS, WITH_TOPIC, Injection, restart
+from hostile_injections import restart
 from hostile_judge import GRACE_S, Body, Judge, Rules, after
+from hostile_kinds import INJECTIONS, WITH_TOPIC, Injection
 from hostile_lines import EMERGENCY
 from hostile_outcomes import Outcome
 from hostile_scene import HOME, Scene, begin, bench_of, demo_body, target

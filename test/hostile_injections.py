@@ -1,9 +1,7 @@
 """What can go wrong between a bridge and its arm, at random moments of a move under way.
 
 Each injection is a function of the scene; it returns from when on the arm must receive nothing
-(`SILENT`), where that is so. What is expected of the bridge stands beside it: `halt`, `go on`
-(a control, or something that must not disturb) or `any` (both are right; what is commanded
-is judged as always).
+(`SILENT`), where that is so. What is expected of the bridge stands in `hostile_kinds`.
 """
 
 from __future__ import annotations
@@ -11,7 +9,6 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from hostile_bench import Bench
@@ -363,42 +360,3 @@ def commands_lost(s: Scene) -> None:
         s.wait(0.1, 0.5)
         s.bench.plan_state('running')
         s.wait(0.2, 0.8)
-
-
-@dataclass(frozen=True)
-class Injection:
-    """A kind: what is done, what the bridge has to do, and how often it is drawn."""
-
-    act: Callable[[Scene], None]
-    expected: str
-    weight: float = 1.0
-
-    @property
-    def name(self) -> str:
-        """Its name in tables."""
-        return self.act.__name__.replace('_', ' ')
-
-
-INJECTIONS = (
-    *(Injection(act, 'go on') for act in (control, planner_silent, recorder_silent)),
-    *(Injection(act, 'go on') for act in (sensor_missing, lost_states, short_silence)),
-    *(Injection(act, 'go on') for act in (a_little_late, command_doubled, pose_taken_back)),
-    Injection(pauses, 'go on', 3.0),
-    Injection(process_killed, 'go on', 0.5),
-    *(Injection(act, 'halt', 1.5) for act in (emergency, emergency_driver_silent)),
-    *(Injection(act, 'halt') for act in (emergency_released, emergency_while_measuring)),
-    *(Injection(act, 'halt') for act in (emergency_while_paused, process_paused_emergency)),
-    Injection(killed_while_halted, 'halt', 0.5),
-    *(Injection(act, 'halt') for act in (late_states, silence, wrapped, nan_states)),
-    *(Injection(act, 'halt') for act in (frozen_states, stopped_stamps)),
-    *(Injection(act, 'halt') for act in (foreign_states, foreign_garbage, foreign_commands)),
-    Injection(late_from_the_start, 'any', 0.5),
-    *(Injection(act, 'any') for act in (process_paused, somewhat_late, early_stamps)),
-    *(Injection(act, 'any') for act in (clock_set_back, doubled_states, reordered_states)),
-    *(Injection(act, 'any') for act in (wrapped_once, nan_once, commands_late, commands_lost)),
-)
-WITH_TOPIC = (
-    Injection(emergency_topic, 'halt', 1.5),
-    Injection(emergency_topic_blinks, 'halt'),
-)
-"""Where the bridge has an emergency_stop_topic, these are drawn too."""

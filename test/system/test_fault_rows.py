@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 
+import fault_observation
 import fault_observer
 import fault_page
 import fault_rows
@@ -20,7 +21,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
 
 ALL = bool(fault_page.MODE)
 TRIED = [row for row in fault_rows.ROWS if ALL or row.quick]
-TRIED.sort(key=lambda row: (list(fault_rows.BENCHES).index(row.bench), not row.quick))
+TRIED.sort(key=lambda row: (list(fault_observation.BENCHES).index(row.bench), not row.quick))
 TRIES = 3
 ENOUGH = 12
 """So many configurations must be left for another row."""
@@ -50,7 +51,7 @@ class Benches:
 
             folder = self._folders.mktemp(f'faults_{next(self._numbers)}')
             self._kind, self.broken = kind, True
-            self._bench = Bench(folder, next(domains), **fault_rows.BENCHES[kind])
+            self._bench = Bench(folder, next(domains), **fault_observation.BENCHES[kind])
             self._bench.begin()
         return self._bench
 
@@ -83,7 +84,7 @@ def write(section, seen):
     order += OTHERS
     rows = [row for row in rows if row[:keys] in order]
     rows.sort(key=lambda row: order.index(row[:keys]))
-    heading = FIVE_HEADING if keys == 1 else fault_rows.COLUMNS
+    heading = FIVE_HEADING if keys == 1 else fault_observation.COLUMNS
     fault_page.replace(section, fault_page.table(heading, rows))
 
 
@@ -91,7 +92,7 @@ def is_on_page(section, row):
     """Return whether the page has this row, and the lines that it has of this fault."""
     keys = 1 if section == 'five' else 2
     page = [other for other in fault_page.rows(section) if other[:keys] == row[:keys]]
-    heading = FIVE_HEADING if section == 'five' else fault_rows.COLUMNS
+    heading = FIVE_HEADING if section == 'five' else fault_observation.COLUMNS
     return fault_page.allows(page, row, heading.index('what is said')), page
 
 
@@ -125,8 +126,8 @@ def test_row(benches, row):
         bench = benches.of(row.bench)
         benches.broken = True
         try:
-            seen = fault_rows.observe(bench, row)
-        except fault_rows.TooBusyError as busy:
+            seen = fault_observation.observe(bench, row)
+        except fault_observation.TooBusyError as busy:
             benches.broken = False
             pytest.skip(str(busy))
         benches.broken = False

@@ -67,3 +67,9 @@ def test_a_group_without_a_test_of_the_name_is_none(run):
 def test_files_that_are_named_run_alone(run, tmp_path):
     assert run('test/unit/test_run_tests.py', '-x', chosen=3) == 3
     assert set(arguments_of(tmp_path)) == {'chosen'}
+
+
+def test_no_two_test_modules_have_one_name():
+    """Make qualify collects all of them in one process, which refuses a name that comes twice."""
+    names = [path.name for path in (ROOT / 'test').rglob('test_*.py')]
+    assert sorted(names) == sorted(set(names))

@@ -164,3 +164,13 @@ class Rig:
         self.run(1.0)
         self.state = 'running'
         self.run(1.0)
+
+
+def supervisor(rules=RULES, limits=LIMITS):
+    """Return one that is fed by hand."""
+    reports = JointReports(limits.lower, limits.upper, 3 * SPEED)
+    return ArmSupervisor(MotionGate(limits), reports, rules)
+
+
+def report(t, q, wall):
+    return JointReport(t, np.asarray(q, float), t, wall)

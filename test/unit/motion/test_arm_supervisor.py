@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from supervisor_rig import HOME, LIMITS, RULES, SPEED, Rig
+from supervisor_rig import HOME, LIMITS, RULES, Rig, report, supervisor
 
 from remaster_ros.motion.actions import (
     CheckPath,
@@ -14,26 +14,10 @@ from remaster_ros.motion.actions import (
     Stop,
     SupervisorRules,
 )
-from remaster_ros.motion.arm_supervisor import ArmSupervisor
 from remaster_ros.motion.following import STANDING_S
-from remaster_ros.motion.joint_reports import JointReport, JointReports
-from remaster_ros.motion.limits import MotionLimits
-from remaster_ros.motion.motion_gate import MotionGate
 from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import FreePath
-from remaster_ros.motion.settling import SettleRules
 from remaster_ros.motion.trajectory import Line
-from remaster_ros.motion.visit import PROBE_WAIT_S
-
-
-def supervisor(rules=RULES, limits=LIMITS):
-    """Return one that is fed by hand."""
-    reports = JointReports(limits.lower, limits.upper, 3 * SPEED)
-    return ArmSupervisor(MotionGate(limits), reports, rules)
-
-
-def report(t, q, wall):
-    return JointReport(t, np.asarray(q, float), t, wall)
 
 
 @pytest.fixture
@@ -274,111 +258,6 @@ def test_a_reading_goes_on_while_paused_and_no_command_follows_it(rig):
     assert rig.last(Drive).solution == 1
 
 
-# Paths
-
-
-def test_the_way_is_asked_for_and_a_slow_answer_waited_for(rig):
-    rig.answer_path = lambda request: None
-    rig.plan([0.3, 0.0], waypoints={0: np.array([[0.1, 0.5]])})
-    (check,) = rig.said(CheckPath)
-    np.testing.assert_allclose(check.start, HOME, atol=1e-4)
-    np.testing.assert_array_equal(check.target, [0.3, 0.0])
-    np.testing.assert_array_equal(check.waypoints, [[0.1, 0.5]])
-    rig.run(2.0)
-    assert len(rig.said(CheckPath)) == 1
-    assert not rig.supervisor.busy
-    answer = Rig._free(check)
-    rig.do(rig.supervisor.path_found(check.number, answer, rig.wall))
-    np.testing.assert_array_equal(rig.last(Drive).admitted.trajectory.points, answer.path.points)
-    # The same answer once more counts nothing.
-    assert rig.supervisor.path_found(check.number, answer, rig.wall) == []
-    rig.run(20.0, lambda: rig.said(Settled))
-
-
-def test_an_answer_to_another_pose_counts_nothing(rig):
-    rig.answer_path = lambda request: None
-    rig.plan([0.3, 0.0])
-    (first,) = rig.said(CheckPath)
-    rig.plan([-0.3, 0.0])
-    second = rig.last(CheckPath)
-    assert second.number != first.number
-    assert rig.supervisor.path_found(first.number, Rig._free(first), rig.wall) == []
-    assert not rig.supervisor.busy
-    rig.do(rig.supervisor.path_found(second.number, Rig._free(second), rig.wall))
-    assert rig.supervisor._motion.is_moving
-
-
-def test_the_way_to_the_next_solution_goes_through_its_own_waypoints(rig):
-    rig.plan([0.3, 0.0], [0.4, 0.0], waypoints={1: np.array([[0.2, 0.4], [0.3, 0.4]])})
-    rig.run(20.0, lambda: rig.said(Settled))
-    rig.answer(0)
-    first, second = rig.said(CheckPath)
-    assert first.waypoints.shape == (0, 2)
-    np.testing.assert_array_equal(second.waypoints, [[0.2, 0.4], [0.3, 0.4]])
-    rig.run(20.0, lambda: len(rig.said(Settled)) == 2)
-    assert len(rig.said(Drive)[1].admitted.trajectory.lines) == 3
-    # Another pose does not inherit them.
-    rig.plan([0.3, 0.0], [0.4, 0.0])
-    assert rig.last(CheckPath).waypoints.shape == (0, 2)
-
-
-def test_a_target_without_a_free_way_is_given_up_and_the_next_asked_for(rig):
-    rig.answer_path = lambda request: (
-        PathAnswer(None, 'the floor') if request.target[0] > 0.5 else Rig._free(request)
-    )
-    rig.plan([0.8, 0.0], [0.7, 0.0], [0.6, 0.0], [0.3, 0.0])
-    assert [f.solution for f in rig.said(Failed)] == [0, 1, 2]
-    assert {f.reason for f in rig.said(Failed)} == {'no free path: the floor'}
-    assert rig.last(Drive).solution == 3
-    assert not rig.said(Halted), 'that is no failure of the robot'
-
-
-def test_what_the_gate_refuses_is_given_up(rig):
-    rig.answer_path = lambda request: PathAnswer(
-        FreePath(np.vstack([request.start, [[0.0, -2.2]], request.target]))
-        if request.target[0] > 0.5
-        else Rig._free(request).path
-    )
-    rig.plan([0.8, 0.0], [0.3, 0.0])
-    (failed,) = rig.said(Failed)
-    assert failed.solution == 0
-    assert failed.reason.startswith('b would go to -1')
-    assert rig.last(Drive).solution == 1
-    assert rig.supervisor.gate.refused == 1
-
-
-def test_an_arm_that_moved_since_it_was_asked_is_asked_again(rig):
-    rig.answer_path = lambda request: None
-    rig.plan([0.3, 0.0])
-    (check,) = rig.said(CheckPath)
-    rig.alter = lambda t, q: np.add(q, [0.015, 0.0])
-    rig.run(1.0)
-    assert rig.supervisor.path_found(check.number, Rig._free(check), rig.wall) == []
-    rig.answer_path = Rig._free
-    rig.run(0.1)
-    assert len(rig.said(CheckPath)) == 2
-    np.testing.assert_allclose(rig.last(CheckPath).start, np.add(HOME, [0.015, 0.0]), atol=1e-4)
-    assert rig.last(Drive).solution == 0
-    assert not rig.said(Failed, Halted)
-
-
-@pytest.mark.parametrize('what', ['paused', 'moving'])
-def test_an_answer_to_an_arm_that_must_not_move_counts_nothing(rig, what):
-    rig.answer_path = lambda request: None
-    rig.plan([0.3, 0.0])
-    (check,) = rig.said(CheckPath)
-    if what == 'paused':
-        rig.state = 'paused'
-    else:
-        rig.alter = lambda t, q: np.add(q, [1e-3 * np.sin(9 * t), 0.0])
-    rig.run(1.0)
-    assert rig.supervisor.path_found(check.number, Rig._free(check), rig.wall) == []
-    assert not rig.said(Drive)
-    rig.state, rig.alter, rig.answer_path = 'running', lambda t, q: q, Rig._free
-    rig.run(2.0)
-    assert [d.solution for d in rig.said(Drive)] == [0]
-
-
 # The recorder
 
 
@@ -411,117 +290,3 @@ def test_how_old_the_last_report_is():
     assert arm.report_age_s(5.0) == np.inf
     arm.report(report(0.0, HOME, 7.0))
     assert arm.report_age_s(9.5) == 2.5
-
-
-# The probe: commanded as measured?
-
-
-def copying(low=(-1.0, -2.0), high=(1.0, 2.0), home=HOME):
-    """Return what is done with a robot that reports what it was commanded."""
-    limits = MotionLimits(('a', 'b'), np.array(low), np.array(high), SPEED, LIMITS.acceleration)
-    arm = supervisor(limits=limits)
-    arm.planner_is('running', 0.0)
-    arm.recorder_waits('', 0.0)
-    arm.plan(np.array([[0.5, 0.5]]), 0.0)
-    actions, q, t = [], home, 0.0
-    while t < 4.0 and not any(isinstance(action, Halted) for action in actions):
-        t += 0.1
-        todo = arm.report(report(t, q, t))
-        while todo:
-            action = todo.pop(0)
-            if isinstance(action, CheckPath):
-                todo += arm.path_found(action.number, Rig._free(action), t)
-                continue
-            actions.append(action)
-            if isinstance(action, Drive):
-                q = action.admitted.waypoints[-1].q
-        arm.planner_is('running', t)
-        arm.recorder_waits('', t)
-    return actions
-
-
-def test_a_robot_that_repeats_commands_is_found_before_it_is_sent_anywhere():
-    probe, halted = copying()
-    assert probe.solution == PROBE
-    (end,) = probe.admitted.waypoints[1:]
-    assert end.time_s == 1.0
-    np.testing.assert_allclose(end.q, HOME, rtol=0, atol=1.01e-6)
-    assert np.all(end.q != HOME)
-    assert halted.reason == (
-        'joint_states repeat what was commanded to the last bit: no measurement; '
-        'switch the driver to measured positions'
-    )
-
-
-@pytest.mark.parametrize('bounds', [((0.1, 0.2), (9.0, 9.0)), ((-9.0, -9.0), (0.1, 0.2))])
-def test_the_probe_goes_inward(bounds):
-    end = copying(*bounds)[0].admitted.waypoints[-1].q
-    assert np.all((end > bounds[0]) & (end < bounds[1]))
-    np.testing.assert_allclose(np.abs(end - HOME), 1e-6, rtol=1e-6)
-
-
-@pytest.mark.parametrize(('place', 'way'), [(0.4, 1), (0.5, 1), (0.6, -1)])
-def test_the_probe_goes_towards_the_middle(place, way):
-    home = np.full(2, place)
-    end = copying((0.0, 0.0), (1.0, 1.0), home)[0].admitted.waypoints[-1].q
-    np.testing.assert_allclose(end, home + way * 1e-6, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize('side', [1.0, -1.0])
-def test_the_probe_of_a_joint_without_limits_goes_towards_zero(side):
-    probe = copying((-np.inf, -np.inf), (np.inf, np.inf), side * HOME)[0]
-    end = probe.admitted.waypoints[-1].q
-    np.testing.assert_allclose(end, side * (HOME - 1e-6), rtol=0, atol=1e-12)
-
-
-def begun(**kwargs):
-    """Return a rig that has not been probed yet."""
-    rig = Rig(begun=False, **kwargs)
-    rig.plan([0.5, 0.5], [0.3, 0.3])
-    return rig
-
-
-def test_a_robot_that_measures_is_probed_once_and_for_a_moment():
-    rig = begun()
-    start = rig.t
-    rig.run(10.0, lambda: rig.said(Settled))
-    rig.answer(0)
-    rig.run(10.0, lambda: len(rig.said(Settled)) == 2)
-    assert [d.solution for d in rig.said(Drive)] == [PROBE, 0, 1]
-    sent = [t for t, action in rig.actions if isinstance(action, Drive)]
-    assert sent[0] - start < 0.6
-    assert 1.0 + PROBE_WAIT_S < sent[1] - sent[0] < 1.0 + PROBE_WAIT_S + 0.1
-
-
-def test_the_probe_that_was_stopped_is_made_again():
-    rig = begun()
-    rig.run(1.0, lambda: rig.said(Drive))
-    rig.state = 'paused'
-    rig.run(3.0)
-    assert len(rig.said(Stop)) == 1
-    rig.state = 'running'
-    rig.run(20.0, lambda: rig.said(Settled))
-    assert [d.solution for d in rig.said(Drive)] == [PROBE, PROBE, 0]
-
-
-@pytest.mark.parametrize(('settle_s', 'wait'), [(0.2, True), (1.0, False), (3.0, False)])
-def test_a_driver_that_begins_to_repeat_commands_later_is_found(settle_s, wait):
-    """Switched to open loop in the middle: no such configuration is ever announced as settled."""
-    rig = Rig(SupervisorRules(settle=SettleRules(settle_s=settle_s)))
-    rig.plan([0.5, 0.5])
-    arrival = rig.t + Line.within(LIMITS, HOME, np.array([0.5, 0.5])).duration_s
-    rig.alter = lambda t, q: np.array([0.5, 0.5]) if t > arrival else q
-    rig.run(10.0, lambda: rig.said(Halted))
-    assert rig.last(Halted).reason.startswith('joint_states repeat what was commanded')
-    assert not rig.said(Settled)
-    assert rig.t - arrival < (PROBE_WAIT_S + 0.1)
-
-
-def test_a_probe_that_must_not_be_made_halts():
-    """Where the arm stands no way is free, and nothing tells a way out."""
-    rig = Rig(begun=False)
-    rig.answer_path = lambda request: PathAnswer(None, 'the floor')
-    rig.plan([0.5, 0.5])
-    rig.run(1.0)
-    assert rig.last(Halted).reason == 'no free path: the floor'
-    assert not rig.said(Drive, Failed)
