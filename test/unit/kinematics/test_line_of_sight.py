@@ -1,21 +1,11 @@
 """Capsules around the links: distances of segments and the line of sight."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.line_of_sight import LinkCapsules, segment_distance
 from remaster_ros.kinematics.serial_chain import SerialChain
-
-ROBOTS = Path(__file__).parents[3] / 'config' / 'robots'
-
-
-@pytest.fixture(scope='module')
-def lwr():
-    text = (ROBOTS / 'lwr4plus.urdf').read_text(encoding='utf-8')
-    return SerialChain.from_urdf(text)
 
 
 def planar_arm(links):
