@@ -21,6 +21,7 @@ from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.side_by_side import rms_sigmas
 from remaster_ros.discovery.words import percent, shown
 from remaster_ros.errors import InsufficientDataError
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.discovery_json import (
     held_out_coverage,
     predictions_of,
@@ -63,7 +64,10 @@ def run(args: argparse.Namespace) -> int:
     if other is not None:
         # Not after the long search.
         require_other_session(session, other)
-    pairs = () if args.decide is None else earlier_pairs(args.decide)
+    pairs = ()
+    if args.decide is not None:
+        chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+        pairs = earlier_pairs(args.decide, chain.joint_names)
     prepare_folder(args.out, DISCOVERY_FILE)
     with progress_bar(args.quiet or args.json) as progress:
         found = discover_session(

@@ -120,7 +120,7 @@ def planned(
         args.settle,
         args.dwell,
     )
-    causes = read_causes(args.separate) if args.separate else ()
+    causes = read_causes(args.separate, scene.model.chain.joint_names) if args.separate else ()
     counts = {'optimization': args.poses, 'validation': args.validation}
     planner = TourPlanner(
         scene, counts, args.seed, args.reference_every, cell.design_settings(), travel, causes

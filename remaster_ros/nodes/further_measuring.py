@@ -68,7 +68,7 @@ class FurtherMeasuring:
         if not self._discovery or not path.exists():
             return f'{DISCOVER} looks for causes, and collect measures what they leave open', None
         try:
-            causes = read_causes(path, self._digest())
+            causes = read_causes(path, observations_sha256=self._digest())
         except InputError as error:
             return str(error), None
         left = MOST_FURTHER - self._measured()

@@ -168,7 +168,7 @@ class Optimizer(RemasterNode):
         pairs: Sequence[tuple[Any, Any]] = ()
         earlier = out / DISCOVERY_FILE
         try:
-            pairs = earlier_pairs(earlier, session.created) if earlier.exists() else ()
+            pairs = earlier_pairs(earlier, created=session.created) if earlier.exists() else ()
         except RemasterError as error:
             self.get_logger().warning(f'nothing is decided of an earlier search: {error}')
         found = discover_session(

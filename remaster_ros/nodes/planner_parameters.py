@@ -93,14 +93,14 @@ class Parameters:
         design = cell.design_settings()
         return TourPlanner(scene, counts, self.seed, self.reference_every, design, travel, causes)
 
-    def causes(self) -> tuple[FoundCause, ...]:
+    def causes(self, joint_names: Sequence[str]) -> tuple[FoundCause, ...]:
         """Return the causes that the plan is to separate; errors as of `read_causes`."""
         if not self.separate:
             return ()
         # Imported when it is needed, as it takes a while.
         from remaster_ros.reports.found_causes import read_causes
 
-        return read_causes(self.separate)
+        return read_causes(self.separate, joint_names)
 
     def plan_settings(self, cell: Workcell, causes: Sequence[FoundCause]) -> dict[str, Any]:
         """Return what the plan depends on."""

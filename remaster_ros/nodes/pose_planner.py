@@ -69,7 +69,7 @@ class PosePlanner(RemasterNode):
         self.chain = self.cell.chain()
         self._order = JointOrder(self.chain.joint_names)
         self._q: FloatArray | None = None
-        causes = self.p.causes()
+        causes = self.p.causes(self.chain.joint_names)
         self._tours = self.p.tour_planner(self.cell, self.chain, causes)
         settings = self.p.plan_settings(self.cell, causes)
         folder = Path(self.p.session)

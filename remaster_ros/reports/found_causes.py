@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from remaster_ros.discovery.decision import Named
@@ -13,7 +13,9 @@ from remaster_ros.reports.discovery_json import read_discovery
 
 
 def read_causes(
-    path: str | os.PathLike[str], observations_sha256: str = ''
+    path: str | os.PathLike[str],
+    joint_names: Sequence[str] = (),
+    observations_sha256: str = '',
 ) -> tuple[FoundCause, ...]:
     """Return the causes of a discovery.json that have look-alikes.
 
@@ -21,15 +23,18 @@ def read_causes(
     ----------
     path
         The file.
+    joint_names
+        Of the arm that it has to be of; empty for any.
     observations_sha256
         Of the observations that it has to be of; '' for any.
 
     Raises
     ------
     InputError
-        It is no discovery.json, is of other observations, or has no cause with a look-alike.
+        It is no discovery.json, is of another arm or other observations, or has no cause with a
+        look-alike.
     """
-    found = read_discovery(path)
+    found = _read(path, joint_names)
     of = found.get('session', {}).get('observations_sha256')
     if observations_sha256 and of != observations_sha256:
         raise InputError(
@@ -59,7 +64,7 @@ def read_causes(
 
 
 def earlier_pairs(
-    path: str | os.PathLike[str], created: str = ''
+    path: str | os.PathLike[str], joint_names: Sequence[str] = (), created: str = ''
 ) -> tuple[tuple[Named, Named], ...]:
     """Return causes and look-alikes of a discovery.json, and those that it has decided between.
 
@@ -67,15 +72,17 @@ def earlier_pairs(
     ----------
     path
         The file.
+    joint_names
+        Of the arm that it has to be of; empty for any.
     created
         When the session was begun that it has to be of; of another there are none. '' for any.
 
     Raises
     ------
     InputError
-        It is no discovery.json.
+        It is no discovery.json, or is of another arm.
     """
-    found = read_discovery(path)
+    found = _read(path, joint_names)
     if created and found.get('session', {}).get('created') != created:
         return ()
     pairs = [(_named(one['cause']), _named(one['look_alike'])) for one in found.get('decided', ())]
@@ -85,6 +92,17 @@ def earlier_pairs(
         for other in _separable(effect)
     ]
     return tuple(pairs)
+
+
+def _read(path: str | os.PathLike[str], joint_names: Sequence[str]) -> dict[str, Any]:
+    found = read_discovery(path)
+    names = found.get('robot', {}).get('joint_names', joint_names)
+    if joint_names and list(names) != list(joint_names):
+        raise InputError(
+            f'{path}: its causes are of an arm with the joints {", ".join(names)}, this one has '
+            f'{", ".join(joint_names)}; give the discovery.json of this arm'
+        )
+    return found
 
 
 def _named(cause: Mapping[str, Any]) -> Named:

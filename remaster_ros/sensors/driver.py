@@ -141,6 +141,12 @@ class StreamDriver(Driver):
 class TriggeredDriver(Driver):
     """A device that measures on request."""
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        # Where the class is defined, not in front of an arm that stands and waits.
+        if cls.several_markers and cls.turn_to is TriggeredDriver.turn_to:
+            raise TypeError(f'{cls.__name__} has several_markers, and no turn_to')
+
     @abstractmethod
     def measure(self, expected: FloatArray | None) -> MarkerReading:
         """Measure once.
@@ -175,7 +181,6 @@ class TriggeredDriver(Driver):
         DeviceError
             It was not found. Another one is not measured in its place.
         """
-        raise NotImplementedError(f'{self.device} has several_markers, and no turn_to')
 
     def prepare(self, expected: FloatArray | None) -> None:
         """Get ready for the request that follows; called when the arm has arrived.

@@ -68,13 +68,16 @@ def hide(
     Raises
     ------
     InputError
-        Something that this arm cannot show on these visits.
+        Something that this arm cannot show on these visits, or at a joint that it does not have.
     """
     effects = []
     for request in requests:
         kind = request.kind
         if kind == RANDOM:
             kind = str(rng.choice(tuple(NAMED)))
+        joint, joints = request.joint, stage.arm.joints
+        if joint is not None and joint > joints:
+            raise InputError(f'{kind}@{joint}: the arm has {joints} joints; give 1 to {joints}')
         size_m = request.size_m
         if size_m is None:
             # A marker is known to half a millimetre: a smaller offset would be lost in that.

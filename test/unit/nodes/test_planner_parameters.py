@@ -32,7 +32,7 @@ def test_the_parameters_make_what_plans_the_tours(tmp_path, monkeypatch):
     cell = read_cell('demo')
     chain = cell.chain()
     parameters = Parameters(optimization_candidates=20, validation_candidates=0, reference_every=0)
-    assert parameters.causes() == ()
+    assert parameters.causes(()) == ()
     planner = parameters.tour_planner(cell, chain, (CAUSE,))
     tour = planner.collection(planner.rough_places)
     plain = parameters.tour_planner(cell, chain, ()).collection(planner.rough_places)
@@ -40,4 +40,4 @@ def test_the_parameters_make_what_plans_the_tours(tmp_path, monkeypatch):
     assert 0 < added <= 25
     assert tour.configurations['optimization'] == plain.configurations['optimization'] + added
     with pytest.raises(InputError, match=r'none\.json'):
-        Parameters(separate=str(tmp_path / 'none.json')).causes()
+        Parameters(separate=str(tmp_path / 'none.json')).causes(())

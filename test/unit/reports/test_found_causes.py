@@ -47,7 +47,7 @@ def test_what_nothing_separates_is_left_out(tmp_path):
         alike('link_length', (3,), same=True),
         alike('joint_error_curve', (2,), general=True),
     )
-    (cause,) = read_causes(path, 'ab')
+    (cause,) = read_causes(path, observations_sha256='ab')
     assert cause.look_alikes == (('base_compliance', (), 'poses'),)
     assert cause.driver == 'gravity_torque'
     assert earlier_pairs(path) == ((('joint_compliance', (2,)), ('base_compliance', ())),)
@@ -58,9 +58,21 @@ def test_what_nothing_separates_is_left_out(tmp_path):
 def test_a_search_of_other_observations_or_of_another_session_does_not_count(tmp_path):
     path = written(tmp_path, alike('base_compliance'))
     with pytest.raises(InputError, match='not of the observations that the session has now'):
-        read_causes(path, 'cd')
-    assert len(earlier_pairs(path, '2026-01-01')) == 1
-    assert earlier_pairs(path, '2026-02-01') == ()
+        read_causes(path, observations_sha256='cd')
+    assert len(earlier_pairs(path, created='2026-01-01')) == 1
+    assert earlier_pairs(path, created='2026-02-01') == ()
+
+
+def test_a_search_of_another_arm_is_refused(tmp_path):
+    robot = {
+        'name': 'arm', 'urdf_sha256': 'cd', 'joint_names': ['a', 'b'], 'base_link': 'base',
+        'tip_link': 'tip',
+    }  # fmt: skip
+    path = written(tmp_path, alike('base_compliance'), robot=robot)
+    for read in (read_causes, earlier_pairs):
+        assert len(read(path, ('a', 'b'))) == 1
+        with pytest.raises(InputError, match='joints a, b, this one has a, b, c; give'):
+            read(path, ('a', 'b', 'c'))
 
 
 def test_what_was_decided_is_looked_at_again(tmp_path):

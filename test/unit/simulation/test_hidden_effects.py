@@ -105,7 +105,7 @@ def test_what_cannot_be_hidden_is_refused(text):
 
 
 def test_a_joint_that_cannot_show_it_is_refused(stage):
-    with pytest.raises(InputError, match='backlash at joint 9 cannot be seen'):
+    with pytest.raises(InputError, match='backlash@9: the arm has 7 joints; give 1 to 7'):
         hide(stage, [EffectSpec.parse('backlash@9')], np.random.default_rng(SEED))
 
 
