@@ -6,6 +6,7 @@ import importlib.util
 import signal
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 # Distribution -> module, of what package.xml cannot name: rosdep has no Debian package for these.
 PIP_ONLY = {
@@ -25,6 +26,10 @@ if _missing:
         f'pip install -c constraints-ros.txt {" ".join(_missing)}',
         returncode=2,
     )
+
+# How long an example takes says how busy the machine is, not whether the example is right.
+settings.register_profile('busy', deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile('busy')
 
 # What a shell starts in the background, as tools/run-tests does, ignores SIGINT, and so would the
 # nodes of its tests. Either signal ends a run as Ctrl-C does: with the processes that it started.

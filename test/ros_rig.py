@@ -131,6 +131,8 @@ def call(client, service, timeout_s=120):
 
     caller = client.create_client(Trigger, service)
     assert caller.wait_for_service(timeout_sec=20.0), service
+    # The service may find its caller later than it is found, and an answer before that is lost.
+    time.sleep(0.3)
     future = caller.call_async(Trigger.Request())
     deadline = time.monotonic() + timeout_s
     while not future.done():

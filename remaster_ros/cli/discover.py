@@ -16,10 +16,10 @@ from remaster_ros.discovery.confirmation import (
     require_other_session,
 )
 from remaster_ros.discovery.confirmation_words import in_words
-from remaster_ros.discovery.decision import decisions
+from remaster_ros.discovery.decision import Named, decisions
 from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.side_by_side import rms_sigmas
-from remaster_ros.discovery.words import percent, shown
+from remaster_ros.discovery.words import part_words, percent, shown
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.discovery_json import (
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     if other is not None:
         # Not after the long search.
         require_other_session(session, other)
-    pairs = ()
+    pairs: tuple[tuple[Named, Named], ...] = ()
     if args.decide is not None:
         chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
         pairs = earlier_pairs(args.decide, chain.joint_names)
@@ -122,7 +122,9 @@ def summary(
             lines.append(f'    to do: {effect.remedy}')
         for alike in effect.confusable_with:
             where = f' {list(alike.joints)}' if alike.joints else ''
-            lines.append(f'    could be {alike.name}{where}; to distinguish: {alike.separate_by}')
+            fewer = part_words(effect.name, effect.joints, alike.name, alike.joints)
+            name = fewer or f'{alike.name}{where}'
+            lines.append(f'    could be {name}; to distinguish: {alike.separate_by}')
     lines += [f'unexplained: {left.next}' for left in found.unexplained]
     if found.verdict == 'none':
         lines.append('nothing beyond the zero-offsets and the noise was found')

@@ -20,6 +20,7 @@ from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.explain import TIED
 from remaster_ros.discovery.families import family_log_prior
+from remaster_ros.discovery.words import called
 
 
 class Named(NamedTuple):
@@ -30,9 +31,7 @@ class Named(NamedTuple):
 
     def __str__(self) -> str:
         """Return it in a few words."""
-        several = 's' * (len(self.joints) > 1)
-        at = f' of joint{several} {", ".join(map(str, self.joints))}' if self.joints else ''
-        return f'{self.name.replace("_", " ")}{at}'
+        return called(self.name, self.joints)
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class Decision:
     def describe(self) -> str:
         """Return it in a line."""
         if self.answer == 'neither':
-            return f'decided: neither {self.cause} nor {self.look_alike}'
+            return f'the search now names neither {self.cause} nor {self.look_alike}'
         first, second = self.cause, self.look_alike
         if self.log_evidence < 0.0:
             first, second = second, first

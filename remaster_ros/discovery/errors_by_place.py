@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from remaster_ros.calibration.residual_structure import explained_of_poses
+from remaster_ros.calibration.residual_structure import LEAST_NOISE_M, explained_of_poses
 from remaster_ros.calibration.smooth_functions import of_position
 from remaster_ros.discovery.effects.sensor_field import EFFECT as SENSOR_FIELD
 from remaster_ros.discovery.guard import Unexplained
@@ -38,12 +38,15 @@ def errors_by_place(
     fitted = parts[0].shape[2] + parts[1].shape[2]
     model, errors, places = np.split(white, [fitted, fitted + 1], axis=2)
     left = rows.group_sum(data.left(solution), axis=0) / rows.group_size[:, None]
+    noise_m = data.noise_model.sensor_noise(solution.noise).total
     located = {cell.subject for cell in cells if cell.name == SENSOR_FIELD.name}
     families = np.split(places, len(rows.spans), axis=2)
     for (sensor, _), family in zip(rows.spans, families, strict=True):
         name = data.context.sensor_names[sensor]
+        if name in located or noise_m[sensor] < LEAST_NOISE_M:
+            continue
         found = explained_of_poses(rows, model, family, errors[:, :, 0])
-        if found is None or found.p_value > significance or name in located:
+        if found is None or found.p_value > significance:
             continue
         mean_square = np.mean(np.sum(left[rows.group_sensor == sensor] ** 2, axis=1))
         size_m = float(np.sqrt(found.share * mean_square))

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
@@ -20,7 +19,7 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, screen
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stepwise_selection import WHOLE, Selection
-from remaster_ros.discovery.words import clock_time
+from remaster_ros.discovery.words import called, clock_time, joint_words
 
 # Look-alikes within this of the evidence are named; within the other, the leaders tie.
 CONFUSABLE = 5.0
@@ -226,13 +225,7 @@ def _described(
 
 def _also_called(alike: Sequence[LookAlike]) -> str:
     """Return a sentence with the other names of the same displacement; '' where it has none."""
-    names = [
-        f'{other.name.replace("_", " ")} of {_listed(other.joints)}'
-        if other.joints
-        else other.name.replace('_', ' ')
-        for other in alike
-        if other.same
-    ]
+    names = [called(other.name, other.joints) for other in alike if other.same]
     if not names:
         return ''
     return (
@@ -339,7 +332,7 @@ def in_words(group: Sequence[Cell], context: Context) -> str:
     first = group[0]
     joints = _joints(group)
     effect = EFFECTS[first.name]
-    subject = first.subject or _listed(joints[:1] if effect.driven_by_joint else joints)
+    subject = first.subject or joint_words(joints[:1] if effect.driven_by_joint else joints)
     other = f'joint {joints[1]}' if len(joints) > 1 else ''
     place = first.place.replace('_', ' ')
     if first.joints:
@@ -375,7 +368,3 @@ def _when(cell: Cell, context: Context) -> str:
         f'{clock}{cell.moment / 60.0:.1f} min after the first reading, '
         f'between configurations {before} and {behind},'
     )
-
-
-def _listed(joints: Sequence[int]) -> str:
-    return f'joint{"s" if len(joints) > 1 else ""} {listed([str(joint) for joint in joints])}'

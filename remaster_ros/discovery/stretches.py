@@ -53,7 +53,7 @@ class Stretches:
     Attributes
     ----------
     count
-        Of stretches; 0 where there are too few poses.
+        Of stretches; 0 where there are too few poses, or rows determine no parameter.
     ratio
         Of the variance of parameters between stretches to that by the model.
     p_value
@@ -62,7 +62,7 @@ class Stretches:
         What is added to the posterior: one standard deviation of so many independent moves of all
         natural parameters of the fit and the m of the cells, (size + m, moves).
     widening
-        Factor on the size of the predicted 95 % regions; None where there are too few poses.
+        Factor on the size of the predicted 95 % regions; None where nothing was compared.
     """
 
     count: int
@@ -103,6 +103,8 @@ def compare_stretches(found: Estimate, data: Residuals, solution: Solution) -> S
     by_noise = np.sum([(root @ part.vectors) ** 2 @ part.values for part in parts], axis=0)
     shown = by_noise > SHOWN * np.sum(root**2, axis=1)
     groups = [mine for group in _groups(found, solution) if len(mine := group[shown[group]])]
+    if not groups:
+        return Stretches(0, np.nan, np.nan, moves, None)
 
     def ratio_of(pulls: list[FloatArray]) -> FloatArray:
         """Return the ratio for the pulls X_b' e_b of each stretch, (P, s), of s sessions."""

@@ -35,7 +35,7 @@ def shown(value: float, std: float, unit: str) -> tuple[str, str, str]:
 
 def percent(share: float) -> str:
     """Return a share as whole per cent: '35 %', never '-0 %'."""
-    return f'{round(100.0 * share)} %'
+    return f'{round(100.0 * share)} %'.replace('-', '−')
 
 
 def p_value_text(p_value: float, floor: float) -> str:
@@ -55,6 +55,14 @@ def clock_time(stamp_s: float) -> str:
 def called(name: str, joints: Sequence[int]) -> str:
     """Return an effect as people call it: 'link length of joints 2 and 3'."""
     words = name.replace('_', ' ')
-    if not joints:
-        return words
-    return f'{words} of joint{"s" if len(joints) > 1 else ""} {listed([str(j) for j in joints])}'
+    return f'{words} of {joint_words(joints)}' if joints else words
+
+
+def joint_words(joints: Sequence[int]) -> str:
+    """Return joints as people call them: 'joints 2 and 3'."""
+    return f'joint{"s" if len(joints) > 1 else ""} {listed([str(joint) for joint in joints])}'
+
+
+def part_words(name: str, joints: Sequence[int], other: str, of: Sequence[int]) -> str:
+    """Return 'joint 2 alone' where another effect is the same of fewer joints, else ''."""
+    return f'{joint_words(of)} alone' if other == name and set(of) < set(joints) else ''

@@ -33,7 +33,7 @@ from remaster_ros.nodes.locking import NameLock
 TRACEBACK = 'REMASTER_TRACEBACK'
 """Environment variable: also print where in this program a fault came from."""
 
-ANSWERS_DELIVERED_S = 1.0
+ANSWERS_DELIVERED_S = 3.0
 """How long a node that has failed, and is closed, waits for its last answers to arrive, s."""
 
 

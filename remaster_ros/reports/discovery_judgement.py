@@ -67,11 +67,12 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
         return False
     if confirmation is not None and not confirmation.same_offsets:
         return False
+    before, after = discovery.gain.held_out_rms_before_m, discovery.gain.held_out_rms_after_m
+    if before is None or after is None:
+        return False
     if discovery.verdict == 'none':
         return True
-    before, after = discovery.gain.held_out_rms_before_m, discovery.gain.held_out_rms_after_m
-    gains = before is not None and after is not None and after < before
-    return gains and (confirmation is None or confirmation.confirmed)
+    return after < before and (confirmation is None or confirmation.confirmed)
 
 
 def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> str:
@@ -89,6 +90,11 @@ def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> 
         doubt = f' How uncertain the figures are is not known: {discovery.fit.sampler.message}.'
     change += doubt
     if discovery.verdict == 'none':
+        if discovery.gain.held_out_rms_before_m is None:
+            return (
+                'Nothing was found beyond the zero-offsets and the noise, but no poses were held '
+                f'out to check it: measure some and search again.{doubt}'
+            )
         return f'Nothing is there beyond the zero-offsets and the noise.{doubt}'
     if discovery.verdict == 'unexplained':
         return f'Something is there that no cause explains.{change}'

@@ -189,7 +189,7 @@ class Stretches(Struct):
     """How the parameters of ``count`` stretches of the session agree with each other.
 
     ``ratio`` is the variance between them over that by the noise, ``p_value`` that of so much by
-    chance, ``widened`` whether the standard deviations contain it.
+    chance (1/301 stands for that or less), ``widened`` whether the standard deviations contain it.
     """
 
     count: int

@@ -11,7 +11,7 @@ import msgspec
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
-from remaster_ros.discovery.words import p_value_text, percent, shown
+from remaster_ros.discovery.words import called, p_value_text, part_words, percent, shown
 from remaster_ros.reports.discovery_schema import Effect
 from remaster_ros.reports.effect_words import law, title
 from remaster_ros.reports.figures import GRID, INK, PAPER
@@ -34,6 +34,10 @@ def page(template: str, **content: Any) -> str:
         'percent': percent,
         'p_value': p_value_text,
         'shown': shown,
+        'look_alike': lambda other, of: (
+            part_words(of['name'], of['joints'], other['name'], other['joints'])
+            or called(other['name'], other['joints'])
+        ),
         'heading': lambda effect: title(msgspec.convert(effect, Effect)),
         'law': lambda effect: law(msgspec.convert(effect, Effect)),
     }

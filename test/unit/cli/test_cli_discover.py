@@ -22,7 +22,10 @@ EFFECT = FoundEffect(
     parameters=(),
     p_value=0.002,
     log_evidence_gain=50.0,
-    confusable_with=(LookAlike('encoder_scale', (2,), 48.0, 'a payload'),),
+    confusable_with=(
+        LookAlike('encoder_scale', (2,), 48.0, 'a payload'),
+        LookAlike('joint_compliance', (4,), 47.0, 'another payload'),
+    ),
     cause='The weight it carries winds up joints 2 and 4.',
     size_m=0.5e-3,
     share=1.0,
@@ -51,6 +54,7 @@ def test_causes_look_alikes_and_gain_are_said():
     nothing = summary(found((replace(EFFECT, share=-0.004),), Gain(None, None, 1e-4, {}), {}))
     assert ', 0 % of the gain' in nothing
     assert 'could be encoder_scale [2]; to distinguish: a payload' in text
+    assert 'could be joint 4 alone; to distinguish: another payload' in text
     assert '1.000 mm RMS before, 0.300 mm after; the noise alone is 0.280 mm' in text
 
 

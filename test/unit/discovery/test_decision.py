@@ -46,7 +46,9 @@ def test_what_the_search_has_not_found_is_not_decided():
     (one,) = decisions(sagging(), [(Named('backlash', (3,)), Named('settling', (3,)))])
     assert one.answer == 'neither'
     assert np.isnan(one.log_evidence)
-    assert one.describe() == 'decided: neither backlash of joint 3 nor settling of joint 3'
+    assert one.describe() == (
+        'the search now names neither backlash of joint 3 nor settling of joint 3'
+    )
 
 
 @pytest.mark.parametrize('log_odds', [0.0, 0.5, 3.0, 12.5, -12.5, 50.0])

@@ -68,6 +68,12 @@ def test_half_a_bent_lens_is_located_at_its_sensor(sensor):
     assert right >= 5
 
 
+def test_rounding_is_no_structure():
+    data = residuals_of(session_with(53, sensor_count=2, sigma_m=0.0, pose_sigma_m=0.0))
+    assert np.abs(data.errors).max() < 1e-6
+    assert found_in(data, significance=1.0) == []
+
+
 def test_noise_fires_as_often_as_stated():
     data = residuals_of(session_with(52, sensor_count=2, pose_sigma_m=0.05e-3))
     rng = np.random.default_rng(7)

@@ -111,3 +111,11 @@ def test_too_few_poses_are_not_compared():
     assert solution is not None
     compared = compare_stretches(found, data, solution)
     assert (compared.count, compared.widening, compared.widened) == (0, None, False)
+
+
+def test_nothing_is_compared_where_rows_determine_no_parameter(monkeypatch):
+    monkeypatch.setattr('remaster_ros.discovery.stretches.SHOWN', np.inf)
+    scene = Scene.of(61)
+    data, solution = scene.with_errors(scene.noise(np.random.default_rng(1)))
+    found = compare_stretches(scene.found, data, solution)
+    assert (found.count, found.widening, found.widened) == (0, None, False)

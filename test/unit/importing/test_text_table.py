@@ -29,7 +29,7 @@ finite = st.floats(-5e3, 5e3).map(lambda value: round(value, 4))
 tables = st.lists(st.tuples(*[finite] * 5), min_size=1, max_size=8)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     rows=tables,
     header=st.sampled_from(sorted(HEADERS)),

@@ -334,7 +334,7 @@ def test_a_way_out_keeps_limits_margin_and_accelerations():
 corner = st.tuples(st.floats(-1.1, 1.1), st.floats(-2.2, 2.2)).map(np.array)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     corners=st.lists(corner, min_size=2, max_size=4),
     off=st.tuples(st.floats(-0.002, 0.002), st.floats(-0.002, 0.002)),
@@ -375,7 +375,7 @@ def test_what_is_admitted_is_allowed_by_another_judge(corners, off, acceleration
 numbers = st.floats(-3.0, 3.0, allow_subnormal=False)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     q=st.tuples(numbers, numbers),
     v=st.tuples(numbers, numbers),

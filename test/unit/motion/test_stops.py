@@ -62,7 +62,7 @@ angles = st.integers(-3_000_000, 3_000_000).map(lambda n: n * 1e-6)
 configurations = st.tuples(angles, angles, angles).map(np.array)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     start=configurations,
     end=configurations,
@@ -82,7 +82,7 @@ def test_a_stop_from_anywhere_in_the_window(start, end, moment, width, inside):
     assert stop.time_s <= max(STOP_S, 3.3 * width) * 4 + 2 * RAMP_S
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     end=configurations,
     acceleration=st.floats(0.3, 10.0),
@@ -230,7 +230,7 @@ def admitted(points, limits=LIMITS):
     return gate, gate.admit(FreePath(np.asarray(points, float)), np.asarray(points[0], float))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     corners=st.lists(configurations, min_size=2, max_size=4),
     moment=st.floats(0.0, 1.1),

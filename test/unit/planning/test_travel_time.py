@@ -57,7 +57,7 @@ def length(times, order):
 
 
 @given(st.integers(1, 7), st.integers(0, 2**32 - 1))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_every_place_is_visited_once_and_no_small_tour_is_much_better(n, seed):
     points = np.random.default_rng(seed).random((n, 3))
     times = np.linalg.norm(points[:, None] - points, axis=-1)

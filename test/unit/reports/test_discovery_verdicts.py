@@ -111,6 +111,15 @@ def test_a_table_without_the_optional_columns_has_its_page(tmp_path):
     assert 'What this session cannot test' in page
 
 
+def test_without_held_out_poses_nothing_found_is_not_proven(found, tmp_path):
+    healthy = found['healthy']
+    unproven = replace(healthy.gain, held_out_rms_before_m=None, held_out_rms_after_m=None)
+    page, mood, _ = saved(replace(healthy, gain=unproven), tmp_path)
+    assert mood == 'caution'
+    assert 'Nothing was found' in page
+    assert 'no poses were held out to check it' in page
+
+
 def test_a_posterior_that_is_only_approximate_is_never_green(found, tmp_path):
     message = 'NOT converged: Pareto k of the importance weights 1.18, not below 0.7'
     fit = found['healthy'].fit

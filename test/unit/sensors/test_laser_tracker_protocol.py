@@ -6,7 +6,7 @@ import itertools
 import struct
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from remaster_ros.sensors.laser_tracker.protocol.codes import Command, Status, describe_status
@@ -272,19 +272,16 @@ def feed(reader: PacketReader, stream: bytes, cuts: list[int]) -> list[Event]:
     return events
 
 
-@settings(deadline=None)
 @given(st.lists(requests(), min_size=1, max_size=5), st.lists(st.integers(0, 10_000)))
 def test_requests_survive_any_cutting_of_the_stream(sent, cuts):
     assert feed(PacketReader('server'), b''.join(map(encode, sent)), cuts) == sent
 
 
-@settings(deadline=None)
 @given(st.lists(from_instrument, min_size=1, max_size=5), st.lists(st.integers(0, 10_000)))
 def test_what_an_instrument_sends_survives_any_cutting_of_the_stream(sent, cuts):
     assert feed(PacketReader('client'), b''.join(map(encode, sent)), cuts) == sent
 
 
-@settings(deadline=None)
 @given(
     st.sampled_from(['client', 'server']),
     st.lists(from_instrument | requests(), max_size=3),
@@ -309,7 +306,6 @@ def test_damage_raises_one_exception_and_memory_stays_bounded(side, sent, flips,
         assert len(reader.trailing_data) < MAX_PACKET_SIZE
 
 
-@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_every_status_is_described_in_one_line(status):
     text = describe_status(status)

@@ -117,7 +117,7 @@ def test_size_of_the_demo_scene(version, bytes_with_header):
 
 
 @pytest.mark.parametrize('version', VERSIONS)
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(data=st.data())
 def test_what_is_encoded_is_decoded(version, data):
     frame = data.draw(frames(version))
@@ -126,7 +126,7 @@ def test_what_is_encoded_is_decoded(version, data):
 
 
 @pytest.mark.parametrize('version', VERSIONS)
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(data=st.data())
 def test_markers_only_leaves_out_the_rest_and_nothing_else(version, data):
     frame = data.draw(frames(version))
@@ -152,7 +152,7 @@ def test_bytes_after_the_end_tag_are_refused(version):
         decode_frame(payload + b'\0', version)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(payload=st.binary(max_size=400), version=st.sampled_from(VERSIONS))
 def test_random_bytes_give_a_protocol_error_or_a_frame(payload, version):
     for markers_only in (False, True):
@@ -160,7 +160,7 @@ def test_random_bytes_give_a_protocol_error_or_a_frame(payload, version):
             decode_frame(payload, version, markers_only=markers_only)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(
     version=st.sampled_from(VERSIONS),
     flips=st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 7)), max_size=8),

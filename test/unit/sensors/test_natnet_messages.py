@@ -91,7 +91,7 @@ def test_a_payload_cut_with_a_header_that_agrees_is_refused(version):
                 natnet.decode_message(natnet.join_datagram(message_id, payload[:length]), version)
 
 
-@settings(deadline=None, max_examples=500)
+@settings(max_examples=500)
 @given(
     datagram=st.one_of(
         st.binary(max_size=300),
@@ -110,7 +110,7 @@ def test_random_bytes_raise_nothing_but_protocol_errors(datagram, version):
             decode()
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(
     version=st.sampled_from(VERSIONS),
     which=st.integers(0, 8),
