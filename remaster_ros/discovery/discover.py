@@ -34,6 +34,7 @@ from remaster_ros.discovery.guard import Unexplained, harm_of, held, is_harmful,
 from remaster_ros.discovery.marker_offsets import held_markers, loosened, moved_markers
 from remaster_ros.discovery.omnibus import structure_left
 from remaster_ros.discovery.plain_forms import plainest
+from remaster_ros.discovery.repeated_search import RepeatedSearch, repeat_search
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stepwise_selection import Search, Selection
@@ -93,6 +94,8 @@ class Discovery:
         its sensor, m, (n, 3).
     unexplained
         Structure that no cause explains.
+    repeated
+        What the search finds without some of the poses; None where it was not repeated.
     """
 
     verdict: Verdict
@@ -111,6 +114,14 @@ class Discovery:
     residuals_before: FloatArray
     thinning: Thinning | None = None
     unexplained: tuple[Unexplained, ...] = ()
+    repeated: RepeatedSearch | None = None
+
+    @property
+    def widening(self) -> float | None:
+        """Factor on the size of the predicted 95 % regions; None where nothing shows it."""
+        if self.repeated is None:
+            return self.stretches.widening
+        return max(self.repeated.widening, self.stretches.widening or 1.0)
 
 
 def discover_session(
@@ -192,6 +203,7 @@ def discover_session(
         residuals_before=residuals_of(findings.before),
         thinning=findings.thinning,
         unexplained=unexplained,
+        repeated=findings.repeated,
     )
 
 
@@ -213,6 +225,7 @@ class Findings:
     structure: tuple[FoundEffect, ...]
     untestable: Mapping[str, str]
     thinning: Thinning | None
+    repeated: RepeatedSearch | None
 
     def without_causes(self) -> Findings:
         """Return the same as if the search had found nothing."""
@@ -228,6 +241,7 @@ class Findings:
             effects=(),
             structure=(),
             thinning=None,
+            repeated=None,
         )
 
 
@@ -245,7 +259,9 @@ def _sampled(
     """
     residuals, solution = findings.residuals, findings.selection.solution
     stretches = compare_stretches(findings.found, residuals, solution)
-    unmodelled = undetected(findings.found, residuals, solution), stretches.moves
+    unmodelled = [undetected(findings.found, residuals, solution), stretches.moves]
+    if findings.repeated is not None:
+        unmodelled.append(findings.repeated.moves)
     fit = fit_session(
         session,
         rng=rng,
@@ -293,6 +309,12 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
     selection = search.run()
     selection = replace(selection, solution=plainest(selection.solution, search.cells, search.fit))
     residuals = search.data
+    repeated = repeat_search(
+        found,
+        search,
+        selection.solution,
+        lambda share: progress('searching again without some of the poses', share),
+    )
     groups, described = describe(
         residuals, selection, cells, lambda share: progress('comparing look-alikes', share)
     )
@@ -307,7 +329,16 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         )
     groups = tuple(itertools.compress(groups, causes))
     return Findings(
-        before, found, residuals, selection, groups, effects, structure, untestable, thinning
+        before,
+        found,
+        residuals,
+        selection,
+        groups,
+        effects,
+        structure,
+        untestable,
+        thinning,
+        repeated,
     )
 
 
