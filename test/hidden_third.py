@@ -95,7 +95,7 @@ def predictions_elsewhere(found: Discovery, third: Session) -> Predictions:
         fit = replace(fit, predictive=replace(fit.predictive, model=model))
     # The factor is that of the rows to fit: None would determine another with these rows.
     widening = predictions_of(found).widening
-    return predict(fit, third.measurements, widening)
+    return predict(fit, third.measurements, widening, found.missed.covariance(context))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +123,10 @@ class _Elsewhere(PartOfContext):
     @cached_property
     def elapsed_s(self) -> FloatArray:
         return self.measurements.stamp_s - self.whole.measurements.stamp_s.min()
+
+    @cached_property
+    def progress(self) -> FloatArray:
+        return Context.progress.func(self)  # type: ignore[attr-defined, no-any-return]
 
     @cached_property
     def warming(self) -> FloatArray:

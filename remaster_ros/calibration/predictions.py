@@ -92,7 +92,10 @@ class Coverage:
 
 
 def predict(
-    fit: FitResult, measurements: Measurements, widening: float | None = None
+    fit: FitResult,
+    measurements: Measurements,
+    widening: float | None = None,
+    unmodelled: FloatArray | None = None,
 ) -> Predictions:
     """Predict all rows of a session.
 
@@ -104,6 +107,9 @@ def predict(
         Those that were fitted, in the model's order of sensors and markers.
     widening
         The factor on standard deviations; None where poses left out one by one determine it.
+    unmodelled
+        Covariance of what causes outside the model may displace, in the frame N of the row's
+        sensor, m², (n, 3, 3); None where none are expected.
     """
     model, draws = fit.predictive.model, fit.predictive.draws
     root = (draws - draws.mean(axis=0)) / np.sqrt(max(1, len(draws) - 1))
@@ -126,6 +132,8 @@ def predict(
         widening = 1.0
         if len(left_out) >= FEWEST_ROWS:
             widening = max(1.0, float(np.sqrt(np.quantile(left_out, REGION) / limit)))
+    if unmodelled is not None:
+        covariance += unmodelled
     covariance *= widening**2
     distance = squared_distances(measurements.position - position, covariance)
     return Predictions(position, covariance, distance <= limit, widening)

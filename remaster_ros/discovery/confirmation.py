@@ -259,7 +259,7 @@ class _OtherSession:
             parts = shown
         assert own is not None
         values = dict(zip(discovery.fit.theta_names, discovery.fit.theta, strict=True))
-        moves = undetected(found, data, own), compare_stretches(found, data, own).moves
+        moves = undetected(found, data, own).moves, compare_stretches(found, data, own).moves
         unmodelled = np.concatenate(moves, axis=1)
         return cls(found, data, values, given, tuple(parts), tuple(beyond), known, own, unmodelled)
 

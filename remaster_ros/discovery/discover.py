@@ -41,7 +41,7 @@ from remaster_ros.discovery.stepwise_selection import Search, Selection
 from remaster_ros.discovery.stretches import Stretches, compare_stretches
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
 from remaster_ros.discovery.to_extension import extension_of
-from remaster_ros.discovery.undetected import undetected
+from remaster_ros.discovery.undetected import Undetected, undetected
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Priors, Session
 
@@ -89,6 +89,8 @@ class Discovery:
         all of it was searched.
     stretches
         How stretches of the session agree with each other.
+    missed
+        Causes that the search may have missed.
     residuals_before
         Measured minus modelled position of every row with the zero-offsets alone, in the frame of
         its sensor, m, (n, 3).
@@ -111,6 +113,7 @@ class Discovery:
     residuals: Residuals
     fit: FitResult
     stretches: Stretches
+    missed: Undetected
     residuals_before: FloatArray
     thinning: Thinning | None = None
     unexplained: tuple[Unexplained, ...] = ()
@@ -155,23 +158,23 @@ def discover_session(
     findings = find_causes(session, rng=rng, progress=report)
     unexplained: tuple[Unexplained, ...] = ()
     try:
-        fit, gain, stretches = _sampled(session, findings, rng, report, clock)
+        fit, gain, stretches, missed = _sampled(session, findings, rng, report, clock)
     except InsufficientDataError as error:
         if not findings.selection.solution.cells:
             raise
         suggested = findings.effects + findings.structure
         try:
             markers = held_markers(findings.found)
-            fit, gain, stretches = _sampled(session, findings, rng, report, clock, markers)
+            fit, gain, stretches, missed = _sampled(session, findings, rng, report, clock, markers)
             unexplained = (held(gain.noise_floor_m, markers, error),)
         except InsufficientDataError:
             unexplained = (unfitted(findings.residuals.errors, suggested, error),)
             findings = findings.without_causes()
-            fit, gain, stretches = _sampled(session, findings, rng, report, clock)
+            fit, gain, stretches, missed = _sampled(session, findings, rng, report, clock)
     if (findings.effects or findings.structure) and is_harmful(gain):
         unexplained = (harm_of(findings.before, fit, gain, findings.effects + findings.structure),)
         findings = findings.without_causes()
-        fit, gain, stretches = _sampled(session, findings, rng, report, clock)
+        fit, gain, stretches, missed = _sampled(session, findings, rng, report, clock)
     residuals, solution = findings.residuals, findings.selection.solution
     structure, gross = structure_left(residuals, solution, fit, findings.structure)
     unexplained += structure
@@ -200,6 +203,7 @@ def discover_session(
         residuals=residuals,
         fit=fit,
         stretches=stretches,
+        missed=missed,
         residuals_before=residuals_of(findings.before),
         thinning=findings.thinning,
         unexplained=unexplained,
@@ -252,14 +256,15 @@ def _sampled(
     report: Progress,
     clock: Callable[[], float] | None,
     priors: Priors | None = None,
-) -> tuple[FitResult, Gain, Stretches]:
+) -> tuple[FitResult, Gain, Stretches, Undetected]:
     """Sample the model with the causes found, and measure its gain on held-out rows.
 
     Priors are those that let moved markers go, where none are given.
     """
     residuals, solution = findings.residuals, findings.selection.solution
     stretches = compare_stretches(findings.found, residuals, solution)
-    unmodelled = [undetected(findings.found, residuals, solution), stretches.moves]
+    missed = undetected(findings.found, residuals, solution)
+    unmodelled = [missed.moves, stretches.moves]
     if findings.repeated is not None:
         unmodelled.append(findings.repeated.moves)
     fit = fit_session(
@@ -272,7 +277,8 @@ def _sampled(
         unmodelled=np.concatenate(unmodelled, axis=1),
         progress=lambda _, share: report('sampling the extended model', share),
     )
-    return fit, gain_of(findings.before, residuals, solution, fit, rng), stretches
+    gain = gain_of(findings.before, residuals, solution, fit, rng)
+    return fit, gain, stretches, missed
 
 
 def find_causes(session: Session, *, rng: np.random.Generator, progress: Progress) -> Findings:

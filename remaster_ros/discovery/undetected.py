@@ -4,18 +4,23 @@ A search that names no more causes does not show that there are none: two that a
 is found move zero-offsets and named sizes by more than their standard deviations. Each cause that
 has a name and was not found therefore gets a Gaussian prior about 0, as wide as a cause that
 escapes the search; the parameters' posterior is widened by what it moves them by (Kennedy &
-O'Hagan 2001, J. R. Stat. Soc. B 63, with physical causes in place of a Gaussian process).
+O'Hagan 2001, J. R. Stat. Soc. B 63, with physical causes in place of a Gaussian process). Beside
+the poses that were fitted the other parameters make up for it, elsewhere they do not: predictions
+there are widened, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from remaster_ros.calibration.estimate import Estimate
+from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.priors import prior_rows
 from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
@@ -31,8 +36,60 @@ IMITATED = 0.3
 ABSORBED = 0.02
 
 
-def undetected(found: Estimate, data: Residuals, solution: Solution) -> FloatArray:
-    """Return how undetected causes move the parameters, one standard deviation of each.
+@dataclass(frozen=True, eq=False)
+class Undetected:
+    """Causes that a search may have missed; c independent ones.
+
+    Attributes
+    ----------
+    found, solution
+        The fit that the search began with, and what it found.
+    cells, std
+        The causes, and the standard deviations of their priors, (c,).
+    moved
+        How the f free parameters of the fit and the m of the solution's cells move for a unit of
+        each, (f + m, c).
+    moves
+        How the causes move all natural parameters of the fit and the m, one standard deviation of
+        each, (size + m, c). Zeros where the gauge holds a parameter.
+    """
+
+    found: Estimate
+    solution: Solution
+    cells: tuple[Cell, ...]
+    std: FloatArray
+    moved: FloatArray
+    moves: FloatArray
+
+    def covariance(self, context: Context) -> FloatArray:
+        """Return by how much they may displace each row, in its sensor's frame, m², (n, 3, 3).
+
+        Beside the poses that were fitted that is little, since other parameters make up for it;
+        away from them it grows. Rows are those of the session, or of another one of the arm.
+        """
+        model, free = self.found.model, self.found.posterior.free
+        x = model.natural(self.found.mode.z)
+        covariance = np.empty((len(context), 3, 3))
+        for where, block in context.blocks():
+            rows = Rows.of(block.measurements, np.arange(len(block)), model.reference)
+            jacobian = np.empty((len(block), 3, model.size))
+            jacobian[rows.source] = model.natural_jacobian(x, rows)
+            known = np.concatenate(
+                (jacobian[:, :, free], _displacements(block, self.solution.cells)), axis=2
+            )
+            left = _displacements(block, self.cells) + known @ self.moved
+            left = np.swapaxes(block.sensor_turn, 1, 2) @ left * self.std
+            covariance[where] = left @ np.swapaxes(left, 1, 2)
+        return covariance
+
+
+def _displacements(context: Context, cells: Sequence[Cell]) -> FloatArray:
+    parts = [cell.columns(context).displacement(context) for cell in cells]
+    return np.concatenate([np.zeros((len(context), 3, 0)), *parts], axis=2)
+
+
+def undetected(found: Estimate, data: Residuals, solution: Solution) -> Undetected:
+    """Return the causes that a search may have missed, and what they move.
 
     Parameters
     ----------
@@ -40,16 +97,10 @@ def undetected(found: Estimate, data: Residuals, solution: Solution) -> FloatArr
         The fit that the search began with.
     data, solution
         What it worked on and found.
-
-    Returns
-    -------
-    ndarray
-        (size + m, c) for the natural parameters of the fit, the m of the solution's cells, and c
-        independent undetected causes. Zeros where the gauge holds a parameter.
     """
     fitted, precision, where = fitted_columns(found, data, solution)
     free = len(found.posterior.free)
-    cells = list(_not_found(data, solution))
+    cells = tuple(_not_found(data, solution))
     columns = data.columns(cells)
     both = np.concatenate((fitted, columns), axis=2)
     white = data.noise_model.whitened(both, solution.noise).reshape(3 * len(data), -1)
@@ -66,9 +117,9 @@ def undetected(found: Estimate, data: Residuals, solution: Solution) -> FloatArr
     seen = DETECTED * np.sqrt(MISSED / 3.0 / max(int(apart.sum()), 1))
     largest = np.array([cell.largest or np.inf for cell in cells for _ in cell.parameters])
     std = apart * np.minimum(largest, seen / np.maximum(left, np.finfo(float).tiny))
-    spread = np.zeros((found.model.size + len(solution.parameters), columns.shape[2]))
-    spread[where] = moved * std
-    return spread
+    moves = np.zeros((found.model.size + len(solution.parameters), columns.shape[2]))
+    moves[where] = moved * std
+    return Undetected(found, solution, cells, std, moved, moves)
 
 
 def fitted_columns(

@@ -36,8 +36,9 @@ LEAST_P_VALUE = 1.0 / (1.0 + DRAWS)
 
 def predictions_of(discovery: Discovery) -> Predictions:
     """Return where the final model predicts every row of the session."""
-    measurements = discovery.residuals.context.measurements
-    return predict(discovery.fit, measurements, discovery.widening)
+    context = discovery.residuals.context
+    missed = discovery.missed.covariance(context)
+    return predict(discovery.fit, context.measurements, discovery.widening, missed)
 
 
 def discovery_content(

@@ -62,6 +62,8 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
         return False
     if not discovery.fit.sampler.converged:
         return False
+    if _other_choices(discovery):
+        return False
     if any(effect.form == STEP for effect in discovery.effects):
         # What was measured before and after it does not agree.
         return False
@@ -73,6 +75,17 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
     if discovery.verdict == 'none':
         return True
     return after < before and (confirmation is None or confirmation.confirmed)
+
+
+def _other_choices(discovery: Discovery) -> str:
+    """Return that most searches without some of the poses found other causes; ''."""
+    repeated = discovery.repeated
+    if repeated is None or repeated.same >= 0.5 * repeated.count:
+        return ''
+    return (
+        f' Which causes are named depends on the poses: of {repeated.count} searches without '
+        f'some of them {repeated.same or "none"} found the same.'
+    )
 
 
 def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> str:
@@ -105,6 +118,7 @@ def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> 
             f'Something is there, but two explanations fit equally well: see which measurements '
             f'would decide.{change}'
         )
+    change += _other_choices(discovery)
     if confirmation is not None and not confirmation.confirmed:
         change += f' The other session does not confirm {"it" if count == 1 else "them"}' + (
             '.'

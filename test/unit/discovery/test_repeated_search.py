@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -122,3 +123,9 @@ def test_the_result_says_that_the_search_was_repeated():
     assert content.repeated_search.count == GROUPS
     assert content.predicted_regions95.widening == found.widening
     assert found.widening == max(found.repeated.widening, found.stretches.widening)
+    for same, said in ((1, True), (4, False)):
+        repeated = replace(found.repeated, same=same)
+        other = replace(found, verdict='effects', repeated=repeated)
+        judged = discovery_content(other).judgement
+        assert ('depends on the poses: of 5 searches' in judged.headline) == said
+        assert judged.mood == 'caution' or not said

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from discovery_scenes import at_joint, residuals_of, session_with
 
+from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.discovery.discover import Findings, discover_session, find_causes
 from remaster_ros.discovery.effects.registry import EFFECTS
@@ -198,7 +199,7 @@ def test_causes_too_small_to_be_found_widen_the_offsets_and_nothing_else():
     """They move zero-offsets, not the predictions; the more of them, the further."""
     found = findings(session_with(39))
     data, solution = found.residuals, found.selection.solution
-    spread = undetected(found.found, data, solution)
+    spread = undetected(found.found, data, solution).moves
     free = found.found.posterior.free
     assert spread.shape[0] == found.found.model.size + len(solution.parameters)
     held = np.setdiff1d(np.arange(found.found.model.size), free)
@@ -217,6 +218,29 @@ def test_causes_too_small_to_be_found_widen_the_offsets_and_nothing_else():
     expected = np.hypot(by_data, np.linalg.norm(spread[: len(known)], axis=1))
     # A standard deviation of 400 independent draws is known to 3.5 %.
     np.testing.assert_allclose(std[known], expected[known], rtol=0.15)
+
+
+def test_causes_too_small_to_be_found_open_the_regions_away_from_the_poses_that_were_fitted():
+    session = session_with(81, poses=60)
+    m = session.measurements
+    away = np.linalg.norm(m.q - m.q[0], axis=1)
+    near = away < np.quantile(away, 0.3)
+    near &= np.isin(m.pose, np.unique(m.pose[near])[:18])
+    session = replace(session, measurements=replace(m, is_validation=~near))
+    data, found = residuals_of(session), estimate(Problem.of(session))
+    solution = solve(data, ())
+    assert solution is not None
+    covariance = undetected(found, data, solution).covariance(data.context)
+    std = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    noise = float(np.sqrt(3.0) * data.noise_model.sensor_noise(solution.noise).total[0])
+    print('m:', np.median(std[near]), np.median(std[~near]), 'noise', noise)
+    assert np.median(std[near]) < 0.5 * noise
+    assert np.median(std[~near]) > 2.0 * np.median(std[near])
+    # Of a block of rows the same as of all.
+    part = data.context.at(np.flatnonzero(~near)[:5])
+    np.testing.assert_allclose(
+        undetected(found, data, solution).covariance(part), covariance[~near][:5]
+    )
 
 
 @pytest.mark.parametrize('shift_m', [1e-3, 20e-3])
