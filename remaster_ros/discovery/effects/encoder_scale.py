@@ -8,7 +8,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Effect
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.sizes import angle, number
+from remaster_ros.discovery.effects.sizes import along_mean, angle, number
 from remaster_ros.types import FloatArray
 
 
@@ -29,7 +29,7 @@ def _scaled(context: Context, cell: Cell, draws: FloatArray) -> str:
     share = 100.0 * np.abs(scale.mean())
     return (
         f'joint {joint} turns {number(share, 100.0 * scale.std(), " %")} {more} than it reports, '
-        f'{angle(np.abs(scale) * span)} over the {np.degrees(span):.0f}° that it took'
+        f'{angle(along_mean(draws[:, :1]) * span)} over the {np.degrees(span):.0f}° that it took'
     )
 
 

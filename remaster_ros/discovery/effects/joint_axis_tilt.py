@@ -9,7 +9,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, ModelChange, turned
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.sizes import angle
+from remaster_ros.discovery.effects.sizes import along_mean, angle
 from remaster_ros.types import FloatArray
 
 # A tilt along the axis before is, with that joint's zero-offset, another name for a shift of the
@@ -49,7 +49,7 @@ def tilt_directions(context: Context, joint: int) -> dict[str, FloatArray]:
 
 
 def _tilt(context: Context, cell: Cell, draws: FloatArray) -> str:
-    size = np.linalg.norm(draws, axis=1) if cell.size > 1 else draws[:, 0]
+    size = along_mean(draws) if cell.size > 1 else draws[:, 0]
     axes = ' and '.join(cell.variant)
     return f'the axis of joint {cell.joints[0]} is tilted by {angle(size)} about {axes}'
 

@@ -15,7 +15,7 @@ from remaster_ros.discovery.effects.base import (
     displaced,
 )
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.sizes import length
+from remaster_ros.discovery.effects.sizes import along_mean, length
 from remaster_ros.types import FloatArray
 
 
@@ -54,12 +54,12 @@ def link_directions(context: Context, link: int) -> dict[str, FloatArray]:
 
 
 def _longer(context: Context, cell: Cell, draws: FloatArray) -> str:
-    link, value = cell.joints[0], draws[:, 0]
+    link, value, size = cell.joints[0], draws[:, 0], length(along_mean(draws[:, :1]))
     if cell.variant == 'along':
         longer = 'longer' if value.mean() >= 0.0 else 'shorter'
-        return f'link {link} is {length(np.abs(value))} {longer} than the model'
+        return f'link {link} is {size} {longer} than the model'
     side = '+' if value.mean() >= 0.0 else '−'
-    return f'link {link} ends {length(np.abs(value))} off, along {side}{cell.variant} of its frame'
+    return f'link {link} ends {size} off, along {side}{cell.variant} of its frame'
 
 
 EFFECT = Effect(

@@ -9,7 +9,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, displaced, needs_time
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.sizes import length
+from remaster_ros.discovery.effects.sizes import along_mean, length
 from remaster_ros.types import FloatArray
 
 
@@ -41,7 +41,7 @@ def _crept(context: Context, sensor: int, turning: bool) -> Design:
 
 def _moved_by(context: Context, cell: Cell, draws: FloatArray) -> str:
     hours = float(np.ptp(context.elapsed_s)) / 3600.0
-    way = np.linalg.norm(draws[:, :3], axis=1) * hours * 3600.0
+    way = along_mean(draws[:, :3]) * hours * 3600.0
     return f'{cell.subject} moves by {length(way)} in {hours:.1f} h'
 
 

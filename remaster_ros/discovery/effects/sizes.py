@@ -52,6 +52,17 @@ def length(values: FloatArray) -> str:
     return number(float(np.mean(values) / MM), float(np.std(values) / MM), ' mm')
 
 
+def along_mean(draws: FloatArray) -> FloatArray:
+    """Return what draws (draws, c) have along the direction of their mean, (draws,).
+
+    Absolute values would be too large on the average, and too close to each other, where the
+    draws lie about zero.
+    """
+    mean = draws.mean(axis=0)
+    along: FloatArray = draws @ (mean / max(float(np.linalg.norm(mean)), np.finfo(float).tiny))
+    return along
+
+
 def largest(values: FloatArray) -> float:
     """Return the largest absolute value; 0 of none."""
     return float(np.abs(values).max(initial=0.0))
@@ -66,10 +77,9 @@ def at_most(context: Context, cell: Cell, draws: FloatArray) -> str:
     if columns.at is not None:
         turns = columns.values - columns.values.mean(axis=0)
         row = int(np.argmax(np.abs(turns @ draws.mean(axis=0))))
-        there = draws @ turns[row]
-        return angle(there * np.sign(there.mean()))
+        return angle(along_mean(draws @ turns[[row]].T))
     row = int(np.argmax(np.linalg.norm(columns.values @ draws.mean(axis=0), axis=1)))
-    return length(np.linalg.norm(draws @ columns.values[row].T, axis=1))
+    return length(along_mean(draws @ columns.values[row].T))
 
 
 def up_to(words: str) -> Callable[[Context, Cell, FloatArray], str]:

@@ -20,7 +20,7 @@ from remaster_ros.discovery.effects.base import (
     needs_time,
 )
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.sizes import angle, length
+from remaster_ros.discovery.effects.sizes import along_mean, angle, length
 from remaster_ros.types import FloatArray
 
 MOMENTS = 40
@@ -134,8 +134,8 @@ LARGEST_RAD = 2e-2
 def _jump(context: Context, cell: Cell, draws: FloatArray) -> str:
     if cell.place == 'joint_angle':
         return f'joint {cell.joints[0]} by {angle(draws[:, 0])}'
-    way = length(np.linalg.norm(draws[:, :3], axis=1))
-    turn = f' and {angle(np.linalg.norm(draws[:, 3:], axis=1))}' if cell.size > 3 else ''
+    way = length(along_mean(draws[:, :3]))
+    turn = f' and {angle(along_mean(draws[:, 3:]))}' if cell.size > 3 else ''
     mean = draws[:, :3].mean(axis=0)
     parts = ', '.join(f'{part:+.2f}' for part in mean / max(float(np.linalg.norm(mean)), 1e-12))
     frame = 'the tool' if cell.place == 'marker' else 'its own frame' if cell.subject else 'R'

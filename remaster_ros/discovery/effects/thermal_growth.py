@@ -10,7 +10,7 @@ import numpy as np
 from remaster_ros.discovery.effects.base import NO_TIMES, Cell, Design, Effect, displaced
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import Driver, driver_named, slow_drivers
-from remaster_ros.discovery.effects.sizes import length
+from remaster_ros.discovery.effects.sizes import along_mean, length
 from remaster_ros.types import FloatArray
 
 # What grows by 1e-4 per K grows by this per s in a warm-up of 10 K in a quarter of an hour.
@@ -72,7 +72,7 @@ def _grown_by(context: Context, cell: Cell, draws: FloatArray) -> str:
     span = float(np.ptp(driver.value(context)))
     grows = 'grows' if draws.mean() >= 0.0 else 'shrinks'
     amount = f'{span / driver.per_shown:.1f} {driver.shown_unit}'
-    return f'1 m {part} {grows} by {length(np.abs(draws[:, 0]) * span)} over {amount}'
+    return f'1 m {part} {grows} by {length(along_mean(draws[:, :1]) * span)} over {amount}'
 
 
 EFFECT = Effect(

@@ -14,7 +14,7 @@ from discovery_scenes import residuals_of, session_with
 from remaster_ros.discovery.effects.base import PLACES, Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.effects.sizes import number
+from remaster_ros.discovery.effects.sizes import along_mean, number
 from remaster_ros.discovery.effects.splines import Curve, basis, centers, knot_vector, roughness
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, rotation_vector_to_matrix, transform
@@ -342,3 +342,13 @@ def test_the_search_names_no_effect(path):
     tree = ast.parse(path.read_text(encoding='utf-8'))
     texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
     assert not texts & set(EFFECTS)
+
+
+@pytest.mark.parametrize('size', [1, 3])
+def test_a_size_of_draws_about_zero_is_their_mean_and_spread_not_those_of_absolute_values(size):
+    mean = np.array([-1.4, 0.3, 0.2])[:size]
+    draws = mean + 1.3 * np.random.default_rng(5).standard_normal((4000, size))
+    along = along_mean(draws)
+    assert along.mean() == pytest.approx(np.linalg.norm(draws.mean(axis=0)))
+    assert along.std() == pytest.approx(1.3, rel=0.05)
+    assert np.linalg.norm(draws, axis=1).mean() > 1.1 * along.mean()
