@@ -17,13 +17,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from remaster_ros.discovery.cross_validation import held_out_error, worth_of
+from remaster_ros.discovery.cross_validation import held_out_deviance, worth_of
 from remaster_ros.discovery.dating import refine_moments
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.families import (
     FAMILIES,
+    WHOLE,
     family_log_prior,
     grouped,
     relatives,
@@ -32,7 +33,7 @@ from remaster_ros.discovery.families import (
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, Screening, screen
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.substitutes import named_instead
+from remaster_ros.discovery.substitutes import named_instead, regrown
 
 # Family-wise error of one round.
 SIGNIFICANCE = 0.01
@@ -49,8 +50,6 @@ LEAST_GAIN = 0.01
 HYSTERESIS = 0.5
 MOST_EXCHANGED = 6
 MOST_MERGED = 4
-# So many cells of one family are a family.
-WHOLE = 3
 # Members of a family of which none raises the evidence alone have to raise it by this together.
 TOGETHER = 10.0
 # A member of a family has to raise the evidence by this: a free form of no size costs nothing.
@@ -151,7 +150,12 @@ class Search:
                     break
                 rejected = rejected or step
             else:
-                break
+                anew = regrown(solution, self.with_all, self.prune)
+                gain = anew.log_evidence - solution.log_evidence
+                if gain <= HYSTERESIS or self.held_out_share(solution, anew) < 0.0:
+                    break
+                solution = self.backward_elimination(self.drop_unpredictive(anew))
+                continue
             steps.append(step)
             solution = self.swap(self.prune(candidate))
             solution = refine_moments(solution, self.cells, self.data.part, self.fit)
@@ -226,6 +230,13 @@ class Search:
         Also where none of them does so alone: errors of six joints may each be below the
         threshold, and far above it together.
         """
+        grown = self.with_all(solution, family)
+        if grown is None or len(grown.cells) < len(solution.cells) + 2:
+            return None
+        return self.prune(grown, set(grown.cells) - set(solution.cells))
+
+    def with_all(self, solution: Solution, family: tuple[str, ...]) -> Solution | None:
+        """Return the set with all of a family that add something to it; None where none do."""
         members = [
             cell
             for cell in self.catalogue.cells
@@ -234,10 +245,7 @@ class Search:
         present = {(cell.name, cell.joints, cell.label) for cell in solution.cells}
         others = [cell for cell in members if (cell.name, cell.joints, cell.label) not in present]
         new = visible(self.data, solution.cells, others)
-        if len(new) < 2:
-            return None
-        grown = self.fit((*solution.cells, *new), solution)
-        return None if grown is None else self.prune(grown, set(new))
+        return self.fit((*solution.cells, *new), solution) if new else None
 
     def prune(self, solution: Solution, among: set[Cell] | None = None) -> Solution:
         """Drop, one by one, the cells without which the evidence is higher.
@@ -383,11 +391,11 @@ class Search:
         return sorted(found, key=lambda fit: -fit.log_evidence)
 
     def held_out_share(self, smaller: Solution, larger: Solution) -> float:
-        """Return the share of the squared error on poses left out that the larger set saves."""
+        """Return the share of the deviance of poses left out that the larger set saves."""
         if self._last_held_out[0] is not larger:
-            after = held_out_error(self.data, larger, larger.noise, self._fold_of_pose)
+            after = held_out_deviance(self.data, larger, larger.noise, self._fold_of_pose)
             self._last_held_out = larger, float(after.sum())
-        before = held_out_error(self.data, smaller, larger.noise, self._fold_of_pose)
+        before = held_out_deviance(self.data, smaller, larger.noise, self._fold_of_pose)
         return float(1.0 - self._last_held_out[1] / before.sum())
 
 
