@@ -2,8 +2,9 @@
 
 What follows from one reading to the next resembles what follows a joint angle, which does so, too.
 The wander of `effects.sensor_wander` takes up a part of it; the tests of the search hold the rest
-for independent. So each cause beside a wander is tested again, the weakest first, against
-surrogates with the memory that the residuals show (`memory`). Those that fail are dropped.
+for independent. So causes beside a wander are tested again, the weakest first, against
+surrogates with the memory that the residuals show (`memory`), until one passes: what explains more
+would pass, too. Those that fail are dropped.
 """
 
 from __future__ import annotations
@@ -32,34 +33,35 @@ def withstanding_memory(search: Search, solution: Solution) -> Solution:
         Returned as it is where no errors remember.
     """
     sensors = remembering(search.data, solution)
-    tested: set[object] = set()
     while sensors:
         rest = [cell for cell in solution.cells if not is_memory(cell)]
-        plain = search.fit(rest, solution)
-        weakest = None
-        for group in grouped(rest):
-            if group in tested or not EFFECTS[group[0].name].is_cause:
-                continue
-            others = [cell for cell in solution.cells if cell not in group]
-            without = search.fit(others, solution)
-            if without is None:
-                continue
-            gain = solution.log_evidence - without.log_evidence
-            if weakest is None or gain < weakest[0]:
-                weakest = gain, group, without
-        if weakest is None or plain is None:
+        plain, without = search.fit(rest, solution), _without_weakest(search, solution)
+        if plain is None or without is None:
             break
-        gain, group, without = weakest
-        tested.add(group)
-        memory = Memory.of(search.data, plain, sensors)
         screening = screen(
             search.data,
             search.catalogue,
             replace(without, noise=solution.noise),
             rng=search.rng,
             draws=DRAWS,
-            errors=memory.draw,
+            errors=Memory.of(search.data, plain, sensors).draw,
         )
-        if screening.p_value(gain) > SIGNIFICANCE:
-            solution = without
+        gain = solution.log_evidence - without.log_evidence
+        if screening.p_value(gain) <= SIGNIFICANCE:
+            break
+        solution = without
     return solution
+
+
+def _without_weakest(search: Search, solution: Solution) -> Solution | None:
+    """Return the solution without the cause that explains least; None where it has none."""
+    smaller = [
+        search.fit([cell for cell in solution.cells if cell not in group], solution)
+        for group in grouped(solution.cells)
+        if EFFECTS[group[0].name].is_cause
+    ]
+    return max(
+        (fit for fit in smaller if fit is not None),
+        key=lambda fit: fit.log_evidence,
+        default=None,
+    )
