@@ -2,9 +2,11 @@
 
 The errors that a model leaves are taken as the sum of three independent parts: one of each row,
 one that all rows of a pose share, and an Ornstein-Uhlenbeck process over the sensor's readings in
-their order, whose correlation falls by e over a length. The mean products of the errors of two
-rows, by how many readings they lie apart and whether they are of one pose, determine the variances
-by non-negative least squares; of a grid of lengths the one that leaves least is taken.
+their order, whose correlation falls by e over a length. Three kinds of moments determine the
+variances by non-negative least squares: the mean square of the errors; half that of the difference
+of two rows of a pose; the mean product of two rows of different poses; the latter two by how many
+readings the rows lie apart (variogram and covariogram, Cressie 1993, Statistics for Spatial Data).
+Each has the weight of its relative error. Of a grid of lengths the one that leaves least is taken.
 
 Unlike the wander of `effects.sensor_wander`, which has some knots over the session, this resolves
 a memory of a few readings.
@@ -28,6 +30,8 @@ from remaster_ros.types import FloatArray, IntArray
 MOST_APART = 40
 SHORTEST = 0.5
 LENGTHS = 24
+# Of the mean square: a difference of two rows of a pose is taken for no smaller.
+LEAST = 1e-4
 # To know a covariance by, to a few percent; and how many of them are held at once.
 DRAWS = 2000
 AT_ONCE = 250
@@ -71,7 +75,7 @@ class Memory:
                 mine = [i for i, channel in enumerate(model.channels) if channel.sensor == sensor]
                 channels = [model.channels[i] for i in mine]
                 variances, length[sensor] = _fitted(
-                    _Products.of(errors[span], reading(data)[span], data.pose_of_row[span]),
+                    _Moments.of(errors[span], reading(data)[span], data.pose_of_row[span]),
                     channels,
                     frame[mine] ** 2,
                 )
@@ -144,13 +148,14 @@ def reading(data: Residuals) -> IntArray:
 
 
 @dataclass(frozen=True, eq=False)
-class _Products:
-    """Mean products of the errors of pairs of rows, by how far apart they are.
+class _Moments:
+    """Moments of the errors of pairs of rows, by how far apart they are.
 
     Attributes
     ----------
     value
-        For each axis, m², (kinds, 3).
+        For each axis, m², (kinds, 3): of a row with itself the mean square, of two of a pose half
+        the mean square of their difference, of others their mean product.
     apart
         Readings between the two; 0 for a row with itself, (kinds,).
     same_pose
@@ -165,7 +170,7 @@ class _Products:
     count: IntArray
 
     @classmethod
-    def of(cls, errors: FloatArray, order: IntArray, pose: IntArray) -> _Products:
+    def of(cls, errors: FloatArray, order: IntArray, pose: IntArray) -> _Moments:
         by_time = np.argsort(order, kind='stable')
         errors, order, pose = errors[by_time], order[by_time], pose[by_time]
         sums = np.zeros((MOST_APART + 1, 2, 3))
@@ -176,7 +181,9 @@ class _Products:
             # Markers of one frame share errors that are not memory.
             near = (apart > 0) & (apart <= MOST_APART)
             same = (pose[step:] == pose[:-step]).astype(np.int64)[near]
-            np.add.at(sums, (apart[near], same), (errors[step:] * errors[:-step])[near])
+            one, other = errors[step:][near], errors[:-step][near]
+            values = np.where(same[:, None], 0.5 * (one - other) ** 2, one * other)
+            np.add.at(sums, (apart[near], same), values)
             np.add.at(counts, (apart[near], same), 1)
         apart, same = np.nonzero(counts)
         count = counts[apart, same]
@@ -184,28 +191,32 @@ class _Products:
 
 
 def _fitted(
-    products: _Products, channels: Sequence[Channel], frame: FloatArray
+    moments: _Moments, channels: Sequence[Channel], frame: FloatArray
 ) -> tuple[FloatArray, float]:
     """Return variances (own and pose's of each channel, the process's) and the length."""
-    longest = max(2.0, float(products.apart.max()))
+    longest = max(2.0, float(moments.apart.max()))
     best: tuple[float, FloatArray, float] | None = None
-    itself = products.apart == 0
+    itself = moments.apart == 0
+    together = moments.same_pose == 1
     for length in np.geomspace(SHORTEST, longest, LENGTHS):
+        correlation = np.exp(-moments.apart / length)
         blocks, values = [], []
         for index, channel in enumerate(channels):
-            weight = np.sqrt(products.count * channel.dimension)
+            value = moments.value[:, slice(*channel.axes)].mean(axis=1)
+            # A mean product is as uncertain as the mean square, a variance in proportion.
+            size = np.maximum(np.where(together, value, value[itself]), LEAST * value[itself])
+            weight = np.sqrt(moments.count * channel.dimension) / size
             block = np.zeros((len(weight), 2 * len(channels) + 1))
-            block[:, 2 * index] = itself
-            block[:, 2 * index + 1] = products.same_pose
-            block[:, -1] = np.exp(-products.apart / length)
-            value = products.value[:, slice(*channel.axes)].mean(axis=1) - itself * frame[index]
+            block[:, 2 * index] = together
+            block[:, 2 * index + 1] = itself
+            block[:, -1] = np.where(together & ~itself, 1.0 - correlation, correlation)
             blocks.append(block * weight[:, None])
-            values.append(value * weight)
+            values.append((value - together * frame[index]) * weight)
         system, target = np.concatenate(blocks), np.concatenate(values)
-        scale = float(np.max(np.abs(target))) or 1.0
-        variances, left = nnls(system, target / scale)
-        if best is None or left * scale < best[0]:
-            best = left * scale, variances * scale, float(length)
+        unit = np.max(np.abs(moments.value))
+        variances, left = nnls(system * unit, target)
+        if best is None or left < best[0]:
+            best = float(left), variances * unit, float(length)
     assert best is not None
     return best[1], best[2]
 
