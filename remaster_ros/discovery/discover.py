@@ -317,6 +317,7 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
     aside = set_aside(residuals, selection.solution)
     if aside is not None:
         selection = replace(selection, solution=aside.solution)
+        structure = aside.said(structure)
     memory = None if aside is None else aside.memory
     effects += moved_markers(found, residuals, selection.solution, memory)
     thinning = None

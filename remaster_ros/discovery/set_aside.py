@@ -16,7 +16,8 @@ parametric covariance of the errors).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
+from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.guard import MOST_HARM
 from remaster_ros.discovery.memory import DRAWS, Memory, draws_of
 from remaster_ros.discovery.residuals import Residuals
@@ -36,6 +38,10 @@ from remaster_ros.types import FloatArray, IntArray
 # with at least the other.
 RISK = 0.01
 HOPE = 0.5
+NOT_FITTED = (
+    ' This is not in the model, where it could do harm: everything is estimated as from readings '
+    'that do not follow each other, with intervals that allow for it.'
+)
 # Directions in which the two estimates differ by less than this share in variance say nothing.
 RESOLVED = 1e-3
 
@@ -68,6 +74,14 @@ class SetAside:
     searched: Solution
     solution: Solution
     memory: Memory
+
+    @staticmethod
+    def said(structure: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:
+        """Return structure without a cause, where the wander's sentence says what is done."""
+        return tuple(
+            replace(found, cause=found.cause + NOT_FITTED) if found.driver == 'time' else found
+            for found in structure
+        )
 
 
 def set_aside(data: Residuals, solution: Solution) -> SetAside | None:
