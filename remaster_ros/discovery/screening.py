@@ -16,7 +16,7 @@ whitened rows are flipped one by one, which relies on the noise model's independ
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +28,8 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
+# Number and generator to that many sets of errors of all rows, m, (n, 3, draws).
+Draw = Callable[[int, np.random.Generator], FloatArray]
 CHUNK = 1024
 # With fewer, flips of whole poses meet the observed pattern, or its like, by chance.
 FEWEST_POSES = 12
@@ -148,6 +150,7 @@ def screen(
     rng: np.random.Generator | None = None,
     draws: int = 0,
     chosen: BoolArray | None = None,
+    errors: Draw | None = None,
 ) -> Screening:
     """Score all cells beside the given ones, under their noise.
 
@@ -161,6 +164,8 @@ def screen(
         For surrogates of each kind; none by default.
     chosen
         Which cells to score; all by default.
+    errors
+        To draw surrogates with; by default the noise of the given ones.
     """
     noise = given.noise
     project = _Projection(data, given)
@@ -168,7 +173,7 @@ def screen(
     surrogates = observed
     if draws and rng is not None:
         surrogates = np.concatenate(
-            (observed, _surrogates(data, project, observed, draws, rng)), 1
+            (observed, _surrogates(data, project, observed, draws, rng, noise, errors)), 1
         )
     total = np.sum(surrogates**2, axis=0)
     surrogates = np.asarray(surrogates / np.sqrt(total), dtype=np.float32)
@@ -215,12 +220,17 @@ def _surrogates(
     observed: FloatArray,
     draws: int,
     rng: np.random.Generator,
+    noise: Noise,
+    errors: Draw | None,
 ) -> FloatArray:
     """Return residuals with flipped poses, and drawn ones, (3n, 2 draws)."""
     unit = data.pose_of_row if data.poses >= FEWEST_POSES else np.arange(len(data))
     signs = rng.integers(0, 2, (int(unit.max()) + 1, draws)) * 2.0 - 1.0
     flipped = observed * np.repeat(signs[unit], 3, axis=0)
-    drawn = rng.standard_normal((len(observed), draws))
+    if errors is None:
+        drawn = rng.standard_normal((len(observed), draws))
+    else:
+        drawn = data.noise_model.whitened(errors(draws, rng), noise).reshape(-1, draws)
     return project.residual(np.concatenate((flipped, drawn), axis=1))
 
 
