@@ -35,6 +35,7 @@ from remaster_ros.discovery.guard import Unexplained, harm_of, held, is_harmful,
 from remaster_ros.discovery.marker_offsets import held_markers, loosened, moved_markers
 from remaster_ros.discovery.omnibus import structure_left
 from remaster_ros.discovery.plain_forms import plainest
+from remaster_ros.discovery.repeated_search import RepeatedSearch, repeat_search
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.set_aside import SetAside, moved_by_memory, set_aside
 from remaster_ros.discovery.solution import Solution
@@ -95,6 +96,8 @@ class Discovery:
         its sensor, m, (n, 3).
     unexplained
         Structure that no cause explains.
+    repeated
+        What the search finds without some of the poses; None where it was not repeated.
     """
 
     verdict: Verdict
@@ -113,6 +116,14 @@ class Discovery:
     residuals_before: FloatArray
     thinning: Thinning | None = None
     unexplained: tuple[Unexplained, ...] = ()
+    repeated: RepeatedSearch | None = None
+
+    @property
+    def widening(self) -> float | None:
+        """Factor on the size of the predicted 95 % regions; None where nothing shows it."""
+        if self.repeated is None:
+            return self.stretches.widening
+        return max(self.repeated.widening, self.stretches.widening or 1.0)
 
 
 def discover_session(
@@ -196,6 +207,7 @@ def discover_session(
         residuals_before=residuals_of(findings.before),
         thinning=findings.thinning,
         unexplained=unexplained,
+        repeated=findings.repeated,
     )
 
 
@@ -217,7 +229,8 @@ class Findings:
     structure: tuple[FoundEffect, ...]
     untestable: Mapping[str, str]
     thinning: Thinning | None
-    aside: SetAside | None = None
+    aside: SetAside | None
+    repeated: RepeatedSearch | None
 
     @property
     def searched(self) -> Solution:
@@ -239,6 +252,7 @@ class Findings:
             structure=(),
             thinning=None,
             aside=None,
+            repeated=None,
         )
 
 
@@ -260,6 +274,8 @@ def _sampled(
     if findings.aside is not None:
         memory = findings.aside.memory
         unmodelled.append(moved_by_memory(findings.found, residuals, solution, memory))
+    if findings.repeated is not None:
+        unmodelled.append(findings.repeated.moves)
     fit = fit_session(
         session,
         rng=rng,
@@ -318,6 +334,12 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
     if aside is not None:
         selection = replace(selection, solution=aside.solution)
         structure = aside.said(structure)
+    repeated = repeat_search(
+        found,
+        search,
+        selection.solution,
+        lambda share: progress('searching again without some of the poses', share),
+    )
     memory = None if aside is None else aside.memory
     effects += moved_markers(found, residuals, selection.solution, memory)
     thinning = None
@@ -337,6 +359,7 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         untestable,
         thinning,
         aside,
+        repeated,
     )
 
 

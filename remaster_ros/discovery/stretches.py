@@ -206,6 +206,17 @@ def root_of_inverse(precision: FloatArray) -> FloatArray:
     return root
 
 
+def noise_covariance(data: Residuals, solution: Solution) -> FloatArray:
+    """Return the covariance of all the noise of each row worked on, m², (n, 3, 3)."""
+    sensor = data.context.sensor[data.rows.source]
+    along, across = data.noise_model.total_noise(solution.noise)[sensor].T ** 2
+    sight = data.rows.target - data.reference[sensor, :3, 3]
+    sight /= np.linalg.norm(sight, axis=1)[:, None]
+    covariance: FloatArray = across[:, None, None] * np.eye(3)
+    covariance += (along - across)[:, None, None] * sight[:, :, None] * sight[:, None, :]
+    return covariance
+
+
 def _widening(
     data: Residuals,
     solution: Solution,
@@ -223,12 +234,7 @@ def _widening(
     left
         Residuals at the solution, m, (n, 3).
     """
-    sensor = data.context.sensor[data.rows.source]
-    along, across = data.noise_model.total_noise(solution.noise)[sensor].T ** 2
-    sight = data.rows.target - data.reference[sensor, :3, 3]
-    sight /= np.linalg.norm(sight, axis=1)[:, None]
-    covariance = across[:, None, None] * np.eye(3)
-    covariance += (along - across)[:, None, None] * sight[:, :, None] * sight[:, None, :]
+    covariance = noise_covariance(data, solution)
     errors = left.copy()
     for index, part in enumerate(parts):
         mine = stretch == index
