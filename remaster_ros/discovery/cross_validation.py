@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
@@ -48,13 +49,15 @@ def held_out_error(
     prior[p:, p:] = solution.prior_precision()
     prior /= np.outer(scale[:-1], scale[:-1])
     fold = np.repeat(fold_of_pose[data.pose_of_row], 3)
-    total = white.T @ white
+    parts = [white[fold == index] for index in range(fold.max() + 1)]
+    grams = [part.T @ part for part in parts]
+    total = np.sum(grams, axis=0)
     total[:-1, :-1] += prior + 1e-12 * np.eye(size)
     errors = np.empty(len(white))
-    for index in np.unique(fold):
-        out = white[fold == index]
-        kept = total - out.T @ out
-        beta = np.linalg.solve(kept[:-1, :-1], kept[:-1, -1])
+    for index, (out, gram) in enumerate(zip(parts, grams, strict=True)):
+        kept = total - gram
+        root = cho_factor(kept[:-1, :-1], lower=True, check_finite=False)
+        beta = cho_solve(root, kept[:-1, -1], check_finite=False)
         errors[fold == index] = out[:, -1] - out[:, :-1] @ beta
     square = np.add.reduceat(errors**2, np.arange(0, len(errors), 3))
     by_pose: FloatArray = np.bincount(data.pose_of_row, square).astype(float)

@@ -26,6 +26,7 @@ from remaster_ros.discovery.families import (
     FAMILIES,
     family_log_prior,
     grouped,
+    less,
     relatives,
     visible,
 )
@@ -129,8 +130,7 @@ class Search:
     def _look_at(self, data: Residuals) -> None:
         self.data = data
         self.catalogue = Catalogue.of(data, self.cells)
-        order = self.rng.permutation(data.poses)
-        self._fold_of_pose = order % min(FOLDS, data.poses)
+        self._fold_of_pose = self.rng.permutation(data.poses) % min(FOLDS, data.poses)
         # The larger set is compared with many smaller ones in turn.
         self._last_held_out: tuple[Solution | None, float] = None, np.nan
 
@@ -185,15 +185,12 @@ class Search:
         again = self.fit(solution.cells, solution)
         return solution if again is None else self.prune(again)
 
-    def fit(
-        self, cells: Sequence[Cell], start: Solution | None = None, settled: bool = True
-    ) -> Solution | None:
+    def fit(self, cells: Sequence[Cell], start: Solution | None = None) -> Solution | None:
         """Fit a set with its prior probability; None for two cells of the same parameters."""
         names = [name for cell in cells for name in cell.parameters]
         if len(set(names)) < len(names):
             return None
-        prior = family_log_prior(cells, self.catalogue.cells)
-        return solve(self.data, cells, start, prior=prior, settled=settled)
+        return solve(self.data, cells, start, prior=family_log_prior(cells, self.catalogue.cells))
 
     def propose(self, solution: Solution, screening: Screening) -> list[Proposal]:
         """Return sets one step on that raise the evidence, the best first."""
@@ -237,10 +234,11 @@ class Search:
         if len(new) < 2:
             return None
         grown = self.fit((*solution.cells, *new), solution)
-        return None if grown is None else self.prune(grown, set(new))
+        pruned = None if grown is None else self.prune(grown, solution)
+        return None if pruned is solution else pruned
 
-    def prune(self, solution: Solution, among: set[Cell] | None = None) -> Solution:
-        """Drop, one by one, the cells without which the evidence is higher.
+    def prune(self, solution: Solution, given: Solution | None = None) -> Solution:
+        """Drop, one by one, the cells without which the evidence is higher, but the given ones.
 
         Those of a sign that physics excludes go first, whatever they explain.
         """
@@ -250,7 +248,7 @@ class Search:
             unphysical = solution.unphysical()
             worth = [
                 worth_of(solution, cell, where, price)
-                if among is None or cell in among
+                if given is None or cell not in given.cells
                 else np.inf
                 for cell, where in zip(solution.cells, solution.slices(), strict=True)
             ]
@@ -265,6 +263,8 @@ class Search:
                     solution, settled = smaller
                     break
             else:
+                if given is not None and set(solution.cells) == set(given.cells):
+                    return given
                 if settled:
                     return solution
                 # Noise and smoothness follow what was dropped; then it is looked at again.
@@ -279,12 +279,13 @@ class Search:
         Where the evidence rises with the noise as it is, the best noise for the smaller set can
         wait; the cell is kept only by settled evidences.
         """
-        rest = (*solution.cells[:index], *solution.cells[index + 1 :])
-        for settle in (False, True) if settled else (False,):
-            smaller = self.fit(rest, solution, settled=settle)
-            if smaller and (unphysical or smaller.log_evidence > solution.log_evidence):
-                return smaller, settle
-        return None
+        smaller = less(solution, index, len(self.data), self.catalogue.cells)
+        if unphysical or smaller.log_evidence > solution.log_evidence:
+            return smaller, False
+        again = self.fit(smaller.cells, solution) if settled else None
+        if again is None or again.log_evidence <= solution.log_evidence:
+            return None
+        return again, True
 
     def swap(self, solution: Solution) -> Solution:
         """Replace cells, one at a time, by what explains more in their place."""
@@ -348,8 +349,7 @@ class Search:
             _, index = min(weak)
             cell = solution.cells[index]
             tested.add(cell)
-            rest = (*solution.cells[:index], *solution.cells[index + 1 :])
-            without = self.fit(rest, solution)
+            without = self.fit((*solution.cells[:index], *solution.cells[index + 1 :]), solution)
             if without is not None and not self._passes(cell, without, solution):
                 solution = without
 

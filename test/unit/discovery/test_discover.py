@@ -218,13 +218,15 @@ def test_restricted_likelihood_has_the_gradient_it_says(name, split):
     noise = model.of_sensors(*robust_noise(data.rows, data.errors, np.ones(len(data), bool)))
     ridge = np.where(np.arange(len(unit)) < p, 0.0, 0.5)
     system = _System(model, grams, noise, cells, p, unit, ridge)
-    eta, _ = system._start(None)
-    _, gradient = system.evaluate(eta)
+    eta, _, _ = system._start(None)
+    _, gradient, information = system.evaluate(eta)
     for i in range(len(eta)):
         step = np.zeros(len(eta))
         step[i] = 1e-5
         numeric = (system.evaluate(eta + step)[0] - system.evaluate(eta - step)[0]) / 2e-5
         assert gradient[i] == pytest.approx(numeric, rel=1e-3, abs=1e-3)
+    # The average of observed and expected information has no negative direction.
+    assert np.linalg.eigvalsh(information).min() > -1e-9 * np.trace(information)
 
 
 def test_a_curve_has_a_plausible_size_where_the_data_leave_it_open():
