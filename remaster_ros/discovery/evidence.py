@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve
-from scipy.linalg.lapack import dpotri
+from scipy.linalg.lapack import dpotrf, dpotri
 
 from remaster_ros.calibration.noise import RESOLUTION_M, Noise, NoiseModel
 from remaster_ros.discovery.effects.base import LARGEST_M, Cell
@@ -98,7 +98,7 @@ def solve(
     ridge = np.concatenate((np.zeros(p), np.where(sized, (std * scale) ** -2.0, 0.0)))
     unit = np.concatenate((np.ones(p), scale))
     inverse_unit = 1.0 / np.append(unit, 1.0)
-    grams = grams * (inverse_unit[:, None] * inverse_unit)
+    grams *= inverse_unit[:, None] * inverse_unit
     system = _System(data.noise_model, grams, data.noise, cells, p, unit, ridge)
     if not system.visible():
         return None
@@ -173,13 +173,13 @@ class _System:
         count = len(self.entering)
         weights, factors = self._precisions(eta)
         total, root, beta, lower = self._solved(eta)
-        # Below the diagonal twice: products with symmetric matrices are then those of the whole.
+        # Beside the diagonal twice: products with symmetric matrices are then those of the whole.
         inverse = np.zeros_like(total)
-        np.multiply(lower, 2.0, out=inverse[:-1, :-1])
+        np.multiply(lower.T, 2.0, out=inverse[:-1, :-1])
         np.fill_diagonal(inverse[:-1, :-1], np.diag(lower))
         error = np.append(-beta, 1.0)
         trace, pulls = np.empty(len(weights)), np.empty((len(weights), len(error)))
-        # Both of one matrix after the other: reading them from memory is most of the work.
+        # Both of one matrix after the other: it is read from memory once.
         for index, gram in enumerate(self.grams):
             trace[index] = np.vdot(gram, inverse)
             pulls[index] = gram @ error
@@ -230,15 +230,18 @@ class _System:
             return self._last[1]
         weights, factors = self._precisions(eta)
         total = (weights @ self.grams.reshape(len(weights), -1)).reshape(self.grams.shape[1:])
-        H = total[:-1, :-1] + np.diag(self.ridge)
+        # In LAPACK's order, and in the memory of H.
+        H = np.array(total[:-1, :-1], order='F')
+        np.einsum('ii->i', H)[:] += self.ridge
         for index, penalty, factor in zip(self.penalised, self.penalties, factors, strict=True):
             where = self.where[index]
             H[where, where] += factor * penalty
-        root = np.linalg.cholesky(H).astype(float, copy=False)
+        root, wrong = dpotrf(H, lower=1, overwrite_a=1)
+        if wrong:
+            raise np.linalg.LinAlgError
         beta = cho_solve((root, True), total[:-1, -1], check_finite=False)
-        # The transpose is the same memory in LAPACK's order.
-        upper, _ = dpotri(root.T, lower=0)
-        self._last = eta.copy(), (total, root, beta, upper.T)
+        lower, _ = dpotri(root, lower=1)
+        self._last = eta.copy(), (total, root, beta, lower)
         return self._last[1]
 
     def solution(self, start: Solution | None, prior: float) -> Solution:
@@ -247,6 +250,8 @@ class _System:
         total, root, beta, lower = self._solved(eta)
         evidence = self._evidence(total, root, weights, factors, beta)
         covariance = (lower + np.tril(lower, -1).T) / np.outer(self.unit, self.unit)
+        part, unit = slice(self.unpenalised), self.unit[: self.unpenalised]
+        unpenalised = cho_solve((root[part, part], True), np.eye(len(unit))) / np.outer(unit, unit)
         beta = beta / self.unit
         smoothness = np.full(len(self.cells), np.nan)
         smoothness[self.penalised] = factors
@@ -259,6 +264,7 @@ class _System:
             self.noise(eta),
             smoothness,
             (self.ridge * self.unit**2)[self.p :],
+            unpenalised,
             evidence + prior,
         )
 

@@ -6,6 +6,7 @@ registrations, offsets and markers can absorb is projected out with flat priors 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -209,7 +210,7 @@ class Residuals:
         norms
             Of the columns over all rows, (p + c + 1,).
         grams
-            In each error group of the noise model, (groups, p + c + 1, p + c + 1).
+            In each error group of the noise model, (groups, p + c + 1, p + c + 1); a copy.
         """
         wanted = set(cells)
         known, norms, grams = max(
@@ -219,15 +220,17 @@ class Residuals:
             part = [cell for cell in known if cell in wanted]
             chosen = self._positions(known, part)
             known = (*part, *(cell for cell in cells if cell not in part))
-            norms, more = self._more_grams(known, len(chosen))
-            across = more[:, :, : len(chosen)].transpose(0, 2, 1)
-            upper = np.concatenate((grams[:, chosen[:, None], chosen], across), axis=2)
-            grams = np.concatenate((upper, more), axis=1)
+            norms, more = self._more_grams(known, old := len(chosen))
+            grown = np.empty((len(grams), len(norms), len(norms)))
+            grown[:, :old, :old] = _picked(grams, chosen)
+            grown[:, old:] = more
+            grown[:, :old, old:] = more[:, :, :old].transpose(0, 2, 1)
+            grams = grown
             self._grams.insert(0, (known, norms, grams))
             del self._grams[KEPT_GRAMS:]
         p = self.base.shape[2]
         order = np.append(np.delete(self._positions(known, cells), p), p)
-        return norms[order], grams.take(order, axis=1).take(order, axis=2)
+        return norms[order], _picked(grams, order)
 
     def _positions(self, known: Sequence[Cell], cells: Sequence[Cell]) -> IntArray:
         """Return where base, errors and some cells are among the columns of a set of `_grams`."""
@@ -264,6 +267,17 @@ class Residuals:
         """Return the same in the rows worked on, m, (n, 3)."""
         explained: FloatArray = self.base @ fit.base + self.columns(fit.cells) @ fit.parameters
         return self.errors - explained
+
+
+def _picked(grams: FloatArray, order: IntArray) -> FloatArray:
+    """Return the rows and columns of Gram matrices in some order, run by run: runs are long."""
+    starts = np.flatnonzero(np.diff(order, prepend=-2) != 1)
+    runs = list(zip(starts, np.append(starts[1:], len(order)), strict=True))
+    picked = np.empty((len(grams), len(order), len(order)))
+    for (i, i_end), (j, j_end) in itertools.product(runs, runs):
+        rows = slice(order[i], order[i_end - 1] + 1)
+        picked[:, i:i_end, j:j_end] = grams[:, rows, order[j] : order[j_end - 1] + 1]
+    return picked
 
 
 def _orthonormal(jacobian: FloatArray) -> FloatArray:

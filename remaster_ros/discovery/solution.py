@@ -6,7 +6,6 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
@@ -31,6 +30,9 @@ class Solution:
         Precision factor of each penalised cell, in order of the cells (NaN for the others).
     ridge
         Prior precision of each unpenalised parameter (0 for the others), (m,).
+    unpenalised_covariance
+        Of the columns of the offsets model and the unpenalised parameters, in order, were the
+        penalised ones known, (p + u, p + u).
     log_evidence
         With the prior probability of the cells.
     """
@@ -43,6 +45,7 @@ class Solution:
     noise: Noise
     smoothness: FloatArray
     ridge: FloatArray
+    unpenalised_covariance: FloatArray
     log_evidence: float
 
     def slices(self) -> list[slice]:
@@ -51,7 +54,7 @@ class Solution:
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
     def reordered(self, order: IntArray) -> Solution:
-        """Return the same with the cells in another order."""
+        """Return the same with the cells in another order, the unpenalised ones in the same."""
         where = self.slices()
         m = [np.arange(len(self.parameters))[where[index]] for index in order]
         chosen = np.concatenate([np.zeros(0, dtype=int), *m])
@@ -81,23 +84,24 @@ class Solution:
         rows
             Number of rows n that were fitted.
         """
-        cell, p = self.cells[index], len(self.base)
-        covariance, every = self.full_covariance, np.concatenate((self.base, self.parameters))
-        out = p + np.arange(len(self.parameters))[self.slices()[index]]
-        kept = np.delete(np.arange(len(every)), out)
-        pull = np.linalg.solve(covariance[np.ix_(out, out)], covariance[np.ix_(out, kept)]).T
-        values = every[out]
-        worth = 0.5 * values @ np.linalg.solve(covariance[np.ix_(out, out)], values)
-        price = 0.5 * np.linalg.slogdet(covariance[np.ix_(out, out)])[1]
+        cell, p, where = self.cells[index], len(self.base), self.slices()[index]
+        every = np.concatenate((self.base, self.parameters))
+        out = p + np.arange(where.start, where.stop)
+        covariance, pull, determinant = _conditioned(self.full_covariance, out)
+        worth = (
+            0.5 * every[out] @ np.linalg.solve(self.full_covariance[np.ix_(out, out)], every[out])
+        )
+        unpenalised = self.unpenalised_covariance
         if cell.penalty is not None:
-            ridge = self.ridge[out[0] - p]
-            price += 0.5 * np.sum(np.log(self.smoothness[index] * cell.roughness + ridge))
+            prior = self.smoothness[index] * cell.roughness + self.ridge[where.start]
+            price = 0.5 * (determinant + np.sum(np.log(prior)))
         else:
+            before = sum(other.size for other in self.cells[:index] if other.penalty is None)
+            among = p + before + np.arange(cell.size)
+            unpenalised, _, alone = _conditioned(unpenalised, among)
             # Half log N in place of the determinant that the unpenalised ones have by themselves.
-            price -= 0.5 * np.linalg.slogdet(self._unpenalised_covariance(out))[1]
-            price -= 0.5 * cell.size * np.log(3.0 * rows - p)
-        every = every[kept] - pull @ values
-        covariance = covariance[np.ix_(kept, kept)] - pull @ covariance[np.ix_(out, kept)]
+            price = 0.5 * (determinant - alone - cell.size * np.log(3.0 * rows - p))
+        every = np.delete(every, out) - pull @ every[out]
         return replace(
             self,
             cells=(*self.cells[:index], *self.cells[index + 1 :]),
@@ -107,25 +111,9 @@ class Solution:
             full_covariance=covariance,
             smoothness=np.delete(self.smoothness, index),
             ridge=np.delete(self.ridge, out - p),
+            unpenalised_covariance=unpenalised,
             log_evidence=float(self.log_evidence - worth - price),
         )
-
-    def _unpenalised_covariance(self, chosen: IntArray) -> FloatArray:
-        """Return the covariance of some parameters if all penalised ones were known."""
-        covariance = self.full_covariance
-        own = covariance[np.ix_(chosen, chosen)]
-        penalised = [
-            np.arange(len(self.base) + where.start, len(self.base) + where.stop)
-            for cell, where in zip(self.cells, self.slices(), strict=True)
-            if cell.penalty is not None
-        ]
-        if not penalised:
-            return own
-        known = np.concatenate(penalised)
-        across = covariance[np.ix_(known, chosen)]
-        root = cho_factor(covariance[np.ix_(known, known)], lower=True)
-        alone: FloatArray = own - across.T @ cho_solve(root, across)
-        return alone
 
     def unphysical(self) -> set[int]:
         """Return the indices of the cells with a parameter of the sign that physics excludes."""
@@ -142,3 +130,15 @@ class Solution:
             if cell.penalty is not None:
                 precision[where, where] += factor * cell.penalty
         return precision
+
+
+def _conditioned(covariance: FloatArray, out: IntArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return the covariance of the others were some parameters known, and what follows from these.
+
+    Their regression on these, and the log determinant of the covariance of these.
+    """
+    kept = np.delete(np.arange(len(covariance)), out)
+    own, across = covariance[np.ix_(out, out)], covariance[np.ix_(out, kept)]
+    pull: FloatArray = np.linalg.solve(own, across).T.astype(float, copy=False)
+    conditioned = covariance[np.ix_(kept, kept)] - pull @ across
+    return conditioned, pull, float(np.linalg.slogdet(own)[1])
