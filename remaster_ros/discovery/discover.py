@@ -35,8 +35,9 @@ from remaster_ros.discovery.marker_offsets import held_markers, loosened, moved_
 from remaster_ros.discovery.omnibus import structure_left
 from remaster_ros.discovery.plain_forms import plainest
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.selection import Selection
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.stepwise_selection import Search, Selection
+from remaster_ros.discovery.stepwise_selection import Search
 from remaster_ros.discovery.stretches import Stretches, compare_stretches
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
 from remaster_ros.discovery.to_extension import extension_of

@@ -32,6 +32,7 @@ from remaster_ros.discovery.families import (
 )
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, Screening, screen
+from remaster_ros.discovery.selection import Selection, Step
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.substitutes import named_instead
 
@@ -46,6 +47,8 @@ ROUNDS = 8
 FOLDS = 10
 # What leaves less than this share of the held-out error out is not worth a parameter.
 LEAST_GAIN = 0.01
+# With noise and smoothness as they are: a cause that saves this share predicts.
+NEEDED = 0.1
 # The evidence must rise by this for an exchange: equals are not exchanged again and again.
 HYSTERESIS = 0.5
 MOST_EXCHANGED = 6
@@ -61,41 +64,11 @@ BEYOND_DOUBT = 20.0
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
-    """One cell set that joined: with what p-value, held-out gain and evidence."""
-
-    cells: tuple[Cell, ...]
-    p_value: float
-    held_out_share: float
-    log_evidence_gain: float
-
-
-@dataclass(frozen=True, eq=False)
 class Proposal:
     """A set one step on, with the p-value of the step."""
 
     solution: Solution
     p_value: float
-
-
-@dataclass(frozen=True, eq=False)
-class Selection:
-    """The outcome: the fit without and with the cells, and how they were found.
-
-    Attributes
-    ----------
-    empty, solution
-        Fit of the offsets model alone, and with the cells.
-    steps
-        What joined, in order.
-    rejected
-        The best proposal of the last round, which failed a test; None where there was none.
-    """
-
-    empty: Solution
-    solution: Solution
-    steps: tuple[Step, ...]
-    rejected: Step | None
 
 
 @dataclass(eq=False)
@@ -131,6 +104,8 @@ class Search:
         self.data = data
         self.catalogue = Catalogue.of(data, self.cells)
         self._fold_of_pose = self.rng.permutation(data.poses) % min(FOLDS, data.poses)
+        # Sets with a member that has passed the tests of a step beside the others.
+        self._passed: set[tuple[frozenset[Cell], Cell]] = set()
         # The larger set is compared with many smaller ones in turn.
         self._last_held_out: tuple[Solution | None, float] = None, np.nan
 
@@ -320,8 +295,13 @@ class Search:
         for group in grouped(solution.cells):
             if len(group) == len(solution.cells):
                 continue
-            rest = tuple(cell for cell in solution.cells if cell not in group)
-            without = self.fit(rest, solution)
+            held = solution
+            for cell in group:
+                held = held.less(held.cells.index(cell), len(self.data))
+            # Other smoothness of the others cannot make up for so much.
+            if self.held_out_share(held, solution) > NEEDED:
+                continue
+            without = self.fit(held.cells, solution)
             if without is not None and self.held_out_share(without, solution) < 0.0:
                 solution = without
         return solution
@@ -349,8 +329,13 @@ class Search:
             _, index = min(weak)
             cell = solution.cells[index]
             tested.add(cell)
+            tried = frozenset(solution.cells), cell
+            if tried in self._passed:
+                continue
             without = self.fit((*solution.cells[:index], *solution.cells[index + 1 :]), solution)
-            if without is not None and not self._passes(cell, without, solution):
+            if without is None or self._passes(cell, without, solution):
+                self._passed.add(tried)
+            else:
                 solution = without
 
     def _passes(self, cell: Cell, without: Solution, solution: Solution) -> bool:
