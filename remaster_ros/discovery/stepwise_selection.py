@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from remaster_ros.discovery.cross_validation import held_out_error, worth_of
+from remaster_ros.discovery.cross_validation import LeftOut, worth_of
 from remaster_ros.discovery.dating import refine_moments
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
@@ -104,10 +104,8 @@ class Search:
         self.data = data
         self.catalogue = Catalogue.of(data, self.cells)
         self._fold_of_pose = self.rng.permutation(data.poses) % min(FOLDS, data.poses)
-        # Sets with a member that has passed the tests of a step beside the others.
-        self._passed: set[tuple[frozenset[Cell], Cell]] = set()
         # The larger set is compared with many smaller ones in turn.
-        self._last_held_out: tuple[Solution | None, float] = None, np.nan
+        self._last_held_out: tuple[Solution, LeftOut, float] | None = None
 
     def run(self, given: Solution | None = None) -> Selection:
         """Search until nothing passes both tests."""
@@ -329,13 +327,8 @@ class Search:
             _, index = min(weak)
             cell = solution.cells[index]
             tested.add(cell)
-            tried = frozenset(solution.cells), cell
-            if tried in self._passed:
-                continue
             without = self.fit((*solution.cells[:index], *solution.cells[index + 1 :]), solution)
-            if without is None or self._passes(cell, without, solution):
-                self._passed.add(tried)
-            else:
+            if without is not None and not self._passes(cell, without, solution):
                 solution = without
 
     def _passes(self, cell: Cell, without: Solution, solution: Solution) -> bool:
@@ -369,11 +362,13 @@ class Search:
 
     def held_out_share(self, smaller: Solution, larger: Solution) -> float:
         """Return the share of the squared error on poses left out that the larger set saves."""
-        if self._last_held_out[0] is not larger:
-            after = held_out_error(self.data, larger, larger.noise, self._fold_of_pose)
-            self._last_held_out = larger, float(after.sum())
-        before = held_out_error(self.data, smaller, larger.noise, self._fold_of_pose)
-        return float(1.0 - self._last_held_out[1] / before.sum())
+        last = self._last_held_out
+        if last is None or last[0] is not larger or not set(smaller.cells) <= set(last[1].cells):
+            cells = tuple(dict.fromkeys((*larger.cells, *smaller.cells)))
+            left_out = LeftOut.of(self.data, cells, larger.noise, self._fold_of_pose)
+            last = larger, left_out, float(left_out.errors(larger).sum())
+            self._last_held_out = last
+        return float(1.0 - last[2] / last[1].errors(smaller).sum())
 
 
 def _least_share(solution: Solution, candidate: Solution) -> float:

@@ -12,7 +12,7 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
 from remaster_ros.discovery import discover
-from remaster_ros.discovery.cross_validation import held_out_error
+from remaster_ros.discovery.cross_validation import LeftOut
 from remaster_ros.discovery.discover import Findings, discover_session, find_causes
 from remaster_ros.discovery.effects.base import Design
 from remaster_ros.discovery.effects.registry import EFFECTS
@@ -312,7 +312,9 @@ def test_held_out_error_is_that_of_fits_without_the_pose():
     fit = solve(data, (cell,))
     assert fit is not None
     folds = np.arange(data.poses)
-    by_pose = held_out_error(data, fit, fit.noise, folds)
+    others = cells_named('joint_compliance')[2:4]
+    left_out = LeftOut.of(data, (*others, cell), fit.noise, folds)
+    by_pose = left_out.errors(fit)
     pose = 4
     columns = np.concatenate((data.base, data.columns([cell]), data.errors[:, :, None]), axis=2)
     white = data.noise_model.whitened(columns, fit.noise)
