@@ -37,9 +37,10 @@ from remaster_ros.discovery.omnibus import structure_left
 from remaster_ros.discovery.plain_forms import plainest
 from remaster_ros.discovery.repeated_search import RepeatedSearch, repeat_search
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.selection import Selection
 from remaster_ros.discovery.set_aside import SetAside, moved_by_memory, set_aside
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.stepwise_selection import Search, Selection
+from remaster_ros.discovery.stepwise_selection import Search
 from remaster_ros.discovery.stretches import Stretches, compare_stretches
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
 from remaster_ros.discovery.to_extension import extension_of

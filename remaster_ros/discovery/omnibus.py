@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import binom, mannwhitneyu
 
 from remaster_ros.calibration.result import FitResult
-from remaster_ros.discovery.cross_validation import held_out_error
+from remaster_ros.discovery.cross_validation import LeftOut
 from remaster_ros.discovery.errors_by_place import errors_by_place
 from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.gain import rms
@@ -190,9 +190,8 @@ class _Checks:
         if len(np.unique(measurements.pose[rows])) < FEWEST_POSES or data.poses < FEWEST_POSES:
             return
         folds = np.arange(data.poses) % min(FOLDS, data.poses)
-        expected = held_out_error(data, self.searched, noise, folds) / np.bincount(
-            data.pose_of_row
-        )
+        left_out = LeftOut.of(data, self.searched.cells, noise, folds)
+        expected = left_out.errors(self.searched) / np.bincount(data.pose_of_row)
         others = data.only(rows)
         left = others.noise_model.whitened(
             data.unexplained(self.searched)[others.rows.source], noise

@@ -13,7 +13,7 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
 from remaster_ros.discovery import discover
-from remaster_ros.discovery.cross_validation import held_out_deviance, held_out_error
+from remaster_ros.discovery.cross_validation import LeftOut
 from remaster_ros.discovery.discover import Findings, discover_session, find_causes
 from remaster_ros.discovery.effects.base import Design
 from remaster_ros.discovery.effects.registry import EFFECTS
@@ -219,13 +219,15 @@ def test_restricted_likelihood_has_the_gradient_it_says(name, split):
     noise = model.of_sensors(*robust_noise(data.rows, data.errors, np.ones(len(data), bool)))
     ridge = np.where(np.arange(len(unit)) < p, 0.0, 0.5)
     system = _System(model, grams, noise, cells, p, unit, ridge)
-    eta, _ = system._start(None)
-    _, gradient = system.evaluate(eta)
+    eta, _, _ = system._start(None)
+    _, gradient, information = system.evaluate(eta)
     for i in range(len(eta)):
         step = np.zeros(len(eta))
         step[i] = 1e-5
         numeric = (system.evaluate(eta + step)[0] - system.evaluate(eta - step)[0]) / 2e-5
         assert gradient[i] == pytest.approx(numeric, rel=1e-3, abs=1e-3)
+    # The average of observed and expected information has no negative direction.
+    assert np.linalg.eigvalsh(information).min() > -1e-9 * np.trace(information)
 
 
 def test_a_curve_has_a_plausible_size_where_the_data_leave_it_open():
@@ -311,7 +313,9 @@ def test_held_out_error_and_deviance_are_those_of_fits_without_the_pose():
     fit = solve(data, (cell,))
     assert fit is not None
     folds = np.arange(data.poses)
-    by_pose = held_out_error(data, fit, fit.noise, folds)
+    others = cells_named('joint_compliance')[2:4]
+    left_out = LeftOut.of(data, (*others, cell), fit.noise, folds)
+    by_pose = left_out.errors(fit)
     pose = 4
     columns = np.concatenate((data.base, data.columns([cell]), data.errors[:, :, None]), axis=2)
     white = data.noise_model.whitened(columns, fit.noise)
@@ -329,5 +333,4 @@ def test_held_out_error_and_deviance_are_those_of_fits_without_the_pose():
         variance = np.eye(3) + spread[row] @ spread[row].T
         density = multivariate_normal(cov=variance).logpdf(errors[row])
         expected -= 2.0 * density + 3.0 * np.log(2.0 * np.pi)
-    by_pose = held_out_deviance(data, fit, fit.noise, folds)
-    assert by_pose[pose] == pytest.approx(expected, rel=1e-4)
+    assert left_out.deviance(fit)[pose] == pytest.approx(expected, rel=1e-4)
