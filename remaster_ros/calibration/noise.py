@@ -223,8 +223,10 @@ class NoiseModel:
         # Cancellation may leave a value just below zero.
         return np.maximum(sums, 0.0)
 
-    def gram(self, features: Callable[[Rows, slice], FloatArray], width: int) -> FloatArray:
-        """Return the Gram matrix of features in each error group, (error groups, width, width).
+    def gram(
+        self, features: Callable[[Rows, slice], FloatArray], width: int, known: int = 0
+    ) -> FloatArray:
+        """Return the Gram matrix of features in each error group, (error groups, rows, width).
 
         Parameters
         ----------
@@ -234,8 +236,10 @@ class NoiseModel:
             does not grow with their number.
         width
             Number of features.
+        known
+            The rows of so many first features are left out.
         """
-        result = np.zeros((len(self.error_groups), width, width))
+        result = np.zeros((len(self.error_groups), width - known, width))
         for first, last in self.rows.blocks(GRAM_ROWS):
             rows = self.rows.of_groups(first, last)
             start = int(self.rows.group_start[first])
@@ -245,7 +249,7 @@ class NoiseModel:
                 values = self.frames[where] @ values
             for index, part in self._parts(rows, values, first):
                 flat = part.reshape(-1, width)
-                result[index] += flat.T @ flat
+                result[index] += flat[:, known:].T @ flat
         for index, parts in self._contained.items():
             result[index] -= result[parts].sum(axis=0)
         return result

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
@@ -20,42 +24,112 @@ def worth_of(solution: Solution, cell: Cell, where: slice, price: float) -> floa
     return float(drop - 0.5 * cell.size)
 
 
-def held_out_error(
-    data: Residuals, solution: Solution, noise: Noise, fold_of_pose: IntArray
-) -> FloatArray:
-    """Return each pose's squared error, in units of the noise, by the fit to other poses.
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Poses left out in turn, to be predicted by fits of some cells to the other poses.
 
-    Parameters
+    Attributes
     ----------
     data
         The residuals.
-    solution
-        Which cells, with which smoothness.
-    noise
-        The noise to fit and to judge by.
-    fold_of_pose
-        Poses with the same number are left out together, (poses,).
+    cells
+        All that can be fitted.
+    scale
+        Of each column of the offsets model, of the cells, and of the errors, (size + 1,).
+    rows
+        Which coordinates of the rows are left out together, (fold size,) each.
+    parts, grams
+        Of each fold columns and errors in units of the noise and of the scale, (fold size,
+        size + 1), and their products with each other.
     """
-    columns = data.columns(solution.cells)
-    joined = np.concatenate((data.base, columns, data.errors[:, :, None]), axis=2)
-    white = data.noise_model.whitened(joined, noise).reshape(3 * len(data), -1)
-    scale = np.linalg.norm(white, axis=0)
-    scale[-1] = 1.0
-    scale[scale == 0.0] = 1.0
-    white /= scale
-    p, size = data.base.shape[2], white.shape[1] - 1
-    prior = np.zeros((size, size))
-    prior[p:, p:] = solution.prior_precision()
-    prior /= np.outer(scale[:-1], scale[:-1])
-    fold = np.repeat(fold_of_pose[data.pose_of_row], 3)
-    total = white.T @ white
-    total[:-1, :-1] += prior + 1e-12 * np.eye(size)
-    errors = np.empty(len(white))
-    for index in np.unique(fold):
-        out = white[fold == index]
-        kept = total - out.T @ out
-        beta = np.linalg.solve(kept[:-1, :-1], kept[:-1, -1])
-        errors[fold == index] = out[:, -1] - out[:, :-1] @ beta
-    square = np.add.reduceat(errors**2, np.arange(0, len(errors), 3))
-    by_pose: FloatArray = np.bincount(data.pose_of_row, square).astype(float)
-    return by_pose
+
+    data: Residuals
+    cells: tuple[Cell, ...]
+    scale: FloatArray
+    rows: list[IntArray]
+    parts: list[FloatArray]
+    grams: list[FloatArray]
+
+    @classmethod
+    def of(
+        cls, data: Residuals, cells: Sequence[Cell], noise: Noise, fold_of_pose: IntArray
+    ) -> LeftOut:
+        """Assemble.
+
+        Parameters
+        ----------
+        data
+            The residuals.
+        cells
+            All that can be fitted.
+        noise
+            The noise to fit and to judge by.
+        fold_of_pose
+            Poses with the same number are left out together, (poses,).
+        """
+        joined = np.concatenate((data.base, data.columns(cells), data.errors[:, :, None]), axis=2)
+        white = data.noise_model.whitened(joined, noise).reshape(3 * len(data), -1)
+        scale = np.linalg.norm(white, axis=0)
+        scale[-1] = 1.0
+        scale[scale == 0.0] = 1.0
+        white /= scale
+        fold = np.repeat(fold_of_pose[data.pose_of_row], 3)
+        rows = [np.flatnonzero(fold == index) for index in range(int(fold.max()) + 1)]
+        parts = [white[mine] for mine in rows]
+        return cls(data, tuple(cells), scale, rows, parts, [part.T @ part for part in parts])
+
+    def errors(self, solution: Solution) -> FloatArray:
+        """Return each pose's squared error by the fit of some of the cells, in units of the noise.
+
+        Parameters
+        ----------
+        solution
+            Which cells, with which smoothness.
+        """
+        errors, _ = self._predicted(solution)
+        return self._by_pose(np.sum(errors**2, axis=1))
+
+    def deviance(self, solution: Solution) -> FloatArray:
+        """Return −2 log of the density of each pose by the fit of some of the cells.
+
+        Without the constants, which are those of the noise. In units of what is uncertain of its
+        prediction, a pose that is far from all others does not decide between two sets of cells,
+        as it does by its squared error (Gelman, Hwang & Vehtari 2014, Stat. Comput. 24, 997).
+
+        Parameters
+        ----------
+        solution
+            As in `errors`.
+        """
+        errors, variance = self._predicted(solution)
+        scaled = np.linalg.solve(variance, errors[:, :, None])[:, :, 0]
+        return self._by_pose(np.sum(errors * scaled, axis=1) + np.linalg.slogdet(variance)[1])
+
+    def _by_pose(self, by_row: FloatArray) -> FloatArray:
+        by_pose: FloatArray = np.bincount(self.data.pose_of_row, by_row).astype(float)
+        return by_pose
+
+    def _predicted(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
+        """Return the error of each row by the fit to others, (n, 3), and its variance."""
+        p = self.data.base.shape[2]
+        edges = p + np.cumsum([0, *(cell.size for cell in self.cells)])
+        first = dict(zip(self.cells, edges, strict=False))
+        mine = [np.arange(first[cell], first[cell] + cell.size) for cell in solution.cells]
+        chosen = np.concatenate((np.arange(p), *mine)).astype(int)
+        every = np.append(chosen, len(self.scale) - 1)
+        total = np.sum(self.grams, axis=0)[np.ix_(every, every)]
+        unit = self.scale[chosen[p:]]
+        total[p:-1, p:-1] += solution.prior_precision() / np.outer(unit, unit)
+        np.einsum('ii->i', total)[:-1] += 1e-12
+        errors = np.empty(3 * len(self.data))
+        variance = np.empty((len(self.data), 3, 3))
+        for rows, part, gram in zip(self.rows, self.parts, self.grams, strict=True):
+            kept = total - gram[np.ix_(every, every)]
+            root = np.linalg.cholesky(kept[:-1, :-1])
+            X = part[:, chosen]
+            pulls = np.column_stack((kept[:-1, -1], X.T))
+            solved = solve_triangular(root, pulls, lower=True, check_finite=False)
+            errors[rows] = part[:, -1] - solved[:, 1:].T @ solved[:, 0]
+            spread = solved[:, 1:].T.reshape(-1, 3, len(chosen))
+            variance[rows[::3] // 3] = np.eye(3) + spread @ spread.transpose(0, 2, 1)
+        return errors.reshape(-1, 3), variance

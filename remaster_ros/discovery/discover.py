@@ -19,6 +19,7 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
+from remaster_ros.discovery.beside_memory import withstanding_memory
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
@@ -36,8 +37,10 @@ from remaster_ros.discovery.omnibus import structure_left
 from remaster_ros.discovery.plain_forms import plainest
 from remaster_ros.discovery.repeated_search import RepeatedSearch, repeat_search
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.selection import Selection
+from remaster_ros.discovery.set_aside import SetAside, moved_by_memory, set_aside
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.stepwise_selection import Search, Selection
+from remaster_ros.discovery.stepwise_selection import Search
 from remaster_ros.discovery.stretches import Stretches, compare_stretches
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
 from remaster_ros.discovery.to_extension import extension_of
@@ -176,7 +179,9 @@ def discover_session(
         findings = findings.without_causes()
         fit, gain, stretches, missed = _sampled(session, findings, rng, report, clock)
     residuals, solution = findings.residuals, findings.selection.solution
-    structure, gross = structure_left(residuals, solution, fit, findings.structure)
+    structure, gross = structure_left(
+        residuals, solution, fit, findings.structure, findings.searched
+    )
     unexplained += structure
     effects = tuple(
         effect.sampled(fit, group, residuals.part)
@@ -217,7 +222,7 @@ class Findings:
 
     ``before`` is the fit of the session as it is, without any effect, ``found`` the one that the
     search began with (its priors let moved markers go where they are), ``structure`` what the
-    search located without a cause.
+    search located without a cause, ``aside`` the part of that which is not in the model.
     """
 
     before: Estimate
@@ -229,7 +234,13 @@ class Findings:
     structure: tuple[FoundEffect, ...]
     untestable: Mapping[str, str]
     thinning: Thinning | None
+    aside: SetAside | None
     repeated: RepeatedSearch | None
+
+    @property
+    def searched(self) -> Solution:
+        """The solution with all that the search located."""
+        return self.selection.solution if self.aside is None else self.aside.searched
 
     def without_causes(self) -> Findings:
         """Return the same as if the search had found nothing."""
@@ -245,6 +256,7 @@ class Findings:
             effects=(),
             structure=(),
             thinning=None,
+            aside=None,
             repeated=None,
         )
 
@@ -265,6 +277,9 @@ def _sampled(
     stretches = compare_stretches(findings.found, residuals, solution)
     missed = undetected(findings.found, residuals, solution)
     unmodelled = [missed.moves, stretches.moves]
+    if findings.aside is not None:
+        memory = findings.aside.memory
+        unmodelled.append(moved_by_memory(findings.found, residuals, solution, memory))
     if findings.repeated is not None:
         unmodelled.append(findings.repeated.moves)
     fit = fit_session(
@@ -313,21 +328,27 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         lambda share: progress('searching causes', share),
     )
     selection = search.run()
-    selection = replace(selection, solution=plainest(selection.solution, search.cells, search.fit))
+    solution = withstanding_memory(search, selection.solution)
+    selection = replace(selection, solution=plainest(solution, search.cells, search.fit))
     residuals = search.data
-    repeated = repeat_search(
-        found,
-        search,
-        selection.solution,
-        lambda share: progress('searching again without some of the poses', share),
-    )
     groups, described = describe(
         residuals, selection, cells, lambda share: progress('comparing look-alikes', share)
     )
     causes = [EFFECTS[group[0].name].is_cause for group in groups]
     effects = tuple(itertools.compress(described, causes))
     structure = tuple(effect for effect, cause in zip(described, causes, strict=True) if not cause)
-    effects += moved_markers(found, residuals, selection.solution)
+    aside = set_aside(residuals, selection.solution)
+    if aside is not None:
+        selection = replace(selection, solution=aside.solution)
+        structure = aside.said(structure)
+    repeated = repeat_search(
+        found,
+        search,
+        selection.solution,
+        lambda share: progress('searching again without some of the poses', share),
+    )
+    memory = None if aside is None else aside.memory
+    effects += moved_markers(found, residuals, selection.solution, memory)
     thinning = None
     if thinned:
         thinning = judge_by_others(
@@ -344,6 +365,7 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         structure,
         untestable,
         thinning,
+        aside,
         repeated,
     )
 

@@ -6,10 +6,12 @@ from the Gram matrices G_s of the columns in each group, whatever the number of 
     H = Σ w_s G_s + Λ,   restricted log likelihood
     L = ½ Σ n_s log w_s − ½ log|H| + ½ log|Λ| − ½ (y'Wy − b'H⁻¹b)
 
-(Patterson & Thompson 1971; Harville 1977). Noise and smoothness maximise L. Two sets of cells are
-compared by L in which every unpenalised parameter pays ½ log N (Schwarz 1978) and every penalised
-one has its proper Gaussian prior. What is implausibly large costs more: Λ holds the prior of the
-unpenalised parameters, too, a Gaussian about 0 as wide as the largest plausible value.
+(Patterson & Thompson 1971; Harville 1977). Noise and smoothness maximise L, by Newton's method
+with the average of observed and expected information, which follows from the factor of H (Gilmour,
+Thompson & Cullis 1995, Biometrics 51). Two sets of cells are compared by L in which every
+unpenalised parameter pays ½ log N (Schwarz 1978) and every penalised one has its proper Gaussian
+prior. What is implausibly large costs more: Λ holds the prior of the unpenalised parameters, too,
+a Gaussian about 0 as wide as the largest plausible value.
 """
 
 from __future__ import annotations
@@ -20,8 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve
-from scipy.linalg.lapack import dpotri
-from scipy.optimize import minimize
+from scipy.linalg.lapack import dpotrf, dpotri
 
 from remaster_ros.calibration.noise import RESOLUTION_M, Noise, NoiseModel
 from remaster_ros.discovery.effects.base import LARGEST_M, Cell
@@ -35,6 +36,10 @@ ABSORBED = 1e-4
 STEPS = 60
 # Where the slope in these units falls below this, L is within its square of the maximum.
 SLOPE = 0.1
+# Longest step, of these logarithms.
+STRIDE = 2.0
+# Step that no longer raises L by more than rounding.
+SHORTEST = 1e-3
 _LARGE = 18.0
 
 
@@ -49,7 +54,6 @@ def solve(
     start: Solution | None = None,
     *,
     prior: float | None = None,
-    settled: bool = True,
 ) -> Solution | None:
     """Fit a set of cells; None where one of them adds nothing to the others.
 
@@ -63,9 +67,6 @@ def solve(
         A fit whose noise and smoothness are near.
     prior
         Log prior probability of the set; by default that of its cells one by one.
-    settled
-        False: with noise and smoothness as they are at the start, which costs one evaluation in
-        place of half a dozen; the evidence is too low then, if anything.
     """
     # Penalised ones last: one Cholesky factor holds all determinants.
     order = sorted(range(len(cells)), key=lambda index: cells[index].penalty is not None)
@@ -97,14 +98,14 @@ def solve(
     ridge = np.concatenate((np.zeros(p), np.where(sized, (std * scale) ** -2.0, 0.0)))
     unit = np.concatenate((np.ones(p), scale))
     inverse_unit = 1.0 / np.append(unit, 1.0)
-    grams = grams * (inverse_unit[:, None] * inverse_unit)
+    grams *= inverse_unit[:, None] * inverse_unit
     system = _System(data.noise_model, grams, data.noise, cells, p, unit, ridge)
     if not system.visible():
         return None
     try:
         if prior is None:
             prior = log_prior_one_by_one(cells)
-        return system.solution(start, prior, settled).reordered(np.argsort(order))
+        return system.solution(start, prior).reordered(np.argsort(order))
     except np.linalg.LinAlgError:
         # The columns agree up to rounding: they cannot be distinguished.
         return None
@@ -127,23 +128,29 @@ class _System:
         edges = self.p + np.cumsum([0, *(cell.size for cell in self.cells)])
         self.where = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
         self.penalised = [i for i, cell in enumerate(self.cells) if cell.penalty is not None]
-        self.penalties = []
+        # Of each the penalty, of order one in the scaled columns so that the factors start near
+        # right, and for the determinant its spectrum and the ridge, the same for all of a cell.
+        self.penalties, self.spectra, self.ridges = [], [], []
         for i in self.penalised:
-            penalty = self.cells[i].penalty
-            assert penalty is not None
-            u = self.unit[self.where[i]]
-            scaled = penalty / np.outer(u, u)
-            # Of order one in the scaled columns, so that the factors start near right.
-            self.penalties.append(scaled)
-        # Of each, for the determinant beside the ridge, which is the same for all of a cell.
-        self.spectra = [np.linalg.eigvalsh(penalty) for penalty in self.penalties]
-        self.ridges = [float(self.ridge[self.where[i].start]) for i in self.penalised]
+            cell, u = self.cells[i], self.unit[self.where[i].start]
+            assert cell.penalty is not None
+            self.penalties.append(cell.penalty / u**2)
+            self.spectra.append(cell.roughness / u**2)
+            self.ridges.append(float(self.ridge[self.where[i].start]))
         # Base first, then unpenalised, then penalised.
         self.unpenalised = self.where[self.penalised[0]].start if self.penalised else self.size
-        self.shares = self.model.shares
-        # Each group's matrix as one row: sums and traces over groups are then products.
-        self.flat = self.grams.reshape(len(self.grams), -1)
-        self._last: tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray]] | None = None
+        # Share of the square of each coordinate of the noise in the variance of each error group.
+        model, count = self.model, len(self.model.channels)
+        entering = np.arange(count)[:, None] == model.channel_of
+        self.entering = np.concatenate(
+            (
+                entering.astype(float),
+                entering[list(model.separable)] * model.size_of,
+                entering[list(model.framed)] * model.frame_size_of,
+            )
+        )
+        self._last: tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray, FloatArray]] | None
+        self._last = None
 
     def visible(self) -> bool:
         """Return whether the unpenalised columns add something to the others and to the base."""
@@ -156,40 +163,35 @@ class _System:
 
     def noise(self, eta: FloatArray) -> Noise:
         count = len(self.model.channels)
-        return self.model.noise(np.exp(eta[:count]), np.exp(eta[count : count + len(self.shares)]))
+        return self.model.noise(np.exp(eta[:count]), np.exp(eta[count : len(self.entering)]))
 
-    def evaluate(self, eta: FloatArray) -> tuple[float, FloatArray]:
-        """Return −L and its gradient by eta: log sigmas, what rows share, smoothness."""
-        noise, weights, factors = self._precisions(eta)
-        root, beta, lower = self._solved(eta)
-        # Below the diagonal twice: products with symmetric matrices are then those of the whole.
-        inverse = 2.0 * lower
-        np.fill_diagonal(inverse, np.diag(lower))
+    def evaluate(self, eta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Return L, its gradient and its average information.
+
+        By eta: the logarithms of the sigmas, of what rows share, and of the smoothness.
+        """
+        count = len(self.entering)
+        weights, factors = self._precisions(eta)
+        total, root, beta, lower = self._solved(eta)
+        # Beside the diagonal twice: products with symmetric matrices are then those of the whole.
+        inverse = np.zeros_like(total)
+        np.multiply(lower.T, 2.0, out=inverse[:-1, :-1])
+        np.fill_diagonal(inverse[:-1, :-1], np.diag(lower))
         error = np.append(-beta, 1.0)
-        factorised = np.zeros((2, self.size + 1, self.size + 1))
-        factorised[0, :-1, :-1] = inverse
-        np.outer(error, error, out=factorised[1])
-        # Of every error group in one pass over the matrices, which are most of the work.
-        trace, rss = (self.flat @ factorised.reshape(2, -1).T).T
+        trace, pulls = np.empty(len(weights)), np.empty((len(weights), len(error)))
+        # Both of one matrix after the other: it is read from memory once.
+        for index, gram in enumerate(self.grams):
+            trace[index] = np.vdot(gram, inverse)
+            pulls[index] = gram @ error
+        rss = pulls @ error
         n = self.model.freedom
         value = 0.5 * n @ np.log(weights) - np.sum(np.log(np.diag(root))) - 0.5 * weights @ rss
         value -= 0.5 * self.ridge @ beta**2
-        by_log_weight = 0.5 * (n - weights * trace - weights * rss)
-        # d log w / d log sigma = -2 sigma² w, and the same with g pose_sigma², M frame_sigma².
-        slope = np.zeros(len(eta))
-        channel, count = self.model.channel_of, len(self.model.channels)
-        by_variance = -2.0 * weights * by_log_weight
-        by_sigma = np.bincount(channel, by_variance, count).astype(float)
-        by_pose_sigma = np.bincount(channel, self.model.size_of * by_variance, count)
-        by_frame_sigma = np.bincount(channel, self.model.frame_size_of * by_variance, count)
-        slope[:count] = noise.sigma**2 * by_sigma
-        slope[count : count + len(self.shares)] = self.model.shared(
-            Noise(
-                by_sigma,
-                noise.pose_sigma**2 * by_pose_sigma,
-                noise.frame_sigma**2 * by_frame_sigma,
-            )
-        )
+        by_variance = 0.5 * weights * (weights * (trace + rss) - n)
+        # d variance / d log sigma = 2 sigma², of what rows share times its share.
+        change = 2.0 * np.exp(2.0 * eta[:count, None]) * self.entering
+        slope = np.concatenate((change @ by_variance, np.zeros(len(factors))))
+        turns = np.zeros((self.size, len(factors)))
         for i, (index, penalty, factor) in enumerate(
             zip(self.penalised, self.penalties, factors, strict=True)
         ):
@@ -199,45 +201,57 @@ class _System:
             quadratic = factor * beta[where] @ penalty @ beta[where]
             spread = factor * np.sum(inverse[where, where] * penalty)
             value += 0.5 * (np.sum(np.log(prior)) - quadratic)
-            slope[len(eta) - len(self.penalised) + i] = 0.5 * (smooth - spread - quadratic)
-        return -value, -slope
+            slope[count + i] = 0.5 * (smooth - spread - quadratic)
+            # Roughly, beside a ridge: it decides how far to step, not where to end.
+            turns[where, i] = beta[where] * smooth / len(prior)
+        # ½ q_j' P q_k with q_j = (∂V/∂eta_j) P y and P = W − W X H⁻¹ X' W.
+        moved = total[:-1, :-1] @ turns
+        noise_part = (change * weights**2) @ pulls[:, :-1]
+        both = np.concatenate((noise_part.T, -moved), axis=1)
+        square = np.zeros((len(eta), len(eta)))
+        square[:count, :count] = (change * weights**3 * rss) @ change.T
+        square[:count, count:] = -noise_part @ turns
+        square[count:, :count] = square[:count, count:].T
+        square[count:, count:] = turns.T @ moved
+        information = 0.5 * (square - both.T @ cho_solve((root, True), both, check_finite=False))
+        return value, slope, information
 
-    def _precisions(self, eta: FloatArray) -> tuple[Noise, FloatArray, FloatArray]:
-        """Return the noise, the weight of each error group, the factor of each penalty."""
-        noise = self.noise(eta)
-        weights = 1.0 / self.model.variances(noise)
-        return noise, weights, np.exp(eta[len(eta) - len(self.penalised) :])
+    def _precisions(self, eta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the weight of each error group, and the factor of each penalty."""
+        count = len(self.entering)
+        return 1.0 / (np.exp(2.0 * eta[:count]) @ self.entering), np.exp(eta[count:])
 
-    def _solved(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the lower Cholesky factor of H, the estimate, and H⁻¹ with zeros above."""
+    def _solved(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return the weighted sum of the Gram matrices, and what follows from H.
+
+        Its lower Cholesky factor, the estimate, and H⁻¹ with zeros above the diagonal.
+        """
         if self._last is not None and np.array_equal(self._last[0], eta):
             return self._last[1]
-        _, weights, factors = self._precisions(eta)
-        total = (weights @ self.flat).reshape(self.size + 1, self.size + 1)
-        H = total[:-1, :-1] + np.diag(self.ridge)
+        weights, factors = self._precisions(eta)
+        total = (weights @ self.grams.reshape(len(weights), -1)).reshape(self.grams.shape[1:])
+        # In LAPACK's order, and in the memory of H.
+        H = np.array(total[:-1, :-1], order='F')
+        np.einsum('ii->i', H)[:] += self.ridge
         for index, penalty, factor in zip(self.penalised, self.penalties, factors, strict=True):
             where = self.where[index]
             H[where, where] += factor * penalty
-        root = np.linalg.cholesky(H).astype(float, copy=False)
+        root, wrong = dpotrf(H, lower=1, overwrite_a=1)
+        if wrong:
+            raise np.linalg.LinAlgError
         beta = cho_solve((root, True), total[:-1, -1], check_finite=False)
-        # The transpose is the same memory in LAPACK's order.
-        upper, _ = dpotri(root.T, lower=0)
-        self._last = eta.copy(), (root, beta, upper.T)
+        lower, _ = dpotri(root, lower=1)
+        self._last = eta.copy(), (total, root, beta, lower)
         return self._last[1]
 
-    def _squares(self, beta: FloatArray) -> FloatArray:
-        """Return the sum of squared errors in each error group, m², (groups,)."""
-        error = np.append(-beta, 1.0)
-        return self.flat @ np.outer(error, error).ravel()
-
-    def solution(self, start: Solution | None, prior: float, settled: bool) -> Solution:
-        eta, bounds = self._start(start)
-        if settled:
-            eta = self._most_likely(eta, bounds)
-        noise, weights, factors = self._precisions(eta)
-        root, beta, lower = self._solved(eta)
-        evidence = self._evidence(root, weights, factors, beta)
+    def solution(self, start: Solution | None, prior: float) -> Solution:
+        eta = self._most_likely(*self._start(start))
+        weights, factors = self._precisions(eta)
+        total, root, beta, lower = self._solved(eta)
+        evidence = self._evidence(total, root, weights, factors, beta)
         covariance = (lower + np.tril(lower, -1).T) / np.outer(self.unit, self.unit)
+        part, unit = slice(self.unpenalised), self.unit[: self.unpenalised]
+        unpenalised = cho_solve((root[part, part], True), np.eye(len(unit))) / np.outer(unit, unit)
         beta = beta / self.unit
         smoothness = np.full(len(self.cells), np.nan)
         smoothness[self.penalised] = factors
@@ -247,40 +261,48 @@ class _System:
             covariance[self.p :, self.p :],
             beta[: self.p],
             covariance,
-            noise,
+            self.noise(eta),
             smoothness,
             (self.ridge * self.unit**2)[self.p :],
+            unpenalised,
             evidence + prior,
         )
 
-    def _most_likely(self, eta: FloatArray, bounds: list[tuple[float, float]]) -> FloatArray:
+    def _most_likely(self, eta: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
         """Return the noise and smoothness, as logarithms, that maximise L."""
         # In units of about their own standard deviations: L has a curvature near 1 everywhere.
         unit = self._curvature() ** -0.5
-
-        def scaled(x: FloatArray) -> tuple[float, FloatArray]:
-            value, gradient = self.evaluate(unit * x)
-            return value, unit * gradient
-
-        best = minimize(
-            scaled,
-            eta / unit,
-            jac=True,
-            method='L-BFGS-B',
-            bounds=np.array(bounds) / unit[:, None],
-            options={'maxiter': STEPS, 'ftol': 1e-9, 'gtol': SLOPE},
-        )
-        most_likely: FloatArray = unit * best.x
-        return most_likely
+        value, slope, information = self.evaluate(eta)
+        for _ in range(STEPS):
+            free = np.where(slope > 0.0, eta < high, eta > low)
+            if np.max(np.abs(unit * slope)[free], initial=0.0) < SLOPE:
+                break
+            step = _step(slope[free], information[np.ix_(free, free)])
+            while True:
+                trial = eta.copy()
+                trial[free] = np.clip(eta[free] + step, low[free], high[free])
+                new = self.evaluate(trial)
+                if new[0] > value:
+                    break
+                step *= 0.25
+                if np.max(np.abs(step)) < SHORTEST:
+                    return eta
+            eta, (value, slope, information) = trial, new
+        return eta
 
     def _evidence(
-        self, root: FloatArray, weights: FloatArray, factors: FloatArray, beta: FloatArray
+        self,
+        total: FloatArray,
+        root: FloatArray,
+        weights: FloatArray,
+        factors: FloatArray,
+        beta: FloatArray,
     ) -> float:
         """Return L with ½ log N for each unpenalised parameter in place of its determinant."""
         logs = np.log(np.diag(root))
-        rss = self._squares(beta)
+        error = np.append(-beta, 1.0)
         n = self.model.freedom
-        value = 0.5 * n @ np.log(weights) - 0.5 * weights @ rss - logs[: self.p].sum()
+        value = 0.5 * n @ np.log(weights) - 0.5 * error @ total @ error - logs[: self.p].sum()
         value -= 0.5 * (self.unpenalised - self.p) * np.log(n.sum() - self.p)
         value -= logs[self.unpenalised :].sum() + 0.5 * self.ridge @ beta**2
         for index, penalty, spectrum, ridge, factor in zip(
@@ -293,17 +315,14 @@ class _System:
 
     def _curvature(self) -> FloatArray:
         """Return about what the second derivatives of −L by eta are."""
-        channel, count = self.model.channel_of, len(self.model.channels)
-        freedom = self.model.freedom
-        own, poses, frames = (
-            np.bincount(channel, freedom * entering, count).astype(float)
-            for entering in (1.0, self.model.size_of > 0, self.model.frame_size_of > 0)
-        )
-        shared = self.model.shared(Noise(own, poses, frames))
+        count = len(self.model.channels)
+        noise = (self.entering > 0.0) @ self.model.freedom
+        noise *= np.where(np.arange(len(noise)) < count, 2.0, 0.5)
         smooth = [len(penalty) / 6.0 for penalty in self.penalties]
-        return np.array([*(2.0 * own), *(0.5 * shared), *smooth])
+        return np.concatenate((noise, smooth))
 
-    def _start(self, start: Solution | None) -> tuple[FloatArray, list[tuple[float, float]]]:
+    def _start(self, start: Solution | None) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return where the search for noise and smoothness begins, and its bounds."""
         noise = self.guess if start is None else start.noise
         sigma = np.log(np.maximum(noise.sigma, RESOLUTION_M))
         least = 0.1 * noise.sigma
@@ -321,17 +340,28 @@ class _System:
                 for cell, factor in zip(start.cells, start.smoothness, strict=True)
                 if np.isfinite(factor)
             }
-        smooth = [
-            np.log(known.get(self.cells[i].key, self._typical(penalty, self.where[i], noise)))
-            for i, penalty in zip(self.penalised, self.penalties, strict=True)
+        factors = [
+            known[key] if (key := self.cells[i].key) in known else self._typical(which, noise)
+            for which, i in enumerate(self.penalised)
         ]
+        smooth = np.log(factors)
         eta = np.concatenate((sigma, np.log(shared), smooth))
-        floor, ceiling = np.log(RESOLUTION_M), np.log(0.1)
-        bounds = [(floor, ceiling)] * (len(sigma) + len(shared))
-        bounds += [(value - _LARGE, value + _LARGE) for value in smooth]
-        return eta, bounds
+        bound = np.full(len(self.entering), np.log(RESOLUTION_M))
+        low = np.concatenate((bound, smooth - _LARGE))
+        high = np.concatenate((np.full(len(bound), np.log(0.1)), smooth + _LARGE))
+        return np.clip(eta, low, high), low, high
 
-    def _typical(self, penalty: FloatArray, where: slice, noise: Noise) -> float:
-        """Return the factor at which penalty and data weigh about the same."""
-        total = np.tensordot(1.0 / self.model.variances(noise), self.grams, axes=1)
-        return float(np.trace(total[where, where]) / np.trace(penalty))
+    def _typical(self, which: int, noise: Noise) -> float:
+        """Return the factor at which a penalty and the data weigh about the same."""
+        where = self.where[self.penalised[which]]
+        diagonal = np.einsum('gii->gi', self.grams)[:, where].sum(axis=1)
+        data = diagonal @ (1.0 / self.model.variances(noise))
+        return float(data / np.trace(self.penalties[which]))
+
+
+def _step(slope: FloatArray, information: FloatArray) -> FloatArray:
+    """Return Newton's step up a slope, at most `STRIDE` long in each principal direction."""
+    values, vectors = np.linalg.eigh(information)
+    along = (vectors.T @ slope) / np.maximum(values, SHORTEST)
+    step: FloatArray = vectors @ np.clip(along, -STRIDE, STRIDE)
+    return step

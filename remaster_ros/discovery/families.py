@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray
 
 # A member of a family that the others explain to this share of its size is another name for them.
 FAMILY_ABSORBED = 1e-3
+# So many cells of one family are a family.
+WHOLE = 3
 
 FAMILIES: tuple[tuple[str, ...], ...] = tuple(
     tuple(name for name, effect in EFFECTS.items() if effect.family == family)
@@ -40,10 +45,21 @@ def family_log_prior(cells: Sequence[Cell], catalogue: Sequence[Cell]) -> float:
         if not mine:
             continue
         rest = [cell for cell in rest if cell.name not in family]
-        members = len({(cell.name, cell.joints) for cell in catalogue if cell.name in family})
         alone = -sum(np.log(cell.drawn_from) for cell in mine)
-        total += max(alone, -members * np.log(2.0))
+        total += max(alone, -_members(tuple(catalogue), family) * np.log(2.0))
     return float(total - sum(np.log(cell.drawn_from) for cell in rest))
+
+
+@lru_cache(maxsize=2 * len(FAMILIES))
+def _members(catalogue: tuple[Cell, ...], family: tuple[str, ...]) -> int:
+    return len({(cell.name, cell.joints) for cell in catalogue if cell.name in family})
+
+
+def less(solution: Solution, index: int, rows: int, catalogue: Sequence[Cell]) -> Solution:
+    """Return the fit without one cell as `Solution.less`, with the prior of the smaller set."""
+    smaller = solution.less(index, rows)
+    priors = [family_log_prior(one.cells, catalogue) for one in (smaller, solution)]
+    return replace(smaller, log_evidence=smaller.log_evidence + priors[0] - priors[1])
 
 
 def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
@@ -60,15 +76,16 @@ def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
 
 def visible(data: Residuals, given: Sequence[Cell], cells: Sequence[Cell]) -> list[Cell]:
     """Return the cells that add something to base, given and earlier ones, in order."""
-    if not cells:
-        return []
-    if cells[0].penalty is not None:
+    if all(cell.penalty is not None for cell in cells):
         return list(cells)
     fixed = [cell for cell in given if cell.penalty is None]
     start = np.concatenate((data.base, data.columns(fixed)), axis=2)
     known, _ = np.linalg.qr(_unit(start.reshape(3 * len(data), -1)))
     kept = []
     for cell in cells:
+        if cell.penalty is not None:
+            kept.append(cell)
+            continue
         block = _unit(data.columns([cell]).reshape(3 * len(data), -1))
         left = block - known @ (known.T @ block)
         left -= known @ (known.T @ left)

@@ -25,6 +25,7 @@ from scipy.stats import chi2
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.predictions import REGION, squared_distances
+from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stepwise_selection import Search
@@ -114,7 +115,7 @@ def repeat_search(
 
 
 def _causes(solution: Solution) -> set[tuple[str, tuple[int, ...]]]:
-    return {(cell.name, cell.joints) for cell in solution.cells}
+    return {(cell.name, cell.joints) for cell in solution.cells if EFFECTS[cell.name].is_cause}
 
 
 def row_covariance(data: Residuals, solution: Solution) -> FloatArray:

@@ -6,6 +6,7 @@ registrations, offsets and markers can absorb is projected out with flat priors 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -195,8 +196,11 @@ class Residuals:
 
     @cached_property
     def _grams(self) -> list[tuple[tuple[Cell, ...], FloatArray, FloatArray]]:
-        """The last results of `gram_matrices`: most sets that a search fits are parts of one."""
-        return []
+        """The last sets of `gram_matrices`, each in the order base, errors, cells.
+
+        A search fits parts of them, and them with a cell more.
+        """
+        return [((), *self._more_grams((), 0))]
 
     def gram_matrices(self, cells: Sequence[Cell]) -> tuple[FloatArray, FloatArray]:
         """Return norms and Gram matrices of the base columns, of cells, and of the errors.
@@ -206,22 +210,42 @@ class Residuals:
         norms
             Of the columns over all rows, (p + c + 1,).
         grams
-            In each error group of the noise model, (groups, p + c + 1, p + c + 1).
+            In each error group of the noise model, (groups, p + c + 1, p + c + 1); a copy.
         """
+        wanted = set(cells)
+        known, norms, grams = max(
+            self._grams, key=lambda one: sum(cell.size for cell in one[0] if cell in wanted)
+        )
+        if not wanted <= set(known):
+            part = [cell for cell in known if cell in wanted]
+            chosen = self._positions(known, part)
+            known = (*part, *(cell for cell in cells if cell not in part))
+            norms, more = self._more_grams(known, old := len(chosen))
+            grown = np.empty((len(grams), len(norms), len(norms)))
+            grown[:, :old, :old] = _picked(grams, chosen)
+            grown[:, old:] = more
+            grown[:, :old, old:] = more[:, :, :old].transpose(0, 2, 1)
+            grams = grown
+            self._grams.insert(0, (known, norms, grams))
+            del self._grams[KEPT_GRAMS:]
         p = self.base.shape[2]
-        for known, norms, grams in self._grams:
-            if set(cells) <= set(known):
-                edges = np.cumsum([p, *(cell.size for cell in known)])
-                first = dict(zip(known, edges, strict=False))
-                parts = [np.arange(first[cell], first[cell] + cell.size) for cell in cells]
-                chosen = np.concatenate((np.arange(p), *parts, [len(norms) - 1]))
-                return norms[chosen], grams.take(chosen, axis=1).take(chosen, axis=2)
-        joined = np.concatenate((self.base, self.columns(cells), self.errors[:, :, None]), axis=2)
+        order = np.append(np.delete(self._positions(known, cells), p), p)
+        return norms[order], _picked(grams, order)
+
+    def _positions(self, known: Sequence[Cell], cells: Sequence[Cell]) -> IntArray:
+        """Return where base, errors and some cells are among the columns of a set of `_grams`."""
+        count = self.base.shape[2] + 1
+        first = dict(zip(known, np.cumsum([count, *(cell.size for cell in known)]), strict=False))
+        parts = [np.arange(first[cell], first[cell] + cell.size) for cell in cells]
+        return np.concatenate([np.arange(count), *parts])
+
+    def _more_grams(self, cells: Sequence[Cell], known: int) -> tuple[FloatArray, FloatArray]:
+        """Return the norms of base, errors and cells, and the Gram matrices but the known part."""
+        columns = self.base, self.errors[:, :, None], self.columns(cells)
+        joined = np.concatenate(columns, axis=2)
         norms = np.sqrt(np.einsum('nim,nim->m', joined, joined))
-        grams = self.noise_model.gram(lambda _, where: joined[where], joined.shape[2])
-        self._grams.insert(0, (tuple(cells), norms, grams))
-        del self._grams[KEPT_GRAMS:]
-        return norms.copy(), grams
+        grams = self.noise_model.gram(lambda _, where: joined[where], joined.shape[2], known)
+        return norms, grams
 
     def displaced(self, cells: Sequence[Cell], parameters: FloatArray) -> FloatArray:
         """Return what cells with these parameters displace in every row, m, (all rows, 3)."""
@@ -243,6 +267,17 @@ class Residuals:
         """Return the same in the rows worked on, m, (n, 3)."""
         explained: FloatArray = self.base @ fit.base + self.columns(fit.cells) @ fit.parameters
         return self.errors - explained
+
+
+def _picked(grams: FloatArray, order: IntArray) -> FloatArray:
+    """Return the rows and columns of Gram matrices in some order, run by run: runs are long."""
+    starts = np.flatnonzero(np.diff(order, prepend=-2) != 1)
+    runs = list(zip(starts, np.append(starts[1:], len(order)), strict=True))
+    picked = np.empty((len(grams), len(order), len(order)))
+    for (i, i_end), (j, j_end) in itertools.product(runs, runs):
+        rows = slice(order[i], order[i_end - 1] + 1)
+        picked[:, i:i_end, j:j_end] = grams[:, rows, order[j] : order[j_end - 1] + 1]
+    return picked
 
 
 def _orthonormal(jacobian: FloatArray) -> FloatArray:

@@ -16,11 +16,13 @@ whitened rows are flipped one by one, which relies on the noise model's independ
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
@@ -28,6 +30,8 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
+# Number and generator to that many sets of errors of all rows, m, (n, 3, draws).
+Draw = Callable[[int, np.random.Generator], FloatArray]
 CHUNK = 1024
 # With fewer, flips of whole poses meet the observed pattern, or its like, by chance.
 FEWEST_POSES = 12
@@ -148,6 +152,7 @@ def screen(
     rng: np.random.Generator | None = None,
     draws: int = 0,
     chosen: BoolArray | None = None,
+    errors: Draw | None = None,
 ) -> Screening:
     """Score all cells beside the given ones, under their noise.
 
@@ -161,17 +166,17 @@ def screen(
         For surrogates of each kind; none by default.
     chosen
         Which cells to score; all by default.
+    errors
+        To draw surrogates with; by default the noise of the given ones.
     """
     noise = given.noise
     project = _Projection(data, given)
     observed = project.residual(data.noise_model.whitened(data.errors, noise).reshape(-1, 1))
-    surrogates = observed
+    surrogates = observed.astype(np.float32)
     if draws and rng is not None:
-        surrogates = np.concatenate(
-            (observed, _surrogates(data, project, observed, draws, rng)), 1
-        )
-    total = np.sum(surrogates**2, axis=0)
-    surrogates = np.asarray(surrogates / np.sqrt(total), dtype=np.float32)
+        drawn = project.residual(_surrogates(data, observed, draws, rng, noise, errors))
+        surrogates = np.concatenate((surrogates, drawn), axis=1)
+    surrogates /= np.linalg.norm(surrogates, axis=0)
     n_eff = 3 * len(data) - data.base.shape[2]
     scores = np.full(len(catalogue.cells), -np.inf)
     best = np.full(surrogates.shape[1], -np.inf)
@@ -192,18 +197,16 @@ class _Projection:
         columns = data.columns(given.cells)
         joined = np.concatenate((data.base, columns), axis=2)
         white = data.noise_model.whitened(joined, given.noise).reshape(3 * len(data), -1)
-        # Penalties are rows of their own, in which the candidates are zero.
-        precision = given.prior_precision()
-        values, vectors = np.linalg.eigh(precision) if len(precision) else (np.zeros(0), precision)
-        root = (vectors * np.sqrt(np.maximum(values, 0.0))).T
-        root = root[values > 0.0]
-        extra = np.concatenate((np.zeros((len(root), data.base.shape[2])), root), axis=1)
-        stacked = np.concatenate((white, extra))
-        scale = np.linalg.norm(stacked, axis=0)
-        self.top = np.linalg.qr(stacked / scale)[0][: len(white)]
+        # The factor of H, which is that of a fit: much less work than that of all the rows.
+        H = white.T @ white
+        p = data.base.shape[2]
+        H[p:, p:] += given.prior_precision()
+        scale = np.sqrt(np.diag(H))
+        root = np.linalg.cholesky(H / np.outer(scale, scale))
+        self.top = solve_triangular(root, (white / scale).T, lower=True, check_finite=False).T
         self.single = self.top.astype(np.float32)
 
-    def residual(self, values: FloatArray) -> FloatArray:
+    def residual(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return (M v) of values (3n, c), M = I − Z (Z'Z + Λ)⁻¹ Z' restricted to the rows."""
         top = self.single if values.dtype == np.float32 else self.top
         return values - top @ (top.T @ values)
@@ -211,17 +214,21 @@ class _Projection:
 
 def _surrogates(
     data: Residuals,
-    project: _Projection,
     observed: FloatArray,
     draws: int,
     rng: np.random.Generator,
-) -> FloatArray:
-    """Return residuals with flipped poses, and drawn ones, (3n, 2 draws)."""
+    noise: Noise,
+    errors: Draw | None,
+) -> NDArray[np.float32]:
+    """Return residuals with flipped poses, and drawn ones, (3n, 2 draws), single precision."""
     unit = data.pose_of_row if data.poses >= FEWEST_POSES else np.arange(len(data))
     signs = rng.integers(0, 2, (int(unit.max()) + 1, draws)) * 2.0 - 1.0
     flipped = observed * np.repeat(signs[unit], 3, axis=0)
-    drawn = rng.standard_normal((len(observed), draws))
-    return project.residual(np.concatenate((flipped, drawn), axis=1))
+    if errors is None:
+        drawn = rng.standard_normal((len(observed), draws))
+    else:
+        drawn = data.noise_model.whitened(errors(draws, rng), noise).reshape(-1, draws)
+    return np.concatenate((flipped, drawn), axis=1, dtype=np.float32)
 
 
 def _scores(
@@ -229,7 +236,7 @@ def _scores(
     catalogue: Catalogue,
     batch: IntArray,
     project: _Projection,
-    residuals: FloatArray,
+    residuals: NDArray[np.float32],
     noise: Noise,
     n_eff: int,
 ) -> FloatArray:

@@ -30,6 +30,9 @@ class Solution:
         Precision factor of each penalised cell, in order of the cells (NaN for the others).
     ridge
         Prior precision of each unpenalised parameter (0 for the others), (m,).
+    unpenalised_covariance
+        Of the columns of the offsets model and the unpenalised parameters, in order, were the
+        penalised ones known, (p + u, p + u).
     log_evidence
         With the prior probability of the cells.
     """
@@ -42,6 +45,7 @@ class Solution:
     noise: Noise
     smoothness: FloatArray
     ridge: FloatArray
+    unpenalised_covariance: FloatArray
     log_evidence: float
 
     def slices(self) -> list[slice]:
@@ -50,7 +54,7 @@ class Solution:
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
     def reordered(self, order: IntArray) -> Solution:
-        """Return the same with the cells in another order."""
+        """Return the same with the cells in another order, the unpenalised ones in the same."""
         where = self.slices()
         m = [np.arange(len(self.parameters))[where[index]] for index in order]
         chosen = np.concatenate([np.zeros(0, dtype=int), *m])
@@ -64,6 +68,51 @@ class Solution:
             full_covariance=full_covariance,
             smoothness=self.smoothness[order],
             ridge=self.ridge[chosen],
+        )
+
+    def less(self, index: int, rows: int) -> Solution:
+        """Return the fit without one cell, with noise and smoothness as they are.
+
+        Exact, from the covariance C alone: the square that is left rises by b_i' C_ii⁻¹ b_i, the
+        determinant of what is estimated falls by that of C_ii. Log evidence of the columns: the
+        prior probability of the cells is that of the larger set.
+
+        Parameters
+        ----------
+        index
+            Of the cell.
+        rows
+            Number of rows n that were fitted.
+        """
+        cell, p, where = self.cells[index], len(self.base), self.slices()[index]
+        every = np.concatenate((self.base, self.parameters))
+        out = p + np.arange(where.start, where.stop)
+        covariance, pull, determinant = _conditioned(self.full_covariance, out)
+        worth = (
+            0.5 * every[out] @ np.linalg.solve(self.full_covariance[np.ix_(out, out)], every[out])
+        )
+        unpenalised = self.unpenalised_covariance
+        if cell.penalty is not None:
+            prior = self.smoothness[index] * cell.roughness + self.ridge[where.start]
+            price = 0.5 * (determinant + np.sum(np.log(prior)))
+        else:
+            before = sum(other.size for other in self.cells[:index] if other.penalty is None)
+            among = p + before + np.arange(cell.size)
+            unpenalised, _, alone = _conditioned(unpenalised, among)
+            # Half log N in place of the determinant that the unpenalised ones have by themselves.
+            price = 0.5 * (determinant - alone - cell.size * np.log(3.0 * rows - p))
+        every = np.delete(every, out) - pull @ every[out]
+        return replace(
+            self,
+            cells=(*self.cells[:index], *self.cells[index + 1 :]),
+            parameters=every[p:],
+            covariance=covariance[p:, p:],
+            base=every[:p],
+            full_covariance=covariance,
+            smoothness=np.delete(self.smoothness, index),
+            ridge=np.delete(self.ridge, out - p),
+            unpenalised_covariance=unpenalised,
+            log_evidence=float(self.log_evidence - worth - price),
         )
 
     def unphysical(self) -> set[int]:
@@ -81,3 +130,15 @@ class Solution:
             if cell.penalty is not None:
                 precision[where, where] += factor * cell.penalty
         return precision
+
+
+def _conditioned(covariance: FloatArray, out: IntArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return the covariance of the others were some parameters known, and what follows from these.
+
+    Their regression on these, and the log determinant of the covariance of these.
+    """
+    kept = np.delete(np.arange(len(covariance)), out)
+    own, across = covariance[np.ix_(out, out)], covariance[np.ix_(out, kept)]
+    pull: FloatArray = np.linalg.solve(own, across).T.astype(float, copy=False)
+    conditioned = covariance[np.ix_(kept, kept)] - pull @ across
+    return conditioned, pull, float(np.linalg.slogdet(own)[1])

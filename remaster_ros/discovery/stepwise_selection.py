@@ -17,22 +17,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from remaster_ros.discovery.cross_validation import held_out_error, worth_of
+from remaster_ros.discovery.cross_validation import LeftOut, worth_of
 from remaster_ros.discovery.dating import refine_moments
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.families import (
     FAMILIES,
+    WHOLE,
     family_log_prior,
     grouped,
+    less,
     relatives,
     visible,
 )
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, Screening, screen
+from remaster_ros.discovery.selection import Selection, Step
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.substitutes import named_instead
+from remaster_ros.discovery.substitutes import named_instead, regrown
 
 # Family-wise error of one round.
 SIGNIFICANCE = 0.01
@@ -45,12 +48,12 @@ ROUNDS = 8
 FOLDS = 10
 # What leaves less than this share of the held-out error out is not worth a parameter.
 LEAST_GAIN = 0.01
+# With noise and smoothness as they are: a cause that saves this share predicts.
+NEEDED = 0.1
 # The evidence must rise by this for an exchange: equals are not exchanged again and again.
 HYSTERESIS = 0.5
 MOST_EXCHANGED = 6
 MOST_MERGED = 4
-# So many cells of one family are a family.
-WHOLE = 3
 # Members of a family of which none raises the evidence alone have to raise it by this together.
 TOGETHER = 10.0
 # A member of a family has to raise the evidence by this: a free form of no size costs nothing.
@@ -60,41 +63,11 @@ BEYOND_DOUBT = 20.0
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
-    """One cell set that joined: with what p-value, held-out gain and evidence."""
-
-    cells: tuple[Cell, ...]
-    p_value: float
-    held_out_share: float
-    log_evidence_gain: float
-
-
-@dataclass(frozen=True, eq=False)
 class Proposal:
     """A set one step on, with the p-value of the step."""
 
     solution: Solution
     p_value: float
-
-
-@dataclass(frozen=True, eq=False)
-class Selection:
-    """The outcome: the fit without and with the cells, and how they were found.
-
-    Attributes
-    ----------
-    empty, solution
-        Fit of the offsets model alone, and with the cells.
-    steps
-        What joined, in order.
-    rejected
-        The best proposal of the last round, which failed a test; None where there was none.
-    """
-
-    empty: Solution
-    solution: Solution
-    steps: tuple[Step, ...]
-    rejected: Step | None
 
 
 @dataclass(eq=False)
@@ -129,10 +102,9 @@ class Search:
     def _look_at(self, data: Residuals) -> None:
         self.data = data
         self.catalogue = Catalogue.of(data, self.cells)
-        order = self.rng.permutation(data.poses)
-        self._fold_of_pose = order % min(FOLDS, data.poses)
+        self._fold_of_pose = self.rng.permutation(data.poses) % min(FOLDS, data.poses)
         # The larger set is compared with many smaller ones in turn.
-        self._last_held_out: tuple[Solution | None, float] = None, np.nan
+        self._last_held_out: tuple[Solution, LeftOut, float] | None = None
 
     def run(self, given: Solution | None = None) -> Selection:
         """Search until nothing passes both tests."""
@@ -151,7 +123,12 @@ class Search:
                     break
                 rejected = rejected or step
             else:
-                break
+                anew = regrown(solution, self.with_all, self.prune)
+                gain = anew.log_evidence - solution.log_evidence
+                if gain <= HYSTERESIS or self.held_out_share(solution, anew) < 0.0:
+                    break
+                solution = self.backward_elimination(self.drop_unpredictive(anew))
+                continue
             steps.append(step)
             solution = self.swap(self.prune(candidate))
             solution = refine_moments(solution, self.cells, self.data.part, self.fit)
@@ -185,15 +162,12 @@ class Search:
         again = self.fit(solution.cells, solution)
         return solution if again is None else self.prune(again)
 
-    def fit(
-        self, cells: Sequence[Cell], start: Solution | None = None, settled: bool = True
-    ) -> Solution | None:
+    def fit(self, cells: Sequence[Cell], start: Solution | None = None) -> Solution | None:
         """Fit a set with its prior probability; None for two cells of the same parameters."""
         names = [name for cell in cells for name in cell.parameters]
         if len(set(names)) < len(names):
             return None
-        prior = family_log_prior(cells, self.catalogue.cells)
-        return solve(self.data, cells, start, prior=prior, settled=settled)
+        return solve(self.data, cells, start, prior=family_log_prior(cells, self.catalogue.cells))
 
     def propose(self, solution: Solution, screening: Screening) -> list[Proposal]:
         """Return sets one step on that raise the evidence, the best first."""
@@ -226,6 +200,14 @@ class Search:
         Also where none of them does so alone: errors of six joints may each be below the
         threshold, and far above it together.
         """
+        grown = self.with_all(solution, family)
+        if grown is None or len(grown.cells) < len(solution.cells) + 2:
+            return None
+        pruned = self.prune(grown, solution)
+        return None if pruned is solution else pruned
+
+    def with_all(self, solution: Solution, family: tuple[str, ...]) -> Solution | None:
+        """Return the set with all of a family that add something to it; None where none do."""
         members = [
             cell
             for cell in self.catalogue.cells
@@ -234,13 +216,10 @@ class Search:
         present = {(cell.name, cell.joints, cell.label) for cell in solution.cells}
         others = [cell for cell in members if (cell.name, cell.joints, cell.label) not in present]
         new = visible(self.data, solution.cells, others)
-        if len(new) < 2:
-            return None
-        grown = self.fit((*solution.cells, *new), solution)
-        return None if grown is None else self.prune(grown, set(new))
+        return self.fit((*solution.cells, *new), solution) if new else None
 
-    def prune(self, solution: Solution, among: set[Cell] | None = None) -> Solution:
-        """Drop, one by one, the cells without which the evidence is higher.
+    def prune(self, solution: Solution, given: Solution | None = None) -> Solution:
+        """Drop, one by one, the cells without which the evidence is higher, but the given ones.
 
         Those of a sign that physics excludes go first, whatever they explain.
         """
@@ -250,7 +229,7 @@ class Search:
             unphysical = solution.unphysical()
             worth = [
                 worth_of(solution, cell, where, price)
-                if among is None or cell in among
+                if given is None or cell not in given.cells
                 else np.inf
                 for cell, where in zip(solution.cells, solution.slices(), strict=True)
             ]
@@ -265,6 +244,8 @@ class Search:
                     solution, settled = smaller
                     break
             else:
+                if given is not None and set(solution.cells) == set(given.cells):
+                    return given
                 if settled:
                     return solution
                 # Noise and smoothness follow what was dropped; then it is looked at again.
@@ -279,12 +260,13 @@ class Search:
         Where the evidence rises with the noise as it is, the best noise for the smaller set can
         wait; the cell is kept only by settled evidences.
         """
-        rest = (*solution.cells[:index], *solution.cells[index + 1 :])
-        for settle in (False, True) if settled else (False,):
-            smaller = self.fit(rest, solution, settled=settle)
-            if smaller and (unphysical or smaller.log_evidence > solution.log_evidence):
-                return smaller, settle
-        return None
+        smaller = less(solution, index, len(self.data), self.catalogue.cells)
+        if unphysical or smaller.log_evidence > solution.log_evidence:
+            return smaller, False
+        again = self.fit(smaller.cells, solution) if settled else None
+        if again is None or again.log_evidence <= solution.log_evidence:
+            return None
+        return again, True
 
     def swap(self, solution: Solution) -> Solution:
         """Replace cells, one at a time, by what explains more in their place."""
@@ -319,8 +301,13 @@ class Search:
         for group in grouped(solution.cells):
             if len(group) == len(solution.cells):
                 continue
-            rest = tuple(cell for cell in solution.cells if cell not in group)
-            without = self.fit(rest, solution)
+            held = solution
+            for cell in group:
+                held = held.less(held.cells.index(cell), len(self.data))
+            # Other smoothness of the others cannot make up for so much.
+            if self.held_out_share(held, solution) > NEEDED:
+                continue
+            without = self.fit(held.cells, solution)
             if without is not None and self.held_out_share(without, solution) < 0.0:
                 solution = without
         return solution
@@ -348,8 +335,7 @@ class Search:
             _, index = min(weak)
             cell = solution.cells[index]
             tested.add(cell)
-            rest = (*solution.cells[:index], *solution.cells[index + 1 :])
-            without = self.fit(rest, solution)
+            without = self.fit((*solution.cells[:index], *solution.cells[index + 1 :]), solution)
             if without is not None and not self._passes(cell, without, solution):
                 solution = without
 
@@ -383,12 +369,14 @@ class Search:
         return sorted(found, key=lambda fit: -fit.log_evidence)
 
     def held_out_share(self, smaller: Solution, larger: Solution) -> float:
-        """Return the share of the squared error on poses left out that the larger set saves."""
-        if self._last_held_out[0] is not larger:
-            after = held_out_error(self.data, larger, larger.noise, self._fold_of_pose)
-            self._last_held_out = larger, float(after.sum())
-        before = held_out_error(self.data, smaller, larger.noise, self._fold_of_pose)
-        return float(1.0 - self._last_held_out[1] / before.sum())
+        """Return the share of the deviance of poses left out that the larger set saves."""
+        last = self._last_held_out
+        if last is None or last[0] is not larger or not set(smaller.cells) <= set(last[1].cells):
+            cells = tuple(dict.fromkeys((*larger.cells, *smaller.cells)))
+            left_out = LeftOut.of(self.data, cells, larger.noise, self._fold_of_pose)
+            last = larger, left_out, float(left_out.deviance(larger).sum())
+            self._last_held_out = last
+        return float(1.0 - last[2] / last[1].deviance(smaller).sum())
 
 
 def _least_share(solution: Solution, candidate: Solution) -> float:

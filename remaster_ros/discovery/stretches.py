@@ -96,7 +96,7 @@ def compare_stretches(found: Estimate, data: Residuals, solution: Solution) -> S
     both = np.concatenate((columns, left[:, :, None]), axis=2)
     white = data.noise_model.whitened(both, solution.noise).reshape(3 * len(data), -1)
     X, errors = white[:, :-1], white[:, -1]
-    root = _root_of_inverse(X.T @ X + precision)
+    root = root_of_inverse(X.T @ X + precision)
     X = X @ root
     of_stretch = [np.repeat(stretch == index, 3) for index in range(STRETCHES)]
     parts = [_Part.of(X[mine], errors[mine]) for mine in of_stretch]
@@ -198,7 +198,7 @@ def _groups(found: Estimate, solution: Solution) -> list[IntArray]:
     return [*joints[:, None], *(own[where] for where in solution.slices())]
 
 
-def _root_of_inverse(precision: FloatArray) -> FloatArray:
+def root_of_inverse(precision: FloatArray) -> FloatArray:
     """Return L with L L' the inverse of a matrix of parameters in units far apart, (P, P)."""
     unit = np.maximum(np.diag(precision), np.finfo(float).tiny) ** -0.5
     scaled = precision * np.outer(unit, unit) + 1e-12 * np.eye(len(precision))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -136,12 +136,18 @@ class Cell:
         """Number of parameters m."""
         return len(self.parameters)
 
-    @property
+    @cached_property
+    def roughness(self) -> FloatArray:
+        """Eigenvalues of the penalty, ascending, (m,); none where there is none."""
+        penalty = np.zeros((0, 0)) if self.penalty is None else self.penalty
+        return np.linalg.eigvalsh(penalty).astype(float, copy=False)
+
+    @cached_property
     def key(self) -> tuple[str, tuple[int, ...], str, str, str, str]:
         """What distinguishes this cell from all others."""
         return self.name, self.joints, self.place, self.driver, self.form, self.label
 
-    @property
+    @cached_property
     def label(self) -> str:
         """Subject, variant and moment in one."""
         moment = '' if np.isnan(self.moment) else f'{self.moment:.3f} s'

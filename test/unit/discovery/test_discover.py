@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from calibration_scenes import CHAIN
 from discovery_scenes import at_joint, residuals_of, session_with
+from scipy.stats import multivariate_normal
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
 from remaster_ros.discovery import discover
-from remaster_ros.discovery.cross_validation import held_out_error
+from remaster_ros.discovery.cross_validation import LeftOut
 from remaster_ros.discovery.discover import Findings, discover_session, find_causes
 from remaster_ros.discovery.effects.base import Design
 from remaster_ros.discovery.effects.registry import EFFECTS
@@ -218,13 +219,15 @@ def test_restricted_likelihood_has_the_gradient_it_says(name, split):
     noise = model.of_sensors(*robust_noise(data.rows, data.errors, np.ones(len(data), bool)))
     ridge = np.where(np.arange(len(unit)) < p, 0.0, 0.5)
     system = _System(model, grams, noise, cells, p, unit, ridge)
-    eta, _ = system._start(None)
-    _, gradient = system.evaluate(eta)
+    eta, _, _ = system._start(None)
+    _, gradient, information = system.evaluate(eta)
     for i in range(len(eta)):
         step = np.zeros(len(eta))
         step[i] = 1e-5
         numeric = (system.evaluate(eta + step)[0] - system.evaluate(eta - step)[0]) / 2e-5
         assert gradient[i] == pytest.approx(numeric, rel=1e-3, abs=1e-3)
+    # The average of observed and expected information has no negative direction.
+    assert np.linalg.eigvalsh(information).min() > -1e-9 * np.trace(information)
 
 
 def test_a_curve_has_a_plausible_size_where_the_data_leave_it_open():
@@ -304,13 +307,15 @@ def test_p_values_are_uniform_where_nothing_is():
     assert np.max(-below) < 0.31
 
 
-def test_held_out_error_is_that_of_fits_without_the_pose():
+def test_held_out_error_and_deviance_are_those_of_fits_without_the_pose():
     data = residuals()
     cell = cells_named('joint_compliance')[1]
     fit = solve(data, (cell,))
     assert fit is not None
     folds = np.arange(data.poses)
-    by_pose = held_out_error(data, fit, fit.noise, folds)
+    others = cells_named('joint_compliance')[2:4]
+    left_out = LeftOut.of(data, (*others, cell), fit.noise, folds)
+    by_pose = left_out.errors(fit)
     pose = 4
     columns = np.concatenate((data.base, data.columns([cell]), data.errors[:, :, None]), axis=2)
     white = data.noise_model.whitened(columns, fit.noise)
@@ -318,5 +323,14 @@ def test_held_out_error_is_that_of_fits_without_the_pose():
     kept = white[~out].reshape(-1, white.shape[2])
     beta = np.linalg.lstsq(kept[:, :-1], kept[:, -1], rcond=None)[0]
     left = white[out].reshape(-1, white.shape[2])
-    expected = np.sum((left[:, -1] - left[:, :-1] @ beta) ** 2)
-    assert by_pose[pose] == pytest.approx(expected, rel=1e-4)
+    errors = left[:, -1] - left[:, :-1] @ beta
+    assert by_pose[pose] == pytest.approx(np.sum(errors**2), rel=1e-4)
+    scale = np.linalg.norm(kept[:, :-1], axis=0)
+    spread = left[:, :-1] / scale @ np.linalg.inv(np.linalg.qr(kept[:, :-1] / scale, mode='r'))
+    expected = 0.0
+    for first in range(0, len(left), 3):
+        row = slice(first, first + 3)
+        variance = np.eye(3) + spread[row] @ spread[row].T
+        density = multivariate_normal(cov=variance).logpdf(errors[row])
+        expected -= 2.0 * density + 3.0 * np.log(2.0 * np.pi)
+    assert left_out.deviance(fit)[pose] == pytest.approx(expected, rel=1e-4)

@@ -1,4 +1,4 @@
-"""Fits of sets of cells: Gram matrices that are kept, noise that is settled later."""
+"""Fits of sets of cells: Gram matrices that are kept, cells taken out, noise that is settled."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from discovery_scenes import residuals_of, session_with
 
+from remaster_ros.discovery import evidence
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import solve
+from remaster_ros.discovery.evidence import log_prior_one_by_one, solve
 from remaster_ros.discovery.families import visible
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
 
 
 @pytest.fixture(scope='module')
@@ -47,19 +49,65 @@ def test_what_a_caller_does_to_the_norms_stays_with_the_caller(scene):
     assert np.array_equal(data.gram_matrices(scene[1])[0], kept)
 
 
+def test_gram_matrices_of_a_known_set_with_other_cells_are_those_computed_for_it_alone(scene):
+    session, cells = scene
+    data = residuals_of(session)
+    data.gram_matrices(cells[:5])
+    wanted = [cells[6], cells[1], cells[4], cells[7]]
+    norms, grams = data.gram_matrices(wanted)
+    fresh_norms, fresh_grams = residuals_of(session).gram_matrices(wanted)
+    assert norms == pytest.approx(fresh_norms, rel=1e-12)
+    size = np.sqrt(np.einsum('gii->gi', fresh_grams))
+    error = np.abs(grams - fresh_grams) / (1e-300 + size[:, :, None] * size[:, None, :])
+    assert error.max() < 1e-9
+
+
 @pytest.mark.parametrize('dropped', range(6))
-def test_the_evidence_with_the_noise_of_a_larger_set_is_at_most_that_with_its_own(scene, dropped):
+def test_a_fit_less_a_cell_is_the_fit_of_the_others_with_the_same_noise(
+    scene, dropped, monkeypatch
+):
     data: Residuals = residuals_of(scene[0])
     cells = scene[1][1:7]
     whole = solve(data, cells)
-    rest = [cell for cell in cells if cell is not cells[dropped]]
-    held, settled = solve(data, rest, whole, settled=False), solve(data, rest, whole)
-    assert held is not None
-    assert settled is not None
     assert whole is not None
-    assert held.noise.sigma == pytest.approx(whole.noise.sigma, rel=1e-12)
+    rest = [cell for cell in cells if cell is not cells[dropped]]
+    held, settled = whole.less(dropped, len(data)), solve(data, rest, whole)
+    with monkeypatch.context() as patch:
+        patch.setattr(evidence, 'STEPS', 0)
+        same_noise = solve(data, rest, whole, prior=log_prior_one_by_one(cells))
+    assert settled is not None
+    assert same_noise is not None
+    assert held.cells == same_noise.cells
+    assert held.noise.sigma == pytest.approx(same_noise.noise.sigma, rel=1e-12)
+    assert held.log_evidence == pytest.approx(same_noise.log_evidence, abs=1e-6)
+    std = np.sqrt(np.diag(same_noise.full_covariance))
+    assert np.max(np.abs(held.parameters - same_noise.parameters) / std[len(held.base) :]) < 1e-6
+    error = (held.full_covariance - same_noise.full_covariance) / np.outer(std, std)
+    assert np.abs(error).max() < 1e-6
+    assert held.ridge == pytest.approx(same_noise.ridge, rel=1e-9)
     # ½ log N in place of a determinant: the maxima of evidence and likelihood differ a little.
-    assert held.log_evidence < settled.log_evidence + 0.05
+    prior = log_prior_one_by_one(rest) - log_prior_one_by_one(cells)
+    assert held.log_evidence + prior < settled.log_evidence + 0.05
     again = solve(data, rest, held)
     assert again is not None
     assert again.log_evidence == pytest.approx(settled.log_evidence, abs=0.05)
+
+
+def test_noise_and_smoothness_are_where_no_small_step_raises_the_likelihood(scene):
+    data: Residuals = residuals_of(scene[0])
+    systems: list[Any] = []
+    solve_with = evidence._System.solution
+
+    def kept(system: Any, start: Solution | None, prior: float) -> Solution:
+        found = solve_with(system, start, prior)
+        systems.append((system, system._last[0]))
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evidence._System, 'solution', kept)
+        assert solve(data, scene[1]) is not None
+    ((system, eta),) = systems
+    most = system.evaluate(eta)[0]
+    for step in 0.3 * np.eye(len(eta)):
+        assert system.evaluate(eta + step)[0] < most + 0.05
+        assert system.evaluate(eta - step)[0] < most + 0.05

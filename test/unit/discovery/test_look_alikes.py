@@ -12,7 +12,7 @@ from remaster_ros.discovery.evidence import Solution, solve
 from remaster_ros.discovery.explain import TIED, describe
 from remaster_ros.discovery.plain_forms import is_special_case, plainest
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.stepwise_selection import Selection, Step
+from remaster_ros.discovery.selection import Selection, Step
 
 ARC_MINUTE = np.radians(1.0 / 60.0)
 

@@ -1,0 +1,38 @@
+"""What a search for causes found, and in which steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.solution import Solution
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One cell set that joined: with what p-value, held-out gain and evidence."""
+
+    cells: tuple[Cell, ...]
+    p_value: float
+    held_out_share: float
+    log_evidence_gain: float
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The outcome: the fit without and with the cells, and how they were found.
+
+    Attributes
+    ----------
+    empty, solution
+        Fit of the offsets model alone, and with the cells.
+    steps
+        What joined, in order.
+    rejected
+        The best proposal of the last round, which failed a test; None where there was none.
+    """
+
+    empty: Solution
+    solution: Solution
+    steps: tuple[Step, ...]
+    rejected: Step | None
