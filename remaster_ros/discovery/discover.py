@@ -277,9 +277,8 @@ def _sampled(
     stretches = compare_stretches(findings.found, residuals, solution)
     missed = undetected(findings.found, residuals, solution)
     unmodelled = [missed.moves, stretches.moves]
-    if findings.aside is not None:
-        memory = findings.aside.memory
-        unmodelled.append(moved_by_memory(findings.found, residuals, solution, memory))
+    if (aside := findings.aside) is not None:
+        unmodelled.append(moved_by_memory(findings.found, residuals, solution, aside.memory))
     if findings.repeated is not None:
         unmodelled.append(findings.repeated.moves)
     fit = fit_session(
@@ -292,8 +291,7 @@ def _sampled(
         unmodelled=np.concatenate(unmodelled, axis=1),
         progress=lambda _, share: report('sampling the extended model', share),
     )
-    gain = gain_of(findings.before, residuals, solution, fit, rng)
-    return fit, gain, stretches, missed
+    return fit, gain_of(findings.before, residuals, solution, fit, rng), stretches, missed
 
 
 def find_causes(session: Session, *, rng: np.random.Generator, progress: Progress) -> Findings:
