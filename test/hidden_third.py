@@ -6,17 +6,20 @@ would see there without noise: what they leave is the model's fault alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from hidden_world import HiddenWorld, Visits
 
 from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.extension import Term
+from remaster_ros.calibration.predictions import Predictions, predict
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.context import Context, PartOfContext
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.kinematics.transforms import apply, inverse
+from remaster_ros.reports.discovery_json import predictions_of
 from remaster_ros.simulation.hidden_effect import HiddenEffect
 from remaster_ros.types import FloatArray, Session
 
@@ -66,25 +69,33 @@ def predicted_by(found: Discovery, third: Session) -> FloatArray:
 
     Sensors and markers are those of the discovery's session, in that order.
     """
-    fit, rows = found.fit, third.measurements
-    context = _Elsewhere.of(found.residuals.context, third)
-    turns = np.zeros(rows.q.shape)
-    shift = np.zeros((len(rows), 3))
-    # By their place: two cells without a name may call their parameters alike.
-    solution = found.selection.solution
-    for cell, where in zip(solution.cells, solution.slices(), strict=True):
-        if cell.driver == 'time' and not EFFECTS[cell.name].is_cause:
-            # Errors that follow each other belong to the readings, not to the poses.
-            continue
-        columns = cell.columns(context)
-        if columns.at is None:
-            shift += columns.values @ fit.theta[where]
-        else:
-            turns[:, columns.at] += columns.values @ fit.theta[where]
-    markers = np.array([fit.marker_positions[name] for name in third.marker_names])
-    T_N_R = inverse(np.array([fit.T_R_N[name] for name in third.sensor_names]))
-    points = fit.chain.positions(rows.q + turns, markers[rows.marker], fit.joint_offsets)
-    return apply(T_N_R[rows.sensor], points + shift)
+    return predictions_elsewhere(found, third).position
+
+
+def predictions_elsewhere(found: Discovery, third: Session) -> Predictions:
+    """Predict the rows of another session with their 95 % regions; see `predicted_by`."""
+    fit, context = found.fit, _Elsewhere.of(found.residuals.context, third)
+    model = fit.predictive.model
+    if model.extension is not None:
+        terms, displacement0 = [], np.zeros((len(third.measurements), 3))
+        # By their place: two cells without a name may call their parameters alike.
+        solution = found.selection.solution
+        for cell, where in zip(solution.cells, solution.slices(), strict=True):
+            if cell.driver == 'time' and not EFFECTS[cell.name].is_cause:
+                # Errors that follow each other belong to the readings, not to the poses.
+                continue
+            columns = cell.columns(context)
+            terms.append(Term(where, columns.at, columns.values))
+            if columns.at is None:
+                displacement0 += columns.values @ model.extension.theta0[where]
+        model = replace(
+            model,
+            extension=replace(model.extension, terms=tuple(terms), displacement0=displacement0),
+        )
+        fit = replace(fit, predictive=replace(fit.predictive, model=model))
+    # The factor is that of the rows to fit: None would determine another with these rows.
+    widening = predictions_of(found).widening
+    return predict(fit, third.measurements, widening)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import solve_triangular
 
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
@@ -86,6 +86,31 @@ class LeftOut:
         solution
             Which cells, with which smoothness.
         """
+        errors, _ = self._predicted(solution)
+        return self._by_pose(np.sum(errors**2, axis=1))
+
+    def deviance(self, solution: Solution) -> FloatArray:
+        """Return −2 log of the density of each pose by the fit of some of the cells.
+
+        Without the constants, which are those of the noise. In units of what is uncertain of its
+        prediction, a pose that is far from all others does not decide between two sets of cells,
+        as it does by its squared error (Gelman, Hwang & Vehtari 2014, Stat. Comput. 24, 997).
+
+        Parameters
+        ----------
+        solution
+            As in `errors`.
+        """
+        errors, variance = self._predicted(solution)
+        scaled = np.linalg.solve(variance, errors[:, :, None])[:, :, 0]
+        return self._by_pose(np.sum(errors * scaled, axis=1) + np.linalg.slogdet(variance)[1])
+
+    def _by_pose(self, by_row: FloatArray) -> FloatArray:
+        by_pose: FloatArray = np.bincount(self.data.pose_of_row, by_row).astype(float)
+        return by_pose
+
+    def _predicted(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
+        """Return the error of each row by the fit to others, (n, 3), and its variance."""
         p = self.data.base.shape[2]
         edges = p + np.cumsum([0, *(cell.size for cell in self.cells)])
         first = dict(zip(self.cells, edges, strict=False))
@@ -97,12 +122,14 @@ class LeftOut:
         total[p:-1, p:-1] += solution.prior_precision() / np.outer(unit, unit)
         np.einsum('ii->i', total)[:-1] += 1e-12
         errors = np.empty(3 * len(self.data))
+        variance = np.empty((len(self.data), 3, 3))
         for rows, part, gram in zip(self.rows, self.parts, self.grams, strict=True):
             kept = total - gram[np.ix_(every, every)]
-            root = cho_factor(kept[:-1, :-1], lower=True, check_finite=False)
-            beta = np.zeros(len(self.scale) - 1)
-            beta[chosen] = cho_solve(root, kept[:-1, -1], check_finite=False)
-            errors[rows] = part[:, -1] - part[:, :-1] @ beta
-        square = np.add.reduceat(errors**2, np.arange(0, len(errors), 3))
-        by_pose: FloatArray = np.bincount(self.data.pose_of_row, square).astype(float)
-        return by_pose
+            root = np.linalg.cholesky(kept[:-1, :-1])
+            X = part[:, chosen]
+            pulls = np.column_stack((kept[:-1, -1], X.T))
+            solved = solve_triangular(root, pulls, lower=True, check_finite=False)
+            errors[rows] = part[:, -1] - solved[:, 1:].T @ solved[:, 0]
+            spread = solved[:, 1:].T.reshape(-1, 3, len(chosen))
+            variance[rows[::3] // 3] = np.eye(3) + spread @ spread.transpose(0, 2, 1)
+        return errors.reshape(-1, 3), variance

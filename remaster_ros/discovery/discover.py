@@ -19,6 +19,7 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
+from remaster_ros.discovery.beside_memory import withstanding_memory
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
@@ -34,8 +35,10 @@ from remaster_ros.discovery.guard import Unexplained, harm_of, held, is_harmful,
 from remaster_ros.discovery.marker_offsets import held_markers, loosened, moved_markers
 from remaster_ros.discovery.omnibus import structure_left
 from remaster_ros.discovery.plain_forms import plainest
+from remaster_ros.discovery.repeated_search import RepeatedSearch, repeat_search
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.selection import Selection
+from remaster_ros.discovery.set_aside import SetAside, moved_by_memory, set_aside
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stepwise_selection import Search
 from remaster_ros.discovery.stretches import Stretches, compare_stretches
@@ -94,6 +97,8 @@ class Discovery:
         its sensor, m, (n, 3).
     unexplained
         Structure that no cause explains.
+    repeated
+        What the search finds without some of the poses; None where it was not repeated.
     """
 
     verdict: Verdict
@@ -112,6 +117,14 @@ class Discovery:
     residuals_before: FloatArray
     thinning: Thinning | None = None
     unexplained: tuple[Unexplained, ...] = ()
+    repeated: RepeatedSearch | None = None
+
+    @property
+    def widening(self) -> float | None:
+        """Factor on the size of the predicted 95 % regions; None where nothing shows it."""
+        if self.repeated is None:
+            return self.stretches.widening
+        return max(self.repeated.widening, self.stretches.widening or 1.0)
 
 
 def discover_session(
@@ -163,7 +176,9 @@ def discover_session(
         findings = findings.without_causes()
         fit, gain, stretches = _sampled(session, findings, rng, report, clock)
     residuals, solution = findings.residuals, findings.selection.solution
-    structure, gross = structure_left(residuals, solution, fit, findings.structure)
+    structure, gross = structure_left(
+        residuals, solution, fit, findings.structure, findings.searched
+    )
     unexplained += structure
     effects = tuple(
         effect.sampled(fit, group, residuals.part)
@@ -193,6 +208,7 @@ def discover_session(
         residuals_before=residuals_of(findings.before),
         thinning=findings.thinning,
         unexplained=unexplained,
+        repeated=findings.repeated,
     )
 
 
@@ -202,7 +218,7 @@ class Findings:
 
     ``before`` is the fit of the session as it is, without any effect, ``found`` the one that the
     search began with (its priors let moved markers go where they are), ``structure`` what the
-    search located without a cause.
+    search located without a cause, ``aside`` the part of that which is not in the model.
     """
 
     before: Estimate
@@ -214,6 +230,13 @@ class Findings:
     structure: tuple[FoundEffect, ...]
     untestable: Mapping[str, str]
     thinning: Thinning | None
+    aside: SetAside | None
+    repeated: RepeatedSearch | None
+
+    @property
+    def searched(self) -> Solution:
+        """The solution with all that the search located."""
+        return self.selection.solution if self.aside is None else self.aside.searched
 
     def without_causes(self) -> Findings:
         """Return the same as if the search had found nothing."""
@@ -229,6 +252,8 @@ class Findings:
             effects=(),
             structure=(),
             thinning=None,
+            aside=None,
+            repeated=None,
         )
 
 
@@ -246,7 +271,12 @@ def _sampled(
     """
     residuals, solution = findings.residuals, findings.selection.solution
     stretches = compare_stretches(findings.found, residuals, solution)
-    unmodelled = undetected(findings.found, residuals, solution), stretches.moves
+    unmodelled = [undetected(findings.found, residuals, solution), stretches.moves]
+    if findings.aside is not None:
+        memory = findings.aside.memory
+        unmodelled.append(moved_by_memory(findings.found, residuals, solution, memory))
+    if findings.repeated is not None:
+        unmodelled.append(findings.repeated.moves)
     fit = fit_session(
         session,
         rng=rng,
@@ -292,7 +322,8 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         lambda share: progress('searching causes', share),
     )
     selection = search.run()
-    selection = replace(selection, solution=plainest(selection.solution, search.cells, search.fit))
+    solution = withstanding_memory(search, selection.solution)
+    selection = replace(selection, solution=plainest(solution, search.cells, search.fit))
     residuals = search.data
     groups, described = describe(
         residuals, selection, cells, lambda share: progress('comparing look-alikes', share)
@@ -300,7 +331,18 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
     causes = [EFFECTS[group[0].name].is_cause for group in groups]
     effects = tuple(itertools.compress(described, causes))
     structure = tuple(effect for effect, cause in zip(described, causes, strict=True) if not cause)
-    effects += moved_markers(found, residuals, selection.solution)
+    aside = set_aside(residuals, selection.solution)
+    if aside is not None:
+        selection = replace(selection, solution=aside.solution)
+        structure = aside.said(structure)
+    repeated = repeat_search(
+        found,
+        search,
+        selection.solution,
+        lambda share: progress('searching again without some of the poses', share),
+    )
+    memory = None if aside is None else aside.memory
+    effects += moved_markers(found, residuals, selection.solution, memory)
     thinning = None
     if thinned:
         thinning = judge_by_others(
@@ -308,7 +350,17 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         )
     groups = tuple(itertools.compress(groups, causes))
     return Findings(
-        before, found, residuals, selection, groups, effects, structure, untestable, thinning
+        before,
+        found,
+        residuals,
+        selection,
+        groups,
+        effects,
+        structure,
+        untestable,
+        thinning,
+        aside,
+        repeated,
     )
 
 

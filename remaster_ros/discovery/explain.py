@@ -12,14 +12,13 @@ from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
-from remaster_ros.discovery.families import family_log_prior, grouped
+from remaster_ros.discovery.families import WHOLE, family_log_prior, grouped
 from remaster_ros.discovery.gain import shares
 from remaster_ros.discovery.plain_forms import AS_WELL, is_special_case
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, screen
 from remaster_ros.discovery.selection import Selection
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.stepwise_selection import WHOLE
 from remaster_ros.discovery.words import called, clock_time, joint_words
 
 # Look-alikes within this of the evidence are named; within the other, the leaders tie.

@@ -16,6 +16,8 @@ from remaster_ros.types import FloatArray
 
 # A member of a family that the others explain to this share of its size is another name for them.
 FAMILY_ABSORBED = 1e-3
+# So many cells of one family are a family.
+WHOLE = 3
 
 FAMILIES: tuple[tuple[str, ...], ...] = tuple(
     tuple(name for name, effect in EFFECTS.items() if effect.family == family)
@@ -74,15 +76,16 @@ def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
 
 def visible(data: Residuals, given: Sequence[Cell], cells: Sequence[Cell]) -> list[Cell]:
     """Return the cells that add something to base, given and earlier ones, in order."""
-    if not cells:
-        return []
-    if cells[0].penalty is not None:
+    if all(cell.penalty is not None for cell in cells):
         return list(cells)
     fixed = [cell for cell in given if cell.penalty is None]
     start = np.concatenate((data.base, data.columns(fixed)), axis=2)
     known, _ = np.linalg.qr(_unit(start.reshape(3 * len(data), -1)))
     kept = []
     for cell in cells:
+        if cell.penalty is not None:
+            kept.append(cell)
+            continue
         block = _unit(data.columns([cell]).reshape(3 * len(data), -1))
         left = block - known @ (known.T @ block)
         left -= known @ (known.T @ left)

@@ -16,6 +16,7 @@ from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.discovery.effects.marker_offset import EFFECT as MARKER_OFFSET
 from remaster_ros.discovery.effects.sizes import number
 from remaster_ros.discovery.explain import FoundEffect, Parameter
+from remaster_ros.discovery.memory import Memory, draws_of
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray, Priors, Session
@@ -33,8 +34,20 @@ HELD_M = 1e-3
 HIDDEN = 0.1
 
 
-def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple[FoundEffect, ...]:
-    """Return an effect for every marker that the fit moved beyond its stated accuracy."""
+def moved_markers(
+    found: Estimate, data: Residuals, solution: Solution, memory: Memory | None = None
+) -> tuple[FoundEffect, ...]:
+    """Return an effect for every marker that the fit moved beyond its stated accuracy.
+
+    Parameters
+    ----------
+    found
+        The fit.
+    data, solution
+        What it leaves, and the causes beside.
+    memory
+        Of the errors that they leave; None where the errors do not remember.
+    """
     model, problem = found.model, found.problem
     x = model.natural(found.mode.z)
     jacobian = model.natural_jacobian(x, data.rows)
@@ -57,14 +70,20 @@ def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple
         seen = values * std**2 > KNOWN_BETTER
         if not seen.any():
             continue
-        u = axes.T @ pull
-        square = float(np.sum(u[seen] ** 2 / (values[seen] + (values[seen] * std) ** 2)))
+        u = axes[:, seen].T @ pull
+        noise = np.diag(values[seen])
+        if memory is not None:
+            (drawn,) = draws_of(memory, [((own @ axes[:, seen]).T, solution)])
+            noise = drawn @ drawn.T / drawn.shape[1]
+        square = float(u @ np.linalg.solve(noise + np.diag((values[seen] * std) ** 2), u))
         p_value = float(chi2.sf(square, seen.sum()))
         if p_value * len(problem.marker_names) > SIGNIFICANCE:
             continue
-        inverse = axes[:, seen] / values[seen] @ axes[:, seen].T
-        by_data = inverse @ pull
-        covariance = inverse + _unseen(by_data, problem.markers[index], axes, seen)
+        inverse = axes[:, seen] / values[seen]
+        by_data = inverse @ u
+        covariance = inverse @ noise @ inverse.T + _unseen(
+            by_data, problem.markers[index], axes, seen
+        )
         blind = np.sum(axes[:, ~seen] ** 2, axis=1) > HIDDEN
         effects.append(_effect(name, by_data, covariance, blind, p_value, square, int(seen.sum())))
     return tuple(effects)

@@ -43,18 +43,24 @@ FOLDS = 10
 
 
 def structure_left(
-    data: Residuals, solution: Solution, fit: FitResult, located: Sequence[FoundEffect]
+    data: Residuals,
+    solution: Solution,
+    fit: FitResult,
+    located: Sequence[FoundEffect],
+    searched: Solution,
 ) -> tuple[tuple[Unexplained, ...], tuple[tuple[int, str], ...]]:
     """Return all structure that no cause explains, and the gross errors among held-out rows.
 
     Parameters
     ----------
     data, solution
-        What the search worked on and found.
+        What the search worked on, and what is in the model.
     fit
         The sampled fit with it.
     located
         Structure without a cause that the search found.
+    searched
+        The solution with that.
 
     Returns
     -------
@@ -63,13 +69,13 @@ def structure_left(
     gross
         (observation, what is wrong) of every held-out row.
     """
-    checks = _Checks(data, solution, fit)
+    checks = _Checks(data, solution, fit, searched)
     unexplained = (
         *(
             Unexplained(found.place, found.driver, found.size_m, found.p_value, found.cause)
             for found in located
         ),
-        *errors_by_place(data, solution, SIGNIFICANCE),
+        *errors_by_place(data, searched, SIGNIFICANCE),
         *checks.pairing(),
         *far_off(data.context, checks.errors, checks.gross & ~checks.mispaired),
         *checks.held_out(),
@@ -85,6 +91,7 @@ class _Checks:
     data: Residuals
     solution: Solution
     fit: FitResult
+    searched: Solution
 
     @property
     def errors(self) -> FloatArray:
@@ -177,17 +184,17 @@ class _Checks:
 
     def held_out(self) -> Iterator[Unexplained]:
         """Held-out poses with larger errors than poses that were left out of the fit in turn."""
-        data, noise = self.data, self.solution.noise
+        data, noise = self.data, self.searched.noise
         measurements = data.context.measurements
         rows = np.flatnonzero(measurements.is_validation & ~self.gross)
         if len(np.unique(measurements.pose[rows])) < FEWEST_POSES or data.poses < FEWEST_POSES:
             return
         folds = np.arange(data.poses) % min(FOLDS, data.poses)
-        left_out = LeftOut.of(data, self.solution.cells, noise, folds)
-        expected = left_out.errors(self.solution) / np.bincount(data.pose_of_row)
+        left_out = LeftOut.of(data, self.searched.cells, noise, folds)
+        expected = left_out.errors(self.searched) / np.bincount(data.pose_of_row)
         others = data.only(rows)
         left = others.noise_model.whitened(
-            data.unexplained(self.solution)[others.rows.source], noise
+            data.unexplained(self.searched)[others.rows.source], noise
         )
         pose = others.pose_of_row
         found = np.bincount(pose, np.sum(left**2, axis=1)) / np.bincount(pose)

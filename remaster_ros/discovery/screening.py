@@ -16,7 +16,7 @@ whitened rows are flipped one by one, which relies on the noise model's independ
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,8 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
+# Number and generator to that many sets of errors of all rows, m, (n, 3, draws).
+Draw = Callable[[int, np.random.Generator], FloatArray]
 CHUNK = 1024
 # With fewer, flips of whole poses meet the observed pattern, or its like, by chance.
 FEWEST_POSES = 12
@@ -150,6 +152,7 @@ def screen(
     rng: np.random.Generator | None = None,
     draws: int = 0,
     chosen: BoolArray | None = None,
+    errors: Draw | None = None,
 ) -> Screening:
     """Score all cells beside the given ones, under their noise.
 
@@ -163,13 +166,15 @@ def screen(
         For surrogates of each kind; none by default.
     chosen
         Which cells to score; all by default.
+    errors
+        To draw surrogates with; by default the noise of the given ones.
     """
     noise = given.noise
     project = _Projection(data, given)
     observed = project.residual(data.noise_model.whitened(data.errors, noise).reshape(-1, 1))
     surrogates = observed.astype(np.float32)
     if draws and rng is not None:
-        drawn = project.residual(_surrogates(data, observed, draws, rng))
+        drawn = project.residual(_surrogates(data, observed, draws, rng, noise, errors))
         surrogates = np.concatenate((surrogates, drawn), axis=1)
     surrogates /= np.linalg.norm(surrogates, axis=0)
     n_eff = 3 * len(data) - data.base.shape[2]
@@ -208,13 +213,21 @@ class _Projection:
 
 
 def _surrogates(
-    data: Residuals, observed: FloatArray, draws: int, rng: np.random.Generator
+    data: Residuals,
+    observed: FloatArray,
+    draws: int,
+    rng: np.random.Generator,
+    noise: Noise,
+    errors: Draw | None,
 ) -> NDArray[np.float32]:
     """Return residuals with flipped poses, and drawn ones, (3n, 2 draws), single precision."""
     unit = data.pose_of_row if data.poses >= FEWEST_POSES else np.arange(len(data))
     signs = rng.integers(0, 2, (int(unit.max()) + 1, draws)) * 2.0 - 1.0
     flipped = observed * np.repeat(signs[unit], 3, axis=0)
-    drawn = rng.standard_normal((len(observed), draws))
+    if errors is None:
+        drawn = rng.standard_normal((len(observed), draws))
+    else:
+        drawn = data.noise_model.whitened(errors(draws, rng), noise).reshape(-1, draws)
     return np.concatenate((flipped, drawn), axis=1, dtype=np.float32)
 
 

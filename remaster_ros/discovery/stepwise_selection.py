@@ -24,6 +24,7 @@ from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.families import (
     FAMILIES,
+    WHOLE,
     family_log_prior,
     grouped,
     less,
@@ -34,7 +35,7 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, Screening, screen
 from remaster_ros.discovery.selection import Selection, Step
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.substitutes import named_instead
+from remaster_ros.discovery.substitutes import named_instead, regrown
 
 # Family-wise error of one round.
 SIGNIFICANCE = 0.01
@@ -53,8 +54,6 @@ NEEDED = 0.1
 HYSTERESIS = 0.5
 MOST_EXCHANGED = 6
 MOST_MERGED = 4
-# So many cells of one family are a family.
-WHOLE = 3
 # Members of a family of which none raises the evidence alone have to raise it by this together.
 TOGETHER = 10.0
 # A member of a family has to raise the evidence by this: a free form of no size costs nothing.
@@ -124,7 +123,12 @@ class Search:
                     break
                 rejected = rejected or step
             else:
-                break
+                anew = regrown(solution, self.with_all, self.prune)
+                gain = anew.log_evidence - solution.log_evidence
+                if gain <= HYSTERESIS or self.held_out_share(solution, anew) < 0.0:
+                    break
+                solution = self.backward_elimination(self.drop_unpredictive(anew))
+                continue
             steps.append(step)
             solution = self.swap(self.prune(candidate))
             solution = refine_moments(solution, self.cells, self.data.part, self.fit)
@@ -196,6 +200,14 @@ class Search:
         Also where none of them does so alone: errors of six joints may each be below the
         threshold, and far above it together.
         """
+        grown = self.with_all(solution, family)
+        if grown is None or len(grown.cells) < len(solution.cells) + 2:
+            return None
+        pruned = self.prune(grown, solution)
+        return None if pruned is solution else pruned
+
+    def with_all(self, solution: Solution, family: tuple[str, ...]) -> Solution | None:
+        """Return the set with all of a family that add something to it; None where none do."""
         members = [
             cell
             for cell in self.catalogue.cells
@@ -204,11 +216,7 @@ class Search:
         present = {(cell.name, cell.joints, cell.label) for cell in solution.cells}
         others = [cell for cell in members if (cell.name, cell.joints, cell.label) not in present]
         new = visible(self.data, solution.cells, others)
-        if len(new) < 2:
-            return None
-        grown = self.fit((*solution.cells, *new), solution)
-        pruned = None if grown is None else self.prune(grown, solution)
-        return None if pruned is solution else pruned
+        return self.fit((*solution.cells, *new), solution) if new else None
 
     def prune(self, solution: Solution, given: Solution | None = None) -> Solution:
         """Drop, one by one, the cells without which the evidence is higher, but the given ones.
@@ -361,14 +369,14 @@ class Search:
         return sorted(found, key=lambda fit: -fit.log_evidence)
 
     def held_out_share(self, smaller: Solution, larger: Solution) -> float:
-        """Return the share of the squared error on poses left out that the larger set saves."""
+        """Return the share of the deviance of poses left out that the larger set saves."""
         last = self._last_held_out
         if last is None or last[0] is not larger or not set(smaller.cells) <= set(last[1].cells):
             cells = tuple(dict.fromkeys((*larger.cells, *smaller.cells)))
             left_out = LeftOut.of(self.data, cells, larger.noise, self._fold_of_pose)
-            last = larger, left_out, float(left_out.errors(larger).sum())
+            last = larger, left_out, float(left_out.deviance(larger).sum())
             self._last_held_out = last
-        return float(1.0 - last[2] / last[1].errors(smaller).sum())
+        return float(1.0 - last[2] / last[1].deviance(smaller).sum())
 
 
 def _least_share(solution: Solution, candidate: Solution) -> float:

@@ -96,7 +96,7 @@ def compare_stretches(found: Estimate, data: Residuals, solution: Solution) -> S
     both = np.concatenate((columns, left[:, :, None]), axis=2)
     white = data.noise_model.whitened(both, solution.noise).reshape(3 * len(data), -1)
     X, errors = white[:, :-1], white[:, -1]
-    root = _root_of_inverse(X.T @ X + precision)
+    root = root_of_inverse(X.T @ X + precision)
     X = X @ root
     of_stretch = [np.repeat(stretch == index, 3) for index in range(STRETCHES)]
     parts = [_Part.of(X[mine], errors[mine]) for mine in of_stretch]
@@ -198,12 +198,23 @@ def _groups(found: Estimate, solution: Solution) -> list[IntArray]:
     return [*joints[:, None], *(own[where] for where in solution.slices())]
 
 
-def _root_of_inverse(precision: FloatArray) -> FloatArray:
+def root_of_inverse(precision: FloatArray) -> FloatArray:
     """Return L with L L' the inverse of a matrix of parameters in units far apart, (P, P)."""
     unit = np.maximum(np.diag(precision), np.finfo(float).tiny) ** -0.5
     scaled = precision * np.outer(unit, unit) + 1e-12 * np.eye(len(precision))
     root: FloatArray = unit[:, None] * np.linalg.inv(np.linalg.cholesky(scaled)).T
     return root
+
+
+def noise_covariance(data: Residuals, solution: Solution) -> FloatArray:
+    """Return the covariance of all the noise of each row worked on, m², (n, 3, 3)."""
+    sensor = data.context.sensor[data.rows.source]
+    along, across = data.noise_model.total_noise(solution.noise)[sensor].T ** 2
+    sight = data.rows.target - data.reference[sensor, :3, 3]
+    sight /= np.linalg.norm(sight, axis=1)[:, None]
+    covariance: FloatArray = across[:, None, None] * np.eye(3)
+    covariance += (along - across)[:, None, None] * sight[:, :, None] * sight[:, None, :]
+    return covariance
 
 
 def _widening(
@@ -223,12 +234,7 @@ def _widening(
     left
         Residuals at the solution, m, (n, 3).
     """
-    sensor = data.context.sensor[data.rows.source]
-    along, across = data.noise_model.total_noise(solution.noise)[sensor].T ** 2
-    sight = data.rows.target - data.reference[sensor, :3, 3]
-    sight /= np.linalg.norm(sight, axis=1)[:, None]
-    covariance = across[:, None, None] * np.eye(3)
-    covariance += (along - across)[:, None, None] * sight[:, :, None] * sight[:, None, :]
+    covariance = noise_covariance(data, solution)
     errors = left.copy()
     for index, part in enumerate(parts):
         mine = stretch == index

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.families import FAMILIES
+from remaster_ros.discovery.families import FAMILIES, WHOLE
 from remaster_ros.discovery.solution import Solution
 
 # Families join one after another: this often at most.
@@ -52,6 +52,40 @@ def named_instead(
     if better is not None and better.log_evidence > solution.log_evidence + least:
         return better
     return solution
+
+
+def regrown(
+    solution: Solution,
+    with_all: Callable[[Solution, tuple[str, ...]], Solution | None],
+    prune: Callable[[Solution], Solution],
+) -> Solution:
+    """Return the best solution with a whole family anew, and one other family beside it.
+
+    Members of two families imitate each other, lengths of links the compliance of a joint: which
+    of them a family had when it joined was chosen without what was found since, and what is
+    missing gains nothing beside the wrong ones.
+
+    Parameters
+    ----------
+    solution
+        What the search found; where it has no whole family of few parameters, nothing is tried.
+    with_all
+        Adds to a solution all members of these effects; None for nothing.
+    prune
+        Drops what does not raise the evidence.
+    """
+    whole = tuple(
+        name
+        for family in FAMILIES
+        if sum(cell.name in family and cell.penalty is None for cell in solution.cells) >= WHOLE
+        for name in family
+    )
+    best = solution
+    for family in FAMILIES if whole else ():
+        larger = with_all(solution, tuple(dict.fromkeys((*whole, *family))))
+        if larger is not None:
+            best = max(best, prune(larger), key=lambda one: one.log_evidence)
+    return best
 
 
 def _has_a_name(cell: Cell) -> bool:

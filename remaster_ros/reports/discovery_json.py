@@ -37,7 +37,7 @@ LEAST_P_VALUE = 1.0 / (1.0 + DRAWS)
 def predictions_of(discovery: Discovery) -> Predictions:
     """Return where the final model predicts every row of the session."""
     measurements = discovery.residuals.context.measurements
-    return predict(discovery.fit, measurements, discovery.stretches.widening)
+    return predict(discovery.fit, measurements, discovery.widening)
 
 
 def discovery_content(
@@ -88,6 +88,12 @@ def discovery_content(
             'ratio': stretches.ratio,
             'p_value': stretches.p_value,
             'widened': stretches.widened,
+        }
+    if discovery.repeated is not None:
+        content['repeated_search'] = {
+            'count': discovery.repeated.count,
+            'same': discovery.repeated.same,
+            'widening': discovery.repeated.widening,
         }
     if discovery.thinning is not None:
         content['rows_searched'] = discovery.thinning

@@ -198,6 +198,18 @@ class Stretches(Struct):
     widened: bool
 
 
+class RepeatedSearch(Struct):
+    """What ``count`` searches found that each did without some of the poses.
+
+    ``same`` of them found the same causes; ``widening`` is the factor by which regions hold the
+    poses left out. The standard deviations contain how far the searches differ.
+    """
+
+    count: int
+    same: int
+    widening: float
+
+
 class JointCovariance(Struct):
     """Covariance of the zero-offsets that are identifiable and of all of the causes' parameters.
 
@@ -242,6 +254,7 @@ class Discovered(Struct):
     least_p_value: float | UnsetType = UNSET
     predicted_regions95: PredictedRegions | UnsetType = UNSET
     stretches: Stretches | UnsetType = UNSET
+    repeated_search: RepeatedSearch | UnsetType = UNSET
     rows_searched: SearchedRows | UnsetType = UNSET
     confirmation: Confirmed | UnsetType = UNSET
     decided: list[Decided] | UnsetType = UNSET

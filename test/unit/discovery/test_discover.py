@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from calibration_scenes import CHAIN
 from discovery_scenes import at_joint, residuals_of, session_with
+from scipy.stats import multivariate_normal
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise import NoiseModel
@@ -306,7 +307,7 @@ def test_p_values_are_uniform_where_nothing_is():
     assert np.max(-below) < 0.31
 
 
-def test_held_out_error_is_that_of_fits_without_the_pose():
+def test_held_out_error_and_deviance_are_those_of_fits_without_the_pose():
     data = residuals()
     cell = cells_named('joint_compliance')[1]
     fit = solve(data, (cell,))
@@ -322,5 +323,14 @@ def test_held_out_error_is_that_of_fits_without_the_pose():
     kept = white[~out].reshape(-1, white.shape[2])
     beta = np.linalg.lstsq(kept[:, :-1], kept[:, -1], rcond=None)[0]
     left = white[out].reshape(-1, white.shape[2])
-    expected = np.sum((left[:, -1] - left[:, :-1] @ beta) ** 2)
-    assert by_pose[pose] == pytest.approx(expected, rel=1e-4)
+    errors = left[:, -1] - left[:, :-1] @ beta
+    assert by_pose[pose] == pytest.approx(np.sum(errors**2), rel=1e-4)
+    scale = np.linalg.norm(kept[:, :-1], axis=0)
+    spread = left[:, :-1] / scale @ np.linalg.inv(np.linalg.qr(kept[:, :-1] / scale, mode='r'))
+    expected = 0.0
+    for first in range(0, len(left), 3):
+        row = slice(first, first + 3)
+        variance = np.eye(3) + spread[row] @ spread[row].T
+        density = multivariate_normal(cov=variance).logpdf(errors[row])
+        expected -= 2.0 * density + 3.0 * np.log(2.0 * np.pi)
+    assert left_out.deviance(fit)[pose] == pytest.approx(expected, rel=1e-4)

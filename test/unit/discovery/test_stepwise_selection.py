@@ -12,7 +12,7 @@ from discovery_scenes import residuals_of, session_with
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.stepwise_selection import HYSTERESIS, LEAST_GAIN, Search
-from remaster_ros.discovery.substitutes import named_instead
+from remaster_ros.discovery.substitutes import named_instead, regrown
 from remaster_ros.simulation.session_simulator import simulate_session
 from remaster_ros.types import FloatArray, Session
 
@@ -93,3 +93,26 @@ def test_a_field_gives_way_to_named_causes_that_together_explain_more_and_stays_
         assert found.log_evidence > begun.log_evidence
         assert {cell.name for cell in found.cells} == {'joint_error_curve'}
         assert {2, 4, 6} <= {cell.joints[0] for cell in found.cells}
+
+
+def wound_up(session: Session) -> FloatArray:
+    """Joint 2 turns by up to 0.1 degrees under what it carries."""
+    context = residuals_of(session).context
+    torque = next(
+        cell.columns(context).values[:, 0]
+        for cell in EFFECTS['joint_compliance'].cells(context)
+        if cell.joints == (2,)
+    )
+    angles = np.zeros_like(session.measurements.q)
+    angles[:, 1] = np.radians(0.1) * torque / np.abs(torque).max()
+    return angles
+
+
+def test_a_family_that_stands_in_for_a_member_of_another_gives_way_to_it():
+    search = searching(residuals_of(session_with(6, angles=wound_up)))
+    begun = search.with_all(search.fit(()), ('link_length', 'joint_axis_tilt'))
+    few = replace(begun, cells=begun.cells[:2])
+    assert regrown(few, search.with_all, search.prune) is few
+    found = regrown(begun, search.with_all, search.prune)
+    assert search.prune(begun).log_evidence < found.log_evidence - 10.0
+    assert [(cell.name, cell.joints) for cell in found.cells] == [('joint_compliance', (2,))]
