@@ -331,7 +331,7 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
     causes = [EFFECTS[group[0].name].is_cause for group in groups]
     effects = tuple(itertools.compress(described, causes))
     structure = tuple(effect for effect, cause in zip(described, causes, strict=True) if not cause)
-    aside = set_aside(residuals, selection.solution)
+    aside = set_aside(residuals, selection.solution, search.fit)
     if aside is not None:
         selection = replace(selection, solution=aside.solution)
         structure = aside.said(structure)

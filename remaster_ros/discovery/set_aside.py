@@ -16,7 +16,7 @@ parametric covariance of the errors).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +24,6 @@ import numpy as np
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.guard import MOST_HARM
 from remaster_ros.discovery.memory import DRAWS, Memory, draws_of
@@ -84,13 +83,25 @@ class SetAside:
         )
 
 
-def set_aside(data: Residuals, solution: Solution) -> SetAside | None:
-    """Return a solution less its wander where that may do harm; None where nothing changes."""
+def set_aside(
+    data: Residuals,
+    solution: Solution,
+    fit: Callable[[Sequence[Cell], Solution], Solution | None],
+) -> SetAside | None:
+    """Return a solution less its wander where that may do harm; None where nothing changes.
+
+    Parameters
+    ----------
+    data, solution
+        What the search worked on and found.
+    fit
+        Fits a set of cells, as the search does.
+    """
     sensors = remembering(data, solution)
     rest = tuple(cell for cell in solution.cells if not is_memory(cell))
     if not sensors:
         return None
-    without = solve(data, rest, solution)
+    without = fit(rest, solution)
     if without is None:
         return None
     memory = Memory.of(data, without, sensors)

@@ -6,7 +6,8 @@ raise the evidence.
 The proposal of the highest evidence that passes two tests joins: its p-value over all cells
 tried, and its gain on poses left out in turn. After each round, cells that no longer raise the
 evidence are dropped, and each is swapped for what explains more in its place, because the first
-step acts on a mixture of causes.
+step acts on a mixture of causes. When nothing passes any more, families that imitate each other
+are chosen anew, and the rounds go on from there.
 """
 
 from __future__ import annotations

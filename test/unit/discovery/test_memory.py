@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import pytest
@@ -105,7 +105,7 @@ def test_a_short_memory_is_set_aside(scene):
     rng = np.random.default_rng(3)
     data = scene.with_errors(scene.memory(2.8, 1.5 * NOISE_M).draw(1, rng)[:, :, 0])
     solution = solved(data, scene.wander['fast'])
-    aside = set_aside(data, solution)
+    aside = set_aside(data, solution, partial(solve, data))
     assert aside is not None
     assert aside.searched is solution
     assert not any(is_memory(cell) for cell in aside.solution.cells)
@@ -137,7 +137,7 @@ def test_without_a_wander_nothing_changes(scene):
     solution = solved(data)
     search = Search(data, (), np.random.default_rng(0), lambda data, _: data, lambda _: None)
     before = search.rng.bit_generator.state
-    assert set_aside(data, solution) is None
+    assert set_aside(data, solution, search.fit) is None
     assert withstanding_memory(search, solution) is solution
     assert search.rng.bit_generator.state == before
 
