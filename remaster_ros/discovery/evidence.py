@@ -34,8 +34,8 @@ from remaster_ros.types import FloatArray
 ABSORBED = 1e-4
 # Of the noise and smoothness coordinates, which are logarithms.
 STEPS = 60
-# Where the slope in these units falls below this, L is within its square of the maximum.
-SLOPE = 0.1
+# Where Newton's step is to raise L by less than half of this, it is at its maximum.
+GAIN = 0.02
 # Longest step, of these logarithms.
 STRIDE = 2.0
 # Step that no longer raises L by more than rounding.
@@ -270,14 +270,12 @@ class _System:
 
     def _most_likely(self, eta: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
         """Return the noise and smoothness, as logarithms, that maximise L."""
-        # In units of about their own standard deviations: L has a curvature near 1 everywhere.
-        unit = self._curvature() ** -0.5
         value, slope, information = self.evaluate(eta)
         for _ in range(STEPS):
             free = np.where(slope > 0.0, eta < high, eta > low)
-            if np.max(np.abs(unit * slope)[free], initial=0.0) < SLOPE:
-                break
             step = _step(slope[free], information[np.ix_(free, free)])
+            if step @ slope[free] < GAIN:
+                break
             while True:
                 trial = eta.copy()
                 trial[free] = np.clip(eta[free] + step, low[free], high[free])
@@ -312,14 +310,6 @@ class _System:
             value += 0.5 * np.sum(np.log(factor * spectrum + ridge))
             value -= 0.5 * factor * beta[where] @ penalty @ beta[where]
         return float(value)
-
-    def _curvature(self) -> FloatArray:
-        """Return about what the second derivatives of −L by eta are."""
-        count = len(self.model.channels)
-        noise = (self.entering > 0.0) @ self.model.freedom
-        noise *= np.where(np.arange(len(noise)) < count, 2.0, 0.5)
-        smooth = [len(penalty) / 6.0 for penalty in self.penalties]
-        return np.concatenate((noise, smooth))
 
     def _start(self, start: Solution | None) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return where the search for noise and smoothness begins, and its bounds."""
