@@ -78,36 +78,33 @@ class LeftOut:
         parts = [white[mine] for mine in rows]
         return cls(data, tuple(cells), scale, rows, parts, [part.T @ part for part in parts])
 
-    def errors(self, solution: Solution) -> FloatArray:
-        """Return each pose's squared error by the fit of some of the cells, in units of the noise.
+    def of_poses(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
+        """Return how well poses are predicted by the fit of some of the cells to the others.
 
         Parameters
         ----------
         solution
             Which cells, with which smoothness.
-        """
-        errors, _ = self._predicted(solution)
-        return self._by_pose(np.sum(errors**2, axis=1))
 
-    def deviance(self, solution: Solution) -> FloatArray:
-        """Return −2 log of the density of each pose by the fit of some of the cells.
-
-        Without the constants, which are those of the noise. In units of what is uncertain of its
-        prediction, a pose that is far from all others does not decide between two sets of cells,
-        as it does by its squared error (Gelman, Hwang & Vehtari 2014, Stat. Comput. 24, 997).
-
-        Parameters
-        ----------
-        solution
-            As in `errors`.
+        Returns
+        -------
+        squares
+            Squared error of each pose, in units of the noise, (poses,).
+        deviance
+            −2 log of its density, without the constants, which are those of the noise. In units of
+            what is uncertain of its prediction, a pose that is far from all others does not decide
+            between two sets of cells, as it does by its squared error (Gelman, Hwang & Vehtari
+            2014, Stat. Comput. 24, 997), (poses,).
         """
         errors, variance = self._predicted(solution)
         scaled = np.linalg.solve(variance, errors[:, :, None])[:, :, 0]
-        return self._by_pose(np.sum(errors * scaled, axis=1) + np.linalg.slogdet(variance)[1])
-
-    def _by_pose(self, by_row: FloatArray) -> FloatArray:
-        by_pose: FloatArray = np.bincount(self.data.pose_of_row, by_row).astype(float)
-        return by_pose
+        deviance = np.sum(errors * scaled, axis=1) + np.linalg.slogdet(variance)[1]
+        pose = self.data.pose_of_row
+        squares, deviances = (
+            np.bincount(pose, by_row).astype(float)
+            for by_row in (np.sum(errors**2, axis=1), deviance)
+        )
+        return squares, deviances
 
     def _predicted(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
         """Return the error of each row by the fit to others, (n, 3), and its variance."""

@@ -37,6 +37,7 @@ from remaster_ros.discovery.screening import Catalogue, Screening, screen
 from remaster_ros.discovery.selection import Selection, Step
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.substitutes import named_instead, regrown
+from remaster_ros.types import FloatArray
 
 # Family-wise error of one round.
 SIGNIFICANCE = 0.01
@@ -51,6 +52,8 @@ FOLDS = 10
 LEAST_GAIN = 0.01
 # With noise and smoothness as they are: a cause that saves this share predicts.
 NEEDED = 0.1
+# By so much the squared error of poses left out differs between draws of the folds.
+CHANCE = 0.1
 # The evidence must rise by this for an exchange: equals are not exchanged again and again.
 HYSTERESIS = 0.5
 MOST_EXCHANGED = 6
@@ -105,7 +108,7 @@ class Search:
         self.catalogue = Catalogue.of(data, self.cells)
         self._fold_of_pose = self.rng.permutation(data.poses) % min(FOLDS, data.poses)
         # The larger set is compared with many smaller ones in turn.
-        self._last_held_out: tuple[Solution, LeftOut, float] | None = None
+        self._last_held_out: tuple[Solution, LeftOut, FloatArray] | None = None
 
     def run(self, given: Solution | None = None) -> Selection:
         """Search until nothing passes both tests."""
@@ -370,14 +373,18 @@ class Search:
         return sorted(found, key=lambda fit: -fit.log_evidence)
 
     def held_out_share(self, smaller: Solution, larger: Solution) -> float:
-        """Return the share of the deviance of poses left out that the larger set saves."""
+        """Return the share of the deviance of poses left out that the larger set saves.
+
+        Less than nothing where it makes their squared error larger by more than chance does.
+        """
         last = self._last_held_out
         if last is None or last[0] is not larger or not set(smaller.cells) <= set(last[1].cells):
             cells = tuple(dict.fromkeys((*larger.cells, *smaller.cells)))
             left_out = LeftOut.of(self.data, cells, larger.noise, self._fold_of_pose)
-            last = larger, left_out, float(left_out.deviance(larger).sum())
+            last = larger, left_out, np.sum(left_out.of_poses(larger), axis=1)
             self._last_held_out = last
-        return float(1.0 - last[2] / last[1].deviance(smaller).sum())
+        squares, deviance = 1.0 - last[2] / np.sum(last[1].of_poses(smaller), axis=1)
+        return float(min(deviance, squares + CHANCE))
 
 
 def _least_share(solution: Solution, candidate: Solution) -> float:

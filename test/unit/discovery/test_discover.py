@@ -315,7 +315,7 @@ def test_held_out_error_and_deviance_are_those_of_fits_without_the_pose():
     folds = np.arange(data.poses)
     others = cells_named('joint_compliance')[2:4]
     left_out = LeftOut.of(data, (*others, cell), fit.noise, folds)
-    by_pose = left_out.errors(fit)
+    squares, deviance = left_out.of_poses(fit)
     pose = 4
     columns = np.concatenate((data.base, data.columns([cell]), data.errors[:, :, None]), axis=2)
     white = data.noise_model.whitened(columns, fit.noise)
@@ -324,7 +324,7 @@ def test_held_out_error_and_deviance_are_those_of_fits_without_the_pose():
     beta = np.linalg.lstsq(kept[:, :-1], kept[:, -1], rcond=None)[0]
     left = white[out].reshape(-1, white.shape[2])
     errors = left[:, -1] - left[:, :-1] @ beta
-    assert by_pose[pose] == pytest.approx(np.sum(errors**2), rel=1e-4)
+    assert squares[pose] == pytest.approx(np.sum(errors**2), rel=1e-4)
     scale = np.linalg.norm(kept[:, :-1], axis=0)
     spread = left[:, :-1] / scale @ np.linalg.inv(np.linalg.qr(kept[:, :-1] / scale, mode='r'))
     expected = 0.0
@@ -333,4 +333,4 @@ def test_held_out_error_and_deviance_are_those_of_fits_without_the_pose():
         variance = np.eye(3) + spread[row] @ spread[row].T
         density = multivariate_normal(cov=variance).logpdf(errors[row])
         expected -= 2.0 * density + 3.0 * np.log(2.0 * np.pi)
-    assert left_out.deviance(fit)[pose] == pytest.approx(expected, rel=1e-4)
+    assert deviance[pose] == pytest.approx(expected, rel=1e-4)
