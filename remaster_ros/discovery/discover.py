@@ -33,6 +33,7 @@ from remaster_ros.discovery.gain import (
 )
 from remaster_ros.discovery.guard import Unexplained, harm_of, held, is_harmful, unfitted
 from remaster_ros.discovery.marker_offsets import held_markers, loosened, moved_markers
+from remaster_ros.discovery.model_averaging import moved_by_look_alikes
 from remaster_ros.discovery.omnibus import structure_left
 from remaster_ros.discovery.plain_forms import plainest
 from remaster_ros.discovery.repeated_search import RepeatedSearch, repeat_search
@@ -46,7 +47,7 @@ from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
 from remaster_ros.discovery.to_extension import extension_of
 from remaster_ros.discovery.undetected import Undetected, undetected
 from remaster_ros.errors import InsufficientDataError
-from remaster_ros.types import BoolArray, FloatArray, IntArray, Priors, Session
+from remaster_ros.types import FloatArray, IntArray, Priors, Session
 
 Verdict = Literal['effects', 'none', 'undetermined', 'unexplained']
 # Of the means, in standard deviations: 400 effective draws, enough for values of two figures.
@@ -273,12 +274,13 @@ def _sampled(
 
     Priors are those that let moved markers go, where none are given.
     """
-    residuals, solution = findings.residuals, findings.selection.solution
-    stretches = compare_stretches(findings.found, residuals, solution)
-    missed = undetected(findings.found, residuals, solution)
-    unmodelled = [missed.moves, stretches.moves]
+    residuals, solution, found = findings.residuals, findings.selection.solution, findings.found
+    stretches = compare_stretches(found, residuals, solution)
+    missed = undetected(found, residuals, solution)
+    alike = moved_by_look_alikes(found, residuals, solution, findings.effects, findings.groups)
+    unmodelled = [missed.moves, stretches.moves, alike]
     if (aside := findings.aside) is not None:
-        unmodelled.append(moved_by_memory(findings.found, residuals, solution, aside.memory))
+        unmodelled.append(moved_by_memory(found, residuals, solution, aside.memory))
     if findings.repeated is not None:
         unmodelled.append(findings.repeated.moves)
     fit = fit_session(
@@ -385,12 +387,8 @@ def _judged(
     problem = found.problem
     every = residuals.only(pool)
     left = every.left(solution)
-
-    def refit(keep: BoolArray) -> FloatArray:
-        return left
-
     try:
-        gross = find_outliers(every.rows, refit, left, problem.sensor_names).gross
+        gross = find_outliers(every.rows, lambda keep: left, left, problem.sensor_names).gross
     except InsufficientDataError:
         # What is left has long tails: no reason to set a tenth of the rows aside.
         return residuals

@@ -30,6 +30,7 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stepwise_selection import Search
 from remaster_ros.discovery.stretches import noise_covariance
+from remaster_ros.discovery.undetected import natural_parameters
 from remaster_ros.types import FloatArray
 
 GROUPS = 5
@@ -104,7 +105,7 @@ def repeat_search(
         )
         without = again.run().solution
         errors[mine] = kept.unexplained(without)[data.rows.source[mine]]
-        parameters.append(_parameters(found, data, solution, without))
+        parameters.append(natural_parameters(found, data, solution, without))
         same += _causes(without) == _causes(solution)
     distances = squared_distances(errors, row_covariance(data, solution))
     widening = float(np.sqrt(np.quantile(distances, REGION) / chi2.ppf(REGION, 3)))
@@ -124,24 +125,3 @@ def row_covariance(data: Residuals, solution: Solution) -> FloatArray:
     by_parameters = columns @ solution.full_covariance @ np.swapaxes(columns, 1, 2)
     total: FloatArray = by_parameters + noise_covariance(data, solution)
     return total
-
-
-def _parameters(
-    found: Estimate, data: Residuals, solution: Solution, without: Solution
-) -> FloatArray:
-    """Return the natural parameters of the fit, and those of the solution's cells, (size + m,).
-
-    Of the former the steps from the fit that the search began with; zeros where the gauge holds.
-    """
-    free, size = found.posterior.free, found.model.size
-    values = np.zeros(size + len(solution.parameters))
-    columns = data.full_jacobian[data.rows.source][:, :, free].reshape(-1, len(free))
-    scale = np.linalg.norm(columns, axis=0)
-    scale[scale == 0.0] = 1.0
-    step = (data.base @ without.base).ravel()
-    values[free] = np.linalg.lstsq(columns / scale, step, rcond=None)[0] / scale
-    found_again = dict(zip(without.cells, without.slices(), strict=True))
-    for cell, where in zip(solution.cells, solution.slices(), strict=True):
-        if cell in found_again:
-            values[size:][where] = without.parameters[found_again[cell]]
-    return values

@@ -152,6 +152,39 @@ def fitted_columns(
     return columns, precision, np.concatenate((free, size + np.arange(own.shape[2])))
 
 
+def natural_parameters(
+    found: Estimate, data: Residuals, solution: Solution, other: Solution
+) -> FloatArray:
+    """Return the parameters of another set of cells, as those of a solution, (size + m,).
+
+    Parameters
+    ----------
+    found, data, solution
+        As in `undetected`.
+    other
+        The other set, fitted to the same rows.
+
+    Returns
+    -------
+    ndarray
+        Steps of the natural parameters of the fit from where the search began, zeros where the
+        gauge holds; and the parameters of the solution's m cells, 0 of those that the other set
+        does not have.
+    """
+    free, size = found.posterior.free, found.model.size
+    values = np.zeros(size + len(solution.parameters))
+    columns = data.full_jacobian[data.rows.source][:, :, free].reshape(-1, len(free))
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0.0] = 1.0
+    step = (data.base @ other.base).ravel()
+    values[free] = np.linalg.lstsq(columns / scale, step, rcond=None)[0] / scale
+    found_again = dict(zip(other.cells, other.slices(), strict=True))
+    for cell, where in zip(solution.cells, solution.slices(), strict=True):
+        if cell in found_again:
+            values[size:][where] = other.parameters[found_again[cell]]
+    return values
+
+
 def _response(known: FloatArray, precision: FloatArray, unknown: FloatArray) -> FloatArray:
     """Return how the parameters of the known columns move for a unit of each unknown one."""
     gram = known.T @ known + precision

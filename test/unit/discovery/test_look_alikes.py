@@ -6,23 +6,31 @@ from functools import cache
 import numpy as np
 from discovery_scenes import at_joint, residuals_of, session_with
 
+from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.discovery import discover
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import Solution, solve
-from remaster_ros.discovery.explain import TIED, describe
+from remaster_ros.discovery.explain import TIED, LookAlike, describe
+from remaster_ros.discovery.model_averaging import moved_by_look_alikes
 from remaster_ros.discovery.plain_forms import is_special_case, plainest
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.selection import Selection, Step
+from remaster_ros.types import Session
 
 ARC_MINUTE = np.radians(1.0 / 60.0)
+
+
+def wavy(seed: int) -> Session:
+    """Return a session with an eccentric encoder of joint 2."""
+    return session_with(
+        seed, lambda s: at_joint(2, 3 * ARC_MINUTE * np.sin(s.measurements.q[:, 1]))
+    )
 
 
 @cache
 def eccentric() -> Residuals:
     """Return what an eccentric encoder of joint 2 leaves."""
-    return residuals_of(
-        session_with(41, lambda s: at_joint(2, 3 * ARC_MINUTE * np.sin(s.measurements.q[:, 1])))
-    )
+    return residuals_of(wavy(41))
 
 
 def cells_of(data: Residuals, name: str, *joints: int):
@@ -108,3 +116,30 @@ def test_the_largest_cause_is_in_doubt_also_where_held_out_poses_gain_nothing(mo
     monkeypatch.setattr(discover, 'find_causes', tied)
     found = discover.discover_session(session, rng=np.random.default_rng(0))
     assert found.verdict == 'undetermined'
+
+
+def test_a_look_alike_widens_the_posterior_by_how_likely_it_is():
+    session = session_with(
+        42, lambda s: at_joint(2, 3 * ARC_MINUTE * np.sin(s.measurements.q[:, 1]))
+    )
+    found = estimate(Problem.of(session))
+    data = Residuals.of(found)
+    selection = selected(data, cells_of(data, 'encoder_eccentricity', 2)[:1])
+    solution = selection.solution
+    groups, (effect,) = describe(data, selection, solution.cells, lambda share: None)
+    assert effect.confusable_with == ()
+    gain = effect.log_evidence_gain
+    alike = LookAlike('joint_compliance', (3,), gain - 1.0, '')
+    others = (replace(alike, same=True), replace(alike, general=True))
+    either = replace(effect, confusable_with=(alike, *others))
+    none = replace(effect, confusable_with=others)
+    assert moved_by_look_alikes(found, data, solution, [none], groups).shape[1] == 0
+    moves = moved_by_look_alikes(found, data, solution, [either], groups)
+    weight = 1.0 / (1.0 + np.e)
+    own = slice(found.model.size, None)
+    np.testing.assert_allclose(moves[own, 0], -np.sqrt(weight) * solution.parameters, rtol=1e-9)
+    # The zero-offsets of the other set are others, by what its own cell does not take.
+    other = fitted(data, cells_of(data, 'joint_compliance', 3))
+    columns = data.full_jacobian[data.rows.source] @ moves[: found.model.size, 0]
+    expected = np.sqrt(weight) * data.base @ (other.base - solution.base)
+    np.testing.assert_allclose(columns, expected, atol=1e-3 * np.abs(expected).max())
