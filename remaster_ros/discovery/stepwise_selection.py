@@ -131,7 +131,7 @@ class Search:
                 gain = anew.log_evidence - solution.log_evidence
                 if gain <= HYSTERESIS or self.held_out_share(solution, anew) < 0.0:
                     break
-                solution = self.backward_elimination(self.drop_unpredictive(anew))
+                solution = self.backward_elimination(self.drop_unpredictive(anew), solution)
                 continue
             steps.append(step)
             solution = self.swap(self.prune(candidate))
@@ -316,11 +316,12 @@ class Search:
                 solution = without
         return solution
 
-    def backward_elimination(self, solution: Solution) -> Solution:
+    def backward_elimination(self, solution: Solution, given: Solution | None = None) -> Solution:
         """Drop, the weakest first, the members of families that fail the tests by themselves.
 
         A family passes its tests as a whole. Each member has still to raise the evidence, to
-        predict poses left out, and to beat itself on surrogate residuals.
+        predict poses left out, and to beat itself on surrogate residuals. So has what joined a
+        given solution without relatives, which has to beat all cells.
         """
         price = np.log(3.0 * len(self.data))
         tested: set[Cell] = set()
@@ -331,7 +332,7 @@ class Search:
                     zip(solution.cells, solution.slices(), strict=True)
                 )
                 if cell not in tested
-                and relatives(solution.cells, cell) > 1
+                and (relatives(solution.cells, cell) > 1 or cell not in (given or solution).cells)
                 and (worth := worth_of(solution, cell, where, price)) < BEYOND_DOUBT
             ]
             if not weak:
@@ -350,10 +351,13 @@ class Search:
         if self.held_out_share(without, solution) <= 0.0:
             return False
         own = np.array([other.key == cell.key for other in self.catalogue.cells])
+        chosen, limit = own, SIGNIFICANCE_OF_ONE
+        if relatives(solution.cells, cell) == 1:
+            chosen, limit = np.ones_like(own), SIGNIFICANCE
         screening = screen(
-            self.data, self.catalogue, without, rng=self.rng, draws=DRAWS_OF_ONE, chosen=own
+            self.data, self.catalogue, without, rng=self.rng, draws=DRAWS_OF_ONE, chosen=chosen
         )
-        return screening.p_value(float(screening.score[own][0])) <= SIGNIFICANCE_OF_ONE
+        return screening.p_value(float(screening.score[own][0])) <= limit
 
     def replacements(self, solution: Solution, cells: set[Cell], count: int) -> list[Solution]:
         """Return fits with the best other cells in the place of these, best first."""
