@@ -321,7 +321,7 @@ class Search:
 
         A family passes its tests as a whole. Each member has still to raise the evidence, to
         predict poses left out, and to beat itself on surrogate residuals. So has what joined a
-        given solution without relatives, which has to beat all cells.
+        given solution without relatives.
         """
         price = np.log(3.0 * len(self.data))
         tested: set[Cell] = set()
@@ -351,13 +351,10 @@ class Search:
         if self.held_out_share(without, solution) <= 0.0:
             return False
         own = np.array([other.key == cell.key for other in self.catalogue.cells])
-        chosen, limit = own, SIGNIFICANCE_OF_ONE
-        if relatives(solution.cells, cell) == 1:
-            chosen, limit = np.ones_like(own), SIGNIFICANCE
         screening = screen(
-            self.data, self.catalogue, without, rng=self.rng, draws=DRAWS_OF_ONE, chosen=chosen
+            self.data, self.catalogue, without, rng=self.rng, draws=DRAWS_OF_ONE, chosen=own
         )
-        return screening.p_value(float(screening.score[own][0])) <= limit
+        return screening.p_value(float(screening.score[own][0])) <= SIGNIFICANCE_OF_ONE
 
     def replacements(self, solution: Solution, cells: set[Cell], count: int) -> list[Solution]:
         """Return fits with the best other cells in the place of these, best first."""
