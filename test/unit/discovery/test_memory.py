@@ -9,6 +9,9 @@ from functools import cached_property, partial
 import numpy as np
 import pytest
 from discovery_scenes import session_with
+
+pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
+
 from hidden_sessions import Recipe, hidden_session
 
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
