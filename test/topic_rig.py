@@ -1,5 +1,7 @@
 """A collection whose sensors are topics of nodes of other packages: no heartbeat, real DDS."""
 
+from collections import defaultdict
+
 import numpy as np
 from collection_rig import Cell
 from foreign_source import SIGMA_RAD, orientation
@@ -109,15 +111,16 @@ class Collection:
         cell = self.cell
         self.until(lambda: cell.recorder('exit_status') == 'complete', 'the end', 300)
         session = read_session(cell.session)
-        cell.check(session)
-        partial = {
-            (e.stamp, e.solution)
-            for e in cell.events
-            if isinstance(e, ConfigurationEnded)
-            and e.result == 'partial'
-            and e.reason != 'recorded before'
-        }
-        assert 2 * cell.planned() - len(session.measurements) == len(partial)
+        ended = defaultdict(set)
+        for event in cell.events:
+            if isinstance(event, ConfigurationEnded) and event.reason != 'recorded before':
+                ended[event.result].add((event.stamp, event.solution))
+        partial = ended['partial'] - ended['recorded']
+        # On a busy machine a fault of one sensor meets a late reading of the other.
+        rejected = ended['rejected'] - ended['recorded'] - partial
+        cell.check(session, len(rejected))
+        missing = 2 * cell.planned() - len(session.measurements)
+        assert missing == len(partial) + 2 * len(rejected), cell.events
         found = fit(session)
         error = np.abs(found.joint_offsets - cell.world.truth.joint_offsets)[found.identifiable]
         assert len(error) == 5
