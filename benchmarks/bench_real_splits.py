@@ -25,8 +25,6 @@ from __future__ import annotations
 import argparse
 import json
 import resource
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -34,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import ROOT, known, table
+from common import ROOT, each_in_its_process, table
 from hidden_third import HARM, predicted_by_offsets, predictions_elsewhere
 from scipy.cluster.vq import kmeans2
 
@@ -370,24 +368,12 @@ def main() -> None:
         whole_file = args.results.with_suffix(f'.{part.data}.npz')
         print(json.dumps(one(part, whole_file)))
         return
-    lines = known(args.results)
     wanted = [name for name in todo if name.startswith(tuple(args.only) or '')]
-    for name in () if args.report else wanted:
-        if name in lines:
-            continue
-        command = [sys.executable, __file__, '--run', name, '--limit', str(args.limit)]
-        command += ['--results', str(args.results)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode == 0:
-            line = json.loads(done.stdout)
-        elif done.returncode < 0:
-            line = {'name': name, 'error': f'not ended after {args.limit} s of CPU'}
-        else:
-            line = {'name': name, 'error': done.stderr.strip().splitlines()[-1]}
-        lines[name] = line
-        with args.results.open('a', encoding='utf-8') as file:
-            file.write(json.dumps(line) + '\n')
-        print(f'{name}: {line.get("error") or line["verdict"]}', flush=True)
+    commands = {
+        name: (__file__, '--run', name, '--results', str(args.results))
+        for name in (() if args.report else wanted)
+    }
+    lines = each_in_its_process(args.results, commands, args.limit)
     print(table(HEADER, [row_of(lines[name]) for name in wanted if name in lines]))
 
 

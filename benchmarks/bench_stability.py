@@ -15,13 +15,11 @@ from __future__ import annotations
 import argparse
 import json
 import resource
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import ROOT, known, table
+from common import ROOT, each_in_its_process, table
 
 from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.session.reader import read_session
@@ -157,25 +155,12 @@ def main() -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (args.limit, args.limit))
         print(json.dumps(one(args.folders[0], args.run)))
         return
-    lines = known(args.results)
-    for folder in () if args.report else args.folders:
-        for run in range(RUNS + 1):
-            name = f'{folder.name}-{run}'
-            if name in lines:
-                continue
-            command = [sys.executable, __file__, str(folder), '--run', str(run)]
-            command += ['--limit', str(args.limit)]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            if done.returncode == 0:
-                line = json.loads(done.stdout)
-            elif done.returncode < 0:
-                line = {'name': name, 'error': f'not ended after {args.limit} s of CPU'}
-            else:
-                line = {'name': name, 'error': done.stderr.strip().splitlines()[-1]}
-            lines[name] = line
-            with args.results.open('a', encoding='utf-8') as file:
-                file.write(json.dumps(line) + '\n')
-            print(f'{name}: {line.get("error") or line["verdict"]}', flush=True)
+    commands = {
+        f'{folder.name}-{run}': (__file__, str(folder), '--run', str(run))
+        for folder in (() if args.report else args.folders)
+        for run in range(RUNS + 1)
+    }
+    lines = each_in_its_process(args.results, commands, args.limit)
     header = (
         'session',
         'main causes',

@@ -24,9 +24,10 @@ sys.path.insert(0, str(ROOT / 'test'))
 from hidden_tours import world  # noqa: E402
 from hidden_world import Noise  # noqa: E402
 
-from remaster_ros.discovery.discover import Findings, find_causes  # noqa: E402
+from remaster_ros.discovery.discover import find_causes  # noqa: E402
 from remaster_ros.discovery.effects.base import Cell  # noqa: E402
 from remaster_ros.discovery.effects.registry import EFFECTS  # noqa: E402
+from remaster_ros.discovery.findings import Findings  # noqa: E402
 from remaster_ros.discovery.residuals import Residuals  # noqa: E402
 from remaster_ros.simulation.hidden_effect import HiddenEffect  # noqa: E402
 

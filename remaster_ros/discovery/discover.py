@@ -24,6 +24,7 @@ from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.explain import FoundEffect, describe
+from remaster_ros.discovery.findings import Findings
 from remaster_ros.discovery.gain import (
     Gain,
     gain_of,
@@ -39,7 +40,10 @@ from remaster_ros.discovery.plain_forms import plainest
 from remaster_ros.discovery.repeated_search import RepeatedSearch, repeat_search
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.selection import Selection
-from remaster_ros.discovery.set_aside import SetAside, moved_by_memory, set_aside
+from remaster_ros.discovery.set_aside import (
+    moved_by_memory,
+    set_aside,
+)
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stepwise_selection import Search
 from remaster_ros.discovery.stretches import Stretches, compare_stretches
@@ -215,51 +219,6 @@ def discover_session(
         unexplained=unexplained,
         repeated=findings.repeated,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Findings:
-    """What is found before anything is sampled; fields as in `Discovery`.
-
-    ``before`` is the fit of the session as it is, without any effect, ``found`` the one that the
-    search began with (its priors let moved markers go where they are), ``structure`` what the
-    search located without a cause, ``aside`` the part of that which is not in the model.
-    """
-
-    before: Estimate
-    found: Estimate
-    residuals: Residuals
-    selection: Selection
-    groups: tuple[tuple[Cell, ...], ...]
-    effects: tuple[FoundEffect, ...]
-    structure: tuple[FoundEffect, ...]
-    untestable: Mapping[str, str]
-    thinning: Thinning | None
-    aside: SetAside | None
-    repeated: RepeatedSearch | None
-
-    @property
-    def searched(self) -> Solution:
-        """The solution with all that the search located."""
-        return self.selection.solution if self.aside is None else self.aside.searched
-
-    def without_causes(self) -> Findings:
-        """Return the same as if the search had found nothing."""
-        residuals = Residuals.of(self.before)
-        empty = solve(residuals, ())
-        assert empty is not None
-        return replace(
-            self,
-            found=self.before,
-            residuals=residuals,
-            selection=Selection(empty, empty, (), None),
-            groups=(),
-            effects=(),
-            structure=(),
-            thinning=None,
-            aside=None,
-            repeated=None,
-        )
 
 
 def _sampled(

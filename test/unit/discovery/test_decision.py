@@ -9,7 +9,8 @@ from discovery_scenes import at_joint, session_with
 from scipy.stats import norm
 
 from remaster_ros.discovery.decision import Decision, Named, decisions, sigma_of
-from remaster_ros.discovery.discover import Findings, find_causes
+from remaster_ros.discovery.discover import find_causes
+from remaster_ros.discovery.findings import Findings
 
 SAG, BASE = Named('joint_compliance', (2,)), Named('base_compliance', ())
 WAVE = Named('encoder_eccentricity', (2,))

@@ -14,10 +14,11 @@ from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
 from remaster_ros.discovery import discover
 from remaster_ros.discovery.cross_validation import LeftOut
-from remaster_ros.discovery.discover import Findings, discover_session, find_causes
+from remaster_ros.discovery.discover import discover_session, find_causes
 from remaster_ros.discovery.effects.base import Design
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import _System, solve
+from remaster_ros.discovery.findings import Findings
 from remaster_ros.discovery.screening import Catalogue, screen
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.types import Session

@@ -19,9 +19,11 @@ from remaster_ros.discovery.beside_memory import withstanding_memory
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
+from remaster_ros.discovery.findings import Findings
 from remaster_ros.discovery.marker_offsets import moved_markers
 from remaster_ros.discovery.memory import Memory
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.selection import Selection
 from remaster_ros.discovery.set_aside import harm_and_gain, is_memory, moved_by_memory, set_aside
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stepwise_selection import Search
@@ -204,3 +206,28 @@ def test_a_pull_on_a_marker_counts_for_less_where_errors_remember():
     wander = [c for c in EFFECTS['sensor_wander'].cells(data.context) if c.variant == 'fast']
     assert moved_markers(found, data, solved(data, *wander))
     assert not moved_markers(found, data, plain, Memory.of(data, plain, [0]))
+
+
+def test_where_causes_are_refused_the_memory_still_widens(scene):
+    rng = np.random.default_rng(8)
+    data = scene.with_errors(scene.memory(2.8, 1.5 * NOISE_M).draw(1, rng)[:, :, 0])
+    empty, solution = solved(data), solved(data, scene.wander['fast'])
+    found = Findings(
+        before=scene.found,
+        found=scene.found,
+        residuals=data,
+        selection=Selection(empty, solution, (), None),
+        groups=(),
+        effects=(),
+        structure=(),
+        untestable={},
+        thinning=None,
+        aside=set_aside(data, solution, partial(solve, data)),
+        repeated=None,
+    )
+    refused = found.without_causes()
+    assert refused.aside is not None
+    assert refused.aside.memory.data is refused.residuals
+    assert refused.selection.solution.cells == refused.searched.cells == ()
+    bare = replace(found, selection=Selection(empty, empty, (), None), aside=None)
+    assert bare.without_causes().aside is None

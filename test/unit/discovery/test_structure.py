@@ -8,10 +8,11 @@ from discovery_scenes import at_joint, residuals_of, session_with
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import fit_session
-from remaster_ros.discovery.discover import Findings, discover_session, find_causes
+from remaster_ros.discovery.discover import discover_session, find_causes
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.step import moments_of
 from remaster_ros.discovery.evidence import solve
+from remaster_ros.discovery.findings import Findings
 from remaster_ros.discovery.undetected import undetected
 from remaster_ros.types import FloatArray, Session
 

@@ -5,6 +5,7 @@ import numpy as np
 from remaster_ros.motion.actions import (
     CheckPath,
     Drive,
+    Halted,
     PathAnswer,
     Settled,
     Stop,
@@ -14,6 +15,7 @@ from remaster_ros.motion.arm_supervisor import ArmSupervisor
 from remaster_ros.motion.joint_reports import JointReport, JointReports
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import Cubic, MotionGate
+from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.motion.trajectory import Waypoint
@@ -27,6 +29,8 @@ RULES = SupervisorRules(
     settle=SettleRules(settle_s=1.0), arrive_timeout_s=5.0, answer_timeout_s=20.0
 )
 HOME = np.array([0.1, 0.2])
+STOPPED = 'the robot stopped on its way: an emergency or protective stop?'
+NOT_TAKEN = 'the robot does not take commands: see its controller, and its driver'
 
 
 class Rig:
@@ -174,3 +178,61 @@ def supervisor(rules=RULES, limits=LIMITS):
 
 def report(t, q, wall):
     return JointReport(t, np.asarray(q, float), t, wall)
+
+
+def halted(rig, reason, within_s=5.0):
+    """Wait for the halt; nothing is commanded with it or after it, whatever happens."""
+    commands = len(rig.commands)
+    rig.run(within_s, lambda: rig.said(Halted))
+    assert rig.last(Halted).reason == rig.supervisor.halted == reason
+    assert rig.supervisor.blocked(rig.wall) == reason
+    stays_halted(rig, reason)
+    assert len(rig.commands) == commands
+    assert not rig.supervisor.busy
+
+
+def stays_halted(rig, reason):
+    """Neither plans nor a planner that pauses and runs again end a halt."""
+    commands = len(rig.commands)
+    rig.plan([0.2, 0.1], [0.3, 0.1])
+    rig.state = 'paused'
+    rig.run(2.0)
+    rig.state = 'running'
+    rig.run(2.0)
+    rig.answer(0)
+    assert rig.supervisor.halted == reason
+    assert len(rig.said(Halted)) == 1
+    assert len(rig.commands) == commands
+
+
+def goes_on(rig):
+    """Only a person's word and a collection that is begun again let it go on, by a probe."""
+    commands = len(rig.commands)
+    assert rig.supervisor.clear_halt() == ''
+    assert rig.supervisor.halted == ''
+    reason = 'the halt was cleared: /remaster/collect goes on'
+    assert rig.supervisor.blocked(rig.wall) == reason
+    rig.run(3.0)
+    assert rig.supervisor.blocked(rig.wall) == reason
+    assert len(rig.commands) == commands
+    rig.state = 'paused'
+    rig.run(1.0)
+    assert rig.supervisor.blocked(rig.wall) == 'planner is paused'
+    rig.state = 'running'
+    rig.plan([0.2, 0.1])
+    drives = len(rig.said(Drive))
+    rig.run(30.0, lambda: rig.said(Drive)[drives:] and rig.said(Settled))
+    assert rig.said(Drive)[drives].solution == PROBE
+    rig.run(30.0, lambda: rig.supervisor.busy and not rig.supervisor._motion.is_moving)
+    np.testing.assert_allclose(rig.last(Settled).q, [0.2, 0.1], atol=1e-4)
+
+
+def restless(rig, which=range(99)):
+    """Report the arm trembling by a milliradian where it is sent to one of these."""
+
+    def alter(t, q):
+        last = rig.said(Drive)
+        busy = rig.supervisor.busy and last and last[-1].solution in which
+        return np.add(q, [1e-3 * np.sin(20 * t) * bool(busy), 0.0])
+
+    return alter

@@ -19,12 +19,6 @@ from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import FreePath
 from remaster_ros.motion.trajectory import Line
 
-
-@pytest.fixture
-def rig():
-    return Rig()
-
-
 # One after the other
 
 

@@ -12,11 +12,6 @@ from remaster_ros.motion.joint_reports import JointReport
 from remaster_ros.simulation import arm_motion as servo
 
 
-@pytest.fixture
-def rig():
-    return Rig()
-
-
 def pause(rig):
     rig.state = 'paused'
     rig.do(rig.supervisor.planner_is('paused', rig.wall))

@@ -4,15 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from supervisor_rig import LIMITS, Rig
+from supervisor_rig import LIMITS
 
 from remaster_ros.motion.actions import Drive, Failed, Halted, Settled, Stop
 from remaster_ros.simulation import arm_motion as servo
-
-
-@pytest.fixture
-def rig():
-    return Rig()
 
 
 def freeze(rig):

@@ -15,11 +15,6 @@ from remaster_ros.motion.actions import (
 from remaster_ros.motion.path_check import FreePath
 
 
-@pytest.fixture
-def rig():
-    return Rig()
-
-
 def test_the_way_is_asked_for_and_a_slow_answer_waited_for(rig):
     rig.answer_path = lambda request: None
     rig.plan([0.3, 0.0], waypoints={0: np.array([[0.1, 0.5]])})

@@ -9,7 +9,8 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 import rclpy
-from bridge_rig import DOMAIN, HOME, Rig
+from bridge_places import AWAY
+from bridge_rig import DOMAIN, HOME
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
@@ -22,7 +23,6 @@ from remaster_ros.nodes.status import LEASED
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 
-AWAY = HOME + np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 COMMANDS = 'joint_trajectory_controller/joint_trajectory'
 TOPICS = [
     ('joint_states', JointState, 'peer'),
@@ -30,20 +30,6 @@ TOPICS = [
     ('remaster/joint_waypoints', JointTrajectory, 'peer'),
     (COMMANDS, JointTrajectory, 'robot_bridge'),
 ]
-
-
-@pytest.fixture
-def rig(monkeypatch, tmp_path):
-    """Return a function that makes a rig with these parameters."""
-    made = []
-
-    def make(ready=True, **options):
-        made.append(Rig(monkeypatch, tmp_path, **options))
-        return made[-1].ready() if ready else made[-1]
-
-    yield make
-    for one in made:
-        one.close()
 
 
 @pytest.fixture

@@ -1,0 +1,10 @@
+"""The supervisor of most tests here."""
+
+import pytest
+from supervisor_rig import Rig
+
+
+@pytest.fixture
+def rig():
+    """Return a supervisor and its arm, in stepped time."""
+    return Rig()

@@ -1,0 +1,272 @@
+"""Configurations and ways that the robot bridge commands, and what it makes of bad ones."""
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+
+from bridge_places import AWAY, LOW, POST, TARGET, TOOL, turned
+from bridge_rig import CHAIN, HOME, stamp
+from simple_cells import write_cell
+from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory
+
+from remaster_ros.collection.events import (
+    ArmStopped,
+    SolutionCommanded,
+    SolutionFailed,
+    SolutionSettled,
+)
+from remaster_ros.nodes import robot_bridge
+from remaster_ros.session.workcell import read_cell
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
+
+
+# What it commands
+
+
+def test_a_configuration_is_commanded_settles_and_is_announced(rig):
+    """Every value of every event; the joints of both messages in their own orders."""
+    r = rig()
+    r.names = r.names[::-1]
+    r.order = 6 - r.order
+    before = r.wall
+    named = r.plan(TARGET[::-1], names=r.names)
+    r.names = r.names[::-1]
+    r.order = 6 - r.order
+    r.run(20.0, lambda: r.settled)
+    probe, move = r.commands
+    assert np.max(np.abs(probe.q - probe.start_q)) < 1e-4
+    np.testing.assert_allclose(move.q[-1], TARGET, atol=1e-12)
+    np.testing.assert_array_equal(move.v[-1], np.zeros(7))
+    assert np.max(np.abs(move.v[0])) > 0.1
+    assert np.all(np.diff(move.times_s) > 0.0)
+    _, v, _ = move.spline().sample()
+    assert np.all(np.abs(v) <= CHAIN.velocity_limits * 1.001)
+
+    (message,) = r.settled
+    assert list(message.name) == r.names
+    np.testing.assert_allclose(message.position, TARGET, atol=1e-4)
+    assert message.header.stamp == stamp(r.wall)
+
+    commanded, settled = r.events
+    assert isinstance(commanded, SolutionCommanded)
+    assert commanded.since_settled_wall_s == pytest.approx(move.arrival_s - 1000.0, abs=1e-6)
+    assert (commanded.stamp, commanded.solution) == (named, 0)
+    assert isinstance(settled, SolutionSettled)
+    assert (settled.stamp, settled.solution) == (named, 0)
+    motion, still = settled.motion_s, settled.settle_s
+    assert motion + still == pytest.approx(r.wall - move.arrival_s, abs=0.03)
+    assert 0.3 <= still < 0.35
+    # From there on the time is counted until the next command.
+    settled_at = r.wall
+    r.answer(named, 0)
+    named = r.settle(HOME)
+    commanded = r.named(SolutionCommanded)[1]
+    since_s = r.commands[-1].arrival_s - settled_at
+    assert commanded.since_settled_wall_s == pytest.approx(since_s, abs=1e-6)
+    assert commanded.stamp == named
+    assert before < settled_at
+
+
+def test_what_cannot_be_reached_is_named_and_the_next_one_is_commanded(rig):
+    r = rig()
+    outside = HOME.copy()
+    outside[1] = CHAIN.upper[1] + np.deg2rad(0.1)
+    named = r.settle(outside, TARGET)
+    (failed,) = r.named(SolutionFailed)
+    assert (failed.stamp, failed.solution) == (named, 0)
+    assert failed.reason.startswith('joint_2 at ')
+    np.testing.assert_allclose(r.moves()[0].q[-1], TARGET, atol=1e-12)
+    level, text, values = r.summary()
+    assert (level, text) == ('ok', 'moving or measuring')
+    counts = [values[key] for key in ('commanded', 'settled', 'failed', 'stopped')]
+    assert counts == ['1', '1', '1', '0']
+
+
+ANSWER = {'kind': 'configuration', 'solution': 0, 'result': 'recorded'}
+
+
+@pytest.mark.parametrize(
+    ('node', 'change'),
+    [
+        ('recorder', {'stamp': '77.000000000'}),
+        ('recorder', {'solution': 1}),
+        ('recorder', {'solution': -1}),
+        ('recorder', {'solution': '0'}),
+        ('recorder', {'solution': None}),
+        ('recorder', {'kind': 'reading'}),
+        ('recorder', {'result': 'lost'}),
+        ('optimizer', {}),
+    ],
+)
+def test_only_the_recorders_answer_for_this_pose_and_solution_counts(rig, node, change):
+    r = rig()
+    named = r.settle(TARGET, HOME)
+    for left_out in ('', 'stamp', 'solution', 'result'):
+        body = {'stamp': named, **ANSWER, **change}
+        body.pop(left_out, None)
+        r.said.publish(String(data=json.dumps({'version': 1, 'node': f'/{node}', 'body': body})))
+    r.run(1.0, dt=0.1)
+    assert len(r.moves()) == 1, 'it went on'
+    r.answer(named, 0)
+    r.run(20.0, lambda: len(r.settled) == 2)
+    np.testing.assert_allclose(r.settled[1].position, HOME, atol=1e-4)
+
+
+def test_another_pose_stops_the_arm_and_is_gone_to(rig):
+    r = rig()
+    named = r.go(AWAY, speed=0.2)
+    later = r.plan(HOME)
+    assert r.named(ArmStopped) == [ArmStopped(stamp=later, reason='another pose')]
+    assert later != named
+    assert ('info', 'stopping the arm: another pose') in r.bridge.logged
+    assert r.bridge.counts['stopped'] == 1
+    r.run(20.0, lambda: r.settled)
+    np.testing.assert_allclose(r.settled[0].position, HOME, atol=1e-4)
+
+
+@pytest.mark.parametrize('names', [None, []])
+def test_no_solutions_are_a_stop_whatever_joints_they_name(rig, names):
+    r = rig()
+    r.go(AWAY, speed=0.2)
+    r.plan(names=names)
+    assert [stop.reason for stop in r.named(ArmStopped)] == ['stopped']
+    r.run(3.0)
+    assert r.arm.speed() < 1e-6
+    assert r.arm.q[0] < 0.55
+    assert not r.settled
+    assert r.summary()[:2] == ('ok', 'waiting for a pose')
+
+
+@pytest.mark.parametrize(
+    ('spoil', 'reason'),
+    [
+        (
+            lambda m: m.joint_names.__setitem__(0, 'elbow'),
+            f'they are for elbow, {", ".join(CHAIN.joint_names[1:])}, '
+            f'the cell has {", ".join(CHAIN.joint_names)}',
+        ),
+        (
+            lambda m: setattr(m.points[1], 'positions', [0.0] * 6),
+            'a point has not as many positions as joints, 7',
+        ),
+        (
+            lambda m: setattr(m.points[0], 'positions', [0.0] * 8),
+            'a point has not as many positions as joints, 7',
+        ),
+    ],
+)
+def test_solutions_that_cannot_be_read_are_dropped(rig, spoil, reason):
+    r = rig()
+    message = JointTrajectory(joint_names=list(r.names))
+    message.header.stamp = stamp(5)
+    message.points = [robot_bridge.JointTrajectoryPoint(positions=HOME.tolist()) for _ in 'ab']
+    spoil(message)
+    r.taken(r.solutions, message, 'solutions')
+    assert r.logged() == [('error', f'joint_solutions dropped: {reason}')]
+    r.run(0.5)
+    assert not r.commands
+    assert r.summary()[2]['pose'] == ''
+
+
+def test_joints_of_other_arms_in_the_solutions_do_no_harm(rig):
+    r = rig()
+    target = np.array([9.0, *TARGET, -9.0])
+    r.settle(target, names=['gripper', *r.names, 'rail'])
+    np.testing.assert_allclose(r.moves()[0].q[-1], TARGET, atol=1e-12)
+
+
+WAY = HOME + np.array([0.2, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0])
+
+
+def test_waypoints_of_the_pose_are_gone_through(rig):
+    r = rig()
+    r.settle(TARGET, ways=[(0, [WAY])])
+    (move,) = r.moves()
+    assert np.min(np.max(np.abs(move.q - WAY), axis=1)) < 1e-12
+
+
+@pytest.mark.parametrize('options', [{'ways': [(1, [WAY])]}, {'ways_stamp': 99}])
+def test_waypoints_of_another_pose_or_solution_are_not(rig, options):
+    r = rig()
+    r.settle(TARGET, **{'ways': [(0, [WAY])], **options})
+    (move,) = r.moves()
+    assert np.min(np.max(np.abs(move.q - WAY), axis=1)) > 0.05
+
+
+def test_waypoints_that_cannot_be_read_drop_the_pose(rig):
+    r = rig()
+    r.plan(TARGET, ways=[(0, [WAY[:6]])])
+    ((level, text),) = r.logged()
+    assert level == 'error'
+    assert text.startswith('joint_solutions dropped: joint_waypoints: a point ')
+    r.run(1.0)
+    assert not r.commands
+
+
+# Paths
+
+
+def test_a_path_that_is_not_free_is_gone_around(rig, tmp_path):
+    cell = write_cell(tmp_path / 'cell.yaml', obstacles={'post': POST})
+    r = rig(cell=cell, cartesian_speed_limit_m_s=0.0, home=turned(-0.8))
+    target = turned(0.8)
+    model = read_cell(cell).collision_model(CHAIN)
+    assert 'post' in model.path_trouble(np.array([turned(-0.8), target]))
+    r.settle(target)
+    (move,) = r.moves()
+    q, _, _ = move.spline().sample(30)
+    assert not any(model.trouble(row) for row in q)
+    np.testing.assert_allclose(r.settled[0].position, target, atol=1e-4)
+
+
+def test_a_target_that_is_not_free_is_given_up(rig, tmp_path):
+    box = {'center_m': CHAIN.forward(LOW)[:3, 3].tolist(), 'size_m': [0.02, 0.02, 0.02]}
+    r = rig(cell=write_cell(tmp_path / 'cell.yaml', obstacles={'box': box}))
+    r.plan(LOW, HOME + 0.01)
+    r.run(20.0, lambda: r.settled)
+    (failed,) = r.named(SolutionFailed)
+    assert failed.solution == 0
+    assert failed.reason.startswith('no free path: ')
+    assert 'box' in failed.reason
+    assert [commanded.solution for commanded in r.named(SolutionCommanded)] == [1]
+
+
+def test_a_path_that_cannot_be_checked_is_not_gone(rig, monkeypatch):
+    r = rig()
+    r.settle(TARGET)
+
+    def fails(request):
+        raise ValueError('boom')
+
+    monkeypatch.setattr(r.bridge._search, 'find', fails)
+    r.plan(HOME)
+    r.run(1.0)
+    (failed,) = r.named(SolutionFailed)
+    assert failed.reason == 'no free path: it could not be checked (boom)'
+    assert ('error', "the path could not be checked: ValueError('boom')") in r.bridge.logged
+    assert len(r.moves()) == 1
+
+
+def test_an_arm_in_a_margin_is_halted_and_leaves_slowly_when_a_person_says_so(rig, tmp_path):
+    box = {'center_m': (TOOL - [0.0, 0.0, 0.3]).tolist(), 'size_m': [0.2, 0.2, 0.1]}
+    r = rig(cell=write_cell(tmp_path / 'cell.yaml', obstacles={'box': box}))
+    r.run(1.0)
+    assert r.halted().startswith('the arm stands where it must not: ')
+    assert not r.commands
+    assert r.call_clear().success
+    r.run(0.5)
+    assert not r.commands
+    r.say_planner('paused')
+    r.run(0.5)
+    r.say_planner('running')
+    r.run(30.0, lambda: r.commands)
+    _, v, _ = r.commands[0].spline().sample()
+    assert np.all(np.abs(v) <= 0.1 * CHAIN.velocity_limits * 1.001)
+    # It is no solution of a pose: no event names it.
+    assert not r.named(SolutionCommanded)
+    assert r.bridge.counts['commanded'] == 0

@@ -1,0 +1,197 @@
+"""What parameters, cell and offsets make of the limits that the robot bridge keeps."""
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+
+from bridge_places import AWAY, POST, turned
+from bridge_rig import CHAIN, HOME
+from rclpy.parameter import Parameter
+from simple_cells import write_cell
+
+from remaster_ros.collection.events import (
+    ArmStopped,
+)
+from remaster_ros.errors import InputError
+from remaster_ros.motion.limits import MotionLimits
+from remaster_ros.motion.path_check import PointSpeeds
+from remaster_ros.session.workcell import read_cell
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
+
+
+# Parameters
+
+
+def test_parameters_reach_the_limits_and_the_rules(rig, tmp_path):
+    acceleration = [2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0]
+    cell = write_cell(tmp_path / 'cell.yaml', acceleration_limit_rad_s2=acceleration)
+    r = rig(
+        ready=False,
+        cell=cell,
+        speed_share=0.4,
+        cartesian_speed_limit_m_s=0.15,
+        limit_margin_deg=2.0,
+        settle_s=0.7,
+        heartbeat_s=4.0,
+    )
+    bridge = r.bridge
+    limits = bridge.supervisor.gate.limits
+    wanted = MotionLimits.of(
+        CHAIN, 0.4, None, np.array(acceleration), 0.15, float(np.deg2rad(2.0))
+    )
+    for name in ('lower', 'upper', 'velocity', 'acceleration', 'tool_speed', 'margin'):
+        np.testing.assert_array_equal(getattr(limits, name), getattr(wanted, name), name)
+    assert limits.names == CHAIN.joint_names
+    assert bridge.supervisor.rules == bridge.p.rules()
+    assert bridge.supervisor.rules.settle.settle_s == 0.7
+    assert bridge._emergency._silence_s == 4.0
+    assert bridge._emergency.topic == ''
+    assert not r.logged()
+
+
+def test_without_a_cartesian_limit_it_says_so(rig):
+    r = rig(ready=False, cartesian_speed_limit_m_s=0.0)
+    assert r.bridge.supervisor.gate.limits.tool_speed == np.inf
+    assert r.logged() == [
+        (
+            'warning',
+            'no Cartesian speed limit (cartesian_speed_limit_m_s is 0): the joints alone '
+            'limit the speed of the arm',
+        )
+    ]
+
+
+def test_without_a_cell_file_it_does_not_start(rig):
+    with pytest.raises(InputError) as error:
+        rig(ready=False, cell='')
+    assert str(error.value) == (
+        'robot_bridge: parameter cell is empty; give the cell file of this arm (demo, the '
+        'shipped one, is for the fakes)'
+    )
+
+
+def test_bodies_that_are_never_looked_at_are_named(rig):
+    bridge = rig(ready=False).bridge
+    left_out = bridge._search._model.left_out
+    assert left_out
+    assert bridge.logged == [('info', f'collisions: {pair}') for pair in left_out]
+
+
+def test_other_speeds_are_taken_while_it_runs(rig):
+    r = rig()
+    r.go(AWAY, speed=0.2)
+    values = {'speed_share': 0.25, 'cartesian_speed_limit_m_s': 0.125}
+    answers = r.bridge.set_parameters([Parameter(name, value=v) for name, v in values.items()])
+    assert all(answer.successful for answer in answers)
+    r.flush()
+    limits = r.bridge.supervisor.gate.limits
+    np.testing.assert_allclose(limits.velocity, 0.25 * CHAIN.velocity_limits)
+    assert limits.tool_speed == 0.125
+    assert (r.bridge.p.speed_share, r.bridge.p.cartesian_speed_limit_m_s) == (0.25, 0.125)
+    assert [stop.reason for stop in r.named(ArmStopped)] == ['other limits']
+    text = 'speed_share is 0.25, cartesian_speed_limit_m_s 0.125'
+    assert ('info', text) in r.logged()
+    r.run(30.0, lambda: r.settled)
+    _, v, _ = r.commands[-1].spline().sample()
+    assert np.all(np.abs(v) <= 0.25 * CHAIN.velocity_limits * 1.001)
+
+
+def test_the_fastest_point_keeps_the_cartesian_limit(rig):
+    r = rig(cartesian_speed_limit_m_s=0.1)
+    r.settle(HOME + np.array([0.0, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    (move,) = r.moves()
+    q, v, _ = move.spline().sample(20)
+    model = read_cell('demo').collision_model(CHAIN)
+    fastest = np.max(PointSpeeds(CHAIN, model.extent_points).fastest(q, v))
+    assert 0.09 < fastest < 0.1002
+
+
+def fit_with(folder, offsets_deg, std_deg=0.01, unknown=()):
+    joints = [
+        {
+            'joint': name,
+            'mean_deg': offsets_deg.get(name, 0.0),
+            'std_deg': std_deg,
+            'interval95_deg': [-0.02, 0.02],
+            'identifiable': name not in unknown,
+            'why': '',
+        }
+        for name in CHAIN.joint_names
+    ]
+    empty = {'gauge': [], 'registration': {}, 'markers': {}, 'noise': {}, 'left_out': []}
+    sampler = {'name': 'x', 'chains': 1, 'draws': 1}
+    sampler |= dict.fromkeys(('r_hat_max', 'ess_min', 'seconds'))
+    fit = {'format': 'remaster-fit/1', 'joint_offsets': joints, 'sampler': sampler, **empty}
+    fit['accuracy'] = {'optimization': None, 'validation': None}
+    path = folder / 'fit.json'
+    path.write_text(json.dumps(fit))
+    return path
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_offsets_in_use_shift_the_limits(rig, tmp_path, sign):
+    """True angle = reported + offset: with +2 degrees the upper stop comes 2 degrees earlier."""
+    fit = fit_with(tmp_path, {'joint_2': 2.0 * sign})
+    limits = rig(ready=False, offsets=fit, limit_margin_deg=0.0).bridge.supervisor.gate.limits
+    lower, upper = CHAIN.lower.copy(), CHAIN.upper.copy()
+    if sign > 0:
+        upper[1] -= np.deg2rad(2.0)
+    else:
+        lower[1] += np.deg2rad(2.0)
+    np.testing.assert_allclose(limits.lower, lower)
+    np.testing.assert_allclose(limits.upper, upper)
+
+
+@pytest.mark.parametrize(('sign', 'free'), [(1.0, False), (-1.0, True)])
+def test_paths_are_checked_where_the_arm_is_with_its_offsets(rig, tmp_path, sign, free):
+    """A post on the left: an arm that is further to the left than it reports reaches it."""
+    fit = fit_with(tmp_path, {'joint_1': 3.0 * sign})
+    cell = write_cell(tmp_path / 'cell.yaml', obstacles={'post': POST})
+    nominal = read_cell(cell).collision_model(CHAIN, np.deg2rad(0.1))
+    turns = np.linspace(-0.8, 0.0, 161)
+    touching = next(turn for turn in turns if nominal.trouble(turned(turn)))
+    q = turned(touching - np.deg2rad(1.5))
+    assert not nominal.trouble(q)
+    bridge = rig(ready=False, cell=cell, offsets=fit).bridge
+    assert bool(bridge._search._model.trouble(q)) != free
+    # So are the speeds of its points.
+    v, offsets = np.ones(7), np.deg2rad([3.0 * sign, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    at = PointSpeeds(CHAIN, nominal.extent_points).fastest(q[None] + offsets, v[None])
+    np.testing.assert_allclose(bridge._search._speeds.fastest(q[None], v[None]), at)
+    np.testing.assert_allclose(bridge.supervisor.gate._speeds.fastest(q[None], v[None]), at)
+
+
+@pytest.mark.parametrize(
+    ('options', 'unknown_deg'),
+    [
+        ({}, 0.1),
+        ({'std_deg': 0.2}, 0.6),
+        # One that a fit could not tell is as unknown as before: the cell file's clearance.
+        ({'unknown': ['joint_1']}, 1.0),
+    ],
+)
+def test_the_clearance_covers_what_is_still_unknown(rig, tmp_path, options, unknown_deg):
+    fit = fit_with(tmp_path, {'joint_1': 5.0}, **options)
+    bridge = rig(ready=False, offsets=fit).bridge
+    assert bridge._search._model.unknown_offset == pytest.approx(np.deg2rad(unknown_deg))
+    shifted = bridge.supervisor.gate.limits.upper[0] < CHAIN.upper[0] - 0.01
+    assert shifted == ('unknown' not in options)
+
+
+def test_without_offsets_the_clearance_is_the_cell_files(rig):
+    bridge = rig(ready=False).bridge
+    assert bridge._search._model.unknown_offset == np.deg2rad(1.0)
+    assert bridge._search._model.chain is bridge.chain
+    np.testing.assert_array_equal(bridge.supervisor.gate.limits.upper, CHAIN.upper)
+
+
+def test_reports_are_judged_by_the_limits_of_the_robot(rig):
+    """By its own, not by the share of them that is used."""
+    reports = rig(ready=False, speed_share=0.1).bridge.supervisor.reports
+    np.testing.assert_allclose(reports._lower, CHAIN.lower - 0.05)
+    np.testing.assert_allclose(reports._upper, CHAIN.upper + 0.05)
+    np.testing.assert_allclose(reports._speed, 1.5 * CHAIN.velocity_limits)
