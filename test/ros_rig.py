@@ -18,6 +18,8 @@ LAST_DOMAIN = 101
 """The UDP ports of higher ones are those that Linux gives to any program."""
 DOMAINS_HELD = 4
 """A test uses at most so many at a time."""
+FOUND_S = 0.5
+"""A service may find its caller so much later than it is found; an answer before that is lost."""
 
 
 def free_domains() -> Iterator[int]:
@@ -125,14 +127,19 @@ def wait_until(condition, timeout_s, what):
         time.sleep(0.05)
 
 
+def found(*callers):
+    """Wait until services and their callers have found each other."""
+    for caller in callers:
+        assert caller.wait_for_service(timeout_sec=20.0), caller.srv_name
+    time.sleep(FOUND_S)
+
+
 def call(client, service, timeout_s=120):
     """Call a Trigger service and return its response."""
     from std_srvs.srv import Trigger
 
     caller = client.create_client(Trigger, service)
-    assert caller.wait_for_service(timeout_sec=20.0), service
-    # The service may find its caller later than it is found, and an answer before that is lost.
-    time.sleep(0.3)
+    found(caller)
     future = caller.call_async(Trigger.Request())
     deadline = time.monotonic() + timeout_s
     while not future.done():

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from command_line import remaster
-from ros_rig import call, node_arguments, wait_until
+from ros_rig import call, found, node_arguments, wait_until
 
 from remaster_ros.session.reader import read_session, write_session
 
@@ -61,7 +61,7 @@ def test_a_second_call_while_the_first_is_at_work_is_answered(start, client, tmp
     from std_srvs.srv import Trigger
 
     callers = [client.create_client(Trigger, f'/remaster/{n}') for n in ('discover', 'fit')]
-    assert all(caller.wait_for_service(timeout_sec=20.0) for caller in callers)
+    found(*callers)
     # Which of two services is served first is not determined.
     asked = [caller.call_async(Trigger.Request()) for caller in callers]
     wait_until(lambda: client.spin_some() or any(f.done() for f in asked), 60, 'an answer')

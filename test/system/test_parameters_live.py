@@ -9,7 +9,7 @@ import sys
 import time
 
 import pytest
-from ros_rig import node_arguments, wait_until
+from ros_rig import FOUND_S, node_arguments, wait_until
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 
@@ -72,12 +72,14 @@ def parameters(client):
     def set_them(node, **values):
         service = AsyncParameterClient(client, node)
         wait_until(lambda: client.spin_some() or service.services_are_ready(), 40, node)
+        time.sleep(FOUND_S)
         wanted = [Parameter(name, value=value) for name, value in values.items()]
         result = answer(client, service.set_parameters_atomically(wanted)).result
         return result.successful, result.reason
 
     def get(node, name):
         service = AsyncParameterClient(client, node)
+        time.sleep(FOUND_S)
         return answer(client, service.get_parameters([name])).values[0]
 
     set_them.get = get

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from ros_rig import ROOT, node_arguments, wait_until
+from ros_rig import ROOT, found, node_arguments, wait_until
 
 from remaster_ros.collection.events import (
     ArmStopped,
@@ -257,7 +257,7 @@ def register(rig, q, shift):
     from std_srvs.srv import Trigger
 
     caller = rig.client.create_client(Trigger, '/remaster/register')
-    assert caller.wait_for_service(timeout_sec=20.0)
+    found(caller)
     rig.t += 1.0
     rig.report(q)
     for _ in range(10):

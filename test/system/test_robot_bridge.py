@@ -13,6 +13,7 @@ from hostile_bench import Bench
 from hostile_lines import EMERGENCY
 from hostile_process import environment
 from hostile_scene import HOME
+from ros_rig import found
 from simple_cells import write_cell
 from std_msgs.msg import String
 
@@ -285,7 +286,7 @@ def test_a_speed_that_is_changed_holds_at_once(bridge):
 
     bench = bridge(speed_share=0.3)
     client = bench.node.create_client(SetParameters, '/robot_bridge/set_parameters')
-    assert client.wait_for_service(10)
+    found(client)
 
     def set_to(name, value):
         kind = ParameterType.PARAMETER_DOUBLE

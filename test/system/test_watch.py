@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from played_collection import CHAIN, T_R_N
-from ros_rig import node_arguments, wait_until
+from ros_rig import found, node_arguments, wait_until
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 
@@ -204,7 +204,7 @@ def test_the_token_is_for_this_user_alone(page, client):
     logged = []
     client.create_subscription(Log, '/rosout', logged.append, LATCHED)
     caller = client.create_client(ListParameters, 'watch/list_parameters')
-    assert caller.wait_for_service(timeout_sec=20.0)
+    found(caller)
 
     def result(caller, request):
         future = caller.call_async(request)
@@ -214,7 +214,7 @@ def test_the_token_is_for_this_user_alone(page, client):
     names = result(caller, ListParameters.Request()).result.names
     assert 'port' in names
     caller = client.create_client(GetParameters, 'watch/get_parameters')
-    assert caller.wait_for_service(timeout_sec=20.0)
+    found(caller)
     values = result(caller, GetParameters.Request(names=names)).values
     assert page.token not in str(values)
     assert page.token not in str(logged)
