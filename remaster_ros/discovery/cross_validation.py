@@ -78,8 +78,8 @@ class LeftOut:
         parts = [white[mine] for mine in rows]
         return cls(data, tuple(cells), scale, rows, parts, [part.T @ part for part in parts])
 
-    def of_poses(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
-        """Return how well poses are predicted by the fit of some of the cells to the others.
+    def squares(self, solution: Solution) -> FloatArray:
+        """Return the squared error of each pose by the fit to the others, in units of the noise.
 
         Parameters
         ----------
@@ -88,23 +88,37 @@ class LeftOut:
 
         Returns
         -------
-        squares
-            Squared error of each pose, in units of the noise, (poses,).
-        deviance
-            −2 log of its density, without the constants, which are those of the noise. In units of
-            what is uncertain of its prediction, a pose that is far from all others does not decide
-            between two sets of cells, as it does by its squared error (Gelman, Hwang & Vehtari
-            2014, Stat. Comput. 24, 997), (poses,).
+        ndarray
+            (poses,).
+        """
+        errors, _ = self._predicted(solution)
+        return self._of_poses(np.sum(errors**2, axis=1))
+
+    def deviance(self, solution: Solution) -> FloatArray:
+        """Return how well poses are predicted by the fit of some of the cells to the others.
+
+        In units of what is uncertain of its prediction, a pose that is far from all others does
+        not decide between two sets of cells, as it does by its squared error (Gelman, Hwang &
+        Vehtari 2014, Stat. Comput. 24, 997).
+
+        Parameters
+        ----------
+        solution
+            Which cells, with which smoothness.
+
+        Returns
+        -------
+        ndarray
+            Of each pose −2 log of its density, without the constants, which are those of the
+            noise, (poses,).
         """
         errors, variance = self._predicted(solution)
         scaled = np.linalg.solve(variance, errors[:, :, None])[:, :, 0]
         deviance = np.sum(errors * scaled, axis=1) + np.linalg.slogdet(variance)[1]
-        pose = self.data.pose_of_row
-        squares, deviances = (
-            np.bincount(pose, by_row).astype(float)
-            for by_row in (np.sum(errors**2, axis=1), deviance)
-        )
-        return squares, deviances
+        return self._of_poses(deviance)
+
+    def _of_poses(self, of_rows: FloatArray) -> FloatArray:
+        return np.bincount(self.data.pose_of_row, of_rows).astype(float)
 
     def _predicted(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
         """Return the error of each row by the fit to others, (n, 3), and its variance."""
@@ -117,6 +131,8 @@ class LeftOut:
         total = np.sum(self.grams, axis=0)[np.ix_(every, every)]
         unit = self.scale[chosen[p:]]
         total[p:-1, p:-1] += solution.prior_precision() / np.outer(unit, unit)
+        base = self.scale[:p]
+        total[:p, :p] += self.data.base_precision / np.outer(base, base)
         np.einsum('ii->i', total)[:-1] += 1e-12
         errors = np.empty(3 * len(self.data))
         variance = np.empty((len(self.data), 3, 3))

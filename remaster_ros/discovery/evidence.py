@@ -99,7 +99,7 @@ def solve(
     unit = np.concatenate((np.ones(p), scale))
     inverse_unit = 1.0 / np.append(unit, 1.0)
     grams *= inverse_unit[:, None] * inverse_unit
-    system = _System(data.noise_model, grams, data.noise, cells, p, unit, ridge)
+    system = _System(data.noise_model, grams, data.noise, cells, data.base_precision, unit, ridge)
     if not system.visible():
         return None
     try:
@@ -119,11 +119,12 @@ class _System:
     grams: FloatArray
     guess: Noise
     cells: tuple[Cell, ...]
-    p: int
+    base_precision: FloatArray
     unit: FloatArray
     ridge: FloatArray
 
     def __post_init__(self) -> None:
+        self.p = len(self.base_precision)
         self.size = len(self.unit)
         edges = self.p + np.cumsum([0, *(cell.size for cell in self.cells)])
         self.where = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
@@ -186,7 +187,7 @@ class _System:
         rss = pulls @ error
         n = self.model.freedom
         value = 0.5 * n @ np.log(weights) - np.sum(np.log(np.diag(root))) - 0.5 * weights @ rss
-        value -= 0.5 * self.ridge @ beta**2
+        value -= 0.5 * self._implausible(beta)
         by_variance = 0.5 * weights * (weights * (trace + rss) - n)
         # d variance / d log sigma = 2 sigma², of what rows share times its share.
         change = 2.0 * np.exp(2.0 * eta[:count, None]) * self.entering
@@ -233,6 +234,7 @@ class _System:
         # In LAPACK's order, and in the memory of H.
         H = np.array(total[:-1, :-1], order='F')
         np.einsum('ii->i', H)[:] += self.ridge
+        H[: self.p, : self.p] += self.base_precision
         for index, penalty, factor in zip(self.penalised, self.penalties, factors, strict=True):
             where = self.where[index]
             H[where, where] += factor * penalty
@@ -302,7 +304,7 @@ class _System:
         n = self.model.freedom
         value = 0.5 * n @ np.log(weights) - 0.5 * error @ total @ error - logs[: self.p].sum()
         value -= 0.5 * (self.unpenalised - self.p) * np.log(n.sum() - self.p)
-        value -= logs[self.unpenalised :].sum() + 0.5 * self.ridge @ beta**2
+        value -= logs[self.unpenalised :].sum() + 0.5 * self._implausible(beta)
         for index, penalty, spectrum, ridge, factor in zip(
             self.penalised, self.penalties, self.spectra, self.ridges, factors, strict=True
         ):
@@ -310,6 +312,12 @@ class _System:
             value += 0.5 * np.sum(np.log(factor * spectrum + ridge))
             value -= 0.5 * factor * beta[where] @ penalty @ beta[where]
         return float(value)
+
+    def _implausible(self, beta: FloatArray) -> float:
+        """Return the square of the parameters in units of their priors, those of curves but size.
+        """
+        base = beta[: self.p]
+        return float(self.ridge @ beta**2 + base @ self.base_precision @ base)
 
     def _start(self, start: Solution | None) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return where the search for noise and smoothness begins, and its bounds."""

@@ -191,7 +191,7 @@ class _Checks:
             return
         folds = np.arange(data.poses) % min(FOLDS, data.poses)
         left_out = LeftOut.of(data, self.searched.cells, noise, folds)
-        expected = left_out.of_poses(self.searched)[0] / np.bincount(data.pose_of_row)
+        expected = left_out.squares(self.searched) / np.bincount(data.pose_of_row)
         others = data.only(rows)
         left = others.noise_model.whitened(
             data.unexplained(self.searched)[others.rows.source], noise

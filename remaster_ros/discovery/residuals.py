@@ -1,7 +1,9 @@
 """What the discovery works on: the residuals of the offsets model, its noise, its absorption.
 
 The noise is that of `calibration.noise`, with the directions that the fit distinguishes. What
-registrations, offsets and markers can absorb is projected out with flat priors everywhere.
+registrations, offsets and markers can absorb is projected out with flat priors, but for steps of
+zero-offsets that are longer than the tangent holds: where poses hardly determine one beside the
+causes, it would go many degrees, for a fit that no arm of these dimensions has.
 """
 
 from __future__ import annotations
@@ -25,6 +27,9 @@ from remaster_ros.types import FloatArray, IntArray
 
 # Directions of the offsets model below this share of the largest are its gauge.
 ROUNDING = 1e-8
+# Standard deviation of a zero-offset's step, rad: a marker 1 m from the axis is then 0.15 mm beside
+# the tangent.
+STEP_STD = np.radians(1.0)
 # Bytes of displacements that are kept for the next fit; only those of large sessions are more.
 KEPT_BYTES = 1 << 28
 # Gram matrices of so many sets are kept: of the set so far, and of families beside it.
@@ -61,12 +66,16 @@ class Residuals:
         Measured minus modelled, in base coordinates, m, (n, 3).
     base
         What the offsets model can absorb, orthonormal columns, (n, 3, p).
+    base_precision
+        Of the prior on their coefficients, about 0, (p, p).
     full_base
         The same columns for every row of the session, (all rows, 3, p).
     full_errors
         Errors of every row of the session, m, (all rows, 3).
     full_jacobian
         Derivative of the prediction by the model's natural parameters, (all rows, 3, size).
+    step_precision
+        Of the prior on steps of these; 0 for a flat one, (size,).
     reference
         T_R_N of every sensor that `errors` are relative to, (sensors, 4, 4).
     noise_model
@@ -79,9 +88,11 @@ class Residuals:
     rows: Rows
     errors: FloatArray
     base: FloatArray
+    base_precision: FloatArray
     full_base: FloatArray
     full_errors: FloatArray
     full_jacobian: FloatArray
+    step_precision: FloatArray
     reference: FloatArray
     noise_model: NoiseModel
     noise: Noise
@@ -116,7 +127,11 @@ class Residuals:
             full_jacobian[block.source] = model.natural_jacobian(x, block)
 
         rows = Rows.of(problem.measurements, found.kept, model.reference)
-        full_base = full_jacobian @ _orthonormal(full_jacobian[rows.source])
+        combinations = _orthonormal(full_jacobian[rows.source])
+        full_base = full_jacobian @ combinations
+        step_precision = np.zeros(model.size)
+        free = found.posterior.free
+        step_precision[free[free < model.joints]] = STEP_STD**-2.0
         noise_model = NoiseModel.of(rows, model.reference, found.posterior.noise_model.split)
         noise = robust_noise(rows, full_errors[rows.source], np.ones(len(rows), bool))
         return cls(
@@ -124,9 +139,11 @@ class Residuals:
             rows,
             full_errors[rows.source],
             full_base[rows.source],
+            _quadratic(step_precision, combinations),
             full_base,
             full_errors,
             full_jacobian,
+            step_precision,
             model.reference,
             noise_model,
             noise_model.of_sensors(*noise),
@@ -135,8 +152,14 @@ class Residuals:
     def holding(self, parameters: IntArray) -> Residuals:
         """Return the same where some parameters (of ``full_jacobian``) absorb nothing."""
         jacobian = np.delete(self.full_jacobian, parameters, axis=2)
-        full_base = jacobian @ _orthonormal(jacobian[self.rows.source])
-        return replace(self, full_base=full_base, base=full_base[self.rows.source])
+        combinations = _orthonormal(jacobian[self.rows.source])
+        full_base = jacobian @ combinations
+        return replace(
+            self,
+            base=full_base[self.rows.source],
+            base_precision=_quadratic(np.delete(self.step_precision, parameters), combinations),
+            full_base=full_base,
+        )
 
     def less(self, shift: FloatArray) -> Residuals:
         """Return the same with displacements (all rows, 3), m, taken off the errors."""
@@ -278,6 +301,11 @@ def _picked(grams: FloatArray, order: IntArray) -> FloatArray:
         rows = slice(order[i], order[i_end - 1] + 1)
         picked[:, i:i_end, j:j_end] = grams[:, rows, order[j] : order[j_end - 1] + 1]
     return picked
+
+
+def _quadratic(precision: FloatArray, combinations: FloatArray) -> FloatArray:
+    """Return the precision (p, p) of coefficients of combinations (c, p) of parameters (c,)."""
+    return combinations.T @ (precision[:, None] * combinations)
 
 
 def _orthonormal(jacobian: FloatArray) -> FloatArray:

@@ -200,6 +200,7 @@ class _Projection:
         # The factor of H, which is that of a fit: much less work than that of all the rows.
         H = white.T @ white
         p = data.base.shape[2]
+        H[:p, :p] += data.base_precision
         H[p:, p:] += given.prior_precision()
         scale = np.sqrt(np.diag(H))
         root = np.linalg.cholesky(H / np.outer(scale, scale))

@@ -52,8 +52,9 @@ FOLDS = 10
 LEAST_GAIN = 0.01
 # With noise and smoothness as they are: a cause that saves this share predicts.
 NEEDED = 0.1
-# By so much the squared error of poses left out differs between draws of the folds.
-CHANCE = 0.1
+# Where the evidence rises by this, odds of 150 to one, the poses left out have only not to speak
+# against it: their standard error is on its side.
+EVIDENT = 5.0
 # The evidence must rise by this for an exchange: equals are not exchanged again and again.
 HYSTERESIS = 0.5
 MOST_EXCHANGED = 6
@@ -121,15 +122,14 @@ class Search:
             rejected = None
             for proposal in self.propose(solution, screening):
                 candidate, step = self._tested(solution, proposal, screening)
-                if step.p_value <= SIGNIFICANCE and step.held_out_share >= _least_share(
-                    solution, candidate
-                ):
+                least = _least_share(solution, candidate)
+                if step.p_value <= SIGNIFICANCE and self.predicts(candidate, solution, least):
                     break
                 rejected = rejected or step
             else:
                 anew = regrown(solution, self.with_all, self.prune)
                 gain = anew.log_evidence - solution.log_evidence
-                if gain <= HYSTERESIS or self.held_out_share(solution, anew) < 0.0:
+                if gain <= HYSTERESIS or not self.predicts(anew, solution):
                     break
                 solution = self.backward_elimination(self.drop_unpredictive(anew), solution)
                 continue
@@ -296,9 +296,7 @@ class Search:
                 limit = solution if best is None else best
                 if candidate.log_evidence > limit.log_evidence + HYSTERESIS:
                     best = candidate
-        if best is not None and self.held_out_share(solution, best) < 0.0:
-            return None
-        return best
+        return best if best is not None and self.predicts(best, solution) else None
 
     def drop_unpredictive(self, solution: Solution) -> Solution:
         """Drop the causes without which poses left out are predicted better."""
@@ -312,7 +310,7 @@ class Search:
             if self.held_out_share(held, solution) > NEEDED:
                 continue
             without = self.fit(held.cells, solution)
-            if without is not None and self.held_out_share(without, solution) < 0.0:
+            if without is not None and not self.predicts(solution, without):
                 solution = without
         return solution
 
@@ -348,7 +346,7 @@ class Search:
         """Return whether a cell passes the tests of a step by itself."""
         if solution.log_evidence - without.log_evidence < MEMBER:
             return False
-        if self.held_out_share(without, solution) <= 0.0:
+        if not self.predicts(solution, without):
             return False
         own = np.array([other.key == cell.key for other in self.catalogue.cells])
         screening = screen(
@@ -373,19 +371,32 @@ class Search:
                     found.append(other)
         return sorted(found, key=lambda fit: -fit.log_evidence)
 
-    def held_out_share(self, smaller: Solution, larger: Solution) -> float:
-        """Return the share of the deviance of poses left out that the larger set saves.
+    def predicts(self, larger: Solution, smaller: Solution, least: float = 0.0) -> bool:
+        """Return whether a set saves so much of the deviance of poses left out against another.
 
-        Less than nothing where it makes their squared error larger by more than chance does.
+        A smaller share, by less than its standard error, will do where the evidence is clear.
         """
+        share, error = self._held_out(smaller, larger)
+        if larger.log_evidence - smaller.log_evidence >= EVIDENT:
+            share += error
+        return share >= least
+
+    def held_out_share(self, smaller: Solution, larger: Solution) -> float:
+        """Return the share of the deviance of poses left out that the larger set saves."""
+        return self._held_out(smaller, larger)[0]
+
+    def _held_out(self, smaller: Solution, larger: Solution) -> tuple[float, float]:
+        """Return the share, and the standard error that it has by the choice of poses."""
         last = self._last_held_out
         if last is None or last[0] is not larger or not set(smaller.cells) <= set(last[1].cells):
             cells = tuple(dict.fromkeys((*larger.cells, *smaller.cells)))
             left_out = LeftOut.of(self.data, cells, larger.noise, self._fold_of_pose)
-            last = larger, left_out, np.sum(left_out.of_poses(larger), axis=1)
+            last = larger, left_out, left_out.deviance(larger)
             self._last_held_out = last
-        squares, deviance = 1.0 - last[2] / np.sum(last[1].of_poses(smaller), axis=1)
-        return float(min(deviance, squares + CHANCE))
+        before = last[1].deviance(smaller)
+        saved = before - last[2]
+        error = np.sqrt(len(saved)) * saved.std()
+        return float(saved.sum() / before.sum()), float(error / before.sum())
 
 
 def _least_share(solution: Solution, candidate: Solution) -> float:

@@ -316,7 +316,7 @@ def test_held_out_error_and_deviance_are_those_of_fits_without_the_pose():
     folds = np.arange(data.poses)
     others = cells_named('joint_compliance')[2:4]
     left_out = LeftOut.of(data, (*others, cell), fit.noise, folds)
-    squares, deviance = left_out.of_poses(fit)
+    squares, deviance = left_out.squares(fit), left_out.deviance(fit)
     pose = 4
     columns = np.concatenate((data.base, data.columns([cell]), data.errors[:, :, None]), axis=2)
     white = data.noise_model.whitened(columns, fit.noise)
