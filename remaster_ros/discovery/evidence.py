@@ -314,8 +314,7 @@ class _System:
         return float(value)
 
     def _implausible(self, beta: FloatArray) -> float:
-        """Return the square of the parameters in units of their priors, those of curves but size.
-        """
+        """Return the squared parameters in units of their priors, the smoothness not counted."""
         base = beta[: self.p]
         return float(self.ridge @ beta**2 + base @ self.base_precision @ base)
 

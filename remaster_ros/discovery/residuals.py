@@ -27,7 +27,7 @@ from remaster_ros.types import FloatArray, IntArray
 
 # Directions of the offsets model below this share of the largest are its gauge.
 ROUNDING = 1e-8
-# Standard deviation of a zero-offset's step, rad: a marker 1 m from the axis is then 0.15 mm beside
+# Standard deviation of a zero-offset's step, rad: a marker 1 m from the axis is then 0.15 mm off
 # the tangent.
 STEP_STD = np.radians(1.0)
 # Bytes of displacements that are kept for the next fit; only those of large sessions are more.

@@ -219,7 +219,7 @@ def test_restricted_likelihood_has_the_gradient_it_says(name, split):
     unit = np.concatenate((np.ones(p), scale))
     noise = model.of_sensors(*robust_noise(data.rows, data.errors, np.ones(len(data), bool)))
     ridge = np.where(np.arange(len(unit)) < p, 0.0, 0.5)
-    system = _System(model, grams, noise, cells, p, unit, ridge)
+    system = _System(model, grams, noise, cells, data.base_precision, unit, ridge)
     eta, _, _ = system._start(None)
     _, gradient, information = system.evaluate(eta)
     for i in range(len(eta)):

@@ -110,7 +110,6 @@ def test_the_rest_of_the_discovery_has_the_same_random_numbers():
 
 def test_a_cause_that_most_searches_do_not_find_leaves_unless_the_data_are_clear(monkeypatch):
     _, search, begun, partial = searched(SEEDS[0])
-    cell = begun.cells[0]
     without = search.fit(begun.cells[1:], begun)
     cost = begun.log_evidence - without.log_evidence
     assert cost > 0.0

@@ -9,10 +9,13 @@ import pytest
 from calibration_scenes import CHAIN, MARKERS, URDF, sensors
 from discovery_scenes import residuals_of, session_with
 
+from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.stepwise_selection import HYSTERESIS, LEAST_GAIN, Search
+from remaster_ros.discovery.evidence import solve
+from remaster_ros.discovery.residuals import STEP_STD, Residuals
+from remaster_ros.discovery.stepwise_selection import EVIDENT, HYSTERESIS, LEAST_GAIN, Search
 from remaster_ros.discovery.substitutes import named_instead, regrown
+from remaster_ros.discovery.undetected import natural_parameters
 from remaster_ros.simulation.session_simulator import simulate_session
 from remaster_ros.types import FloatArray, Session
 
@@ -116,3 +119,47 @@ def test_a_family_that_stands_in_for_a_member_of_another_gives_way_to_it():
     found = regrown(begun, search.with_all, search.prune)
     assert search.prune(begun).log_evidence < found.log_evidence - 10.0
     assert [(cell.name, cell.joints) for cell in found.cells] == [('joint_compliance', (2,))]
+
+
+def test_steps_of_zero_offsets_have_a_prior_and_nothing_else_of_the_base_has():
+    found = estimate(Problem.of(session_with(6)))
+    data = Residuals.of(found)
+    empty = solve(data, ())
+    rng, joints = np.random.default_rng(3), found.model.joints
+    for data_or_part in (data, data.only(data.rows.source[::2])):
+        base = 1e-3 * rng.standard_normal(len(empty.base))
+        step = natural_parameters(found, data_or_part, empty, replace(empty, base=base))
+        square = base @ data_or_part.base_precision @ base
+        assert square == pytest.approx(np.sum((step[:joints] / STEP_STD) ** 2), rel=1e-6)
+
+
+def test_an_offset_that_the_readings_hardly_determine_stays_where_the_tangent_holds():
+    data = residuals_of(session_with(6))
+    values, axes = np.linalg.eigh(data.base_precision)
+    degree, axis = 1.0 / np.sqrt(values[-1]), data.base @ axes[:, -1]
+    noise = np.random.default_rng(4).standard_normal(axis.shape)
+    # By these readings alone the step is 10 +- 3 degrees.
+    errors = 10.0 * degree * axis + 3.0 * degree * noise
+    for precision, least, most in (
+        (data.base_precision, 0.0, 3.0),
+        (0.0 * data.base_precision, 4.0, 16.0),
+    ):
+        found = solve(replace(data, errors=errors, base_precision=precision), ())
+        assert least < axes[:, -1] @ found.base / degree < most
+
+
+def test_chance_is_on_the_side_of_clear_evidence_only(monkeypatch):
+    search = searching(residuals_of(session_with(6)))
+    smaller = search.fit(())
+    clear = replace(smaller, log_evidence=smaller.log_evidence + EVIDENT)
+    doubtful = replace(smaller, log_evidence=smaller.log_evidence + 0.9 * EVIDENT)
+    for share, error, expected in (
+        (0.02, 0.0, (True, True)),
+        (0.004, 0.007, (True, False)),
+        (-0.004, 0.02, (True, False)),
+        (0.004, 0.005, (False, False)),
+        (-0.05, 0.01, (False, False)),
+    ):
+        monkeypatch.setattr(search, '_held_out', lambda *_, values=(share, error): values)
+        predicts = tuple(search.predicts(one, smaller, LEAST_GAIN) for one in (clear, doubtful))
+        assert predicts == expected, (share, error)
