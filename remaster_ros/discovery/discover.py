@@ -37,7 +37,7 @@ from remaster_ros.discovery.marker_offsets import held_markers, loosened, moved_
 from remaster_ros.discovery.model_averaging import moved_by_look_alikes
 from remaster_ros.discovery.omnibus import structure_left
 from remaster_ros.discovery.plain_forms import plainest
-from remaster_ros.discovery.repeated_search import RepeatedSearch, search_partly
+from remaster_ros.discovery.repeated_search import RepeatedSearch, repeat_search
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.selection import Selection
 from remaster_ros.discovery.set_aside import (
@@ -287,15 +287,8 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         lambda share: progress('searching causes', share),
     )
     selection = search.run()
-    searched = withstanding_memory(search, selection.solution)
-    partial = search_partly(
-        search,
-        searched,
-        lambda share: progress('searching again without some of the poses', share),
-    )
-    if partial is not None:
-        searched = partial.surviving(search, searched)
-    selection = replace(selection, solution=plainest(searched, search.cells, search.fit))
+    solution = withstanding_memory(search, selection.solution)
+    selection = replace(selection, solution=plainest(solution, search.cells, search.fit))
     residuals = search.data
     groups, described = describe(
         residuals, selection, cells, lambda share: progress('comparing look-alikes', share)
@@ -307,9 +300,12 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
     if aside is not None:
         selection = replace(selection, solution=aside.solution)
         structure = aside.said(structure)
-    repeated = None
-    if partial is not None:
-        repeated = partial.compared(found, residuals, searched, selection.solution)
+    repeated = repeat_search(
+        found,
+        search,
+        selection.solution,
+        lambda share: progress('searching again without some of the poses', share),
+    )
     memory = None if aside is None else aside.memory
     effects += moved_markers(found, residuals, selection.solution, memory)
     thinning = None

@@ -5,9 +5,6 @@ rows are then too small, also where poses are left out with the causes held: the
 with them. So five searches each do without a fifth of the poses and predict it (Varma & Simon
 2006, BMC Bioinformatics 7; Hastie, Tibshirani & Friedman 2009, sec. 7.10.2).
 
-*Causes.* One that most of the five do not find is taken by chance, and leaves (Meinshausen &
-Bühlmann 2010, J. R. Stat. Soc. B 72, 417), unless the data are too clear about it.
-
 *Predictions.* Their 95 % regions are multiplied by what puts 95 % of these rows inside.
 
 *Parameters.* The posterior is widened by how far the five searches differ, as a jackknife by
@@ -20,7 +17,6 @@ nothing, and in larger sessions there would be no end to it.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -29,12 +25,10 @@ from scipy.stats import chi2
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.predictions import REGION, squared_distances
-from remaster_ros.discovery.cross_validation import worth_of
-from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.stepwise_selection import BEYOND_DOUBT, Search
+from remaster_ros.discovery.stepwise_selection import Search
 from remaster_ros.discovery.stretches import noise_covariance
 from remaster_ros.discovery.undetected import natural_parameters
 from remaster_ros.types import FloatArray
@@ -71,81 +65,15 @@ class RepeatedSearch:
     moves: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class PartialSearches:
-    """Five searches, each without a fifth of the poses.
-
-    Attributes
-    ----------
-    solutions
-        What each found.
-    errors
-        What is left of each row by the search that did without it, m, (n, 3).
-    """
-
-    solutions: tuple[Solution, ...]
-    errors: FloatArray
-
-    def surviving(self, search: Search, solution: Solution) -> Solution:
-        """Return a solution of the whole search without the causes that most of these do not find.
-
-        One without which the evidence falls by `BEYOND_DOUBT` stays: they may have found it under
-        another name.
-        """
-        found = Counter(cause for one in self.solutions for cause in _causes(one))
-        price = np.log(3.0 * len(search.data))
-        kept: set[Cell] = set()
-        while True:
-            rare = [
-                (worth_of(solution, cell, where, price), index)
-                for index, (cell, where) in enumerate(
-                    zip(solution.cells, solution.slices(), strict=True)
-                )
-                if EFFECTS[cell.name].is_cause
-                and 2 * found[cell.name, cell.joints] < GROUPS
-                and cell not in kept
-            ]
-            if not rare:
-                return solution
-            _, index = min(rare)
-            rest = (*solution.cells[:index], *solution.cells[index + 1 :])
-            without = search.fit(rest, solution)
-            if without is None or without.log_evidence < solution.log_evidence - BEYOND_DOUBT:
-                kept.add(solution.cells[index])
-            else:
-                solution = without
-
-    def compared(
-        self, found: Estimate, data: Residuals, searched: Solution, solution: Solution
-    ) -> RepeatedSearch:
-        """Return how these differ from a solution, and from the one that the search ended with.
-
-        Parameters
-        ----------
-        found
-            The fit that the search began with.
-        data
-            What it worked on.
-        searched, solution
-            What it ended with, and the same as it is told, with plainer forms in place of some.
-        """
-        distances = squared_distances(self.errors, row_covariance(data, solution))
-        widening = float(np.sqrt(np.quantile(distances, REGION) / chi2.ppf(REGION, 3)))
-        parameters = [natural_parameters(found, data, solution, one) for one in self.solutions]
-        moves = np.array(parameters).T
-        moves -= moves.mean(axis=1, keepdims=True)
-        moves *= np.sqrt((GROUPS - 1) / GROUPS)
-        same = sum(_causes(one) == _causes(searched) for one in self.solutions)
-        return RepeatedSearch(GROUPS, same, max(1.0, widening), moves)
-
-
-def search_partly(
-    search: Search, solution: Solution, progress: Callable[[float], None]
-) -> PartialSearches | None:
+def repeat_search(
+    found: Estimate, search: Search, solution: Solution, progress: Callable[[float], None]
+) -> RepeatedSearch | None:
     """Repeat a search; None where that is not needed, or would take too long.
 
     Parameters
     ----------
+    found
+        The fit that the search began with.
     search
         As it ended.
     solution
@@ -162,7 +90,8 @@ def search_partly(
     # Generators of their own: the rest of the discovery is the same with and without this.
     rngs = search.rng.spawn(GROUPS + 1)
     group = (rngs[-1].permutation(data.poses) % GROUPS)[data.pose_of_row]
-    errors, solutions = np.empty((len(data), 3)), []
+    errors = np.empty((len(data), 3))
+    parameters, same = [], 0
     for index, rng in enumerate(rngs[:GROUPS]):
         progress(index / GROUPS)
         mine = group == index
@@ -174,9 +103,16 @@ def search_partly(
             judge=lambda rows, _: rows,
             progress=lambda _: None,
         )
-        solutions.append(again.run().solution)
-        errors[mine] = kept.unexplained(solutions[-1])[data.rows.source[mine]]
-    return PartialSearches(tuple(solutions), errors)
+        without = again.run().solution
+        errors[mine] = kept.unexplained(without)[data.rows.source[mine]]
+        parameters.append(natural_parameters(found, data, solution, without))
+        same += _causes(without) == _causes(solution)
+    distances = squared_distances(errors, row_covariance(data, solution))
+    widening = float(np.sqrt(np.quantile(distances, REGION) / chi2.ppf(REGION, 3)))
+    moves = np.array(parameters).T
+    moves -= moves.mean(axis=1, keepdims=True)
+    moves *= np.sqrt((GROUPS - 1) / GROUPS)
+    return RepeatedSearch(GROUPS, same, max(1.0, widening), moves)
 
 
 def _causes(solution: Solution) -> set[tuple[str, tuple[int, ...]]]:

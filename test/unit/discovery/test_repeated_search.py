@@ -11,15 +11,13 @@ from scipy.stats import chi2
 
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.predictions import REGION, squared_distances
-from remaster_ros.discovery import repeated_search
 from remaster_ros.discovery.discover import discover_session
-from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.repeated_search import (
     GROUPS,
-    PartialSearches,
+    RepeatedSearch,
+    repeat_search,
     row_covariance,
-    search_partly,
 )
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
@@ -51,7 +49,7 @@ def one_row_of_each_pose(session: Session) -> Session:
 
 
 @cache
-def searched(seed: int) -> tuple[Estimate, Search, Solution, PartialSearches]:
+def searched(seed: int) -> tuple[Estimate, Search, Solution, RepeatedSearch | None]:
     session = session_with(seed, waves_of_all_joints, poses=40, validation=60, pose_sigma_m=0.0)
     found = estimate(Problem.of(one_row_of_each_pose(session)))
     data = Residuals.of(found)
@@ -59,18 +57,16 @@ def searched(seed: int) -> tuple[Estimate, Search, Solution, PartialSearches]:
     rng = np.random.default_rng(7)
     search = Search(data, cells, rng, lambda data, _: data, lambda _: None)
     solution = search.run().solution
-    partial = search_partly(search, solution, lambda _: None)
-    assert partial is not None
-    return found, search, solution, partial
+    return found, search, solution, repeat_search(found, search, solution, lambda _: None)
 
 
 def test_regions_hold_poses_that_the_choice_of_causes_has_not_seen():
     limit, inside = chi2.ppf(REGION, 3), []
     for seed in SEEDS:
-        found, search, solution, partial = searched(seed)
-        data = search.data
-        repeated = partial.compared(found, data, solution, solution)
+        _, search, solution, repeated = searched(seed)
+        assert repeated is not None
         assert repeated.widening > 1.0
+        data = search.data
         held_out = data.only(np.flatnonzero(data.context.measurements.is_validation))
         errors = data.unexplained(solution)[held_out.rows.source]
         distances = squared_distances(errors, row_covariance(held_out, solution))
@@ -85,8 +81,8 @@ def test_regions_hold_poses_that_the_choice_of_causes_has_not_seen():
 
 def test_parameters_contain_how_far_the_searches_differ():
     for seed in SEEDS:
-        found, search, solution, partial = searched(seed)
-        repeated = partial.compared(found, search.data, solution, solution)
+        found, _, solution, repeated = searched(seed)
+        assert repeated is not None
         size = found.model.size
         assert repeated.moves.shape == (size + len(solution.parameters), GROUPS)
         assert 0 <= repeated.same <= repeated.count == GROUPS
@@ -102,28 +98,10 @@ def test_parameters_contain_how_far_the_searches_differ():
 
 
 def test_the_rest_of_the_discovery_has_the_same_random_numbers():
-    _, search, solution, _ = searched(SEEDS[0])
+    found, search, solution, _ = searched(SEEDS[0])
     before = search.rng.bit_generator.state
-    assert search_partly(search, solution, lambda _: None) is not None
+    assert repeat_search(found, search, solution, lambda _: None) is not None
     assert search.rng.bit_generator.state == before
-
-
-def test_a_cause_that_most_searches_do_not_find_leaves_unless_the_data_are_clear(monkeypatch):
-    _, search, begun, partial = searched(SEEDS[0])
-    without = search.fit(begun.cells[1:], begun)
-    cost = begun.log_evidence - without.log_evidence
-    assert cost > 0.0
-
-    def survivors(times: int) -> set[Cell]:
-        """Return what is left where so many of the five searches have found the cell."""
-        ends = (begun,) * times + (without,) * (GROUPS - times)
-        return set(replace(partial, solutions=ends).surviving(search, begun).cells)
-
-    monkeypatch.setattr(repeated_search, 'BEYOND_DOUBT', 1.01 * cost)
-    assert survivors(2) == set(without.cells)
-    assert survivors(3) == set(begun.cells)
-    monkeypatch.setattr(repeated_search, 'BEYOND_DOUBT', 0.99 * cost)
-    assert survivors(0) == set(begun.cells)
 
 
 def test_one_cause_of_many_rows_is_not_searched_for_again():
@@ -134,7 +112,7 @@ def test_one_cause_of_many_rows_is_not_searched_for_again():
     search = Search(data, cells, np.random.default_rng(8), lambda data, _: data, lambda _: None)
     solution = search.run().solution
     assert solution.cells
-    assert search_partly(search, solution, lambda _: None) is None
+    assert repeat_search(found, search, solution, lambda _: None) is None
 
 
 def test_the_result_says_that_the_search_was_repeated():
