@@ -1,6 +1,7 @@
 """A small collection of real nodes on fake devices, without the demo around them."""
 
 import socket
+from collections import Counter
 
 import numpy as np
 from ros_rig import ROOT, call, node_arguments, wait_until
@@ -10,6 +11,7 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.demo import free_ports
 from remaster_ros.session.journal import read_journal
 from remaster_ros.session.reader import read_session
+from remaster_ros.session.recorded_plan import read_plan
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
 
@@ -147,6 +149,11 @@ class Cell:
         count, planned = len(set(m.configuration.tolist())), self.planned()
         assert planned > 3
         assert planned - lost <= count <= planned, (count, planned, lost)
+
+    def ended(self, session):
+        """Return what the plan says became of its configurations: outcome -> how many."""
+        chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+        return Counter(read_plan(self.session, chain).outcomes.values())
 
     def planned(self):
         """Return how many configurations the collection has, with what is measured further."""

@@ -1,7 +1,5 @@
 """A collection whose sensors are topics of nodes of other packages: no heartbeat, real DDS."""
 
-from collections import Counter
-
 import numpy as np
 from collection_rig import Cell
 from foreign_source import SIGMA_RAD, orientation
@@ -10,9 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from remaster_ros import fit
 from remaster_ros.collection.events import ConfigurationEnded
-from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import read_session
-from remaster_ros.session.recorded_plan import read_plan
 from remaster_ros.session.workcell import config_path
 from remaster_ros.simulation.faults import inject
 
@@ -113,10 +109,9 @@ class Collection:
         cell = self.cell
         self.until(lambda: cell.recorder('exit_status') == 'complete', 'the end', 300)
         session = read_session(cell.session)
-        chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
         # On a busy machine a fault of one sensor meets a late reading of the other, or a node that
         # starts again is waited for in vain: each such configuration is said, in the plan.
-        said = Counter(read_plan(cell.session, chain).outcomes.values())
+        said = cell.ended(session)
         print(said)
         assert sum(said.values()) == cell.planned(), said
         lost = cell.planned() - said['recorded'] - said['partial']
