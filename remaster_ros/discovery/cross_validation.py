@@ -78,22 +78,6 @@ class LeftOut:
         parts = [white[mine] for mine in rows]
         return cls(data, tuple(cells), scale, rows, parts, [part.T @ part for part in parts])
 
-    def squares(self, solution: Solution) -> FloatArray:
-        """Return the squared error of each pose by the fit to the others, in units of the noise.
-
-        Parameters
-        ----------
-        solution
-            Which cells, with which smoothness.
-
-        Returns
-        -------
-        ndarray
-            (poses,).
-        """
-        errors, _ = self._predicted(solution)
-        return self._of_poses(np.sum(errors**2, axis=1))
-
     def deviance(self, solution: Solution) -> FloatArray:
         """Return how well poses are predicted by the fit of some of the cells to the others.
 
@@ -115,10 +99,7 @@ class LeftOut:
         errors, variance = self._predicted(solution)
         scaled = np.linalg.solve(variance, errors[:, :, None])[:, :, 0]
         deviance = np.sum(errors * scaled, axis=1) + np.linalg.slogdet(variance)[1]
-        return self._of_poses(deviance)
-
-    def _of_poses(self, of_rows: FloatArray) -> FloatArray:
-        return np.bincount(self.data.pose_of_row, of_rows).astype(float)
+        return np.bincount(self.data.pose_of_row, deviance).astype(float)
 
     def _predicted(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
         """Return the error of each row by the fit to others, (n, 3), and its variance."""

@@ -15,14 +15,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import binom, mannwhitneyu
+from scipy.stats import binom
 
 from remaster_ros.calibration.result import FitResult
-from remaster_ros.discovery.cross_validation import LeftOut
 from remaster_ros.discovery.errors_by_place import errors_by_place
 from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.gain import rms
 from remaster_ros.discovery.guard import Unexplained
+from remaster_ros.discovery.held_out_poses import compare_held_out
 from remaster_ros.discovery.moved_meanwhile import far_off, moved_text
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
@@ -36,10 +36,8 @@ GROSS = 7.0
 FEWEST_MISPAIRED = 2
 # Gross errors that are compared with the places of all rows.
 MOST_COMPARED = 200
-FEWEST_POSES = 8
 # Observations that a sentence lists.
 LISTED = 5
-FOLDS = 10
 
 
 def structure_left(
@@ -184,24 +182,11 @@ class _Checks:
 
     def held_out(self) -> Iterator[Unexplained]:
         """Held-out poses with larger errors than poses that were left out of the fit in turn."""
-        data, noise = self.data, self.searched.noise
-        measurements = data.context.measurements
-        rows = np.flatnonzero(measurements.is_validation & ~self.gross)
-        if len(np.unique(measurements.pose[rows])) < FEWEST_POSES or data.poses < FEWEST_POSES:
+        data = self.data
+        held_out = data.context.measurements.is_validation & ~self.gross
+        compared = compare_held_out(data, self.searched, np.flatnonzero(held_out))
+        if compared is None or compared.p_value > SIGNIFICANCE:
             return
-        folds = np.arange(data.poses) % min(FOLDS, data.poses)
-        left_out = LeftOut.of(data, self.searched.cells, noise, folds)
-        expected = left_out.squares(self.searched) / np.bincount(data.pose_of_row)
-        others = data.only(rows)
-        left = others.noise_model.whitened(
-            data.unexplained(self.searched)[others.rows.source], noise
-        )
-        pose = others.pose_of_row
-        found = np.bincount(pose, np.sum(left**2, axis=1)) / np.bincount(pose)
-        p_value = float(mannwhitneyu(found, expected, alternative='greater').pvalue)
-        if p_value > SIGNIFICANCE:
-            return
-        ratio = float(np.sqrt(np.median(found) / np.median(expected)))
         moved = [
             text
             for sensor in range(len(data.context.sensor_names))
@@ -210,13 +195,14 @@ class _Checks:
         yield Unexplained(
             where='held_out_poses',
             driver='time' if moved else 'unknown',
-            size_m=rms(self.errors, measurements.is_validation & ~self.gross),
-            p_value=p_value,
+            size_m=rms(self.errors, held_out),
+            p_value=compared.p_value,
             next=' '.join(
                 [
-                    f'The errors on the held-out poses are {ratio:.1f} times those on poses left '
-                    'out of the fit in turn: what is held out lies elsewhere, or something '
-                    'changed in between.',
+                    f'The errors on the held-out poses are {compared.ratio:.1f} times those on '
+                    'poses left out of the fit in turn, both in units of what is uncertain of '
+                    'their prediction: what is held out lies elsewhere, or something changed in '
+                    'between.',
                     *(moved or ['Compare where and when the two were measured.']),
                 ]
             ),
