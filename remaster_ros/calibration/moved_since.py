@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import f
+import scipy
 
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
@@ -55,7 +55,9 @@ def moved_since(measurements: Measurements, rows: IntArray, errors: FloatArray) 
     at = int(np.argmax(explained))
     left = float(np.sum((means - means.mean(axis=0)) ** 2) - explained[at])
     freedom = 3 * (poses - 2)
-    p_value = f.sf(explained[at] / 3.0 / (max(left, 1e-30) / freedom), 3, freedom) * len(step)
+    p_value = scipy.stats.f.sf(
+        explained[at] / 3.0 / (max(left, 1e-30) / freedom), 3, freedom
+    ) * len(step)
     if p_value > SIGNIFICANCE:
         return None
     return Moved(int(measurements.observation[rows[place > at][0]]), step[at])

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.grouped_rows import Rows
@@ -181,4 +181,4 @@ class Precision:
         most = float(np.log(MOST_TIMES))
         if excess(most) > 0.0:
             return np.inf
-        return float(np.exp(brentq(excess, 0.0, most, xtol=1e-4)))
+        return float(np.exp(scipy.optimize.brentq(excess, 0.0, most, xtol=1e-4)))

@@ -23,7 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import binomtest, chi2
+import scipy
 
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.result import FitResult
@@ -87,7 +87,7 @@ class Coverage:
         rows, count = len(inside), int(inside.sum())
         if rows == 0:
             return cls(0, 0, None, None)
-        interval = binomtest(count, rows).proportion_ci(0.95)
+        interval = scipy.stats.binomtest(count, rows).proportion_ci(0.95)
         return cls(rows, count, count / rows, (float(interval.low), float(interval.high)))
 
 
@@ -126,7 +126,7 @@ def predict(
         turn = to_sensor[:, :3, :3]
         position[source] = apply(to_sensor, part.place)
         covariance[source] = turn @ found @ np.swapaxes(turn, 1, 2)
-    limit = float(chi2.ppf(REGION, 3))
+    limit = float(scipy.stats.chi2.ppf(REGION, 3))
     if widening is None:
         left_out = _left_out_distances(fit, measurements, triangle)
         widening = 1.0

@@ -14,9 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import beta
-from scipy.stats import f as f_distribution
-from scipy.stats import t as t_distribution
+import scipy
 
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.laplace import Mode
@@ -236,7 +234,7 @@ def _f_test(
     ratio = explained / own.shape[1] / variance
     concerned = float(np.sum(rest[np.any(family != 0.0, axis=1)] ** 2))
     share = max(0.0, explained - own.shape[1] * variance) / concerned
-    return Explained(float(f_distribution.sf(ratio, own.shape[1], freedom)), share)
+    return Explained(float(scipy.stats.f.sf(ratio, own.shape[1], freedom)), share)
 
 
 def _from_pose_to_pose(
@@ -273,7 +271,9 @@ def _from_pose_to_pose(
     # From -1 to 1.
     middle = 0.5 * (mean + 1.0)
     precision = middle * (1.0 - middle) / (0.25 * variance) - 1.0
-    p_value = beta.sf(0.5 * (ratio + 1.0), middle * precision, (1.0 - middle) * precision)
+    p_value = scipy.stats.beta.sf(
+        0.5 * (ratio + 1.0), middle * precision, (1.0 - middle) * precision
+    )
     return StructureTest('reading_before', True, float(p_value))
 
 
@@ -294,4 +294,4 @@ def _within_poses(errors: FloatArray, rows: Rows, seconds: FloatArray) -> Struct
         return None
     excess = (chained + squares / rows.group_size)[several]
     score = excess.mean() / (excess.std(ddof=1) / np.sqrt(len(excess)))
-    return StructureTest('reading_before', False, float(t_distribution.sf(score, len(excess) - 1)))
+    return StructureTest('reading_before', False, float(scipy.stats.t.sf(score, len(excess) - 1)))

@@ -11,8 +11,8 @@ model would end with more data of the same kind, not for the truth (figures: doc
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize
 
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.smooth_functions import (
@@ -86,7 +86,7 @@ def robust_std(mode: Mode, measurements: Measurements) -> FloatArray:
 
     start = np.append(0.0, np.full(len(size), START))
     bounds = [NOISE_RANGE, *[RANGE] * len(size)]
-    logs = minimize(cost, start, method='L-BFGS-B', bounds=bounds).x
+    logs = scipy.optimize.minimize(cost, start, method='L-BFGS-B', bounds=bounds).x
     scaled, scale = system(logs)
     root = cho_factor(scaled, lower=True)
     shift = cho_solve(root, pull / scale / np.exp(logs[0])) / scale

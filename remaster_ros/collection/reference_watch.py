@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from remaster_ros.collection.reference_readings import (
     ReferenceReading,
@@ -252,7 +252,7 @@ class ReferenceWatch:
         for sensor, (_, freedoms) in noise.items():
             mine = z[[place.sensor == sensor for place in places]]
             if len(mine):
-                whole.append(stats.f.sf(np.mean(mine**2), mine.size, freedoms))
+                whole.append(scipy.stats.f.sf(np.mean(mine**2), mine.size, freedoms))
         freedoms = min(freedoms for _, freedoms in noise.values())
         for cause in causes(self._chain, places):
             signal = (cause.jacobian / std[:, None, None]).reshape(z.size, -1)
@@ -260,7 +260,9 @@ class ReferenceWatch:
             basis = basis[:, size > 1e-9 * max(size[0], 1e-300)]
             if basis.shape[1]:
                 explained = float(np.sum((basis.T @ z.ravel()) ** 2))
-                single.append(stats.f.sf(explained / basis.shape[1], basis.shape[1], freedoms))
+                single.append(
+                    scipy.stats.f.sf(explained / basis.shape[1], basis.shape[1], freedoms)
+                )
         return 2.0 * min(min(tests) * len(tests) for tests in (whole, single) if tests)
 
     def _explain(
@@ -312,7 +314,7 @@ class ReferenceWatch:
                 fits.append((score, left, theta, cause, step))
         score, left, theta, cause, step = min(fits, key=lambda fit: fit[0])
         freedoms = max(data - len(theta), 1)
-        poor = stats.f.sf(left / freedoms, freedoms, known)
+        poor = scipy.stats.f.sf(left / freedoms, freedoms, known)
         share = np.sqrt(left / max(float(np.sum(y**2)), 1e-300))
         first_new = number if step is None else step
         earlier = [c for i in range(first_new) for c in self._rounds[i].configurations]

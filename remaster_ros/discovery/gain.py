@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import spearmanr
+import scipy
 
 from remaster_ros.calibration.accuracy import accuracy_of
 from remaster_ros.calibration.estimate import Estimate
@@ -128,7 +128,9 @@ def noise_by_range(data: Residuals, solution: Solution) -> dict[str, dict[str, f
         distance = data.part.range_m[span]
         low, high = np.quantile(distance, (0.25, 0.75))
         near, far = length[span][distance <= low], length[span][distance >= high]
-        p_value = 1.0 if np.ptp(distance) == 0.0 else spearmanr(distance, length[span])[1]
+        p_value = (
+            1.0 if np.ptp(distance) == 0.0 else scipy.stats.spearmanr(distance, length[span])[1]
+        )
         found[data.context.sensor_names[sensor]] = {
             'near_m': float(low),
             'far_m': float(high),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import ttest_1samp
+import scipy
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.result import FitResult, predicted_rows
@@ -75,7 +75,7 @@ def harm_of(
     change = np.log(by_pose(fit.residuals_after) / before)
     p_value = np.nan
     if len(change) > 1 and np.ptp(change) > 0.0:
-        p_value = ttest_1samp(change, 0.0, alternative='greater').pvalue
+        p_value = scipy.stats.ttest_1samp(change, 0.0, alternative='greater').pvalue
     names = ', '.join(dict.fromkeys(effect.name.replace('_', ' ') for effect in effects))
     assert gain.held_out_rms_before_m is not None
     assert gain.held_out_rms_after_m is not None

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import mannwhitneyu
+import scipy
 
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.residuals import Residuals
@@ -67,7 +67,7 @@ def compare_held_out(data: Residuals, solution: Solution, source: IntArray) -> H
         return None
     return HeldOutPoses(
         float(np.sqrt(np.median(found) / np.median(left_out))),
-        float(mannwhitneyu(found, left_out, alternative='greater').pvalue),
+        float(scipy.stats.mannwhitneyu(found, left_out, alternative='greater').pvalue),
     )
 
 

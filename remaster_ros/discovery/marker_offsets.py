@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.discovery.effects.marker_offset import EFFECT as MARKER_OFFSET
@@ -76,7 +76,7 @@ def moved_markers(
             (drawn,) = draws_of(memory, [((own @ axes[:, seen]).T, solution)])
             noise = drawn @ drawn.T / drawn.shape[1]
         square = float(u @ np.linalg.solve(noise + np.diag((values[seen] * std) ** 2), u))
-        p_value = float(chi2.sf(square, seen.sum()))
+        p_value = float(scipy.stats.chi2.sf(square, seen.sum()))
         if p_value * len(problem.marker_names) > SIGNIFICANCE:
             continue
         inverse = axes[:, seen] / values[seen]

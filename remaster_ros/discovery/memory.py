@@ -18,8 +18,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from scipy.optimize import nnls
-from scipy.signal import lfilter
 
 from remaster_ros.calibration.noise import Channel
 from remaster_ros.discovery.residuals import Residuals
@@ -108,7 +108,10 @@ class Memory:
                 rho = np.exp(-1.0 / self.length[sensor])
                 # Stationary from the first reading on.
                 fresh[1:] *= np.sqrt(1.0 - rho**2)
-                errors[span] += self.process[sensor] * lfilter([1.0], [1.0, -rho], fresh, 0)[order]
+                errors[span] += (
+                    self.process[sensor]
+                    * scipy.signal.lfilter([1.0], [1.0, -rho], fresh, 0)[order]
+                )
         return errors
 
 

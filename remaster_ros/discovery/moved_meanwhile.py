@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.stats import binom
+import scipy
 
 from remaster_ros.calibration.moved_since import moved_since
 from remaster_ros.discovery.effects.context import Context
@@ -47,7 +47,7 @@ def far_off(context: Context, errors: FloatArray, gross: BoolArray) -> Iterator[
             where='held_out_poses',
             driver='time' if moved else 'unknown',
             size_m=size,
-            p_value=float(binom.sf(count - 1, len(rows), USUAL_GROSS)),
+            p_value=float(scipy.stats.binom.sf(count - 1, len(rows), USUAL_GROSS)),
             next=moved
             or (
                 f'{count} of the {len(rows)} held-out readings of {sensor} are off by '

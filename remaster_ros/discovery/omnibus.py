@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import binom
+import scipy
 
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.errors_by_place import errors_by_place
@@ -147,7 +147,7 @@ class _Checks:
         # lies within it of the places of other poses.
         some = gross[:: 1 + len(gross) // MOST_COMPARED].tolist()
         chance = min(1.0, 2.0 * np.mean([self._share_near(row) for row in some]))
-        p_value = float(binom.sf(count - 1, len(gross), chance))
+        p_value = float(scipy.stats.binom.sf(count - 1, len(gross), chance))
         if p_value > SIGNIFICANCE:
             return
         listed = ', '.join(map(str, measurements.observation[self.mispaired][:LISTED]))

@@ -21,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.predictions import REGION, squared_distances
@@ -108,7 +108,7 @@ def repeat_search(
         parameters.append(natural_parameters(found, data, solution, without))
         same += _causes(without) == _causes(solution)
     distances = squared_distances(errors, row_covariance(data, solution))
-    widening = float(np.sqrt(np.quantile(distances, REGION) / chi2.ppf(REGION, 3)))
+    widening = float(np.sqrt(np.quantile(distances, REGION) / scipy.stats.chi2.ppf(REGION, 3)))
     moves = np.array(parameters).T
     moves -= moves.mean(axis=1, keepdims=True)
     moves *= np.sqrt((GROUPS - 1) / GROUPS)

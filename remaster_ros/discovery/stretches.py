@@ -26,7 +26,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.predictions import REGION, squared_distances
@@ -243,4 +243,6 @@ def _widening(
         spread = spread.T.reshape(-1, 3, columns.shape[2])
         covariance[mine] += spread @ np.swapaxes(spread, 1, 2)
     distances = squared_distances(errors, covariance)
-    return max(1.0, float(np.sqrt(np.quantile(distances, REGION) / chi2.ppf(REGION, 3))))
+    return max(
+        1.0, float(np.sqrt(np.quantile(distances, REGION) / scipy.stats.chi2.ppf(REGION, 3)))
+    )

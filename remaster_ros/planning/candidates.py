@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.stats import qmc
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.body_pairs import RESERVE_M
@@ -206,7 +206,7 @@ def candidate_poses(
         raise InputError(f'planning: the sensor position {sensor_R} is not three finite numbers')
     lower, upper = np.transpose([getattr(ranges, spec.name) for spec in fields(ranges)])
     # `seed` takes a Generator in every SciPy since 1.7; its new name `rng` only since 1.15.
-    unit = qmc.LatinHypercube(d=len(lower), seed=rng).random(n)
+    unit = scipy.stats.qmc.LatinHypercube(d=len(lower), seed=rng).random(n)
     azimuth, radius, height, roll = (lower + unit * (upper - lower)).T
     positions = np.column_stack((radius * np.cos(azimuth), radius * np.sin(azimuth), height))
 

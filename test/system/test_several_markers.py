@@ -43,11 +43,13 @@ def test_markers_of_a_frame_are_recorded_together_and_a_hidden_one_costs_nothing
     assert all(len(set(found)) == len(found) > 1 for found in of), of
     assert 2 <= sum('sir' not in found for found in of) < len(of) - 3
     np.testing.assert_array_equal(m.frame, m.configuration)
-    # On a busy machine a recorder that starts again is waited for in vain, which the plan says.
+    # On a busy machine a recorder that starts again is waited for in vain, or few frames arrive
+    # in time, which the plan says.
     ended = cell.ended(session)
     assert sum(ended.values()) == cell.planned() > 3
-    assert ended['failed'] <= 1
-    assert len(of) == cell.planned() - ended['failed'], ended
+    lost = ended['failed'] + ended['rejected']
+    assert lost <= 2, ended
+    assert len(of) == cell.planned() - lost, ended
 
     stamps: dict[str, set[int]] = {}
     from geometry_msgs.msg import PointStamped

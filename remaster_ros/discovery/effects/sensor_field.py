@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
+import scipy
 from scipy.spatial.distance import cdist
 
 from remaster_ros.discovery.effects.base import Cell, Design, Effect, along_axes, displaced
@@ -44,7 +44,9 @@ def cells(context: Context) -> Iterator[Cell]:
             continue
         rarity = RARITY * (len(LENGTHS) + 1) * len(context.sensor_names)
         # A fixed seed: the centers are a property of the places.
-        centers, _ = kmeans2(places, count, minit='++', rng=np.random.default_rng(0))
+        centers, _ = scipy.cluster.vq.kmeans2(
+            places, count, minit='++', rng=np.random.default_rng(0)
+        )
         for variant, factor in LENGTHS.items():
             length = factor * spread
             kernel = _kernel(centers, centers, length) + JITTER * np.eye(count)

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
-from scipy.interpolate import BSpline
+import scipy
 
 from remaster_ros.discovery.effects.base import (
     Cell,
@@ -58,7 +58,7 @@ def cells(context: Context) -> Iterator[Cell]:
 def _wandered(context: Context, sensor: int, knots: FloatArray) -> Design:
     # Linear: the splines' own knots stand once more at both ends.
     padded = np.concatenate((knots[:1], knots, knots[-1:]))
-    features = BSpline.design_matrix(context.progress, padded, 1).toarray()
+    features = scipy.interpolate.BSpline.design_matrix(context.progress, padded, 1).toarray()
     features = features * context.seen_by(sensor)[:, None]
     return displaced(*along_axes(features, context.sensor_turn))
 

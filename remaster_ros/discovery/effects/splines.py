@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import BSpline
+import scipy
 
 from remaster_ros.types import BoolArray, FloatArray
 
@@ -182,7 +182,7 @@ def basis(values: FloatArray, knots: FloatArray) -> FloatArray:
     """Return the splines' values, (n, m), at values (n,); outside the knots those of the edge."""
     low, high = knots[DEGREE], knots[-DEGREE - 1]
     inside = np.clip(values, low, high)
-    return np.asarray(BSpline.design_matrix(inside, knots, DEGREE).toarray())
+    return np.asarray(scipy.interpolate.BSpline.design_matrix(inside, knots, DEGREE).toarray())
 
 
 def centers(knots: FloatArray) -> FloatArray:
