@@ -152,7 +152,10 @@ def start_wrongly(executable: str, installed: tuple[Path, dict[str, str]], cwd: 
     assert 'nonsense' in done.stderr
 
 
-@pytest.mark.parametrize('executable', EXECUTABLES)
+@pytest.mark.parametrize(
+    'executable',
+    [EXECUTABLES[0], *(pytest.param(name, marks=pytest.mark.qualify) for name in EXECUTABLES[1:])],
+)
 def test_an_executable_starts(
     executable: str, by_pip: tuple[Path, dict[str, str]], tmp_path: Path
 ) -> None:

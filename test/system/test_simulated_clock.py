@@ -75,6 +75,7 @@ def follow_the_clock(client, said, node):
     return turn
 
 
+@pytest.mark.qualify
 def test_the_laser_tracker_measures_nothing_without_it(start, client, said, world):
     (port,) = free_ports(socket.SOCK_STREAM)
     start(

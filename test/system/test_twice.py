@@ -40,7 +40,9 @@ def begin(start, node, tmp_path, number, *more):
     return start(f'remaster_ros.nodes.{node}', *node_arguments(**values), *more)
 
 
-@pytest.mark.parametrize('node', TWICE)
+@pytest.mark.parametrize(
+    'node', [TWICE[0], *(pytest.param(node, marks=pytest.mark.qualify) for node in TWICE[1:])]
+)
 def test_on_one_computer(start, client, said, tmp_path, node):
     """At once, by the lock; a killed one is followed at once; a namespace is another cell."""
     first = begin(start, node, tmp_path, 1)
@@ -108,9 +110,8 @@ def start_elsewhere(ros_environment, tmp_path):
         process.communicate()
 
 
-@pytest.mark.parametrize(
-    'node', [pytest.param('robot_bridge', marks=pytest.mark.qualify), 'optimizer']
-)
+@pytest.mark.qualify
+@pytest.mark.parametrize('node', ['robot_bridge', 'optimizer'])
 def test_on_two_computers(start_elsewhere, client, said, node):
     """By what the two publish: the one that has been running for less time ends."""
     first = start_elsewhere(node)

@@ -191,6 +191,7 @@ def collected(modules: set[str], folder: Path) -> subprocess.CompletedProcess[st
     )
 
 
+@pytest.mark.qualify
 def test_without_the_judges_the_other_tests_are_collected(tmp_path: Path) -> None:
     """Another's program that judges is not there on every machine; it must not stop the rest."""
     judges = {'pinocchio', 'mcap_ros2', 'NatNetClient', 'natnet', 'CESAPI'}

@@ -39,9 +39,9 @@ def written(folder, description: Description, name='robot.urdf'):
     [
         ('ur5e', ''),
         ('irb120', ''),
-        ('panda', 'panda_joint5'),
+        pytest.param('panda', 'panda_joint5', marks=pytest.mark.qualify),
         ('iiwa14', 'lbr_A3'),
-        ('xarm7', 'joint5'),
+        pytest.param('xarm7', 'joint5', marks=pytest.mark.qualify),
     ],
 )
 def test_known_arms_go_to_a_finished_plan_without_an_edit(robot, held, do, tmp_path, capsys):

@@ -56,16 +56,16 @@ def remembering(session: Session) -> FloatArray:
 
 
 @pytest.mark.parametrize(
-    ('errors', 'driver'),
+    ('errors', 'driver', 'poses'),
     [
-        (bent_on_one_side, 'position'),
-        (bent_about_the_mean_distance, 'position'),
-        (remembering, 'time'),
+        (bent_on_one_side, 'position', 25),
+        (bent_about_the_mean_distance, 'position', 35),
+        (remembering, 'time', 25),
     ],
 )
-def test_structure_without_a_name_is_located_and_no_cause_is_claimed(errors, driver):
+def test_structure_without_a_name_is_located_and_no_cause_is_claimed(errors, driver, poses):
     found = discover_session(
-        session_with(31, sensor=errors, pose_sigma_m=0.05e-3),
+        session_with(31, sensor=errors, pose_sigma_m=0.05e-3, poses=poses),
         rng=np.random.default_rng(0),
         clock=None,
     )

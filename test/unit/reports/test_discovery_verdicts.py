@@ -92,7 +92,7 @@ def test_causes_are_drawn(found, scene, tmp_path):
 
 
 @pytest.mark.parametrize('verdict', get_args(Verdict))
-@pytest.mark.parametrize('scene', ['healthy', 'bent'])
+@pytest.mark.parametrize('scene', [pytest.param('healthy', marks=pytest.mark.qualify), 'bent'])
 def test_every_verdict_has_its_page(found, verdict, scene, tmp_path):
     page, mood, names = saved(replace(found[scene], verdict=verdict), tmp_path)
     assert ('causes' in names) == (scene == 'bent')
