@@ -108,6 +108,6 @@ class MotionUnderWay:
             return []
         admitted = self.gate.stop(*following.window(seen, wall_s, rate))
         (stop,) = admitted.waypoints
-        lag_s = allowed_lag_s(self.rules, rate)
-        self.braking = Braking(stop.q, seen.now(wall_s, rate) + stop.time_s + lag_s + STOPPED_S)
+        over = seen.now(wall_s, rate) + stop.time_s + allowed_lag_s(self.rules, rate)
+        self.braking = Braking(stop.q, over, over + STOPPED_S)
         return [Stop(admitted, reason, wall_s)]

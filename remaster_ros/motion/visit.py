@@ -101,13 +101,27 @@ class Visit:
 
 @dataclass(frozen=True)
 class Braking:
-    """A stop under way: where it ends (rad, (k,)), and when the arm must stand (robot time)."""
+    """A stop under way.
+
+    Attributes
+    ----------
+    end
+        Where it leads, rad, (k,).
+    over
+        Robot time at which the arm has come to its end, however late it reacts, s. Before that an
+        arm that stands may not yet have begun to move.
+    deadline
+        Robot time until which it must stand, s.
+    """
 
     end: FloatArray
+    over: float
     deadline: float
 
     def judge(self, seen: Seen) -> Outcome:
         """Return whether the arm has come to rest where its stop ends, by a report."""
+        if seen.time < self.over:
+            return UNDER_WAY
         if seen.stands(seen.wall):
             if np.max(np.abs(seen.q - self.end)) <= ELSEWHERE_RAD:
                 return 'over', ''

@@ -36,12 +36,10 @@ def test_a_designed_collection_goes_on_after_its_planner_was_killed(start, clien
     assert Floors().hold(fitted.pose)
     # A pose has one number, also where it was visited again for another of its solutions.
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
-    places = np.round(chain.forward(session.measurements.q)[:, :3, 3], 3)
-    numbers = {}
-    for place, pose in zip(map(tuple, places), session.measurements.pose.tolist()):
-        numbers.setdefault(place, set()).add(pose)
-    assert all(len(found) == 1 for found in numbers.values())
-    assert len(set.union(*numbers.values())) == len(numbers)
+    places = chain.forward(session.measurements.q)[:, :3, 3]
+    apart = np.linalg.norm(places[:, None] - places, axis=2) > 2e-3
+    pose = session.measurements.pose
+    np.testing.assert_array_equal(apart, pose[:, None] != pose)
     # The order of the journal, before and after the kill.
     records = read_journal(cell.session / 'plan.jsonl').records
     (order,) = [record['order'] for record in records if record.get('order')]

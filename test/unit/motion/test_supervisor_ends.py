@@ -4,9 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from supervisor_rig import LIMITS
+from supervisor_rig import HOME, LIMITS
 
 from remaster_ros.motion.actions import Drive, Failed, Halted, Settled, Stop
+from remaster_ros.motion.visit import ELSEWHERE_RAD
 from remaster_ros.simulation import arm_motion as servo
 
 
@@ -153,3 +154,27 @@ def test_a_move_that_was_not_sent_is_asked_for_again(rig):
     rig.run(1.0, lambda: len(rig.actions) > count)
     assert rig.last(Drive) is not first
     assert rig.last(Drive).solution == first.solution
+
+
+@pytest.mark.parametrize('delay_s', [0.0, 0.1])
+@pytest.mark.parametrize('moved_s', [0.04, 0.1, 0.2])
+def test_a_stop_of_an_arm_that_has_hardly_begun_to_move(rig, moved_s, delay_s):
+    """The last reports show it where the move began: it is not yet where the stop leads."""
+    rig.delay_s = delay_s
+    rig.plan([0.9, -1.9])
+    rig.run(5.0, lambda: rig.said(Drive))
+    rig.run(moved_s)
+    rig.state = 'paused'
+    rig.do(rig.supervisor.planner_is('paused', rig.wall))
+    rig.run(0.1)
+    # Whoever wants to go on at once waits until the arm is there.
+    rig.state = 'running'
+    rig.run(5.0, lambda: len(rig.said(Drive)) == 2)
+    (stop,) = rig.said(Stop)
+    (end,) = stop.admitted.waypoints
+    # Where it leads is elsewhere, or so near that it would be taken for the end of the stop.
+    assert (np.max(np.abs(end.q - HOME)) > ELSEWHERE_RAD) == (moved_s > 0.05)
+    _, q, velocity, _ = rig.commands[-1]
+    np.testing.assert_allclose(q, end.q, atol=1e-4)
+    assert np.max(np.abs(velocity)) < 1e-3
+    assert not rig.said(Halted)

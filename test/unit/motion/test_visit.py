@@ -94,14 +94,21 @@ def test_an_arm_that_has_stood_for_long_enough_has_settled():
     ('off', 'outcome'), [(ELSEWHERE_RAD, 'over'), (ELSEWHERE_RAD + 1e-12, 'halted')]
 )
 def test_how_far_from_its_stop_an_arm_may_stand(off, outcome):
-    stop = Braking(np.zeros(2), SENT_S + 4.0)
+    stop = Braking(np.zeros(2), SENT_S, SENT_S + 4.0)
     said, why = stop.judge(at([off, 0.0], SENT_S, 1.0))
     assert said == outcome
     assert bool(why) == (outcome == 'halted')
     assert stop.judge(at([0.0, -off], SENT_S, 1.0))[0] == outcome
 
 
+@pytest.mark.parametrize(('q', 'outcome'), [(0.0, 'over'), (1.0, 'halted')])
+def test_an_arm_that_stands_before_its_stop_is_over_may_not_have_begun_to_move(q, outcome):
+    stop = Braking(np.zeros(2), SENT_S + 2.0, SENT_S + 4.0)
+    assert stop.judge(at([q, 0.0], SENT_S + 2.0 - 2.0**-30, 1.0)) == ('', '')
+    assert stop.judge(at([q, 0.0], SENT_S + 2.0, 1.0))[0] == outcome
+
+
 @pytest.mark.parametrize(('late', 'outcome'), [(0.0, ''), (2.0**-30, 'halted')])
 def test_how_long_a_stop_may_take(late, outcome):
-    stop = Braking(np.zeros(2), SENT_S + 4.0)
+    stop = Braking(np.zeros(2), SENT_S, SENT_S + 4.0)
     assert stop.judge(at([1.0, 0.0], SENT_S + 4.0 + late))[0] == outcome
