@@ -36,19 +36,20 @@ class LeftOut:
         All that can be fitted.
     scale
         Of each column of the offsets model, of the cells, and of the errors, (size + 1,).
-    rows
-        Which coordinates of the rows are left out together, (fold size,) each.
-    parts, grams
-        Of each fold columns and errors in units of the noise and of the scale, (fold size,
-        size + 1), and their products with each other.
+    white
+        Columns and errors in units of the noise and of the scale, (3 rows, size + 1).
+    gram
+        Their products with each other, (size + 1, size + 1).
+    folds
+        Which of the coordinates are left out together, (fold size,) each.
     """
 
     data: Residuals
     cells: tuple[Cell, ...]
     scale: FloatArray
-    rows: list[IntArray]
-    parts: list[FloatArray]
-    grams: list[FloatArray]
+    white: FloatArray
+    gram: FloatArray
+    folds: list[IntArray]
 
     @classmethod
     def of(
@@ -74,9 +75,8 @@ class LeftOut:
         scale[scale == 0.0] = 1.0
         white /= scale
         fold = np.repeat(fold_of_pose[data.pose_of_row], 3)
-        rows = [np.flatnonzero(fold == index) for index in range(int(fold.max()) + 1)]
-        parts = [white[mine] for mine in rows]
-        return cls(data, tuple(cells), scale, rows, parts, [part.T @ part for part in parts])
+        folds = [np.flatnonzero(fold == index) for index in range(int(fold.max()) + 1)]
+        return cls(data, tuple(cells), scale, white, white.T @ white, folds)
 
     def deviance(self, solution: Solution) -> FloatArray:
         """Return how well poses are predicted by the fit of some of the cells to the others.
@@ -102,28 +102,31 @@ class LeftOut:
         return np.bincount(self.data.pose_of_row, deviance).astype(float)
 
     def _predicted(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
-        """Return the error of each row by the fit to others, (n, 3), and its variance."""
+        """Return the error of each row by the fit to others, (n, 3), and its variance.
+
+        With S = X H⁻¹ X' of the rows X left out and H of all rows, the variance is (I − S)⁻¹, and
+        the error the product of it and what the fit to all rows leaves (Cook & Weisberg 1982,
+        Residuals and Influence in Regression, section 2.2).
+        """
         p = self.data.base.shape[2]
         edges = p + np.cumsum([0, *(cell.size for cell in self.cells)])
         first = dict(zip(self.cells, edges, strict=False))
         mine = [np.arange(first[cell], first[cell] + cell.size) for cell in solution.cells]
         chosen = np.concatenate((np.arange(p), *mine)).astype(int)
-        every = np.append(chosen, len(self.scale) - 1)
-        total = np.sum(self.grams, axis=0)[np.ix_(every, every)]
-        unit = self.scale[chosen[p:]]
-        total[p:-1, p:-1] += solution.prior_precision() / np.outer(unit, unit)
-        base = self.scale[:p]
-        total[:p, :p] += self.data.base_precision / np.outer(base, base)
-        np.einsum('ii->i', total)[:-1] += 1e-12
+        H = self.gram[np.ix_(chosen, chosen)]
+        unit, base = self.scale[chosen[p:]], self.scale[:p]
+        H[p:, p:] += solution.prior_precision() / np.outer(unit, unit)
+        H[:p, :p] += self.data.base_precision / np.outer(base, base)
+        np.einsum('ii->i', H)[:] += 1e-12
+        root = np.linalg.cholesky(H)
+        X = solve_triangular(root, self.white[:, chosen].T, lower=True, check_finite=False)
+        y = self.white[:, -1]
+        left = y - (X @ y) @ X
         errors = np.empty(3 * len(self.data))
         variance = np.empty((len(self.data), 3, 3))
-        for rows, part, gram in zip(self.rows, self.parts, self.grams, strict=True):
-            kept = total - gram[np.ix_(every, every)]
-            root = np.linalg.cholesky(kept[:-1, :-1])
-            X = part[:, chosen]
-            pulls = np.column_stack((kept[:-1, -1], X.T))
-            solved = solve_triangular(root, pulls, lower=True, check_finite=False)
-            errors[rows] = part[:, -1] - solved[:, 1:].T @ solved[:, 0]
-            spread = solved[:, 1:].T.reshape(-1, 3, len(chosen))
-            variance[rows[::3] // 3] = np.eye(3) + spread @ spread.transpose(0, 2, 1)
+        for fold in self.folds:
+            own, rows = X[:, fold], np.arange(len(fold) // 3)
+            inverse = np.linalg.inv(np.eye(len(fold)) - own.T @ own)
+            errors[fold] = inverse @ left[fold]
+            variance[fold[::3] // 3] = inverse.reshape(len(rows), 3, len(rows), 3)[rows, :, rows]
         return errors.reshape(-1, 3), variance
