@@ -55,12 +55,13 @@ def compare_held_out(data: Residuals, solution: Solution, source: IntArray) -> H
     if min(data.poses, len(np.unique(pose))) < FEWEST_POSES:
         return None
     found = predicted_squares(data.only(source), solution)
-    fold = (np.arange(data.poses) % FOLDS)[data.pose_of_row]
+    count = min(FOLDS, data.poses)
+    fold = (np.arange(data.poses) % count)[data.pose_of_row]
     expected = []
-    for mine in (fold == index for index in range(FOLDS)):
+    for mine in (fold == index for index in range(count)):
         others = data.only(data.rows.source[~mine])
         without = solve(others, solution.cells, solution)
-        if np.any(mine) and without is not None:
+        if without is not None:
             expected.append(predicted_squares(data.only(data.rows.source[mine]), without))
     left_out = np.concatenate(expected) if expected else np.zeros(0)
     if min(len(found), len(left_out)) < FEWEST_POSES:
