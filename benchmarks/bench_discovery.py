@@ -196,6 +196,7 @@ def run(name: str, recipe: Recipe, talk: bool = False) -> dict[str, Any]:
             for effect in found.effects
         ],
         'p_values': [effect.p_value for effect in found.effects],
+        'sigmas': [round(effect.sigmas, 2) for effect in found.effects],
         'outcome': verdict.outcome,
         'unexplained': [
             [entry.where, entry.driver, 1e3 * entry.size_m, entry.p_value]

@@ -7,6 +7,8 @@ import msgspec
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.discover import Discovery
+from remaster_ros.discovery.explain import UNCERTAIN
+from remaster_ros.discovery.words import called
 from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.effect_words import STEP
 from remaster_ros.reports.schemas import Judgement
@@ -64,6 +66,8 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
         return False
     if _other_choices(discovery):
         return False
+    if any(effect.sigmas < UNCERTAIN for effect in discovery.effects):
+        return False
     if any(effect.form == STEP for effect in discovery.effects):
         # What was measured before and after it does not agree.
         return False
@@ -86,6 +90,16 @@ def _other_choices(discovery: Discovery) -> str:
         f' Which causes are named depends on the poses: of {repeated.count} searches without '
         f'some of them {repeated.same or "none"} found the same.'
     )
+
+
+def _uncertain(discovery: Discovery) -> str:
+    """Return which causes may be chance by their own standard deviations; ''."""
+    names = [
+        called(effect.name, effect.joints)
+        for effect in discovery.effects
+        if effect.sigmas < UNCERTAIN
+    ]
+    return f' Not certain by its own standard deviation: {", ".join(names)}.' if names else ''
 
 
 def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> str:
@@ -118,7 +132,7 @@ def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> 
             f'Something is there, but two explanations fit equally well: see which measurements '
             f'would decide.{change}'
         )
-    change += _other_choices(discovery)
+    change += _other_choices(discovery) + _uncertain(discovery)
     if confirmation is not None and not confirmation.confirmed:
         change += f' The other session does not confirm {"it" if count == 1 else "them"}' + (
             '.'

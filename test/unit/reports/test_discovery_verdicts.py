@@ -166,3 +166,18 @@ def test_a_wave_has_no_band_where_nothing_was_measured(found, monkeypatch):
     sides = [path.vertices[:, 0] for path in band.get_paths()]
     assert len(sides) >= 2
     assert all(x.max() < middle - 20.0 or x.min() > middle + 20.0 for x in sides)
+
+
+def test_a_cause_that_may_be_chance_by_its_own_deviation_is_said_and_not_green(found, tmp_path):
+    """It is named because the evidence is for it; what the choice of causes costs comes after."""
+    bent = found['bent']
+    (effect,), group = bent.effects, bent.groups[0]
+    most = max(abs(parameter.value) for parameter in effect.parameters)
+    wide = replace(bent.fit, theta_std=np.full_like(bent.fit.theta_std, most / 1.5))
+    doubtful = effect.sampled(wide, group, bent.residuals.part)
+    assert doubtful.sigmas == pytest.approx(1.5)
+    assert 'is 1.5 standard deviations from nothing' in doubtful.cause
+    assert 'from nothing' not in effect.cause
+    page, mood, _ = saved(replace(bent, effects=(doubtful,)), tmp_path)
+    assert mood == 'caution'
+    assert 'Not certain by its own standard deviation: encoder eccentricity of joint 2.' in page
