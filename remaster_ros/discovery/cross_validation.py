@@ -14,6 +14,9 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray, IntArray
 
+# What rows left out leave of a direction is no less than rounding leaves.
+ROUNDING = 1e-12
+
 
 def worth_of(solution: Solution, cell: Cell, where: slice, price: float) -> float:
     """Estimate how much log evidence would be lost without a cell."""
@@ -126,7 +129,17 @@ class LeftOut:
         variance = np.empty((len(self.data), 3, 3))
         for fold in self.folds:
             own, rows = X[:, fold], np.arange(len(fold) // 3)
-            inverse = np.linalg.inv(np.eye(len(fold)) - own.T @ own)
+            inverse = _inverse(np.eye(len(fold)) - own.T @ own)
             errors[fold] = inverse @ left[fold]
             variance[fold[::3] // 3] = inverse.reshape(len(rows), 3, len(rows), 3)[rows, :, rows]
         return errors.reshape(-1, 3), variance
+
+
+def _inverse(information: FloatArray) -> FloatArray:
+    """Return the inverse of a symmetric matrix (m, m) whose eigenvalues are positive or rounding.
+
+    Where rows determine something that no other row does, nothing is left of it without them.
+    """
+    values, vectors = np.linalg.eigh(information)
+    inverse: FloatArray = (vectors / np.maximum(values, ROUNDING)) @ vectors.T
+    return inverse

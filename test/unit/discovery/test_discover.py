@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
-from remaster_ros.discovery import discover
+from remaster_ros.discovery import cross_validation, discover
 from remaster_ros.discovery.cross_validation import LeftOut
 from remaster_ros.discovery.discover import discover_session, find_causes
 from remaster_ros.discovery.effects.base import Design
@@ -308,6 +308,21 @@ def test_p_values_are_uniform_where_nothing_is():
     assert np.max(-below) < 0.31
 
 
+def test_a_sensor_that_only_poses_left_out_show_is_no_trouble():
+    """Without them nothing determines where it stands."""
+    data = residuals_of(session_with(6, sensor_count=2))
+    rare = (data.context.sensor[data.rows.source] == 1) & (data.pose_of_row > 2)
+    data = data.only(data.rows.source[~rare])
+    fit = solve(data, ())
+    assert fit is not None
+    folds = np.maximum(0, 1 + (np.arange(data.poses) - 3) % 9)
+    folds[:3] = 0
+    deviance = LeftOut.of(data, (), fit.noise, folds).deviance(fit)
+    assert np.all(np.isfinite(deviance))
+    # The poses that every other fold determines are judged as ever.
+    assert np.median(deviance[3:]) < 100.0
+
+
 def test_the_deviance_of_poses_left_out_is_that_of_fits_without_them():
     data = residuals()
     cell = cells_named('joint_compliance')[1]
@@ -334,3 +349,10 @@ def test_the_deviance_of_poses_left_out_is_that_of_fits_without_them():
         density = multivariate_normal(cov=variance).logpdf(errors[row])
         expected -= 2.0 * density + 3.0 * np.log(2.0 * np.pi)
     assert deviance[pose] == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_direction_that_rounding_leaves_nothing_of_has_a_variance_and_not_a_negative_one():
+    turn = np.linalg.qr(np.random.default_rng(8).standard_normal((3, 3)))[0]
+    inverse = cross_validation._inverse(turn @ np.diag([0.5, 1.0, -1e-16]) @ turn.T)
+    np.testing.assert_allclose(np.linalg.eigvalsh(inverse)[:2], [1.0, 2.0], rtol=1e-3)
+    assert np.linalg.eigvalsh(inverse)[2] > 1e9
