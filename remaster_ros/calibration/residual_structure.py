@@ -47,16 +47,23 @@ class StructureTest:
     Attributes
     ----------
     driver
-        What the residuals were held against: 'position', 'time', 'joint_angle', 'reading_before'.
+        What the residuals were held against: 'position', 'time', 'joint_angle', 'reading_before';
+        'held_out' where those on held-out poses were held against those on poses left out.
     between_poses
         Whether in the means of the poses or in the deviations from them.
     p_value
         Of so much or more by chance.
+    sensor
+        Whose; '' where that of all.
+    ratio
+        Of 'held_out': of the typical errors, each in units of what is uncertain of it.
     """
 
     driver: str
     between_poses: bool
     p_value: float
+    sensor: str = ''
+    ratio: float | None = None
 
     @property
     def chance(self) -> str:
@@ -67,6 +74,12 @@ class StructureTest:
     def words(self) -> str:
         """What the residuals follow, for people."""
         where = 'from pose to pose' if self.between_poses else 'within the poses'
+        if self.driver == 'held_out':
+            return (
+                f'on held-out poses the error of {self.sensor} {where} is {self.ratio:.1f} times '
+                'as large as on poses left out of the fit: something changed between them, or the '
+                'model does not hold where they lie'
+            )
         what = {
             'position': 'follows the position in front of the sensor',
             'time': 'follows time',

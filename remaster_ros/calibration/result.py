@@ -12,6 +12,7 @@ from remaster_ros.calibration.accuracy import accuracy_of
 from remaster_ros.calibration.convergence import SamplerInfo
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.held_out_tests import held_out_tests
 from remaster_ros.calibration.identifiability import Gauge, GaugeDirection
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.metropolis import Chains
@@ -91,7 +92,8 @@ class FitResult:
     noise_checks
         Of every sensor: is what the fit leaves what noise explains?
     structure
-        What the residuals follow; None where the sampler is the paper's, or with an extension.
+        What the residuals follow, and whether held-out poses differ; None where the sampler is
+        the paper's, or with an extension.
     widening
         How many times the standard deviation and the interval of each joint's offset are those of
         the model, because of errors that it leaves out, (k,); 1 where there are none.
@@ -280,7 +282,11 @@ def build_result(
     )
     structure, widening = None, np.ones(model.joints)
     if sampled.mode is not None and model.extension is None:
-        structure = residual_structure(sampled.mode, measurements)
+        gross = np.concatenate([np.zeros(0, np.int64), *(check.gross for check in noise_checks)])
+        held_out = held_out_tests(sampled.mode, measurements, gross)
+        structure = ResidualStructure(
+            (*residual_structure(sampled.mode, measurements).tests, *held_out)
+        )
         if errors_are_left(noise_checks, structure):
             robust = robust_std(sampled.mode, measurements)
             widening = np.where(unfixed, 1.0, np.maximum(1.0, robust / std))

@@ -111,7 +111,10 @@ def fit_content(result: FitResult) -> schemas.Fit:
     }
     if result.structure is not None:
         content['residual_structure'] = [
-            {**vars(test), 'found': test in result.structure.found}
+            {
+                **{name: value for name, value in vars(test).items() if value not in ('', None)},
+                'found': test in result.structure.found,
+            }
             for test in result.structure.tests
         ]
         content['intervals'] = 'robust' if result.other_errors else 'model'

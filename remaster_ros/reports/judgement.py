@@ -119,7 +119,7 @@ def verdict(result: FitResult) -> Judgement:
 def _structure(result: FitResult) -> list[str]:
     """Return what the residuals follow, and what that does to the intervals."""
     found = result.structure.found if result.structure is not None else ()
-    lines = [f'{test.words} ({test.chance}).'.capitalize() for test in found]
+    lines = [f'{test.words[0].upper()}{test.words[1:]} ({test.chance}).' for test in found]
     if np.any(result.widening > 1.0):
         lines.append(
             'The standard deviations and intervals of the offsets include what the model leaves '

@@ -199,12 +199,18 @@ class Judgement(Struct):
 
 
 class StructureTest(Struct):
-    """Do the residuals follow a driver: in the means of the poses, or in deviations from them?"""
+    """Do the residuals follow a driver: in the means of the poses, or in deviations from them?
+
+    The driver 'held_out' asks whether those of a ``sensor`` are larger on held-out poses than on
+    poses left out of the fit: ``ratio`` times, in units of what is uncertain of their prediction.
+    """
 
     driver: str
     between_poses: bool
     p_value: float
     found: bool
+    sensor: str | UnsetType = UNSET
+    ratio: float | UnsetType = UNSET
 
 
 class Fit(Struct):
