@@ -40,12 +40,17 @@ def refine_moments(
         low = np.max(moments[moments < cell.moment], initial=-np.inf)
         high = np.min(moments[moments > cell.moment], initial=np.inf)
         rest = tuple(other for other in solution.cells if other is not cell)
-        fits = [
-            moved
+        nearby = [
+            other
             for other in between(context, float(low), float(high))
             if (other.place, other.joints, other.subject)
             == (cell.place, cell.joints, cell.subject)
-            and (moved := fit((*rest, other), solution)) is not None
+        ]
+        # All rows worked on may lie before or after what was tried on either side: then it stays.
+        fits = [
+            moved
+            for other in nearby or [cell]
+            if (moved := fit((*rest, other), solution)) is not None
         ]
         solution = _dated(fits) if fits else solution
     return solution

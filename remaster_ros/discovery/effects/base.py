@@ -104,7 +104,7 @@ class Cell:
     moment
         When it happened, s since the first row; NaN for what does not happen at one moment.
     moment_std
-        How well the rows date it, s; NaN as long as that was not judged.
+        How far apart moments are that explain the rows nearly as well, s; 0 until that is judged.
     curve
         For free forms of one driver: their splines, one parameter each, or one for each of three
         axes, those of a spline next to each other; None else.
@@ -127,7 +127,7 @@ class Cell:
     largest: float | None = None
     sign: int = 0
     moment: float = np.nan
-    moment_std: float = np.nan
+    moment_std: float = 0.0
     curve: Curve | None = None
     model_change: ModelChange | None = None
 

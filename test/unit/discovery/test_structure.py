@@ -14,6 +14,7 @@ from remaster_ros.discovery.effects.step import moments_of
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.findings import Findings
 from remaster_ros.discovery.undetected import undetected
+from remaster_ros.reports.discovery_json import discovery_content
 from remaster_ros.types import FloatArray, Session
 
 
@@ -105,6 +106,29 @@ def test_a_slip_is_dated_between_the_two_configurations():
     assert when.std < 60.0
     assert when.value == pytest.approx(truth, abs=4.0 * when.std)
     assert f'{group[0].moment / 60.0:.1f} min after the first reading' in effect.cause
+
+
+def test_a_step_is_dated_also_where_held_out_readings_lie_between():
+    """Moments between held-out readings are tried; the rows fitted may have none of these."""
+    session = session_with(32, pose_sigma_m=0.05e-3)
+    m = session.measurements
+    when = np.unique(m.stamp_s[~m.is_validation])
+    # All held-out readings within the gap between the fitted ones in which the sensor is moved.
+    low, high = when[len(when) // 2 - 1 : len(when) // 2 + 1]
+    stamp_s = m.stamp_s.copy()
+    count = int(m.is_validation.sum())
+    stamp_s[m.is_validation] = np.linspace(low, high, count + 2)[1:-1]
+    moved = (stamp_s >= high)[:, None] * np.array([0.6e-3, 0.0, 0.0])
+    m = replace(m, stamp_s=stamp_s, position=m.position + moved)
+    found = discover_session(replace(session, measurements=m), rng=np.random.default_rng(0))
+    (effect,) = found.effects
+    assert effect.form == 'step'
+    (moment,) = [one for one in effect.parameters if one.name == 'moment']
+    start = stamp_s.min()
+    assert low - start < moment.value < high - start
+    # Nothing tells when in the gap.
+    assert moment.std >= (high - low) / np.sqrt(12.0) * 0.99
+    assert discovery_content(found).effects[0].parameters[-1].std == moment.std
 
 
 def test_a_marker_that_slips_on_the_tool_is_located():
