@@ -3,13 +3,15 @@
 The residuals at the mode, in units of the noise, fall into two independent parts: the means of
 each sensor's rows at a pose, and the deviations from these. In each part the model's own columns
 are projected out, and an F test asks whether a family of smooth functions (`smooth_functions`)
-explains more of the rest than noise would. Two more tests ask whether one reading resembles the
-next: pose after pose, and within the poses.
+explains more of the rest than noise would: of each sensor's position and time, of the joints'
+angles. Where there are too few poses for all of a family, its simplest functions are tested. Two
+more tests ask whether one reading resembles the next: pose after pose, and within the poses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,6 +22,10 @@ from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.noise_check import NoiseCheck
 from remaster_ros.calibration.smooth_functions import (
+    HARMONICS,
+    POSITION_DEGREE,
+    TIME_DEGREE,
+    by_sensor,
     of_joint_angles,
     of_position,
     of_time,
@@ -36,6 +42,8 @@ LEAST_REST = 2.0
 # a turn of the sensor is a function of the measured as of the modelled position.
 ABSORBED = 0.03
 FEWEST_POSES = 12
+# Degree of the polynomials, and number of harmonics, where there are poses enough.
+LARGEST = {'position': POSITION_DEGREE, 'time': TIME_DEGREE, 'joint_angle': HARMONICS}
 # Simulated readings without noise leave rounding errors, which have structure.
 LEAST_NOISE_M = 1e-6
 
@@ -74,9 +82,10 @@ class StructureTest:
     def words(self) -> str:
         """What the residuals follow, for people."""
         where = 'from pose to pose' if self.between_poses else 'within the poses'
+        whose = f' of {self.sensor}' if self.sensor else ''
         if self.driver == 'held_out':
             return (
-                f'on held-out poses the error of {self.sensor} {where} is {self.ratio:.1f} times '
+                f'on held-out poses the error{whose} {where} is {self.ratio:.1f} times '
                 'as large as on poses left out of the fit: something changed between them, or the '
                 'model does not hold where they lie'
             )
@@ -86,7 +95,7 @@ class StructureTest:
             'joint_angle': "follows the joints' angles",
             'reading_before': 'resembles that of the reading before',
         }[self.driver]
-        return f'the error {what} {where}'
+        return f'the error{whose} {what} {where}'
 
 
 @dataclass(frozen=True)
@@ -126,11 +135,7 @@ def residual_structure(mode: Mode, measurements: Measurements) -> ResidualStruct
     if len(rows.group_start) < FEWEST_POSES or noiseless:
         return ResidualStructure(())
     seconds = measurements.stamp_s[rows.source]
-    families = {
-        'position': of_position(rows),
-        'time': of_time(rows, seconds),
-        'joint_angle': of_joint_angles(mode, rows),
-    }
+    families = _families(mode, rows, seconds)
     white = whitened(mode, rows, families)
     size = rows.group_size[:, None, None]
     middle = {name: rows.group_sum(part, axis=0) / size for name, part in white.items()}
@@ -139,16 +144,39 @@ def residual_structure(mode: Mode, measurements: Measurements) -> ResidualStruct
     within = {name: _flat(part) for name, part in apart.items()}
     basis = _basis(between['model'])
     rest = _without(basis, between['errors'])
-    tests = [_explained(driver, between, rest, basis) for driver in families]
+    sensors = [posterior.model.sensor_names[sensor] for sensor, _ in rows.spans]
+    asked = [('joint_angle', ''), *itertools.product(('position', 'time'), sensors)]
+    tests = [_explained(driver, sensor, between, rest, basis) for driver, sensor in asked]
     tests.append(_from_pose_to_pose(rest, basis, rows, seconds))
     if np.any(rows.group_size > 1):
         basis = _basis(within['model'])
         rest = _without(basis, within['errors'])
         # The deviations from the mean of n rows are n - 1 independent numbers.
         lost = 3 * len(rows.group_start)
-        tests.append(_explained('joint_angle', within, rest, basis, lost))
+        tests.append(_explained('joint_angle', '', within, rest, basis, lost))
         tests.append(_within_poses(rest.reshape(-1, 3), rows, seconds))
     return ResidualStructure(tuple(test for test in tests if test is not None))
+
+
+def _families(mode: Mode, rows: Rows, seconds: FloatArray) -> dict[str, FloatArray]:
+    """Return the functions of every driver, of a sensor's for itself, and of every degree."""
+    names = mode.linearisation.posterior.model.sensor_names
+    families = {
+        _named('joint_angle', '', degree): of_joint_angles(mode, rows, degree)
+        for degree in range(1, LARGEST['joint_angle'] + 1)
+    }
+    for driver, of_driver in (
+        ('position', lambda degree: of_position(rows, degree)),
+        ('time', lambda degree: of_time(rows, seconds, degree)),
+    ):
+        for degree in range(1, LARGEST[driver] + 1):
+            for sensor, columns in by_sensor(rows, of_driver(degree)).items():
+                families[_named(driver, names[sensor], degree)] = columns
+    return families
+
+
+def _named(driver: str, sensor: str, degree: int) -> str:
+    return f'{driver} {degree} {sensor}'
 
 
 def _flat(columns: FloatArray) -> FloatArray:
@@ -172,17 +200,21 @@ def _without(basis: FloatArray, columns: FloatArray) -> FloatArray:
 
 def _explained(
     driver: str,
-    columns: dict[str, FloatArray],
+    sensor: str,
+    columns: Mapping[str, FloatArray],
     rest: FloatArray,
     basis: FloatArray,
     lost: int = 0,
 ) -> StructureTest | None:
     """Test whether the columns of a driver explain the rest (n, 1) that the model's leave.
 
-    None where there are too many of them for the rows.
+    Those of the highest degree for which there are rows enough; None where there are for none.
     """
-    found = _f_test(columns[driver], rest, basis, lost)
-    return None if found is None else StructureTest(driver, lost == 0, found.p_value)
+    for degree in range(LARGEST[driver], 0, -1):
+        found = _f_test(columns[_named(driver, sensor, degree)], rest, basis, lost)
+        if found is not None:
+            return StructureTest(driver, lost == 0, found.p_value, sensor)
+    return None
 
 
 class Explained(NamedTuple):

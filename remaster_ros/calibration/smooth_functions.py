@@ -18,6 +18,7 @@ from remaster_ros.types import FloatArray
 
 # Degree of the polynomials of time, and number of harmonics of a joint's angle.
 TIME_DEGREE, HARMONICS = 3, 2
+POSITION_DEGREE = 2
 # Rows that are looked at; of larger sessions those of evenly spread poses.
 MOST_ROWS = 10_000
 
@@ -61,31 +62,36 @@ def whitened(mode: Mode, rows: Rows, families: Mapping[str, FloatArray]) -> dict
     return {name: noise_model.whitened(part, noise) for name, part in columns.items()}
 
 
-def of_position(rows: Rows) -> FloatArray:
-    """Return polynomials of the measured position up to the second degree, (n, 3, 27 sensors)."""
+def of_position(rows: Rows, degree: int = POSITION_DEGREE) -> FloatArray:
+    """Return polynomials of the measured position up to the first or second degree.
+
+    Without the constant: (n, 3, 9 sensors) or (n, 3, 27 sensors), as `by_sensor` splits them.
+    """
     place = np.empty_like(rows.target)
     for _, span in rows.spans:
         centred = rows.target[span] - rows.target[span].mean(axis=0)
         place[span] = centred / max(float(np.std(centred)), 1e-9)
+    if degree == 1:
+        return _by_sensor(rows, place)
     first, second = np.triu_indices(3)
     products = place[:, first] * place[:, second]
     return _by_sensor(rows, np.concatenate((place, products), axis=1))
 
 
-def of_time(rows: Rows, seconds: FloatArray) -> FloatArray:
-    """Return polynomials of time, s, (n,), without the constant, (n, 3, 9 sensors)."""
+def of_time(rows: Rows, seconds: FloatArray, degree: int = TIME_DEGREE) -> FloatArray:
+    """Return polynomials of time, s, (n,), without the constant, (n, 3, 3 degree sensors)."""
     early, late = seconds.min(), seconds.max()
     share = (2.0 * seconds - early - late) / max(late - early, 1e-9)
-    return _by_sensor(rows, legendre.legvander(share, TIME_DEGREE)[:, 1:])
+    return _by_sensor(rows, legendre.legvander(share, degree)[:, 1:])
 
 
-def of_joint_angles(mode: Mode, rows: Rows) -> FloatArray:
-    """Return what an error of each joint that follows its own angle does, (n, 3, 4 k)."""
+def of_joint_angles(mode: Mode, rows: Rows, harmonics: int = HARMONICS) -> FloatArray:
+    """Return what an error of each joint by its own angle does, (n, 3, 2 harmonics k)."""
     by_joints = mode.linearisation.posterior.model.inner_pose(mode.z, rows).by_joints
     return np.concatenate(
         [
             by_joints * wave(order * rows.q)[:, None, :]
-            for order in range(1, HARMONICS + 1)
+            for order in range(1, harmonics + 1)
             for wave in (np.sin, np.cos)
         ],
         axis=2,
@@ -106,6 +112,12 @@ def of_links(mode: Mode, rows: Rows) -> tuple[FloatArray, FloatArray]:
         return np.swapaxes(vectors.reshape(len(rows), -1, 3), 1, 2)
 
     return columns(axes), columns(turned)
+
+
+def by_sensor(rows: Rows, columns: FloatArray) -> dict[int, FloatArray]:
+    """Split functions of position or time into those of each sensor, by its index."""
+    parts = np.split(columns, len(rows.spans), axis=2)
+    return {sensor: part for (sensor, _), part in zip(rows.spans, parts, strict=True)}
 
 
 def _by_sensor(rows: Rows, functions: FloatArray) -> FloatArray:
