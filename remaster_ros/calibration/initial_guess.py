@@ -30,6 +30,9 @@ UNCALIBRATED_ERROR_M = 5e-3
 LARGEST_START = 5000
 # With larger errors than this share of the points' extent, the model is that of another robot.
 LARGEST_RELATIVE_ERROR = 0.1
+# Errors of a mirrored sensor: beyond this share of the points' extent, and below this share of it
+# when its points are mirrored back.
+LEAST_MIRRORED, MIRRORED = 0.03, 0.3
 
 
 def robust_start(
@@ -68,7 +71,9 @@ def robust_start(
     everything, rows = rows, _some_rows(measurements, rows)
     start, z = closest_start(model, measurements, rows, nominal_markers, marker_std_m, priors)
     sorted_rows = Rows.of(measurements, rows, start.reference)
-    _require_likeness(start, sorted_rows, sorted_rows.target - start.predict(z, sorted_rows))
+    predicted = start.predict(z, sorted_rows)
+    _require_right_hand(start, sorted_rows, predicted)
+    _require_likeness(start, sorted_rows, sorted_rows.target - predicted)
     moved = referenced(model, measurements, everything, start.T_R_N(z))
     return moved, moved.vector(start.offsets(z), start.markers(z))
 
@@ -134,6 +139,26 @@ def referenced(
         mine = rows[measurements.sensor[rows] == index]
         centroid.append(apply(T_R_N, np.median(measurements.position[mine], axis=0)))
     return replace(model, reference=reference, centroid=np.array(centroid))
+
+
+def _require_right_hand(model: Model, rows: Rows, predicted: FloatArray) -> None:
+    """Refuse points that agree with the robot only when they are mirrored."""
+    for sensor, span in rows.spans:
+        here, there = rows.target[span], predicted[span]
+        here, there = here - here.mean(axis=0), there - there.mean(axis=0)
+        left, singular, right = np.linalg.svd(there.T @ here)
+        # The sum of squares that the best turn, and the best turn of the mirrored points, leave.
+        apart = np.sum(here**2) + np.sum(there**2)
+        sign = np.linalg.det(left @ right) * np.array([1.0, -1.0])
+        squares = apart - 2.0 * (singular[0] + singular[1] + sign * singular[2])
+        proper, mirrored = np.sqrt(np.maximum(squares, 0.0) / len(here))
+        extent = np.sqrt(np.mean(np.sum(there**2, axis=1)))
+        if proper > LEAST_MIRRORED * extent and mirrored < MIRRORED * proper:
+            raise InsufficientDataError(
+                f"sensor '{model.sensor_names[sensor]}': its points are mirrored: they agree with "
+                f'the robot within {mirrored * 1e3:.1f} mm with one axis turned round, and within '
+                f'{proper * 1e3:.1f} mm as they are; give x, y, z of a right-handed frame'
+            )
 
 
 def _require_likeness(model: Model, rows: Rows, errors: FloatArray) -> None:

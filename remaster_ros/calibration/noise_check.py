@@ -46,7 +46,7 @@ class NoiseCheck:
     error_m
         Mean 3-D error on the rows judged, without the worst twentieth, m.
     stated_m
-        Standard deviation per axis that the sensor states with its readings (RMS), m; None where
+        Standard deviation per axis that the sensor states of its samples (RMS), m; None where
         no reading has one.
     within_m
         Standard deviation per axis of the errors within poses, m; None where no pose has two.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
+from remaster_ros.calibration.measured_again import MeasuredAgain
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.discover import Discovery
@@ -32,10 +33,13 @@ def judgement(
         The same as discovery.json has it.
     """
     more = more_than_noise(content)
+    again = MeasuredAgain.of(discovery.fit.session.measurements)
+    proven = _is_proven(discovery, confirmation) and not more and not again.most
+    points = in_words(discovery, confirmation) if confirmation is not None else []
     return Judgement(
-        mood='good' if _is_proven(discovery, confirmation) and not more else 'caution',
+        mood='good' if proven else 'caution',
         headline=headline(discovery, confirmation) + (f' {more}' if more else ''),
-        points=in_words(discovery, confirmation) if confirmation is not None else [],
+        points=[*points, again.words] if again.again else points,
     )
 
 

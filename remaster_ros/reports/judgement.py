@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from remaster_ros.calibration.measured_again import MeasuredAgain
 from remaster_ros.calibration.noise_check import NoiseCheck
 from remaster_ros.collection.reference_session import changes
 from remaster_ros.reports.schemas import Judgement
@@ -31,7 +32,10 @@ def verdict(result: FitResult) -> Judgement:
     metrics = result.accuracy[split]['post_registration']
     before, after = metrics['before']['mean_mm'], metrics['after']['mean_mm']
     gain = before / max(after, 1e-9)
+    again = MeasuredAgain.of(result.session.measurements)
     where = 'on poses it never fitted' if validated else 'on the fitted poses'
+    if again.most:
+        where = 'on held-out poses, most of which were fitted as well'
     change = f'{before:.3f} mm to {after:.3f} mm {where}'
     unexplained = [check for check in result.noise_checks if not check.explained]
     changes = references(result)[1]
@@ -59,7 +63,7 @@ def verdict(result: FitResult) -> Judgement:
         headline = f'The mean position error falls from {change}: {times} smaller.'
         if doubtful:
             headline += f' {_dominated(result, unexplained)}'
-        elif validated and not changes and not spoilt and result.sampler.converged:
+        elif validated and not (changes or spoilt or again.most) and result.sampler.converged:
             mood = 'good'
     elif gain > 1 / NOTICEABLE_GAIN:
         headline = (
@@ -73,6 +77,8 @@ def verdict(result: FitResult) -> Judgement:
         mood = 'bad'
         headline += ' Do not apply the offsets yet: they are larger than a mastering is off by.'
         points = [*result.implausible, *points]
+    if again.again:
+        points.append(again.words)
     if not validated:
         points.append(
             'There are no validation poses, so the gain is not proven: measure some and fit again.'

@@ -1,0 +1,53 @@
+"""Held-out configurations that were fitted as well: they prove nothing of others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from remaster_ros.types import Measurements
+
+# Joint angles that differ by less are those of one configuration, approached twice, rad.
+SAME_RAD = float(np.radians(0.05))
+
+
+@dataclass(frozen=True)
+class MeasuredAgain:
+    """How many of the held-out configurations were fitted as well.
+
+    Attributes
+    ----------
+    again, held_out
+        Counts.
+    """
+
+    again: int
+    held_out: int
+
+    @classmethod
+    def of(cls, measurements: Measurements) -> MeasuredAgain:
+        """Count, by joint angles."""
+        first = np.unique(measurements.configuration, return_index=True)[1]
+        q, held_out = measurements.q[first], measurements.is_validation[first]
+        if not held_out.any() or held_out.all():
+            return cls(0, int(held_out.sum()))
+        away = scipy.spatial.cKDTree(q[~held_out]).query(q[held_out], p=np.inf)[0]
+        return cls(int(np.sum(away < SAME_RAD)), int(held_out.sum()))
+
+    @property
+    def most(self) -> bool:
+        """Whether it is more than half of them."""
+        return self.again > 0.5 * self.held_out
+
+    @property
+    def words(self) -> str:
+        """What that means, a sentence; '' where there are none."""
+        if not self.again:
+            return ''
+        return (
+            f'{self.again} of {self.held_out} held-out configurations were fitted as well (joint '
+            f'angles within {np.degrees(SAME_RAD):.2g} degrees): they prove nothing of others'
+            + ('; measure others and fit again.' if self.most else '.')
+        )
