@@ -14,7 +14,7 @@ from remaster_ros.calibration.extension import Extension
 from remaster_ros.calibration.paper import BURN_IN_SHARE, STEPS, fit_paper
 from remaster_ros.calibration.result import FitResult, Sampled, build_result, sampled_columns
 from remaster_ros.calibration.sampling import PRECISION, Progress, sample_posterior, silent
-from remaster_ros.errors import InputError
+from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.types import FloatArray, Priors, Session
 
 __all__ = ['PRECISION', 'FitResult', 'fit_session']
@@ -123,15 +123,21 @@ def _fast(
         x, eta = model.natural(posterior.parameters(points)), points[..., len(posterior.free) :]
         return sampled_columns(posterior, x, eta, posterior.free)
 
-    run, name = sample_posterior(
-        found.mode,
-        chains=chains,
-        rng=rng,
-        draws=draws,
-        precision=precision,
-        quantities=columns,
-        report=report,
-    )
+    try:
+        run, name = sample_posterior(
+            found.mode,
+            chains=chains,
+            rng=rng,
+            draws=draws,
+            precision=precision,
+            quantities=columns,
+            report=report,
+        )
+    except np.linalg.LinAlgError:
+        raise InsufficientDataError(
+            f'the posterior cannot be sampled: the observations hardly determine '
+            f'{found.mode.weakest}; measure more poses, spread further'
+        ) from None
     return Sampled(
         posterior=posterior,
         z=posterior.parameters(run.draws),

@@ -239,6 +239,6 @@ def _left_out_distances(
         out = R @ np.linalg.solve(R - root @ root.T, np.column_stack((error, R)))
         blocks = out[:, 1:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
         found = squared_distances(out[:, 0].reshape(n, 3), blocks)
-        # A pose that alone determines a parameter is far out, whatever rounding makes of it.
-        distances.append(np.where(found >= 0.0, found, np.inf))
+        # Of a pose that alone determines a parameter rounding is left, which says nothing.
+        distances.append(found[found >= 0.0])
     return np.concatenate(distances) if distances else np.zeros(0)

@@ -63,6 +63,9 @@ MOST_MERGED = 4
 TOGETHER = 10.0
 # A member of a family has to raise the evidence by this: a free form of no size costs nothing.
 MEMBER = 1.0
+# With more unpenalised parameters than this share of the numbers measured nothing is left to judge
+# the noise by.
+MOST_PARAMETERS = 0.75
 # A cell whose removal would cost this much evidence is kept without a test by itself.
 BEYOND_DOUBT = 20.0
 
@@ -167,9 +170,15 @@ class Search:
         return solution if again is None else self.prune(again)
 
     def fit(self, cells: Sequence[Cell], start: Solution | None = None) -> Solution | None:
-        """Fit a set with its prior probability; None for two cells of the same parameters."""
+        """Fit a set with its prior probability.
+
+        None for two cells of the same parameters, and where so few rows agree with any parameters.
+        """
         names = [name for cell in cells for name in cell.parameters]
         if len(set(names)) < len(names):
+            return None
+        free = sum(len(cell.parameters) for cell in cells if cell.penalty is None)
+        if free and self.data.base.shape[2] + free > MOST_PARAMETERS * 3 * len(self.data):
             return None
         return solve(self.data, cells, start, prior=family_log_prior(cells, self.catalogue.cells))
 

@@ -128,6 +128,16 @@ def test_what_does_not_settle_is_named() -> None:
         find_mode(posterior)
 
 
+def test_a_posterior_that_cannot_be_factored_is_one_clear_error(monkeypatch) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise np.linalg.LinAlgError('Matrix is not positive definite')
+
+    monkeypatch.setattr('remaster_ros.calibration.fit.sample_posterior', fails)
+    session = scene(11, poses=12)[0]
+    with pytest.raises(InsufficientDataError, match='hardly determine .*; measure more poses'):
+        fit_session(session, rng=np.random.default_rng(1))
+
+
 def test_effects_that_do_not_hold_are_blamed_not_the_units() -> None:
     """Displacements of a metre that no measurement shows."""
     session = scene(12, poses=12)[0]

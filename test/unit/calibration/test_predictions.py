@@ -59,5 +59,18 @@ def test_errors_with_long_tails_widen_the_regions():
     assert abs(np.mean(found.inside[held_out]) - 0.95) < 0.035
 
 
+@pytest.mark.parametrize('seed', [0, 5])
+def test_poses_that_alone_determine_parameters_do_not_spoil_the_factor(seed):
+    """Three poses determine where the second sensor stands: none of them can be left out."""
+    session, _ = scene(seed, poses=12, validation=10, sensor_count=2)
+    m = session.measurements
+    seen = np.isin(m.pose, np.unique(m.pose[~m.is_validation])[:3])
+    few = m.select((m.sensor == 0) | m.is_validation | seen)
+    _, measurements, found = predicted(replace(session, measurements=few))
+    assert 1.0 <= found.widening < 1.5
+    # Rows of a pose share an error: far fewer than 95 % by chance, but not none.
+    assert 0.7 < np.mean(found.inside[measurements.is_validation]) <= 1.0
+
+
 def test_without_rows_there_is_no_coverage():
     assert Coverage.of(np.zeros(0, dtype=bool)) == Coverage(0, 0, None, None)

@@ -163,3 +163,16 @@ def test_chance_is_on_the_side_of_clear_evidence_only(monkeypatch):
         monkeypatch.setattr(search, '_held_out', lambda *_, values=(share, error): values)
         predicts = tuple(search.predicts(one, smaller, LEAST_GAIN) for one in (clear, doubtful))
         assert predicts == expected, (share, error)
+
+
+def test_no_set_explains_eleven_readings_with_as_many_parameters():
+    """Its noise would be nothing, and its evidence without bound."""
+    session = session_with(5, poses=6, validation=0)
+    m = session.measurements
+    session = replace(session, measurements=m.select(np.unique(m.pose, return_index=True)[1]))
+    data = residuals_of(session)
+    assert len(data) < 12
+    search = searching(data)
+    assert search.fit(()) is not None
+    links = [cell for cell in search.cells if cell.name == 'link_length']
+    assert search.fit(links) is None
