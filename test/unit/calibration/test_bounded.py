@@ -134,7 +134,7 @@ def test_a_posterior_that_cannot_be_factored_is_one_clear_error(monkeypatch) -> 
 
     monkeypatch.setattr('remaster_ros.calibration.fit.sample_posterior', fails)
     session = scene(11, poses=12)[0]
-    with pytest.raises(InsufficientDataError, match='hardly determine .*; measure more poses'):
+    with pytest.raises(InsufficientDataError, match=r'hardly determine .*; measure more poses'):
         fit_session(session, rng=np.random.default_rng(1))
 
 
