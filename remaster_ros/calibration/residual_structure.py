@@ -27,6 +27,8 @@ from remaster_ros.calibration.smooth_functions import (
     TIME_DEGREE,
     by_sensor,
     of_joint_angles,
+    of_joint_times,
+    of_links,
     of_position,
     of_time,
     spread_poses,
@@ -43,7 +45,15 @@ LEAST_REST = 2.0
 ABSORBED = 0.03
 FEWEST_POSES = 12
 # Degree of the polynomials, and number of harmonics, where there are poses enough.
-LARGEST = {'position': POSITION_DEGREE, 'time': TIME_DEGREE, 'joint_angle': HARMONICS}
+LARGEST = {
+    'position': POSITION_DEGREE,
+    'time': TIME_DEGREE,
+    'joint_angle': HARMONICS,
+    'joint_time': TIME_DEGREE,
+    'link': 1,
+    'axis': 1,
+}
+OF_THE_ARM = ('joint_angle', 'joint_time', 'link', 'axis')
 # Simulated readings without noise leave rounding errors, which have structure.
 LEAST_NOISE_M = 1e-6
 
@@ -55,8 +65,10 @@ class StructureTest:
     Attributes
     ----------
     driver
-        What the residuals were held against: 'position', 'time', 'joint_angle', 'reading_before';
-        'held_out' where those on held-out poses were held against those on poses left out.
+        What the residuals were held against: 'position', 'time', 'joint_angle', zero-offsets by
+        'joint_time', displacements of a 'link' and tilts of an 'axis' that are constant in their
+        frames, 'reading_before'; 'held_out' where those on held-out poses were held against those
+        on poses left out.
     between_poses
         Whether in the means of the poses or in the deviations from them.
     p_value
@@ -93,6 +105,9 @@ class StructureTest:
             'position': 'follows the position in front of the sensor',
             'time': 'follows time',
             'joint_angle': "follows the joints' angles",
+            'joint_time': 'is that of zero-offsets that change with time',
+            'link': 'is that of links of other lengths',
+            'axis': 'is that of tilted axes',
             'reading_before': 'resembles that of the reading before',
         }[self.driver]
         return f'the error{whose} {what} {where}'
@@ -100,9 +115,18 @@ class StructureTest:
 
 @dataclass(frozen=True)
 class ResidualStructure:
-    """All of the tests; none where there are too few poses."""
+    """All of the tests; none where there are far too few poses, or readings without noise.
+
+    Attributes
+    ----------
+    tests
+        All that were made.
+    too_few
+        Whether there are too few poses to rely on them.
+    """
 
     tests: tuple[StructureTest, ...]
+    too_few: bool = False
 
     @property
     def found(self) -> tuple[StructureTest, ...]:
@@ -131,9 +155,11 @@ def residual_structure(mode: Mode, measurements: Measurements) -> ResidualStruct
     """
     posterior = mode.linearisation.posterior
     rows = spread_poses(posterior.rows)
-    noiseless = np.all(posterior.noise(mode.eta).sigma < LEAST_NOISE_M)
-    if len(rows.group_start) < FEWEST_POSES or noiseless:
+    if np.all(posterior.noise(mode.eta).sigma < LEAST_NOISE_M):
         return ResidualStructure(())
+    too_few = len(np.unique(measurements.pose[rows.source])) < FEWEST_POSES
+    if len(rows.group_start) < FEWEST_POSES:
+        return ResidualStructure((), too_few)
     seconds = measurements.stamp_s[rows.source]
     families = _families(mode, rows, seconds)
     white = whitened(mode, rows, families)
@@ -145,7 +171,8 @@ def residual_structure(mode: Mode, measurements: Measurements) -> ResidualStruct
     basis = _basis(between['model'])
     rest = _without(basis, between['errors'])
     sensors = [posterior.model.sensor_names[sensor] for sensor, _ in rows.spans]
-    asked = [('joint_angle', ''), *itertools.product(('position', 'time'), sensors)]
+    asked = [*((driver, '') for driver in OF_THE_ARM)]
+    asked += itertools.product(('position', 'time'), sensors)
     tests = [_explained(driver, sensor, between, rest, basis) for driver, sensor in asked]
     tests.append(_from_pose_to_pose(rest, basis, rows, seconds))
     if np.any(rows.group_size > 1):
@@ -153,9 +180,9 @@ def residual_structure(mode: Mode, measurements: Measurements) -> ResidualStruct
         rest = _without(basis, within['errors'])
         # The deviations from the mean of n rows are n - 1 independent numbers.
         lost = 3 * len(rows.group_start)
-        tests.append(_explained('joint_angle', '', within, rest, basis, lost))
+        tests += [_explained(driver, '', within, rest, basis, lost) for driver in OF_THE_ARM]
         tests.append(_within_poses(rest.reshape(-1, 3), rows, seconds))
-    return ResidualStructure(tuple(test for test in tests if test is not None))
+    return ResidualStructure(tuple(test for test in tests if test is not None), too_few)
 
 
 def _families(mode: Mode, rows: Rows, seconds: FloatArray) -> dict[str, FloatArray]:
@@ -165,6 +192,11 @@ def _families(mode: Mode, rows: Rows, seconds: FloatArray) -> dict[str, FloatArr
         _named('joint_angle', '', degree): of_joint_angles(mode, rows, degree)
         for degree in range(1, LARGEST['joint_angle'] + 1)
     }
+    for degree in range(1, LARGEST['joint_time'] + 1):
+        columns = of_joint_times(mode, rows, seconds, degree)
+        families[_named('joint_time', '', degree)] = columns
+    for driver, columns in zip(('link', 'axis'), of_links(mode, rows), strict=True):
+        families[_named(driver, '', 1)] = columns
     for driver, of_driver in (
         ('position', lambda degree: of_position(rows, degree)),
         ('time', lambda degree: of_time(rows, seconds, degree)),

@@ -284,9 +284,8 @@ def build_result(
     if sampled.mode is not None and model.extension is None:
         gross = np.concatenate([np.zeros(0, np.int64), *(check.gross for check in noise_checks)])
         held_out = held_out_tests(sampled.mode, measurements, gross)
-        structure = ResidualStructure(
-            (*residual_structure(sampled.mode, measurements).tests, *held_out)
-        )
+        structure = residual_structure(sampled.mode, measurements)
+        structure = replace(structure, tests=(*structure.tests, *held_out))
         if errors_are_left(noise_checks, structure):
             robust = robust_std(sampled.mode, measurements)
             widening = np.where(unfixed, 1.0, np.maximum(1.0, robust / std))

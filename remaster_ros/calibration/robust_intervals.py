@@ -17,6 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.smooth_functions import (
     of_joint_angles,
+    of_joint_times,
     of_links,
     of_position,
     of_time,
@@ -46,11 +47,13 @@ def robust_std(mode: Mode, measurements: Measurements) -> FloatArray:
     """
     posterior = mode.linearisation.posterior
     rows = spread_poses(posterior.rows)
+    seconds = measurements.stamp_s[rows.source]
     links, tilts = of_links(mode, rows)
     families = {
         'position': of_position(rows),
-        'time': of_time(rows, measurements.stamp_s[rows.source]),
+        'time': of_time(rows, seconds),
         'joint_angle': of_joint_angles(mode, rows),
+        'joint_time': of_joint_times(mode, rows, seconds),
         'link': links,
         'tilt': tilts,
     }

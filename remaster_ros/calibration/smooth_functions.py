@@ -1,7 +1,7 @@
 """What errors that no model has may look like: smooth functions, as columns beside the model's.
 
-Of the position in front of a sensor, of time, of each joint's own angle; and a displacement of
-each link and a tilt of each axis, which are constant in the link's frame.
+Of the position in front of a sensor, of time, of each joint's own angle, of the time of its
+zero-offset; and a displacement of each link and a tilt of each axis, constant in the link's frame.
 """
 
 from __future__ import annotations
@@ -80,9 +80,23 @@ def of_position(rows: Rows, degree: int = POSITION_DEGREE) -> FloatArray:
 
 def of_time(rows: Rows, seconds: FloatArray, degree: int = TIME_DEGREE) -> FloatArray:
     """Return polynomials of time, s, (n,), without the constant, (n, 3, 3 degree sensors)."""
+    return _by_sensor(rows, _polynomials(seconds, degree))
+
+
+def of_joint_times(
+    mode: Mode, rows: Rows, seconds: FloatArray, degree: int = TIME_DEGREE
+) -> FloatArray:
+    """Return what zero-offsets do that change with time, s, (n,): (n, 3, degree k)."""
+    by_joints = mode.linearisation.posterior.model.inner_pose(mode.z, rows).by_joints
+    functions = _polynomials(seconds, degree)
+    return np.concatenate([by_joints * one[:, None, None] for one in functions.T], axis=2)
+
+
+def _polynomials(seconds: FloatArray, degree: int) -> FloatArray:
+    """Return Legendre polynomials of time, s, (n,), over its range, from the first on, (n, d)."""
     early, late = seconds.min(), seconds.max()
     share = (2.0 * seconds - early - late) / max(late - early, 1e-9)
-    return _by_sensor(rows, legendre.legvander(share, degree)[:, 1:])
+    return legendre.legvander(share, degree)[:, 1:]
 
 
 def of_joint_angles(mode: Mode, rows: Rows, harmonics: int = HARMONICS) -> FloatArray:

@@ -9,6 +9,7 @@ import numpy as np
 
 from remaster_ros.calibration.measured_again import MeasuredAgain
 from remaster_ros.calibration.noise_check import NoiseCheck
+from remaster_ros.calibration.residual_structure import FEWEST_POSES
 from remaster_ros.collection.reference_session import changes
 from remaster_ros.reports.schemas import Judgement
 
@@ -44,6 +45,8 @@ def verdict(result: FitResult) -> Judgement:
     disagreements = changes + spoilt
     points = doubts + disagreements
     doubtful = bool(unexplained) or result.other_errors
+    few = result.structure is not None and result.structure.too_few
+    unproven = changes or spoilt or few or again.most or not validated
     mood: Literal['good', 'caution', 'bad'] = 'caution'
     if result.sampler.wandering and not result.sampler.converged:
         mood = 'bad'
@@ -63,7 +66,7 @@ def verdict(result: FitResult) -> Judgement:
         headline = f'The mean position error falls from {change}: {times} smaller.'
         if doubtful:
             headline += f' {_dominated(result, unexplained)}'
-        elif validated and not (changes or spoilt or again.most) and result.sampler.converged:
+        elif result.sampler.converged and not unproven:
             mood = 'good'
     elif gain > 1 / NOTICEABLE_GAIN:
         headline = (
@@ -79,6 +82,11 @@ def verdict(result: FitResult) -> Judgement:
         points = [*result.implausible, *points]
     if again.again:
         points.append(again.words)
+    if few:
+        points.append(
+            'So few poses do not show whether other errors than noise are left, which the offsets '
+            f'would take up: measure at least {FEWEST_POSES} and fit again.'
+        )
     if not validated:
         points.append(
             'There are no validation poses, so the gain is not proven: measure some and fit again.'

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibration_scenes import scene
+from discovery_scenes import at_joint, session_with
 
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.fit import fit_session
@@ -92,9 +93,37 @@ def test_p_values_of_noise_are_uniform() -> None:
     for seed in range(70, 82):
         session, _ = scene(seed, poses=36, sensor_count=2)
         values += [test.p_value for test in structure_of(session).tests]
-    assert len(values) == 12 * 8
+    assert len(values) == 12 * 14
     # The tests of a session are nearly independent.
     assert abs(np.mean(values) - 0.5) < 5.0 * np.sqrt(1.0 / 12.0 / len(values))
+
+
+def slipped(session: Session) -> FloatArray:
+    late = session.measurements.stamp_s > np.median(session.measurements.stamp_s)
+    return at_joint(3, np.radians(0.03) * late)
+
+
+def test_a_slip_of_a_joint_is_found_before_it_passes_for_an_offset() -> None:
+    """What the sensor sees of it turns with the pose: its own position and time show little."""
+    found = structure_of(session_with(87, slipped, poses=20, validation=0)).found
+    assert [test.driver for test in found] == ['joint_time']
+    assert found[0].words == (
+        'the error is that of zero-offsets that change with time within the poses'
+    )
+
+
+@pytest.mark.parametrize('kind', ['joint_axis_tilt', 'link_length'])
+def test_errors_of_links_and_axes_are_found_before_they_pass_for_offsets(kind: str) -> None:
+    session, _ = scene(
+        88,
+        poses=20,
+        sigma_m=0.1e-3,
+        pose_sigma_m=0.05e-3,
+        effects=[EffectSpec(kind, None, 0.5e-3)],
+    )
+    found = structure_of(session).found
+    assert {test.driver for test in found} & {'axis', 'link'}
+    assert all(test.words.startswith('the error ') for test in found)
 
 
 def test_one_of_two_sensors_is_named_also_where_few_poses_allow_only_simple_functions() -> None:
@@ -112,9 +141,9 @@ def test_one_of_two_sensors_is_named_also_where_few_poses_allow_only_simple_func
 
 
 def test_few_poses_and_readings_without_noise_are_not_judged() -> None:
-    assert structure_of(scene(82, poses=8)[0]).tests == ()
+    assert structure_of(scene(82, poses=8)[0]) == ResidualStructure((), too_few=True)
     exact = with_errors(84, lambda m, rng: np.zeros((len(m), 3)))
-    assert structure_of(exact).tests == ()
+    assert structure_of(exact) == ResidualStructure(())
 
 
 def test_poses_of_one_solution_are_judged_by_their_means() -> None:

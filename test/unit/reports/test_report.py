@@ -263,6 +263,14 @@ def test_structure_in_the_residuals_is_never_green(fit_result):
     assert 'other errors dominate; run "remaster discover"' in printed
 
 
+def test_too_few_poses_to_show_other_errors_are_never_green(fit_result):
+    proven = replace(with_accuracy(fit_result, 'validation', 4.0, 0.5), noise_checks=())
+    assert verdict(proven).mood == 'good'
+    judged = verdict(replace(proven, structure=ResidualStructure((), too_few=True)))
+    assert judged.mood == 'caution'
+    assert any('measure at least 12 and fit again' in point for point in judged.points)
+
+
 MOVED = NoiseCheck('tracker', 2.337e-3, None, 0.11e-3, poses=12)
 UNTOLD = NoiseCheck('tracker', 0.3e-3, None, None, poses=12)
 
