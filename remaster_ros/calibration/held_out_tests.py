@@ -19,7 +19,7 @@ Mahalanobis distance::
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -73,7 +73,9 @@ def held_out_tests(
     tests = []
     for key in sorted(fitted.keys() & held_out.keys()):
         expected = left_out[key]
-        found = held_out[key].distances(precision) / fitted[key].variance(mode.covariance)
+        part = fitted[key]
+        noise = _variance(part.gram.sum(axis=0), part.size.sum(), mode.covariance)
+        found = held_out[key].distances(precision) / noise
         if len(found) < FEWEST_HELD_OUT or len(expected) < FEWEST_FITTED:
             continue
         p_value = scipy.stats.mannwhitneyu(found, expected, alternative='greater').pvalue
@@ -113,23 +115,18 @@ class Part:
         mine = self.pose == pose
         return Part(self.pose[mine], self.size[mine], self.gram[mine])
 
-    def elsewhere(self, pose: int, shift: FloatArray) -> Part:
-        """Return those at all other poses, the parameters shifted, (f,)."""
-        others = self.pose != pose
-        return Part(self.pose[others], self.size[others], _shifted(self.gram[others], shift))
-
-    def variance(self, covariance: FloatArray) -> float:
-        """Return that of the noise, by poses that determined parameters with a covariance."""
-        gram = self.gram.sum(axis=0)
-        freedom = self.size.sum() - np.sum(gram[:-1, :-1] * covariance)
-        return float(gram[-1, -1] / max(freedom, 1.0))
-
     def distances(self, precision: FloatArray) -> FloatArray:
         """Return squared distances over the sizes, (g,); of poses that a precision is without."""
         pull = self.gram[:, :-1, -1]
         inner = np.linalg.solve(precision + self.gram[:, :-1, :-1], pull[..., None])[..., 0]
         distances: FloatArray = (self.gram[:, -1, -1] - np.sum(pull * inner, axis=1)) / self.size
         return distances
+
+
+def _variance(gram: FloatArray, size: int, covariance: FloatArray) -> float:
+    """Return that of the noise, by ``size`` numbers that determined parameters."""
+    freedom = size - np.sum(gram[:-1, :-1] * covariance)
+    return float(gram[-1, -1] / max(freedom, 1.0))
 
 
 def _shifted(gram: FloatArray, shift: FloatArray) -> FloatArray:
@@ -147,6 +144,7 @@ def left_out_distances(
     distances: dict[tuple[int, bool], list[FloatArray]] = {key: [] for key in parts}
     poses = np.unique(np.concatenate([part.pose for part in parts.values()]))
     scale = np.sqrt(np.diag(precision))
+    sums = {key: part.gram.sum(axis=0) for key, part in parts.items()}
     for pose in poses[:: -(-len(poses) // MOST_LEFT_OUT)]:
         mine = {key: part.at(pose) for key, part in parts.items()}
         gram = np.sum([part.gram.sum(axis=0) for part in mine.values()], axis=0)
@@ -156,9 +154,9 @@ def left_out_distances(
         covariance = np.linalg.inv(without)
         shift = -covariance @ gram[:-1, -1]
         for key, part in parts.items():
-            own = mine[key]
-            own = Part(own.pose, own.size, _shifted(own.gram, shift))
-            noise = part.elsewhere(pose, shift).variance(covariance)
+            own = replace(mine[key], gram=_shifted(mine[key].gram, shift))
+            others = _shifted(sums[key] - mine[key].gram.sum(axis=0), shift)
+            noise = _variance(others, int(part.size.sum() - own.size.sum()), covariance)
             distances[key].append(own.distances(without) / noise)
     return {key: np.concatenate([np.zeros(0), *part]) for key, part in distances.items()}
 
