@@ -90,8 +90,9 @@ def test_readings_are_where_the_marker_was(version, transport, data_port):
     # The scene began between `start` and the first frame: find its zero from the first reading.
     times = np.array([sample.timestamp_s for sample in samples])
     positions = np.array([sample.position for sample in samples])
-    angles = np.unwrap(np.arctan2(positions[:, 1], positions[:, 0]))
-    np.testing.assert_allclose(np.diff(angles), np.diff(times), atol=1e-4)
+    # A busy machine may leave more than a whole turn between two readings.
+    turned = np.diff(np.arctan2(positions[:, 1], positions[:, 0])) - np.diff(times)
+    np.testing.assert_allclose(np.exp(1j * turned), 1.0, atol=1e-4)
     np.testing.assert_allclose(np.hypot(positions[:, 0], positions[:, 1]), 0.3, atol=1e-6)
     np.testing.assert_allclose(positions[:, 2], 2.0, atol=1e-6)
     assert (np.diff([sample.frame_number for sample in samples]) >= 1).all()
