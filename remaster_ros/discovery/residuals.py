@@ -30,6 +30,9 @@ ROUNDING = 1e-8
 # Standard deviation of a zero-offset's step, rad: a marker 1 m from the axis is then 0.15 mm off
 # the tangent.
 STEP_STD = np.radians(1.0)
+# With more unpenalised parameters than this share of the numbers measured nothing is left to judge
+# the noise by.
+MOST_PARAMETERS = 0.75
 # Bytes of displacements that are kept for the next fit; only those of large sessions are more.
 KEPT_BYTES = 1 << 28
 # Gram matrices of so many sets are kept: of the set so far, and of families beside it.
@@ -204,6 +207,12 @@ class Residuals:
     def poses(self) -> int:
         """Number of poses."""
         return int(self.pose_of_row.max()) + 1
+
+    def leaves_noise(self, cells: Sequence[Cell]) -> bool:
+        """Return whether cells leave enough of the numbers measured to judge the noise by."""
+        free = sum(len(cell.parameters) for cell in cells if cell.penalty is None)
+        most = MOST_PARAMETERS * 3 * len(self)
+        return free == 0 or self.base.shape[2] + free <= most
 
     def columns(self, cells: Sequence[Cell]) -> FloatArray:
         """Return what a unit of each parameter displaces in the rows worked on, (n, 3, c)."""

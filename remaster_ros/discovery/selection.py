@@ -19,6 +19,14 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False)
+class Proposal:
+    """A set one step on, with the p-value of the step."""
+
+    solution: Solution
+    p_value: float
+
+
+@dataclass(frozen=True, eq=False)
 class Selection:
     """The outcome: the fit without and with the cells, and how they were found.
 

@@ -34,7 +34,7 @@ from remaster_ros.discovery.families import (
 )
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, Screening, screen
-from remaster_ros.discovery.selection import Selection, Step
+from remaster_ros.discovery.selection import Proposal, Selection, Step
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.substitutes import named_instead, regrown
 from remaster_ros.types import FloatArray
@@ -63,19 +63,8 @@ MOST_MERGED = 4
 TOGETHER = 10.0
 # A member of a family has to raise the evidence by this: a free form of no size costs nothing.
 MEMBER = 1.0
-# With more unpenalised parameters than this share of the numbers measured nothing is left to judge
-# the noise by.
-MOST_PARAMETERS = 0.75
 # A cell whose removal would cost this much evidence is kept without a test by itself.
 BEYOND_DOUBT = 20.0
-
-
-@dataclass(frozen=True, eq=False)
-class Proposal:
-    """A set one step on, with the p-value of the step."""
-
-    solution: Solution
-    p_value: float
 
 
 @dataclass(eq=False)
@@ -125,7 +114,10 @@ class Search:
             rejected = None
             for proposal in self.propose(solution, screening):
                 candidate, step = self._tested(solution, proposal, screening)
-                least = _least_share(solution, candidate)
+                # What needs no more parameters than the set it replaces has only to do no worse: a
+                # family of curves that stood in for a weaker cause gives way to it.
+                more = len(candidate.parameters) > len(solution.parameters)
+                least = LEAST_GAIN if more else 0.0
                 if step.p_value <= SIGNIFICANCE and self.predicts(candidate, solution, least):
                     break
                 rejected = rejected or step
@@ -177,8 +169,7 @@ class Search:
         names = [name for cell in cells for name in cell.parameters]
         if len(set(names)) < len(names):
             return None
-        free = sum(len(cell.parameters) for cell in cells if cell.penalty is None)
-        if free and self.data.base.shape[2] + free > MOST_PARAMETERS * 3 * len(self.data):
+        if not self.data.leaves_noise(cells):
             return None
         return solve(self.data, cells, start, prior=family_log_prior(cells, self.catalogue.cells))
 
@@ -406,12 +397,3 @@ class Search:
         saved = before - last[2]
         error = np.sqrt(len(saved)) * saved.std()
         return float(saved.sum() / before.sum()), float(error / before.sum())
-
-
-def _least_share(solution: Solution, candidate: Solution) -> float:
-    """Return the share of the held-out error that a candidate has to save.
-
-    What needs no more parameters than the set it replaces has only to do no worse: a family of
-    curves that stood in for a weaker cause gives way to it.
-    """
-    return LEAST_GAIN if len(candidate.parameters) > len(solution.parameters) else 0.0

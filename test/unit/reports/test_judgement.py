@@ -1,0 +1,121 @@
+"""What a fit is worth: never green where anything contradicts it, with the reason in words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from remaster_ros.calibration.noise_check import NoiseCheck
+from remaster_ros.calibration.residual_structure import ResidualStructure, StructureTest
+from remaster_ros.cli.fit import summary
+from remaster_ros.reports.judgement import verdict
+from remaster_ros.reports.report import report_html
+
+
+def with_accuracy(result, split, before, after):
+    metric = {'before': {'mean_mm': before}, 'after': {'mean_mm': after}}
+    accuracy = {'optimization': None, 'validation': None, split: {'post_registration': metric}}
+    return replace(result, accuracy=accuracy)
+
+
+@pytest.mark.parametrize(
+    ('split', 'before', 'after', 'converged', 'mood', 'words'),
+    [
+        ('validation', 4.0, 0.5, True, 'good', '8.0 times smaller'),
+        ('validation', 1.0, 0.97, True, 'caution', 'hardly matter'),
+        ('validation', 1.0, 1.5, True, 'bad', 'make it worse'),
+        ('optimization', 4.0, 0.5, True, 'caution', 'on the fitted poses'),
+        ('validation', 4.0, 0.5, False, 'bad', 'have not converged'),
+    ],
+)
+def test_the_verdict_is_honest(fit_result, split, before, after, converged, mood, words):
+    r_hat = fit_result.sampler.r_hat if converged else np.full(3, 1.2)
+    sampler = replace(fit_result.sampler, converged=converged, r_hat=r_hat)
+    result = replace(with_accuracy(fit_result, split, before, after), sampler=sampler)
+    # The session has gross errors among its held-out rows, which alone are no good news.
+    assert any(check.spoilt for check in result.noise_checks)
+    assert verdict(result).mood != 'good'
+    checks = tuple(replace(check, gross=()) for check in result.noise_checks)
+    result = replace(result, noise_checks=checks)
+    judged = verdict(result)
+    assert judged.mood == mood
+    assert words in judged.headline
+    told = ' '.join(judged.points)
+    assert ('fit again with more draws' in told) != converged
+    assert ('no validation poses' in told) == (split == 'optimization')
+
+
+def test_an_approximation_that_fails_its_check_is_never_green(fit_result):
+    message = 'NOT converged: Pareto k of the importance weights 1.40, not below 0.7'
+    sampler = replace(
+        fit_result.sampler, converged=False, method='laplace', pareto_k=1.4, message=message
+    )
+    judged = verdict(replace(with_accuracy(fit_result, 'validation', 4.0, 0.5), sampler=sampler))
+    assert judged.mood == 'caution'
+    assert 'known only approximately' in judged.headline
+    assert any(message in point for point in judged.points)
+    text = report_html(replace(fit_result, sampler=sampler), {})
+    assert 'No chain reached the precision' in text
+
+
+def test_structure_in_the_residuals_is_never_green(fit_result):
+    """Also where noise explains their size; the wider intervals are mentioned."""
+    structure = ResidualStructure(
+        (StructureTest('position', True, 1e-9), StructureTest('time', True, 0.4))
+    )
+    result = replace(
+        with_accuracy(fit_result, 'validation', 4.0, 0.5),
+        noise_checks=(),
+        structure=structure,
+        widening=np.array([1.0, 3.14, 1.2, 1.0, 1.0, 1.0, 1.0]),
+    )
+    judged = verdict(result)
+    assert judged.mood == 'caution'
+    assert 'other errors dominate; run "remaster discover"' in judged.headline
+    told = ' '.join(judged.points)
+    assert 'follows the position in front of the sensor from pose to pose (p < 0.0001)' in told
+    assert 'follows time' not in told
+    assert 'up to 3.1 times as wide' in told
+    printed = summary(replace(fit_result, noise_checks=(), structure=structure))
+    assert 'other errors dominate; run "remaster discover"' in printed
+
+
+def test_too_few_poses_to_show_other_errors_are_never_green(fit_result):
+    proven = replace(with_accuracy(fit_result, 'validation', 4.0, 0.5), noise_checks=())
+    assert verdict(proven).mood == 'good'
+    judged = verdict(replace(proven, structure=ResidualStructure((), too_few=True)))
+    assert judged.mood == 'caution'
+    assert any('measure at least 12 and fit again' in point for point in judged.points)
+
+
+MOVED = NoiseCheck('tracker', 2.337e-3, None, 0.11e-3, poses=12)
+UNTOLD = NoiseCheck('tracker', 0.3e-3, None, None, poses=12)
+
+
+@pytest.mark.parametrize('after', [2.337, 4.3])
+@pytest.mark.parametrize('check', [MOVED, UNTOLD], ids=['moved', 'untold'])
+def test_an_error_that_noise_does_not_explain_is_never_green(fit_result, check, after):
+    result = replace(with_accuracy(fit_result, 'validation', 4.395, after), noise_checks=(check,))
+    judged = verdict(result)
+    assert judged.mood == 'caution'
+    told = f'{judged.headline} {judged.points[0]}'
+    if check is MOVED:
+        assert 'other errors dominate; run "remaster discover"' in judged.headline
+        assert '0.110 mm per axis within a pose' in told
+        assert 'makes 0.176 mm' in told
+    else:
+        assert 'this session cannot show' in judged.headline
+        assert 'measure poses in all their joint solutions' in told
+    assert judged.points[0].startswith('tracker: ')
+    html = report_html(replace(fit_result, noise_checks=(check,)), {})
+    assert 'verdict caution' in html
+
+
+def test_offsets_that_hardly_matter_where_noise_explains_the_rest(fit_result):
+    assert all(check.explained for check in fit_result.noise_checks)
+    judged = verdict(with_accuracy(fit_result, 'validation', 0.4, 0.39))
+    assert judged.mood == 'caution'
+    assert 'That is what noise explains' in judged.headline
+    assert 'discover' not in judged.headline
