@@ -59,7 +59,9 @@ class Extension:
     theta0
         Where it was linearised, (m,).
     prior_precision
-        Gaussian prior about 0 (plausible size, smoothness); zeros where flat, (m, m).
+        Gaussian prior (plausible size, smoothness); zeros where flat, (m, m).
+    prior_mean
+        What it is about, (m,); None for 0.
     """
 
     names: tuple[str, ...]
@@ -68,6 +70,7 @@ class Extension:
     displacement0: FloatArray
     theta0: FloatArray
     prior_precision: FloatArray
+    prior_mean: FloatArray | None = None
 
     def turns(self, theta: FloatArray, rows: IntArray, joints: int) -> FloatArray:
         """Return the joint angles that theta (..., m) adds to n rows, rad, (..., n, joints)."""
@@ -86,6 +89,10 @@ class Extension:
                 shift += _product(term.values[rows], step[..., term.where])
         shift += self.displacement0[rows]
         return shift
+
+    def from_prior_mean(self, theta: FloatArray) -> FloatArray:
+        """Return theta (..., m) less what its prior is about."""
+        return theta if self.prior_mean is None else theta - self.prior_mean
 
     def derivative(self, by_joints: FloatArray, base: FloatArray, rows: IntArray) -> FloatArray:
         """Return the derivative of n points by theta, m per unit, (n, 3, m).

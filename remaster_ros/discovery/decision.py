@@ -108,7 +108,7 @@ def _decision(found: Discovery, cause: Named, look_alike: Named) -> Decision:
 
 
 def _rest(found: Discovery, *causes: Named) -> tuple[Cell, ...]:
-    cells = found.selection.solution.cells
+    cells = found.selection.chosen.cells
     return tuple(cell for cell in cells if not any(_belongs(cell, one) for one in causes))
 
 
@@ -118,7 +118,7 @@ def _belongs(cell: Cell, cause: Named) -> bool:
 
 
 def _without(found: Discovery, *causes: Named) -> float:
-    solution = found.selection.solution
+    solution = found.selection.chosen
     rest = _rest(found, *causes)
     bare = solve(found.residuals, rest, solution, prior=family_log_prior(rest, _cells(found)))
     return -np.inf if bare is None else bare.log_evidence
@@ -126,7 +126,7 @@ def _without(found: Discovery, *causes: Named) -> float:
 
 def _evidence(found: Discovery, cause: Named, other: Named) -> float | None:
     """Return the log evidence with a cause in place of another; None where it cannot be fitted."""
-    solution, every = found.selection.solution, _cells(found)
+    solution, every = found.selection.chosen, _cells(found)
     rest = _rest(found, cause, other)
     present = tuple(cell for cell in solution.cells if _belongs(cell, cause))
     whole = {joint for cell in present for joint in cell.joints} == {*cause.joints}

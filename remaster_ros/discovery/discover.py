@@ -20,6 +20,7 @@ from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
 from remaster_ros.discovery.beside_memory import withstanding_memory
+from remaster_ros.discovery.combined_searches import holds
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
@@ -166,10 +167,12 @@ def discover_session(
     findings = find_causes(session, rng=rng, progress=report)
     unexplained: tuple[Unexplained, ...] = ()
     try:
-        fit, gain, stretches, missed = _sampled(session, findings, rng, report, clock)
+        findings, sampled = _combined_or_not(session, findings, rng, report, clock)
+        fit, gain, stretches, missed = sampled
     except InsufficientDataError as error:
         if not findings.selection.solution.cells:
             raise
+        findings = findings.not_combined()
         suggested = findings.effects + findings.structure
         try:
             markers = held_markers(findings.found)
@@ -221,6 +224,28 @@ def discover_session(
     )
 
 
+def _combined_or_not(
+    session: Session,
+    findings: Findings,
+    rng: np.random.Generator,
+    report: Progress,
+    clock: Callable[[], float] | None,
+) -> tuple[Findings, tuple[FitResult, Gain, Stretches, Undetected]]:
+    """Sample the model of several searches, or that of one where their mean does not hold."""
+    if findings.selection.before_combining is not None:
+        try:
+            sampled = _sampled(session, findings, rng, report, clock)
+        except InsufficientDataError:
+            pass
+        else:
+            fit, gain = sampled[:2]
+            as_meant = holds(findings.residuals, findings.selection.solution, fit.residuals_after)
+            if as_meant and fit.sampler.converged and not is_harmful(gain):
+                return findings, sampled
+    findings = findings.not_combined()
+    return findings, _sampled(session, findings, rng, report, clock)
+
+
 def _sampled(
     session: Session,
     findings: Findings,
@@ -234,10 +259,15 @@ def _sampled(
     Priors are those that let moved markers go, where none are given.
     """
     residuals, solution, found = findings.residuals, findings.selection.solution, findings.found
-    stretches = compare_stretches(found, residuals, solution)
+    chosen = findings.selection.chosen
+    stretches = compare_stretches(found, residuals, chosen)
     missed = undetected(found, residuals, solution)
-    alike = moved_by_look_alikes(found, residuals, solution, findings.effects, findings.groups)
-    unmodelled = [missed.moves, stretches.moves, alike]
+    alike = moved_by_look_alikes(
+        found, residuals, findings.selection, findings.effects, findings.groups
+    )
+    # The cells of the search come first in what combines it with others.
+    more = len(solution.parameters) - len(chosen.parameters)
+    unmodelled = [missed.moves, np.pad(stretches.moves, ((0, more), (0, 0))), alike]
     if (aside := findings.aside) is not None:
         unmodelled.append(moved_by_memory(found, residuals, solution, aside.memory))
     if findings.repeated is not None:
@@ -305,9 +335,14 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         search,
         selection.solution,
         lambda share: progress('searching again without some of the poses', share),
+        combine=aside is None,
     )
+    if repeated is not None and repeated.solution is not selection.solution:
+        selection = replace(
+            selection, solution=repeated.solution, before_combining=selection.solution
+        )
     memory = None if aside is None else aside.memory
-    effects += moved_markers(found, residuals, selection.solution, memory)
+    effects += moved_markers(found, residuals, selection.chosen, memory)
     thinning = None
     if thinned:
         thinning = judge_by_others(

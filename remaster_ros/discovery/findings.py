@@ -42,7 +42,18 @@ class Findings:
     @property
     def searched(self) -> Solution:
         """The solution with all that the search located."""
-        return self.selection.solution if self.aside is None else self.aside.searched
+        return self.selection.chosen if self.aside is None else self.aside.searched
+
+    def not_combined(self) -> Findings:
+        """Return the same with what the search of all rows found, by itself."""
+        if self.repeated is None or self.selection.before_combining is None:
+            return self
+        chosen = self.selection.chosen
+        return replace(
+            self,
+            selection=replace(self.selection, solution=chosen, before_combining=None),
+            repeated=self.repeated.not_combined(chosen),
+        )
 
     def without_causes(self) -> Findings:
         """Return the same as if the search had found nothing."""

@@ -22,6 +22,7 @@ from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.explain import FoundEffect, LookAlike
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.selection import Selection
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.undetected import natural_parameters
 from remaster_ros.types import FloatArray
@@ -30,7 +31,7 @@ from remaster_ros.types import FloatArray
 def moved_by_look_alikes(
     found: Estimate,
     data: Residuals,
-    solution: Solution,
+    selection: Selection,
     effects: Sequence[FoundEffect],
     groups: Sequence[tuple[Cell, ...]],
 ) -> FloatArray:
@@ -43,8 +44,8 @@ def moved_by_look_alikes(
     ----------
     found
         The fit that the search began with.
-    data, solution
-        What it worked on and found.
+    data, selection
+        What it worked on and found; look-alikes stand beside what the search of all rows found.
     effects, groups
         The causes, and the cells of each; causes without cells come last.
 
@@ -53,15 +54,16 @@ def moved_by_look_alikes(
     ndarray
         (size + m, c) for all natural parameters of the fit and the m of the solution's cells.
     """
-    own = natural_parameters(found, data, solution, solution)
+    solution, chosen = selection.solution, selection.chosen
+    own = natural_parameters(found, data, solution, chosen)
     moves = [np.zeros((len(own), 0))]
     for effect, group in zip(effects, groups, strict=False):
-        rest = [cell for cell in solution.cells if cell not in group]
+        rest = [cell for cell in chosen.cells if cell not in group]
         rivals = [
             (alike.log_evidence_gain - effect.log_evidence_gain, other)
             for alike in effect.confusable_with
             if not (alike.same or alike.general)
-            if (other := _in_its_place(data, solution, rest, alike)) is not None
+            if (other := _in_its_place(data, chosen, rest, alike)) is not None
         ]
         weights = softmax([0.0, *(gain for gain, _ in rivals)])[1:]
         moves += [

@@ -7,12 +7,14 @@ with them. So five searches each do without a fifth of the poses and predict it 
 
 *Predictions.* Their 95 % regions are multiplied by what puts 95 % of these rows inside.
 
+*The model.* It has the causes of all six searches, each drawn to the share of them that found it
+(`combined_searches`).
+
 *Parameters.* The posterior is widened by how far the five searches differ, as a jackknife by
 groups has it: with the parameters θ_i without group i, and 0 for those of causes that it did not
 find, the covariance is (K − 1)/K Σ (θ_i − mean)(θ_i − mean)' (Efron & Tibshirani 1993, ch. 11).
 
-Only where the causes take up a good part of what the rows tell: elsewhere the choice costs
-nothing, and in larger sessions there would be no end to it.
+Only where several causes were found, and not in larger sessions: there would be no end to it.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ import scipy
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.predictions import REGION, squared_distances
+from remaster_ros.discovery.combined_searches import combined, searches_with
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
@@ -37,9 +40,6 @@ GROUPS = 5
 FEWEST_POSES = 20
 # A search of so many rows takes a second or two.
 MOST_ROWS = 160
-# Causes whose effective parameters are fewer than this share of the coordinates are no choice by
-# noise.
-FREEDOM_SPENT = 0.04
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +54,10 @@ class RepeatedSearch:
         How many of them found the same causes of the same joints.
     widening
         Factor on the size of the predicted 95 % regions.
+    solution
+        The causes of all searches, combined; what the search of all rows found where they are not.
+    found_by
+        Of each cell of the solution, how many of all searches found it, that of all rows included.
     moves
         What is added to the posterior: one standard deviation of each of independent moves of all
         natural parameters of the fit and the m of the cells, (size + m, count).
@@ -62,13 +66,30 @@ class RepeatedSearch:
     count: int
     same: int
     widening: float
+    solution: Solution
+    found_by: tuple[int, ...]
     moves: FloatArray
+
+    def not_combined(self, chosen: Solution) -> RepeatedSearch:
+        """Return the same for a model of what the search of all rows found, by itself."""
+        further = len(self.solution.parameters) - len(chosen.parameters)
+        return replace(
+            self,
+            solution=chosen,
+            found_by=self.found_by[: len(chosen.cells)],
+            moves=self.moves[: len(self.moves) - further],
+        )
 
 
 def repeat_search(
-    found: Estimate, search: Search, solution: Solution, progress: Callable[[float], None]
+    found: Estimate,
+    search: Search,
+    solution: Solution,
+    progress: Callable[[float], None],
+    *,
+    combine: bool = True,
 ) -> RepeatedSearch | None:
-    """Repeat a search; None where that is not needed, or would take too long.
+    """Repeat a search; None where there was no choice of causes, or that would take too long.
 
     Parameters
     ----------
@@ -80,18 +101,17 @@ def repeat_search(
         What it found.
     progress
         Called with the share that is done.
+    combine
+        Whether the model is to have the causes of all searches; it has where there is a cause.
     """
     data = search.data
-    if data.poses < FEWEST_POSES or len(data) > MOST_ROWS:
-        return None
-    spent = len(solution.parameters) - np.trace(solution.prior_precision() @ solution.covariance)
-    if spent < FREEDOM_SPENT * data.errors.size:
+    if len(solution.cells) < 2 or data.poses < FEWEST_POSES or len(data) > MOST_ROWS:
         return None
     # Generators of their own: the rest of the discovery is the same with and without this.
     rngs = search.rng.spawn(GROUPS + 1)
     group = (rngs[-1].permutation(data.poses) % GROUPS)[data.pose_of_row]
     errors = np.empty((len(data), 3))
-    parameters, same = [], 0
+    others: list[Solution] = []
     for index, rng in enumerate(rngs[:GROUPS]):
         progress(index / GROUPS)
         mine = group == index
@@ -105,14 +125,21 @@ def repeat_search(
         )
         without = again.run().solution
         errors[mine] = kept.unexplained(without)[data.rows.source[mine]]
-        parameters.append(natural_parameters(found, data, solution, without))
-        same += _causes(without) == _causes(solution)
+        others.append(without)
     distances = squared_distances(errors, row_covariance(data, solution))
     widening = float(np.sqrt(np.quantile(distances, REGION) / scipy.stats.chi2.ppf(REGION, 3)))
-    moves = np.array(parameters).T
+    model = combined(data, solution, others) if combine and _causes(solution) else solution
+    moves = np.array([natural_parameters(found, data, model, other) for other in others]).T
     moves -= moves.mean(axis=1, keepdims=True)
     moves *= np.sqrt((GROUPS - 1) / GROUPS)
-    return RepeatedSearch(GROUPS, same, max(1.0, widening), moves)
+    return RepeatedSearch(
+        GROUPS,
+        sum(_causes(other) == _causes(solution) for other in others),
+        max(1.0, widening),
+        model,
+        tuple(searches_with(cell, (solution, *others)) for cell in model.cells),
+        moves,
+    )
 
 
 def _causes(solution: Solution) -> set[tuple[str, tuple[int, ...]]]:

@@ -33,14 +33,22 @@ class Selection:
     Attributes
     ----------
     empty, solution
-        Fit of the offsets model alone, and with the cells.
+        Fit of the offsets model alone, and with the cells of the model that is returned.
     steps
         What joined, in order.
     rejected
         The best proposal of the last round, which failed a test; None where there was none.
+    before_combining
+        Where the solution has the cells of several searches, what the search of all rows found.
     """
 
     empty: Solution
     solution: Solution
     steps: tuple[Step, ...]
     rejected: Step | None
+    before_combining: Solution | None = None
+
+    @property
+    def chosen(self) -> Solution:
+        """What the search of all rows found."""
+        return self.solution if self.before_combining is None else self.before_combining

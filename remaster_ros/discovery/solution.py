@@ -35,6 +35,11 @@ class Solution:
         penalised ones known, (p + u, p + u).
     log_evidence
         With the prior probability of the cells.
+    drawn
+        Further precision of the prior on the parameters, because not all searches found them
+        (`combined_searches`), (m, m); None where there is none.
+    prior_mean
+        What the prior on the parameters is about, (m,); None for 0.
     """
 
     cells: tuple[Cell, ...]
@@ -47,6 +52,8 @@ class Solution:
     ridge: FloatArray
     unpenalised_covariance: FloatArray
     log_evidence: float
+    drawn: FloatArray | None = None
+    prior_mean: FloatArray | None = None
 
     def slices(self) -> list[slice]:
         """Return where each cell's parameters are."""
@@ -126,6 +133,8 @@ class Solution:
     def prior_precision(self) -> FloatArray:
         """Return the precision of the Gaussian prior on the parameters, (m, m)."""
         precision = np.diag(self.ridge)
+        if self.drawn is not None:
+            precision += self.drawn
         for cell, factor, where in zip(self.cells, self.smoothness, self.slices(), strict=True):
             if cell.penalty is not None:
                 precision[where, where] += factor * cell.penalty

@@ -30,6 +30,7 @@ def extension_of(residuals: Residuals, solution: Solution) -> Extension:
         displacement0,
         solution.parameters,
         solution.prior_precision(),
+        solution.prior_mean,
     )
 
 

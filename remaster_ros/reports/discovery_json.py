@@ -14,6 +14,7 @@ from remaster_ros.compensation.export import GEOMETRY_FILE
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.decision import Decision
 from remaster_ros.discovery.discover import Discovery
+from remaster_ros.discovery.repeated_search import RepeatedSearch
 from remaster_ros.discovery.stepwise_selection import DRAWS
 from remaster_ros.reports import schemas
 from remaster_ros.reports.discovery_apply import applied
@@ -95,6 +96,7 @@ def discovery_content(
             'count': discovery.repeated.count,
             'same': discovery.repeated.same,
             'widening': discovery.repeated.widening,
+            'found': _found_by(discovery, discovery.repeated),
         }
     if discovery.thinning is not None:
         content['rows_searched'] = discovery.thinning
@@ -137,6 +139,26 @@ def _covariance(discovery: Discovery) -> dict[str, Any]:
         'units': [*('rad' for _ in known), *(units[name] for name in fit.theta_names)],
         'matrix': [[float(f'{value:.5e}') for value in row] for row in matrix],
     }
+
+
+def _found_by(discovery: Discovery, repeated: RepeatedSearch) -> list[dict[str, Any]]:
+    """Return for each cause in the model how many searches found it, those of most first."""
+    named = {cell.key for group in discovery.groups for cell in group}
+    found: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for cell, searches in zip(repeated.solution.cells, repeated.found_by, strict=True):
+        one = found.setdefault(
+            (cell.name, cell.joints, cell.subject),
+            {
+                'name': cell.name,
+                'joints': list(cell.joints),
+                'subject': cell.subject,
+                'searches': 0,
+                'named': False,
+            },
+        )
+        one['searches'] = max(one['searches'], searches)
+        one['named'] |= cell.key in named
+    return sorted(found.values(), key=lambda one: -one['searches'])
 
 
 def held_out_coverage(discovery: Discovery, predictions: Predictions) -> Coverage:

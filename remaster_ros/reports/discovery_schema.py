@@ -198,16 +198,28 @@ class Stretches(Struct):
     widened: bool
 
 
+class FoundBy(Struct):
+    """How many searches found what the model has; ``named`` where it is among the effects."""
+
+    name: str
+    joints: list[int]
+    subject: str
+    searches: int
+    named: bool
+
+
 class RepeatedSearch(Struct):
     """What ``count`` searches found that each did without some of the poses.
 
     ``same`` of them found the same causes; ``widening`` is the factor by which regions hold the
-    poses left out. The standard deviations contain how far the searches differ.
+    poses left out. The model is the mean of what all of them and the search of all poses found;
+    the standard deviations contain how far the searches differ.
     """
 
     count: int
     same: int
     widening: float
+    found: list[FoundBy]
 
 
 class JointCovariance(Struct):

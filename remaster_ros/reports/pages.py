@@ -38,6 +38,7 @@ def page(template: str, **content: Any) -> str:
             part_words(of['name'], of['joints'], other['name'], other['joints'])
             or called(other['name'], other['joints'])
         ),
+        'called': lambda one: called(one['name'], one['joints']),
         'heading': lambda effect: title(msgspec.convert(effect, Effect)),
         'law': lambda effect: law(msgspec.convert(effect, Effect)),
     }

@@ -133,8 +133,8 @@ def test_a_look_alike_widens_the_posterior_by_how_likely_it_is():
     others = (replace(alike, same=True), replace(alike, general=True))
     either = replace(effect, confusable_with=(alike, *others))
     none = replace(effect, confusable_with=others)
-    assert moved_by_look_alikes(found, data, solution, [none], groups).shape[1] == 0
-    moves = moved_by_look_alikes(found, data, solution, [either], groups)
+    assert moved_by_look_alikes(found, data, selection, [none], groups).shape[1] == 0
+    moves = moved_by_look_alikes(found, data, selection, [either], groups)
     weight = 1.0 / (1.0 + np.e)
     own = slice(found.model.size, None)
     np.testing.assert_allclose(moves[own, 0], -np.sqrt(weight) * solution.parameters, rtol=1e-9)

@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.predictions import REGION, squared_distances
+from remaster_ros.discovery import discover
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.repeated_search import (
@@ -84,7 +85,8 @@ def test_parameters_contain_how_far_the_searches_differ():
         found, _, solution, repeated = searched(seed)
         assert repeated is not None
         size = found.model.size
-        assert repeated.moves.shape == (size + len(solution.parameters), GROUPS)
+        assert repeated.solution.cells[: len(solution.cells)] == solution.cells
+        assert repeated.moves.shape == (size + len(repeated.solution.parameters), GROUPS)
         assert 0 <= repeated.same <= repeated.count == GROUPS
         np.testing.assert_allclose(
             repeated.moves.sum(axis=1), 0.0, atol=1e-9 * np.abs(repeated.moves).max()
@@ -129,3 +131,31 @@ def test_the_result_says_that_the_search_was_repeated():
         judged = discovery_content(other).judgement
         assert ('depends on the poses: of 5 searches' in judged.headline) == said
         assert judged.mood == 'caution' or not said
+
+
+def test_the_model_has_what_the_searches_found_and_says_how_many_did():
+    session = session_with(72, waves_of_all_joints, poses=40, validation=20, pose_sigma_m=0.0)
+    found = discover_session(one_row_of_each_pose(session), rng=np.random.default_rng(1))
+    repeated, selection = found.repeated, found.selection
+    assert repeated is not None
+    listed = discovery_content(found).repeated_search.found
+    assert all(1 <= one.searches <= GROUPS + 1 for one in listed)
+    named = {(one.name, joint) for one in found.effects for joint in one.joints}
+    assert {(one.name, *one.joints) for one in listed if one.named} == named
+    assert len(found.fit.theta) == sum(cell.size for cell in selection.solution.cells)
+    assert selection.before_combining is not None
+    assert selection.solution.cells[: len(selection.chosen.cells)] == selection.chosen.cells
+
+
+def test_where_the_mean_does_not_hold_the_search_of_all_rows_stands(monkeypatch):
+    session = session_with(72, waves_of_all_joints, poses=40, validation=20, pose_sigma_m=0.0)
+    monkeypatch.setattr(discover, 'holds', lambda *_: False)
+    found = discover_session(one_row_of_each_pose(session), rng=np.random.default_rng(1))
+    assert found.repeated is not None
+    assert found.selection.before_combining is None
+    size = len(found.selection.solution.parameters)
+    assert found.repeated.solution is found.selection.solution
+    assert len(found.repeated.moves) == found.residuals.full_jacobian.shape[2] + size
+    assert len(found.fit.theta) == size
+    content = discovery_content(found)
+    assert all(one.named for one in content.repeated_search.found)

@@ -1,0 +1,205 @@
+"""One model of several searches: the mean of what they found.
+
+Searches without some of the poses find other causes, and none of them is right alone: the mean of
+their predictions is better than each (Breiman 1996, Machine Learning 24). Each set of causes is
+fitted to all rows, and the model has the causes of all of them, with the mean of their parameters
+(0 of a cause in a set that does not have it). Predictions are linear in the parameters, so they
+are the mean, too.
+
+The model is sampled like any other. So that its parameters are this mean, and as uncertain as they
+are in the sets on the average, its prior has the precision ::
+
+    P = C⁻¹ − H
+
+with C the mean of the covariances of the sets (0 of what a set does not have) and H what the rows
+tell of all the causes together. P is nowhere negative: a cause that a set does not have is known
+in it to be 0. The prior is about what makes the mean the most likely. How far the searches differ
+is added to the posterior by `repeated_search`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.evidence import solve
+from remaster_ros.discovery.families import visible
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
+from remaster_ros.types import FloatArray, IntArray
+
+# Precision, in units of what is known in all, below which a prior is none.
+ROUNDING = 1e-6
+# The RMS error of the rows that were fitted may be so many times that of the linear mean.
+TANGENT = 1.1
+
+
+def combined(data: Residuals, chosen: Solution, others: Sequence[Solution]) -> Solution:
+    """Fit the causes of several searches together.
+
+    Parameters
+    ----------
+    data
+        All rows that were searched.
+    chosen
+        What the search of all of them found: its cells come first, and its noise is taken.
+    others
+        What the other searches found.
+
+    Returns
+    -------
+    Solution
+        Also with what only others found, but what the rest imitates. Its evidence is that of the
+        chosen cells.
+    """
+    cells = (*chosen.cells, *_further(data, chosen, others))
+    fits = (chosen, *(_to_all(data, other, cells) for other in others))
+    return _with_mean(data, fits, cells)
+
+
+def holds(data: Residuals, model: Solution, left: FloatArray) -> bool:
+    """Return whether what the sampled model leaves of the rows is what the mean leaves.
+
+    The mean is that of linear fits. Where poses hardly determine the parameters these go further
+    than the tangent holds, and the mean is then no answer of the model itself.
+
+    Parameters
+    ----------
+    data, model
+        What was searched, and the combined searches.
+    left
+        Measured minus modelled position of every row, as sampled, m, (all rows, 3).
+    """
+    where = data.rows.source
+    meant, sampled = (np.sum(errors[where] ** 2) for errors in (data.unexplained(model), left))
+    return bool(sampled <= TANGENT**2 * meant)
+
+
+def searches_with(cell: Cell, searches: Sequence[Solution]) -> int:
+    """Return how many searches found a cause; what happened at one moment, at any of them."""
+    return sum(any(_same(cell, other) for other in search.cells) for search in searches)
+
+
+def _same(cell: Cell, other: Cell) -> bool:
+    if np.isnan(cell.moment):
+        return cell.key == other.key
+    parts = [(one.name, one.joints, one.subject, one.variant) for one in (cell, other)]
+    return parts[0] == parts[1]
+
+
+def _further(data: Residuals, chosen: Solution, others: Sequence[Solution]) -> Iterator[Cell]:
+    """Give what only others found, the cells of most searches first.
+
+    Errors that follow each other belong to the readings: they are no part of the model unless the
+    search of all rows found them.
+    """
+    found: list[Cell] = []
+    for cell in itertools.chain.from_iterable(search.cells for search in others):
+        of_readings = cell.driver == 'time' and not EFFECTS[cell.name].is_cause
+        if not of_readings and not any(_same(cell, one) for one in (*chosen.cells, *found)):
+            found.append(cell)
+    found.sort(key=lambda cell: -searches_with(cell, others))
+    names = {name for cell in chosen.cells for name in cell.parameters}
+    kept = list(chosen.cells)
+    for cell in visible(data, chosen.cells, found):
+        if names.isdisjoint(cell.parameters) and data.leaves_noise([*kept, cell]):
+            names.update(cell.parameters)
+            kept.append(cell)
+            yield cell
+
+
+def _to_all(data: Residuals, other: Solution, cells: Sequence[Cell]) -> Solution:
+    """Return those causes of another search that are among some cells, fitted to all rows.
+
+    As that search has them where other signs than physics has would come of it.
+    """
+    kept = [cell for cell in other.cells if any(_same(cell, one) for one in cells)]
+    fit = solve(data, kept, other)
+    return other if fit is None or fit.unphysical() else fit
+
+
+def _mean_of(fits: Sequence[Solution], cells: tuple[Cell, ...]) -> tuple[Solution, list[IntArray]]:
+    """Return the mean over fits, the first one's noise with it, and where each has parameters."""
+    edges = np.cumsum([0, *(cell.size for cell in cells)])
+    places = [np.arange(int(a), int(b)) for a, b in itertools.pairwise(edges)]
+    mean, ridge = np.zeros(edges[-1]), np.empty(edges[-1])
+    smoothness = np.full(len(cells), np.nan)
+    sets = []
+    # The smoothness of a curve is that of the first that has it.
+    for fit in reversed(fits):
+        taken: list[int] = []
+        for cell, where, factor in zip(fit.cells, fit.slices(), fit.smoothness, strict=True):
+            index = _index_of(cell, cells, taken)
+            if index is not None:
+                taken.append(index)
+                mean[places[index]] += fit.parameters[where] / len(fits)
+                ridge[places[index]], smoothness[index] = fit.ridge[where], factor
+        sets.append(np.concatenate([np.zeros(0, int), *(places[index] for index in taken)]))
+    model = replace(fits[0], cells=cells, parameters=mean, smoothness=smoothness, ridge=ridge)
+    return model, sets
+
+
+def _index_of(cell: Cell, cells: Sequence[Cell], taken: Sequence[int]) -> int | None:
+    """Return which of the cells is the same as one, at the same moment if there is such a one."""
+    same = [i for i, one in enumerate(cells) if i not in taken and _same(cell, one)]
+    exact = [i for i in same if cells[i].key == cell.key]
+    return next(iter((*exact, *same)), None)
+
+
+def _with_mean(data: Residuals, fits: Sequence[Solution], cells: tuple[Cell, ...]) -> Solution:
+    """Return the model whose posterior has the mean of fits and of their covariances."""
+    model, sets = _mean_of(fits, cells)
+    mean, p = model.parameters, data.base.shape[2]
+    columns = (data.base, data.columns(cells), data.errors[:, :, None])
+    white = data.noise_model.whitened(np.concatenate(columns, axis=2), model.noise)
+    gram = np.tensordot(white, white, axes=((0, 1), (0, 1)))
+    precision, pull = gram[:-1, :-1], gram[:-1, -1]
+    precision[:p, :p] += data.base_precision
+    flat = model.prior_precision()
+    precision[p:, p:] += flat
+    of_base = _inverse(precision[:p, :p])
+    base = of_base @ (pull[:p] - precision[:p, p:] @ mean)
+    # Of the log posterior at the mean: the prior has to make up for it there.
+    slope = pull[p:] - precision[p:] @ np.concatenate((base, mean))
+    told = precision[p:, p:] - precision[p:, :p] @ of_base @ precision[:p, p:]
+    covariance = np.zeros_like(told)
+    for own in sets:
+        covariance[np.ix_(own, own)] += _inverse(told[np.ix_(own, own)]) / len(fits)
+    unit = np.sqrt(np.diag(covariance))
+    values, vectors = _principal(_inverse(covariance) - told, unit)
+    drawn = (vectors * values) @ vectors.T / np.outer(unit, unit)
+    precision[p:, p:] += drawn
+    values, vectors = _principal(flat + drawn, unit)
+    vectors = unit[:, None] * vectors
+    full_covariance = _inverse(precision)
+    fixed = [np.full(cell.size, cell.penalty is None) for cell in cells]
+    unpenalised = np.flatnonzero(np.concatenate((np.ones(p, bool), *fixed)))
+    return replace(
+        model,
+        covariance=full_covariance[p:, p:],
+        base=base,
+        full_covariance=full_covariance,
+        unpenalised_covariance=_inverse(precision[np.ix_(unpenalised, unpenalised)]),
+        drawn=drawn,
+        prior_mean=(vectors / values) @ (vectors.T @ (drawn @ mean - slope)),
+    )
+
+
+def _principal(precision: FloatArray, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return eigenvalues, those of rounding left out, and vectors of a precision in some units."""
+    values, vectors = np.linalg.eigh(precision * np.outer(unit, unit))
+    kept = values > ROUNDING
+    return values[kept], vectors[:, kept]
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Return the inverse of an information or a covariance of parameters in units far apart."""
+    unit = np.maximum(np.diag(matrix), np.finfo(float).tiny) ** -0.5
+    scaled = matrix * np.outer(unit, unit) + 1e-12 * np.eye(len(matrix))
+    inverse: FloatArray = np.linalg.inv(scaled) * np.outer(unit, unit)
+    return 0.5 * (inverse + inverse.T)
