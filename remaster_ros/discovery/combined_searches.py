@@ -1,10 +1,13 @@
-"""One model of several searches: the mean of what they found.
+"""One model of several searches: the mean of the sets that explain all rows nearly as well.
 
-Searches without some of the poses find other causes, and none of them is right alone: the mean of
-their predictions is better than each (Breiman 1996, Machine Learning 24). Each set of causes is
-fitted to all rows, and the model has the causes of all of them, with the mean of their parameters
-(0 of a cause in a set that does not have it). Predictions are linear in the parameters, so they
-are the mean, too.
+Searches without some of the poses find other causes. Where the evidence of such a set, fitted to
+all rows, is within 5 units of that of the set that was chosen, the rows do not tell which of them
+it is, as for look-alikes: no model is right enough for its evidence to be known to a few units.
+The mean of their predictions is better than those of one (Madigan & Raftery 1994, J. Am. Stat.
+Assoc. 89, whose window this is). The model then has the causes of all of these sets, with the mean
+of their parameters (0 of a cause in a set that does not have it). Predictions are linear in the
+parameters, so they are the mean, too. Where the rows decide for the chosen set, as they do where
+causes are few and clear, the model has this set and no other.
 
 The model is sampled like any other. So that its parameters are this mean, and as uncertain as they
 are in the sets on the average, its prior has the precision ::
@@ -27,38 +30,43 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.families import visible
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
+from remaster_ros.discovery.stepwise_selection import Search
 from remaster_ros.types import FloatArray, IntArray
 
+# Sets whose log evidence is lower by more than this are none of the answers.
+WINDOW = 5.0
 # Precision, in units of what is known in all, below which a prior is none.
 ROUNDING = 1e-6
 # The RMS error of the rows that were fitted may be so many times that of the linear mean.
 TANGENT = 1.1
 
 
-def combined(data: Residuals, chosen: Solution, others: Sequence[Solution]) -> Solution:
+def combined(search: Search, chosen: Solution, others: Sequence[Solution]) -> Solution:
     """Fit the causes of several searches together.
 
     Parameters
     ----------
-    data
-        All rows that were searched.
+    search
+        As it ended: of all rows.
     chosen
-        What the search of all of them found: its cells come first, and its noise is taken.
+        What it found: its cells come first, and its noise is taken.
     others
         What the other searches found.
 
     Returns
     -------
     Solution
-        Also with what only others found, but what the rest imitates. Its evidence is that of the
-        chosen cells.
+        Also with what only others found, but what the rest imitates; the chosen one where no other
+        set is as good. Its evidence is that of the chosen cells.
     """
-    cells = (*chosen.cells, *_further(data, chosen, others))
-    fits = (chosen, *(_to_all(data, other, cells) for other in others))
+    data = search.data
+    fits = _as_good([chosen, *(_to_all(search, other) for other in others)])
+    if len(fits) == 1:
+        return chosen
+    cells = (*chosen.cells, *_further(data, chosen, fits))
     return _with_mean(data, fits, cells)
 
 
@@ -92,18 +100,35 @@ def _same(cell: Cell, other: Cell) -> bool:
     return parts[0] == parts[1]
 
 
-def _further(data: Residuals, chosen: Solution, others: Sequence[Solution]) -> Iterator[Cell]:
-    """Give what only others found, the cells of most searches first.
+def _to_all(search: Search, other: Solution) -> Solution | None:
+    """Return another search's causes fitted to all rows; None where they do not make a model.
 
-    Errors that follow each other belong to the readings: they are no part of the model unless the
-    search of all rows found them.
+    Errors that follow each other belong to the readings, and are no part of it.
     """
+    kept = [cell for cell in other.cells if cell.driver != 'time' or EFFECTS[cell.name].is_cause]
+    fit = search.fit(kept, other)
+    return None if fit is None or fit.unphysical() else fit
+
+
+def _as_good(fits: Sequence[Solution | None]) -> list[Solution]:
+    """Return the different sets that explain nearly as much as the first one, and this first."""
+    different: list[Solution] = []
+    for fit in fits:
+        if fit is None or (different and fit.log_evidence < different[0].log_evidence - WINDOW):
+            continue
+        keys = {cell.key for cell in fit.cells}
+        if all(keys != {cell.key for cell in one.cells} for one in different):
+            different.append(fit)
+    return different
+
+
+def _further(data: Residuals, chosen: Solution, fits: Sequence[Solution]) -> Iterator[Cell]:
+    """Give what only other fits have, but what the rest imitates."""
     found: list[Cell] = []
-    for cell in itertools.chain.from_iterable(search.cells for search in others):
-        of_readings = cell.driver == 'time' and not EFFECTS[cell.name].is_cause
-        if not of_readings and not any(_same(cell, one) for one in (*chosen.cells, *found)):
+    for cell in itertools.chain.from_iterable(fit.cells for fit in fits):
+        if not any(_same(cell, one) for one in (*chosen.cells, *found)):
             found.append(cell)
-    found.sort(key=lambda cell: -searches_with(cell, others))
+    found.sort(key=lambda cell: -searches_with(cell, fits))
     names = {name for cell in chosen.cells for name in cell.parameters}
     kept = list(chosen.cells)
     for cell in visible(data, chosen.cells, found):
@@ -111,16 +136,6 @@ def _further(data: Residuals, chosen: Solution, others: Sequence[Solution]) -> I
             names.update(cell.parameters)
             kept.append(cell)
             yield cell
-
-
-def _to_all(data: Residuals, other: Solution, cells: Sequence[Cell]) -> Solution:
-    """Return those causes of another search that are among some cells, fitted to all rows.
-
-    As that search has them where other signs than physics has would come of it.
-    """
-    kept = [cell for cell in other.cells if any(_same(cell, one) for one in cells)]
-    fit = solve(data, kept, other)
-    return other if fit is None or fit.unphysical() else fit
 
 
 def _mean_of(fits: Sequence[Solution], cells: tuple[Cell, ...]) -> tuple[Solution, list[IntArray]]:
@@ -139,7 +154,8 @@ def _mean_of(fits: Sequence[Solution], cells: tuple[Cell, ...]) -> tuple[Solutio
                 taken.append(index)
                 mean[places[index]] += fit.parameters[where] / len(fits)
                 ridge[places[index]], smoothness[index] = fit.ridge[where], factor
-        sets.append(np.concatenate([np.zeros(0, int), *(places[index] for index in taken)]))
+        own = np.concatenate([np.zeros(0, int), *(places[index] for index in taken)])
+        sets.append(own)
     model = replace(fits[0], cells=cells, parameters=mean, smoothness=smoothness, ridge=ridge)
     return model, sets
 

@@ -7,14 +7,15 @@ with them. So five searches each do without a fifth of the poses and predict it 
 
 *Predictions.* Their 95 % regions are multiplied by what puts 95 % of these rows inside.
 
-*The model.* It has the causes of all six searches, each drawn to the share of them that found it
+*The model.* It is the mean of the sets found that explain all rows nearly as well
 (`combined_searches`).
 
 *Parameters.* The posterior is widened by how far the five searches differ, as a jackknife by
 groups has it: with the parameters θ_i without group i, and 0 for those of causes that it did not
 find, the covariance is (K − 1)/K Σ (θ_i − mean)(θ_i − mean)' (Efron & Tibshirani 1993, ch. 11).
 
-Only where several causes were found, and not in larger sessions: there would be no end to it.
+Only where the causes take up a good part of what the rows tell: elsewhere the choice costs
+nothing, and in larger sessions there would be no end to it.
 """
 
 from __future__ import annotations
@@ -40,6 +41,9 @@ GROUPS = 5
 FEWEST_POSES = 20
 # A search of so many rows takes a second or two.
 MOST_ROWS = 160
+# Causes whose effective parameters are fewer than this share of the coordinates are no choice by
+# noise.
+FREEDOM_SPENT = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +93,7 @@ def repeat_search(
     *,
     combine: bool = True,
 ) -> RepeatedSearch | None:
-    """Repeat a search; None where there was no choice of causes, or that would take too long.
+    """Repeat a search; None where that is not needed, or would take too long.
 
     Parameters
     ----------
@@ -105,7 +109,10 @@ def repeat_search(
         Whether the model is to have the causes of all searches; it has where there is a cause.
     """
     data = search.data
-    if len(solution.cells) < 2 or data.poses < FEWEST_POSES or len(data) > MOST_ROWS:
+    if data.poses < FEWEST_POSES or len(data) > MOST_ROWS:
+        return None
+    spent = len(solution.parameters) - np.trace(solution.prior_precision() @ solution.covariance)
+    if spent < FREEDOM_SPENT * data.errors.size:
         return None
     # Generators of their own: the rest of the discovery is the same with and without this.
     rngs = search.rng.spawn(GROUPS + 1)
@@ -128,7 +135,7 @@ def repeat_search(
         others.append(without)
     distances = squared_distances(errors, row_covariance(data, solution))
     widening = float(np.sqrt(np.quantile(distances, REGION) / scipy.stats.chi2.ppf(REGION, 3)))
-    model = combined(data, solution, others) if combine and _causes(solution) else solution
+    model = combined(search, solution, others) if combine and _causes(solution) else solution
     moves = np.array([natural_parameters(found, data, model, other) for other in others]).T
     moves -= moves.mean(axis=1, keepdims=True)
     moves *= np.sqrt((GROUPS - 1) / GROUPS)

@@ -96,6 +96,7 @@ def discovery_content(
             'count': discovery.repeated.count,
             'same': discovery.repeated.same,
             'widening': discovery.repeated.widening,
+            'combined': discovery.selection.before_combining is not None,
             'found': _found_by(discovery, discovery.repeated),
         }
     if discovery.thinning is not None:

@@ -212,13 +212,14 @@ class RepeatedSearch(Struct):
     """What ``count`` searches found that each did without some of the poses.
 
     ``same`` of them found the same causes; ``widening`` is the factor by which regions hold the
-    poses left out. The model is the mean of what all of them and the search of all poses found;
-    the standard deviations contain how far the searches differ.
+    poses left out. Where ``combined``, the model is the mean of several sets of causes that these
+    and the search of all poses found. The standard deviations contain how far the searches differ.
     """
 
     count: int
     same: int
     widening: float
+    combined: bool
     found: list[FoundBy]
 
 
