@@ -67,7 +67,7 @@ def combined(search: Search, chosen: Solution, others: Sequence[Solution]) -> So
     if len(fits) == 1:
         return chosen
     cells = (*chosen.cells, *_further(data, chosen, fits))
-    return _with_mean(data, fits, cells)
+    return _with_mean(data, [_only(search, fit, cells) for fit in fits], cells)
 
 
 def holds(data: Residuals, model: Solution, left: FloatArray) -> bool:
@@ -108,6 +108,12 @@ def _to_all(search: Search, other: Solution) -> Solution | None:
     kept = [cell for cell in other.cells if cell.driver != 'time' or EFFECTS[cell.name].is_cause]
     fit = search.fit(kept, other)
     return None if fit is None or fit.unphysical() else fit
+
+
+def _only(search: Search, fit: Solution, cells: Sequence[Cell]) -> Solution:
+    """Return a fit of those of its cells that are among some others."""
+    kept = [cell for cell in fit.cells if any(_same(cell, one) for one in cells)]
+    return fit if len(kept) == len(fit.cells) else search.fit(kept, fit) or fit
 
 
 def _as_good(fits: Sequence[Solution | None]) -> list[Solution]:
@@ -154,8 +160,7 @@ def _mean_of(fits: Sequence[Solution], cells: tuple[Cell, ...]) -> tuple[Solutio
                 taken.append(index)
                 mean[places[index]] += fit.parameters[where] / len(fits)
                 ridge[places[index]], smoothness[index] = fit.ridge[where], factor
-        own = np.concatenate([np.zeros(0, int), *(places[index] for index in taken)])
-        sets.append(own)
+        sets.append(np.concatenate([np.zeros(0, int), *(places[index] for index in taken)]))
     model = replace(fits[0], cells=cells, parameters=mean, smoothness=smoothness, ridge=ridge)
     return model, sets
 

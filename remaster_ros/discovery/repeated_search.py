@@ -59,7 +59,7 @@ class RepeatedSearch:
     widening
         Factor on the size of the predicted 95 % regions.
     solution
-        The causes of all searches, combined; what the search of all rows found where they are not.
+        The mean of several sets, or what the search of all rows found, alone.
     found_by
         Of each cell of the solution, how many of all searches found it, that of all rows included.
     moves
@@ -106,7 +106,7 @@ def repeat_search(
     progress
         Called with the share that is done.
     combine
-        Whether the model is to have the causes of all searches; it has where there is a cause.
+        Whether sets that are as good may make the model together, where there is a cause.
     """
     data = search.data
     if data.poses < FEWEST_POSES or len(data) > MOST_ROWS:
