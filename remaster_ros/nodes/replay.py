@@ -54,6 +54,8 @@ TAKEN_S = 10.0
 """How long a subscriber may take for half of them before they count as dropped, s."""
 SHOWN_S = 5.0
 """How often it is logged how far the replay is, s."""
+UNNAMED = '_NODE_NAME_UNKNOWN_'
+"""What rmw calls a node whose name it has not received yet."""
 LOOK_S = 1.0
 """How often the graph is checked again for other nodes, s."""
 
@@ -272,6 +274,9 @@ class Replay(RemasterNode):
 
 def _live(info: TopicEndpointInfo, does: str) -> str:
     node = f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+    if UNNAMED in node:
+        # An endpoint may be known before the name of its node is; waiting for that is no option.
+        node = 'a node that has just started'
     return (
         f'replay: this graph is live: {node} {does}; end it, or replay in another ROS domain '
         '(ROS_DOMAIN_ID) or namespace'

@@ -111,7 +111,9 @@ def test_a_controller_that_subscribes_receives_no_command(start, client, bag, mo
     client.create_subscription(JointTrajectory, COMMANDS, heard.append, 100)
     process = start('remaster_ros.cli.main', 'replay', bag, *more)
     line = refusal(spun(client, process))
-    assert f'this graph is live: /test_client listens to {COMMANDS}' in line
+    # On a busy machine the endpoint may be known before the name of its node.
+    who = ('/test_client', 'a node that has just started')
+    assert any(f'this graph is live: {node} listens to {COMMANDS}' in line for node in who)
     assert not heard
 
 
