@@ -34,6 +34,7 @@ from remaster_ros.discovery.families import visible
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stepwise_selection import Search
+from remaster_ros.discovery.stretches import root_of_inverse
 from remaster_ros.types import FloatArray, IntArray
 
 # Sets whose log evidence is lower by more than this are none of the answers.
@@ -67,7 +68,11 @@ def combined(search: Search, chosen: Solution, others: Sequence[Solution]) -> So
     if len(fits) == 1:
         return chosen
     cells = (*chosen.cells, *_further(data, chosen, fits))
-    return _with_mean(data, [_only(search, fit, cells) for fit in fits], cells)
+    try:
+        return _with_mean(data, [_only(search, fit, cells) for fit in fits], cells)
+    except np.linalg.LinAlgError:
+        # The causes of all sets together agree up to rounding.
+        return chosen
 
 
 def holds(data: Residuals, model: Solution, left: FloatArray) -> bool:
@@ -219,8 +224,5 @@ def _principal(precision: FloatArray, unit: FloatArray) -> tuple[FloatArray, Flo
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
-    """Return the inverse of an information or a covariance of parameters in units far apart."""
-    unit = np.maximum(np.diag(matrix), np.finfo(float).tiny) ** -0.5
-    scaled = matrix * np.outer(unit, unit) + 1e-12 * np.eye(len(matrix))
-    inverse: FloatArray = np.linalg.inv(scaled) * np.outer(unit, unit)
-    return 0.5 * (inverse + inverse.T)
+    root = root_of_inverse(matrix)
+    return root @ root.T

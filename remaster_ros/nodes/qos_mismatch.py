@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from remaster_ros.nodes.endpoints import node_of
 
 
 def mismatch(offered: QoSProfile, wanted: QoSProfile) -> str:
@@ -33,14 +34,10 @@ def mismatches(node: Node) -> str:
         topic = subscription.topic_name
         for info in node.get_publishers_info_by_topic(topic):
             if why := mismatch(info.qos_profile, subscription.qos_profile):
-                found.add(f'nothing of {topic} comes from {_name(info)}: it {why}')
+                found.add(f'nothing of {topic} comes from {node_of(info)}: it {why}')
     for publisher in node.publishers:
         topic = publisher.topic_name
         for info in node.get_subscriptions_info_by_topic(topic):
             if why := mismatch(publisher.qos_profile, info.qos_profile):
-                found.add(f'nothing of {topic} reaches {_name(info)}: this node {why}')
+                found.add(f'nothing of {topic} reaches {node_of(info)}: this node {why}')
     return '; '.join(sorted(found))
-
-
-def _name(info: TopicEndpointInfo) -> str:
-    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'

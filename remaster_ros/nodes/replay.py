@@ -23,6 +23,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
+from remaster_ros.nodes.endpoints import node_of
 from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.old_bags import records_of
 from remaster_ros.nodes.parameters import declare, parameter
@@ -54,8 +55,6 @@ TAKEN_S = 10.0
 """How long a subscriber may take for half of them before they count as dropped, s."""
 SHOWN_S = 5.0
 """How often it is logged how far the replay is, s."""
-UNNAMED = '_NODE_NAME_UNKNOWN_'
-"""What rmw calls a node whose name it has not received yet."""
 LOOK_S = 1.0
 """How often the graph is checked again for other nodes, s."""
 
@@ -273,13 +272,9 @@ class Replay(RemasterNode):
 
 
 def _live(info: TopicEndpointInfo, does: str) -> str:
-    node = f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-    if UNNAMED in node:
-        # An endpoint may be known before the name of its node is; waiting for that is no option.
-        node = 'a node that has just started'
     return (
-        f'replay: this graph is live: {node} {does}; end it, or replay in another ROS domain '
-        '(ROS_DOMAIN_ID) or namespace'
+        f'replay: this graph is live: {node_of(info)} {does}; end it, or replay in another ROS '
+        'domain (ROS_DOMAIN_ID) or namespace'
     )
 
 

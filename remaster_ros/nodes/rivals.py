@@ -17,6 +17,7 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from remaster_ros.nodes.endpoints import node_of
 from remaster_ros.nodes.status import LEASED
 
 COUNT_WALL_S = 3.0
@@ -84,7 +85,7 @@ class OnlyPublisher:
         self._alive = change.alive_count
 
     def _words(self, listed: list[TopicEndpointInfo]) -> str:
-        names = sorted(f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in listed)
+        names = sorted(node_of(info) for info in listed)
         return (
             f'{len(listed)} publishers on {self._topic}, where one may be: {", ".join(names)}; '
             'end the others (those of a killed process are listed for some 20 s)'

@@ -9,6 +9,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from remaster_ros.errors import InputError
+from remaster_ros.nodes.endpoints import node_of
 from remaster_ros.sensors.topic.driver import TopicDriver
 from remaster_ros.session.workcell import CellSensor
 
@@ -36,8 +37,7 @@ def subscribe_to_source(node: Node, driver: TopicDriver, sensor: CellSensor) -> 
 
     def publishers() -> list[tuple[str, str]]:
         return [
-            (f'{info.node_namespace.rstrip("/")}/{info.node_name}', info.topic_type)
-            for info in node.get_publishers_info_by_topic(topic)
+            (node_of(info), info.topic_type) for info in node.get_publishers_info_by_topic(topic)
         ]
 
     driver.follow(topic, sensor.message_type, sensor.marker, publishers)
