@@ -36,8 +36,6 @@ class Selection:
         Fit of the offsets model alone, and with the cells of the model that is returned.
     steps
         What joined, in order.
-    rejected
-        The best proposal of the last round, which failed a test; None where there was none.
     before_combining
         Where the solution has the cells of several searches, what the search of all rows found.
     """
@@ -45,7 +43,6 @@ class Selection:
     empty: Solution
     solution: Solution
     steps: tuple[Step, ...]
-    rejected: Step | None
     before_combining: Solution | None = None
 
     @property

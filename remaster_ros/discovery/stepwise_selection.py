@@ -107,11 +107,17 @@ class Search:
         """Search until nothing passes both tests."""
         empty = self.fit(())
         assert empty is not None
-        solution, steps, rejected = given or empty, [], None
+        solution, steps = given or empty, []
+        seen: set[tuple[Residuals, frozenset[Cell]]] = set()
         for count in range(ROUNDS):
+            # What a round adds may be dropped at its end: from the same set the next would do the
+            # same, and chance would have one more try at the p-values.
+            state = self.data, frozenset(solution.cells)
+            if state in seen:
+                break
+            seen.add(state)
             self.progress(count / (count + 2.0))
             screening = screen(self.data, self.catalogue, solution, rng=self.rng, draws=DRAWS)
-            rejected = None
             for proposal in self.propose(solution, screening):
                 candidate, step = self._tested(solution, proposal, screening)
                 # What needs no more parameters than the set it replaces has only to do no worse: a
@@ -120,7 +126,6 @@ class Search:
                 least = LEAST_GAIN if more else 0.0
                 if step.p_value <= SIGNIFICANCE and self.predicts(candidate, solution, least):
                     break
-                rejected = rejected or step
             else:
                 anew = regrown(solution, self.with_all, self.prune)
                 gain = anew.log_evidence - solution.log_evidence
@@ -135,7 +140,7 @@ class Search:
             solution = self._judged(self.backward_elimination(self.drop_unpredictive(solution)))
         empty = self.fit(())
         assert empty is not None
-        return Selection(empty, solution, tuple(steps), rejected)
+        return Selection(empty, solution, tuple(steps))
 
     def _tested(
         self, solution: Solution, proposal: Proposal, screening: Screening
@@ -180,14 +185,17 @@ class Search:
         hidden = np.setdiff1d(np.flatnonzero(self._structure), shortlist)
         found = []
         for index in np.concatenate((shortlist, hidden)):
-            if not np.isfinite(screening.score[index]):
+            score, located = float(screening.score[index]), self._structure[index]
+            # One cell alone has this p-value, however well it fits.
+            if not (located and np.isfinite(score)) and screening.p_value(score) > SIGNIFICANCE:
                 continue
             candidate = self.fit((*solution.cells, self.catalogue.cells[index]), solution)
-            if candidate is not None and not candidate.unphysical():
-                score = float(screening.score[index])
-                if self._structure[index]:
-                    score = max(score, candidate.log_evidence - solution.log_evidence)
-                found.append(Proposal(candidate, screening.p_value(score)))
+            if candidate is None or candidate.unphysical():
+                continue
+            if located:
+                score = max(score, candidate.log_evidence - solution.log_evidence)
+            if (p_value := screening.p_value(score)) <= SIGNIFICANCE:
+                found.append(Proposal(candidate, p_value))
         for family in FAMILIES:
             candidate = self.grown(solution, family)
             if candidate is not None:
