@@ -190,12 +190,10 @@ class Search:
             if not (located and np.isfinite(score)) and screening.p_value(score) > SIGNIFICANCE:
                 continue
             candidate = self.fit((*solution.cells, self.catalogue.cells[index]), solution)
-            if candidate is None or candidate.unphysical():
-                continue
-            if located:
-                score = max(score, candidate.log_evidence - solution.log_evidence)
-            if (p_value := screening.p_value(score)) <= SIGNIFICANCE:
-                found.append(Proposal(candidate, p_value))
+            if candidate is not None and not candidate.unphysical():
+                if located:
+                    score = max(score, candidate.log_evidence - solution.log_evidence)
+                found.append(Proposal(candidate, screening.p_value(score)))
         for family in FAMILIES:
             candidate = self.grown(solution, family)
             if candidate is not None:
@@ -203,7 +201,13 @@ class Search:
                 mine = [cell.name in family for cell in self.catalogue.cells]
                 if gain > TOGETHER or np.any(screening.score[mine] > 0.0):
                     found.append(Proposal(candidate, screening.p_value(gain)))
-        found = [one for one in found if one.solution.log_evidence > solution.log_evidence]
+        found = [
+            one
+            for one in found
+            if one.solution.log_evidence > solution.log_evidence
+            # What is left of a family is judged anew.
+            and (one.p_value <= SIGNIFICANCE or len(one.solution.cells) > len(solution.cells) + 1)
+        ]
         return sorted(found, key=lambda one: -one.solution.log_evidence)
 
     def grown(self, solution: Solution, family: tuple[str, ...]) -> Solution | None:

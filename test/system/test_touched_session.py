@@ -16,8 +16,8 @@ SOON_S = 10
 
 
 def begun(start, client, tmp_path):
-    """Return a cell whose recorder has written a few rows."""
-    cell = Cell(start, client, tmp_path, 'mocap', ['mocap'])
+    """Return a cell whose recorder has written a few rows of many more than the edits last."""
+    cell = Cell(start, client, tmp_path, 'mocap', ['mocap'], candidates=5)
     cell.until(lambda: int(cell.recorder('observations') or 0) > 2, 'the first observations')
     return cell
 

@@ -103,6 +103,38 @@ def test_mode_is_where_the_exact_density_peaks(found) -> None:
             assert posterior.log_density(beside[None])[0] < value
 
 
+@pytest.mark.parametrize('along', [(), (0,)])
+def test_the_density_of_the_noise_depends_on_each_variance_as_is_said(found, along) -> None:
+    """Against differences; two sensors, and one with a noise along its line of sight."""
+    p = found.posterior
+    split = type(p).of(p.model, p.rows, p.priors, p.free, found.mode.z, split=along)
+    eta = find_mode(split).eta + 0.2
+    linearisation = laplace.linearise(split, found.mode.z)
+    _, slope, _ = linearisation.by_variances(eta)
+    of_groups = split.variances(eta)
+
+    class Scaled:
+        """The posterior with the variance of each error group times exp(logs)."""
+
+        def __init__(self, logs):
+            self.logs = logs
+
+        def __getattr__(self, name):
+            return getattr(split, name)
+
+        def variances(self, _):
+            return of_groups * np.exp(self.logs)
+
+    step = 1e-4
+    for group in range(len(of_groups)):
+        unit = step * np.eye(len(of_groups))[group]
+        values = [
+            replace(linearisation, posterior=Scaled(sign * unit)).whitened(eta)[2]
+            for sign in (1.0, -1.0)
+        ]
+        assert slope[group] == pytest.approx((values[0] - values[1]) / (2.0 * step), abs=1e-4)
+
+
 def test_a_search_of_the_noise_that_begins_at_zero_does_not_stay_there(found) -> None:
     """The density is even in a ratio: it has no slope at zero, where it may well be lowest."""
     begun = found.mode.eta.copy()

@@ -356,3 +356,7 @@ def test_a_direction_that_rounding_leaves_nothing_of_has_a_variance_and_not_a_ne
     inverse = cross_validation._inverse(turn @ np.diag([0.5, 1.0, -1e-16]) @ turn.T)
     np.testing.assert_allclose(np.linalg.eigvalsh(inverse)[:2], [1.0, 2.0], rtol=1e-3)
     assert np.linalg.eigvalsh(inverse)[2] > 1e9
+    for least in (0.5, 2e-6, 1e-9):
+        information = turn @ np.diag([1.0, 2.0, least]) @ turn.T
+        ours = cross_validation._inverse(information)
+        np.testing.assert_allclose(ours, np.linalg.inv(information), rtol=1e-6, atol=1e-6 / least)

@@ -10,10 +10,19 @@ from calibration_scenes import CHAIN, MARKERS, URDF, sensors
 from discovery_scenes import residuals_of, session_with
 
 from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.discovery import stepwise_selection
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.residuals import STEP_STD, Residuals
-from remaster_ros.discovery.stepwise_selection import EVIDENT, HYSTERESIS, LEAST_GAIN, Search
+from remaster_ros.discovery.screening import screen
+from remaster_ros.discovery.stepwise_selection import (
+    DRAWS,
+    EVIDENT,
+    HYSTERESIS,
+    LEAST_GAIN,
+    SIGNIFICANCE,
+    Search,
+)
 from remaster_ros.discovery.substitutes import named_instead, regrown
 from remaster_ros.discovery.undetected import natural_parameters
 from remaster_ros.simulation.session_simulator import simulate_session
@@ -176,3 +185,39 @@ def test_no_set_explains_eleven_readings_with_as_many_parameters():
     assert search.fit(()) is not None
     links = [cell for cell in search.cells if cell.name == 'link_length']
     assert search.fit(links) is None
+
+
+def test_a_round_is_not_repeated_from_a_set_it_began_with(monkeypatch):
+    """What joins in a round and leaves at its end was added and dropped in every further round."""
+    search = searching(residuals_of(session_with(6)))
+    rounds = []
+
+    def counted(*args, **options):
+        rounds.append(options.get('draws') == DRAWS)
+        return screen(*args, **options)
+
+    def better(solution, *_):
+        return replace(solution, log_evidence=solution.log_evidence + 10.0)
+
+    monkeypatch.setattr(stepwise_selection, 'screen', counted)
+    monkeypatch.setattr(stepwise_selection, 'regrown', better)
+    monkeypatch.setattr(search, 'predicts', lambda *_: True)
+    found = search.run()
+    assert found.solution.cells == ()
+    assert found.steps == ()
+    assert sum(rounds) == 1
+
+
+def test_a_cell_alone_that_chance_explains_is_not_proposed_and_a_family_is_tried():
+    search = searching(residuals_of(session_with(5, angles=waves_of_three_joints)))
+    empty = search.fit(())
+    rng = np.random.default_rng(8)
+    screening = screen(search.data, search.catalogue, empty, rng=rng, draws=DRAWS)
+    sizes = {len(one.solution.cells) for one in search.propose(empty, screening)}
+    assert 1 in sizes
+    assert max(sizes) > 1
+    # As if surrogates scored as high as the best cell, but not as a family.
+    higher = replace(screening, null=np.full_like(screening.null, screening.score.max()))
+    for one in search.propose(empty, higher):
+        assert len(one.solution.cells) > 1 or one.p_value <= SIGNIFICANCE
+        assert one.solution.log_evidence > empty.log_evidence
