@@ -138,6 +138,39 @@ class LeftOut:
         return errors.reshape(-1, 3), variance
 
 
+class Comparisons:
+    """Sets of cells against each other by poses left out.
+
+    Parameters
+    ----------
+    data
+        The residuals.
+    fold_of_pose
+        Poses with the same number are left out together, (poses,).
+    """
+
+    def __init__(self, data: Residuals, fold_of_pose: IntArray) -> None:
+        self.data, self.fold_of_pose = data, fold_of_pose
+        # The larger set is compared with many smaller ones in turn.
+        self._last: tuple[Solution, LeftOut, FloatArray] | None = None
+
+    def saved(self, smaller: Solution, larger: Solution) -> tuple[float, float]:
+        """Return the share of the smaller set's deviance that the larger one saves.
+
+        And the standard error that it has by the choice of poses.
+        """
+        last = self._last
+        if last is None or last[0] is not larger or not set(smaller.cells) <= set(last[1].cells):
+            cells = tuple(dict.fromkeys((*larger.cells, *smaller.cells)))
+            left_out = LeftOut.of(self.data, cells, larger.noise, self.fold_of_pose)
+            last = larger, left_out, left_out.deviance(larger)
+            self._last = last
+        before = last[1].deviance(smaller)
+        saved = before - last[2]
+        error = np.sqrt(len(saved)) * saved.std()
+        return float(saved.sum() / before.sum()), float(error / before.sum())
+
+
 def _inverse(information: FloatArray) -> FloatArray:
     """Return the inverse of a symmetric matrix (m, m) whose eigenvalues are positive or rounding.
 

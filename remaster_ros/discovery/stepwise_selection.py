@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from remaster_ros.discovery.cross_validation import LeftOut, worth_of
+from remaster_ros.discovery.cross_validation import Comparisons, worth_of
 from remaster_ros.discovery.dating import refine_moments
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
@@ -37,7 +37,6 @@ from remaster_ros.discovery.screening import Catalogue, Screening, screen
 from remaster_ros.discovery.selection import Proposal, Selection, Step
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.substitutes import named_instead, regrown
-from remaster_ros.types import FloatArray
 
 # Family-wise error of one round.
 SIGNIFICANCE = 0.01
@@ -99,9 +98,8 @@ class Search:
     def _look_at(self, data: Residuals) -> None:
         self.data = data
         self.catalogue = Catalogue.of(data, self.cells)
-        self._fold_of_pose = self.rng.permutation(data.poses) % min(FOLDS, data.poses)
-        # The larger set is compared with many smaller ones in turn.
-        self._last_held_out: tuple[Solution, LeftOut, FloatArray] | None = None
+        fold_of_pose = self.rng.permutation(data.poses) % min(FOLDS, data.poses)
+        self._left_out = Comparisons(data, fold_of_pose)
 
     def run(self, given: Solution | None = None) -> Selection:
         """Search until nothing passes both tests."""
@@ -388,24 +386,11 @@ class Search:
 
         A smaller share, by less than its standard error, will do where the evidence is clear.
         """
-        share, error = self._held_out(smaller, larger)
+        share, error = self._left_out.saved(smaller, larger)
         if larger.log_evidence - smaller.log_evidence >= EVIDENT:
             share += error
         return share >= least
 
     def held_out_share(self, smaller: Solution, larger: Solution) -> float:
         """Return the share of the deviance of poses left out that the larger set saves."""
-        return self._held_out(smaller, larger)[0]
-
-    def _held_out(self, smaller: Solution, larger: Solution) -> tuple[float, float]:
-        """Return the share, and the standard error that it has by the choice of poses."""
-        last = self._last_held_out
-        if last is None or last[0] is not larger or not set(smaller.cells) <= set(last[1].cells):
-            cells = tuple(dict.fromkeys((*larger.cells, *smaller.cells)))
-            left_out = LeftOut.of(self.data, cells, larger.noise, self._fold_of_pose)
-            last = larger, left_out, left_out.deviance(larger)
-            self._last_held_out = last
-        before = last[1].deviance(smaller)
-        saved = before - last[2]
-        error = np.sqrt(len(saved)) * saved.std()
-        return float(saved.sum() / before.sum()), float(error / before.sum())
+        return self._left_out.saved(smaller, larger)[0]

@@ -169,7 +169,7 @@ def test_chance_is_on_the_side_of_clear_evidence_only(monkeypatch):
         (0.004, 0.005, (False, False)),
         (-0.05, 0.01, (False, False)),
     ):
-        monkeypatch.setattr(search, '_held_out', lambda *_, values=(share, error): values)
+        monkeypatch.setattr(search._left_out, 'saved', lambda *_, values=(share, error): values)
         predicts = tuple(search.predicts(one, smaller, LEAST_GAIN) for one in (clear, doubtful))
         assert predicts == expected, (share, error)
 
