@@ -151,7 +151,7 @@ class SamplerInfo:
         draws = run.draws
         needed = ESS_LIMIT if wanted is None else wanted**-2
         if run.method == 'metropolis':
-            figures = r_hat(draws), ess_bulk(draws), ess_tail(draws)
+            figures = run.figures or (r_hat(draws), ess_bulk(draws), ess_tail(draws))
             worst, least = float(np.max(figures[0])), float(np.min(figures[1:]))
             sound = worst <= R_HAT_LIMIT
             agreement = f'R-hat up to {worst:.3f} ({names[int(np.argmax(figures[0]))]})'

@@ -38,6 +38,9 @@ class Chains(NamedTuple):
     pareto_k, effective
         Of importance weights: the shape of their tail, and how many independent draws they are
         worth. NaN for chains.
+    figures
+        R-hat and effective draws of bulk and tails of the quantities that the length of chains was
+        judged by, (p,) each; None where it was not.
     """
 
     draws: FloatArray
@@ -48,6 +51,7 @@ class Chains(NamedTuple):
     method: Method = 'metropolis'
     pareto_k: float = float('nan')
     effective: float = float('nan')
+    figures: tuple[FloatArray, FloatArray, FloatArray] | None = None
 
 
 class Proposal(Protocol):

@@ -329,12 +329,15 @@ class _Task:
         while run.acceptance_rate >= poor:
             count = run.draws.shape[1]
             values = self.quantities(run.draws)
-            ess = np.minimum(convergence.ess_bulk(values), convergence.ess_tail(values))
+            bulk, tail = convergence.ess_bulk(values), convergence.ess_tail(values)
             # What never moves has no effective draws.
-            least = max(1.0, float(np.min(np.nan_to_num(ess))))
-            mixed = np.max(convergence.r_hat(values)) <= R_HAT_LIMIT
-            if (mixed and least >= self.wanted) or count >= most:
-                return run, bool(mixed and least >= self.enough)
+            least = max(1.0, float(np.min(np.nan_to_num(np.minimum(bulk, tail)))))
+            if least >= self.wanted or count >= most:
+                r_hat = convergence.r_hat(values)
+                mixed = np.max(r_hat) <= R_HAT_LIMIT
+                if mixed or count >= most:
+                    run = run._replace(figures=(r_hat, bulk, tail))
+                    return run, bool(mixed and least >= self.enough)
             if count * self.enough / least > HOPELESS * most:
                 break
             # A tenth more than the rate so far promises, but no more than three times as many.

@@ -9,8 +9,9 @@ import pytest
 from calibration_scenes import scene
 from scipy.stats import kstest, multivariate_normal, norm
 
-from remaster_ros.calibration import importance, laplace, sampling
+from remaster_ros.calibration import convergence, importance, laplace, sampling
 from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.laplace import find_mode
 from remaster_ros.calibration.metropolis import random_walk_sampler
 from remaster_ros.calibration.noise import RESOLUTION_M
@@ -155,6 +156,18 @@ def test_few_poses_do_not_take_long_chains(seed) -> None:
     assert 'factorised for every draw' in name
     # 100,000 did not suffice in such a session.
     assert run.draws.shape[1] < 12_000
+
+
+def test_what_the_length_is_judged_by_is_what_is_stated() -> None:
+    """R-hat and effective draws are computed once, of the draws that are returned."""
+    fit = fit_session(scene(60, poses=12)[0], rng=np.random.default_rng(4))
+    assert fit.sampler.method == 'metropolis'
+    for stated, of in (
+        (fit.sampler.r_hat, convergence.r_hat),
+        (fit.sampler.ess_bulk, convergence.ess_bulk),
+        (fit.sampler.ess_tail, convergence.ess_tail),
+    ):
+        np.testing.assert_allclose(stated, of(fit.draws), rtol=1e-9)
 
 
 def test_the_draws_do_not_depend_on_the_proposal() -> None:
