@@ -72,12 +72,13 @@ class Extension:
     prior_precision: FloatArray
     prior_mean: FloatArray | None = None
 
-    def turns(self, theta: FloatArray, rows: IntArray, joints: int) -> FloatArray:
-        """Return the joint angles that theta (..., m) adds to n rows, rad, (..., n, joints)."""
-        added = np.zeros((*theta.shape[:-1], len(rows), joints))
+    def turns(self, theta: FloatArray, rows: IntArray) -> dict[int, FloatArray]:
+        """Return the angles that theta (..., m) adds in n rows: joint -> rad, (..., n)."""
+        added: dict[int, FloatArray] = {}
         for term in self.terms:
             if term.at is not None:
-                added[..., term.at] += _product(term.values[rows], theta[..., term.where])
+                angle = _product(term.values[rows], theta[..., term.where])
+                added[term.at] = added[term.at] + angle if term.at in added else angle
         return added
 
     def shifts(self, theta: FloatArray, rows: IntArray) -> FloatArray:

@@ -244,7 +244,8 @@ class Model:
         points = self.chain.positions(
             rows.q,
             self.markers(z)[..., rows.marker, :],
-            self._inner_offsets(z)[..., None, :] + turns,
+            self._inner_offsets(z)[..., None, :],
+            turns,
         )
         points += shifts
         corrections = self.corrections(z)
@@ -274,7 +275,10 @@ class Model:
     def _pose(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> Pose:
         turns, shifts = self._extended(x, rows)
         shifts = shifts @ _rotation_about(*self.base_axis, offsets[0])[:3, :3].T
-        frames = self.chain.frames(rows.q, offsets + turns)
+        angles = rows.q + offsets
+        for joint, turn in turns.items():
+            angles[..., joint] += turn
+        frames = self.chain.frames(angles)
         tool = frames[..., -1, :, :] @ self.chain.T_fixed[-1]
         points = apply(tool, self.markers(x)[rows.marker])
         by_joints = self.chain.velocities(frames, points)
@@ -287,12 +291,12 @@ class Model:
         offsets[..., [0, self.joints - 1]] = 0.0
         return offsets
 
-    def _extended(self, x: FloatArray, rows: Rows) -> tuple[FloatArray, FloatArray]:
-        """Return the joint angles, rad, and displacements, m, that theta adds to each row."""
+    def _extended(self, x: FloatArray, rows: Rows) -> tuple[dict[int, FloatArray], FloatArray]:
+        """Return the angles of joints, rad, and displacements, m, that theta adds to each row."""
         if self.extension is None:
-            return np.zeros(self.joints), np.zeros(3)
+            return {}, np.zeros(3)
         given, theta = self.extension, self.theta(x)
-        return given.turns(theta, rows.source, self.joints), given.shifts(theta, rows.source)
+        return given.turns(theta, rows.source), given.shifts(theta, rows.source)
 
     def _derivative(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> FloatArray:
         derivative = np.zeros((len(rows.q), 3, self.size))

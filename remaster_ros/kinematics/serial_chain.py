@@ -6,6 +6,7 @@ number of leading dimensions in ``q``, ``points`` and ``joint_offsets``, and bro
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -187,13 +188,17 @@ class SerialChain:
         return self.frames(q, joint_offsets)[..., -1, :, :] @ self.T_fixed[-1]
 
     def positions(
-        self, q: ArrayLike, points: ArrayLike, joint_offsets: ArrayLike | None = None
+        self,
+        q: ArrayLike,
+        points: ArrayLike,
+        joint_offsets: ArrayLike | None = None,
+        turns: Mapping[int, FloatArray] | None = None,
     ) -> FloatArray:
         """Return where points of the tool frame are in R: the fast path of the fit.
 
         Turns vectors instead of multiplying matrices, and joins the sines of q (n, k) and of
         joint_offsets (B, 1, k) by the addition theorem, so that a batch of offsets costs no
-        trigonometry over its whole shape.
+        trigonometry over its whole shape but for the joints that are turned row by row.
 
         Parameters
         ----------
@@ -203,29 +208,36 @@ class SerialChain:
             Points in the tool frame T, m, (..., 3).
         joint_offsets
             Zero-offsets, rad, (..., k).
+        turns
+            What some joints turn further: index of the joint -> rad, (...).
 
         Returns
         -------
         ndarray
             m, (..., 3).
         """
-        q, points = self._checked(q), np.asarray(points, dtype=float)
-        sine, cosine = np.sin(q), np.cos(q)
-        if joint_offsets is not None:
-            s, c = np.sin(joint_offsets), np.cos(joint_offsets)
-            sine, cosine = sine * c + cosine * s, cosine * c - sine * s
-        x, y, z = (points[..., i] for i in range(3))
+        q, further = self._checked(q), turns or {}
+        offsets = np.zeros(len(self)) if joint_offsets is None else np.asarray(joint_offsets)
+        # Coordinates first: each turn takes whole arrays, each fixed step is one product.
+        vectors = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
         for i in range(len(self), -1, -1):
-            R, t = self.T_fixed_z[i, :3, :3], self.T_fixed_z[i, :3, 3]
-            x, y, z = (
-                R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0],
-                R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1],
-                R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2],
-            )
-            if i > 0:
-                s, c = sine[..., i - 1], cosine[..., i - 1]
-                x, y = c * x - s * y, s * x + c * y
-        return np.stack((x, y, z), axis=-1)
+            step = self.T_fixed_z[i]
+            vectors = (step[:3, :3] @ vectors.reshape(3, -1)).reshape(vectors.shape)
+            vectors += step[:3, 3].reshape(3, *(1,) * (vectors.ndim - 1))
+            if i == 0:
+                break
+            sine, cosine = np.sin(q[..., i - 1]), np.cos(q[..., i - 1])
+            if joint_offsets is not None or i - 1 in further:
+                added = offsets[..., i - 1] + further.get(i - 1, 0.0)
+                s, c = np.sin(added), np.cos(added)
+                sine, cosine = sine * c + cosine * s, cosine * c - sine * s
+            x = cosine * vectors[0] - sine * vectors[1]
+            y = sine * vectors[0] + cosine * vectors[1]
+            if x.shape == vectors.shape[1:]:
+                vectors[0], vectors[1] = x, y
+            else:
+                vectors = np.stack((x, y, np.broadcast_to(vectors[2], x.shape)))
+        return np.stack(tuple(vectors), axis=-1)
 
     def position_jacobian(
         self, q: ArrayLike, points: ArrayLike, joint_offsets: ArrayLike | None = None

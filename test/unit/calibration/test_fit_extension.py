@@ -9,6 +9,7 @@ import pytest
 from calibration_scenes import CHAIN, extension, scene
 
 from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.extension import Extension, Term
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.errors import InputError
 
@@ -121,3 +122,25 @@ def test_the_paper_s_model_takes_no_effects(sagging) -> None:
         fit_session(
             session, rng=np.random.default_rng(1), sampler='paper', extension=extension(**arrays)
         )
+
+
+def test_two_effects_at_one_joint_add_their_angles() -> None:
+    rng = np.random.default_rng(5)
+    first, second, other = (
+        rng.normal(size=(9, 2)),
+        rng.normal(size=(9, 1)),
+        rng.normal(size=(9, 1)),
+    )
+    terms = (
+        Term(slice(0, 2), 3, first),
+        Term(slice(2, 3), 3, second),
+        Term(slice(3, 4), 0, other),
+        Term(slice(4, 5), None, rng.normal(size=(9, 3, 1))),
+    )
+    given = Extension(('',) * 5, ('',) * 5, terms, np.zeros((9, 3)), np.zeros(5), np.eye(5))
+    theta, rows = rng.normal(size=(6, 5)), np.array([1, 4, 7])
+    turns = given.turns(theta, rows)
+    assert sorted(turns) == [0, 3]
+    expected = theta[:, :2] @ first[rows].T + theta[:, 2:3] @ second[rows].T
+    np.testing.assert_allclose(turns[3], expected)
+    np.testing.assert_allclose(turns[0], theta[:, 3:4] @ other[rows].T)

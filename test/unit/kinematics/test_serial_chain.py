@@ -75,6 +75,22 @@ def test_positions_broadcast_offsets_over_configurations(seed):
         apply(chain.forward(q + offsets), many_points),
         atol=1e-13,
     )
+    last = len(chain) - 1
+    turns = {0: rng.normal(0, 0.1, 7), last: rng.normal(0, 0.1, (4, 7))}
+    angles = q + offsets
+    angles[..., 0] += turns[0]
+    angles[..., last] += turns[last]
+    expected = apply(chain.forward(angles), many_points)
+    given = many_points.copy()
+    turned = chain.positions(q, given, offsets, turns)
+    np.testing.assert_allclose(turned, expected, atol=1e-13)
+    np.testing.assert_array_equal(given, many_points)
+    for point in (TIP_POINT, TIP_POINT.tolist()):
+        np.testing.assert_allclose(
+            chain.positions(q, point, turns=turns),
+            chain.positions(angles - offsets, point),
+            atol=1e-13,
+        )
 
 
 @pytest.mark.parametrize('seed', SEEDS)
