@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +81,32 @@ def scene(
         markers=MARKERS,
         **options,  # type: ignore[arg-type]
     )
+
+
+def one_tool_direction(seed: int, turned: float = 0.01, noise_m: float = 1e-3) -> Session:
+    """Poses in a small cube, the tool always turned the same way, its marker unknown."""
+    print('seed', seed)
+    rng = np.random.default_rng(seed)
+    inverse = InverseKinematics(CHAIN, held={2: (0.0,)})
+    start = np.array([0.3, 0.6, 0.0, -1.2, 0.2, 0.9, 0.4])
+    poses = []
+    while len(poses) < 40:
+        T = CHAIN.forward(start)
+        T[:3, 3] += rng.uniform(-0.1, 0.1, 3)
+        found = inverse.solutions(T)
+        if len(found):
+            nearest = found[np.argmin(np.linalg.norm(found - start, axis=1))]
+            poses.append(nearest + turned * rng.standard_normal((2, 7)))
+    session, _ = simulate_session(
+        CHAIN,
+        URDF,
+        rng,
+        poses=poses,
+        validation_poses=[],
+        sensors=sensors(rng, 1, noise_m, noise_m),
+        markers={**MARKERS, 'sir': np.array([0.002, 0.0, 0.1])},
+    )
+    return replace(session, marker_std_m=0.2)
 
 
 def extension(

@@ -11,29 +11,50 @@ Where the proposal is poor its mean and covariance are moved to those of the wei
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from remaster_ros.calibration.convergence import PARETO_LIMIT
 from remaster_ros.calibration.metropolis import LogDensity, Proposal
-from remaster_ros.calibration.proposal import StudentT
+from remaster_ros.calibration.proposal import ADAPTED_FREEDOM, StudentT
 from remaster_ros.types import FloatArray
 
 # Below this one the proposal is not adapted further.
 GOOD_SHAPE = 0.5
 ROUNDS = 8
-ROUND_DRAWS = 4000
+FEWEST_DRAWS, MOST_DRAWS = 1000, 4000
 # Share of the evaluations that all of the rounds may take.
 ADAPTING = 0.5
-# In tens of dimensions a Student t of few degrees of freedom hardly ever hits the bulk.
-FREEDOM = 15.0
 # Effective draws that moments take for each dimension. Where that is more than this share of the
 # draws nothing is adapted.
 DRAWS_PER_DIMENSION = 5.0
 LARGEST_NEED = 0.25
 # Of the weights, tried one after the other.
 POWERS = 0.7 ** np.arange(1.0, 25.0)
+
+
+class Adaptable(Proposal, Protocol):
+    """A proposal that can be moved to where the density is."""
+
+    @property
+    def dimension(self) -> int:
+        """Of what is adapted."""
+        ...
+
+    @property
+    def first_draws(self) -> int:
+        """So many draws tell whether it has to be adapted."""
+        ...
+
+    @property
+    def cost(self) -> float:
+        """Of a draw, in evaluations of a density."""
+        ...
+
+    def adapted(self, points: FloatArray, weight: FloatArray) -> Adaptable:
+        """Return a proposal with the moments of weighted points (n, d)."""
+        ...
 
 
 class Weighted(NamedTuple):
@@ -57,10 +78,10 @@ class Weighted(NamedTuple):
     log_weight: FloatArray
     weight: FloatArray
     pareto_k: float
-    proposal: Proposal
+    proposal: Adaptable
 
     @classmethod
-    def of(cls, points: FloatArray, log_weight: FloatArray, proposal: Proposal) -> Weighted:
+    def of(cls, points: FloatArray, log_weight: FloatArray, proposal: Adaptable) -> Weighted:
         """Smooth the weights."""
         from arviz_stats.base import array_stats
 
@@ -83,23 +104,28 @@ class Weighted(NamedTuple):
         """Whether the weights' tail passes its check."""
         return self.pareto_k < PARETO_LIMIT
 
-    def adapted(self) -> StudentT:
-        """Return a proposal nearer to the density: with the moments of the weighted draws.
+    def adapted(self) -> Adaptable:
+        """Return a proposal nearer to the density: with the moments of the weighted draws."""
+        return self.proposal.adapted(self.points, self._with_moments(self.proposal.dimension))
 
-        Where these are worth too few draws to have moments the weights are raised to a power below
+    def factor(self) -> FloatArray:
+        """Return a Cholesky factor of the weighted draws' covariance, (d, d)."""
+        weight = self._with_moments(self.points.shape[1])
+        return StudentT.of(self.points, weight, ADAPTED_FREEDOM).factor
+
+    def _with_moments(self, dimension: int) -> FloatArray:
+        """Return the weights, (n,).
+
+        Where the draws are worth too few to have moments the weights are raised to a power below
         1, which leads part of the way.
         """
-        needed = DRAWS_PER_DIMENSION * self.points.shape[1]
         weight = self.weight
         for power in POWERS:
-            if _effective(weight) >= needed:
+            if _effective(weight) >= DRAWS_PER_DIMENSION * dimension:
                 break
             weight = np.exp(power * (self.log_weight - np.max(self.log_weight)))
             weight /= weight.sum()
-        mean = weight @ self.points
-        apart = self.points - mean
-        covariance = (apart * weight[:, None]).T @ apart
-        return StudentT(mean, np.asarray(np.linalg.cholesky(covariance)), FREEDOM)
+        return weight
 
     def resampled(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Return draws of equal weight in random order, (count, d) (systematic resampling)."""
@@ -111,7 +137,7 @@ class Weighted(NamedTuple):
 
 def adaptive_importance(
     log_density: LogDensity,
-    proposal: Proposal,
+    proposal: Adaptable,
     *,
     wanted: float,
     evaluations: int,
@@ -129,15 +155,16 @@ def adaptive_importance(
     wanted
         Effective draws.
     evaluations
-        Of the density, at most.
+        Of the density, at most; a draw of the proposal is counted as its `cost` of them.
     rng
         Source of all randomness.
     progress
         Called with the share of the evaluations done.
     """
     spent = 0
+    evaluations = max(FEWEST_DRAWS, int(evaluations / proposal.cost))
 
-    def drawn(source: Proposal, count: int) -> tuple[FloatArray, FloatArray]:
+    def drawn(source: Adaptable, count: int) -> tuple[FloatArray, FloatArray]:
         nonlocal spent
         points, log_proposal = source.sample(count, rng)
         log_weight = log_density(points) - log_proposal
@@ -145,11 +172,12 @@ def adaptive_importance(
         progress(min(1.0, spent / evaluations))
         return points, log_weight
 
-    count = int(np.clip(ADAPTING * evaluations / ROUNDS, 100, ROUND_DRAWS))
-    best = Weighted.of(*drawn(proposal, count), proposal)
-    last, needed = best, DRAWS_PER_DIMENSION * best.points.shape[1]
+    count = int(np.clip(ADAPTING * evaluations / ROUNDS, FEWEST_DRAWS, MOST_DRAWS))
+    best = last = Weighted.of(*drawn(proposal, min(count, proposal.first_draws)), proposal)
+    needed = DRAWS_PER_DIMENSION * proposal.dimension
     for _ in range(ROUNDS - 1):
-        if best.pareto_k < GOOD_SHAPE or needed > LARGEST_NEED * count:
+        good = best.pareto_k < GOOD_SHAPE
+        if good or needed > LARGEST_NEED * count or spent >= ADAPTING * evaluations:
             break
         proposal = last.adapted()
         last = Weighted.of(*drawn(proposal, count), proposal)

@@ -20,6 +20,9 @@ NOISE_FREEDOM = 10.0
 TAIL_SHARE = 0.05
 TAIL_FREEDOM = 5.0
 TAIL_WIDENING = 1.3
+# Draws by which it is seen whether a proposal has to be adapted, and the tails of what it then
+# becomes: in tens of dimensions a Student t of few degrees of freedom hardly ever hits the bulk.
+TRIED_DRAWS, ADAPTED_FREEDOM = 4000, 15.0
 # Draws at a time: the matrices of more do not fit into the processor's cache. With one matrix for
 # each draw they have so many entries at most.
 BLOCK = 1024
@@ -43,6 +46,26 @@ class StudentT:
     mean: FloatArray
     factor: FloatArray
     freedom: float
+
+    # So many draws tell whether it has to be adapted; a draw costs as much as a density.
+    first_draws, cost = TRIED_DRAWS, 1.0
+
+    @classmethod
+    def of(cls, points: FloatArray, weight: FloatArray, freedom: float) -> StudentT:
+        """Return the one with the mean and covariance of weighted points (n, d)."""
+        mean = weight @ points
+        apart = points - mean
+        covariance = (apart * weight[:, None]).T @ apart
+        return cls(mean, np.asarray(np.linalg.cholesky(covariance)), freedom)
+
+    @property
+    def dimension(self) -> int:
+        """Of what is adapted."""
+        return len(self.mean)
+
+    def adapted(self, points: FloatArray, weight: FloatArray) -> StudentT:
+        """Return the one with the moments of weighted points (n, d)."""
+        return self.of(points, weight, self.freedom)
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Return points (count, d) and their log density (count,)."""
@@ -75,6 +98,18 @@ class LaplaceProposal:
     mode: Mode
     factorised: bool = False
 
+    # So many draws tell whether it has to be adapted; a draw costs as much as a density.
+    first_draws, cost = TRIED_DRAWS, 1.0
+
+    @property
+    def dimension(self) -> int:
+        """Of what is adapted."""
+        return len(self.mode.linearisation.posterior.free) + len(self.mode.eta)
+
+    def adapted(self, points: FloatArray, weight: FloatArray) -> StudentT:
+        """Return a Student t with the moments of weighted points (n, d)."""
+        return StudentT.of(points, weight, ADAPTED_FREEDOM)
+
     def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Return points (count, d) of the posterior and their log density (count,)."""
         block = BLOCK
@@ -88,10 +123,7 @@ class LaplaceProposal:
     def _sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         eta = self._folded(self._noise.sample(count, rng)[0])
         mean, factor, _ = self._conditional(eta)
-        whitened = rng.standard_normal((count, mean.shape[-1]))
-        tail = np.flatnonzero(rng.random(count) < TAIL_SHARE)
-        mixing = np.sqrt(rng.chisquare(TAIL_FREEDOM, len(tail)) / TAIL_FREEDOM)
-        whitened[tail] *= (TAIL_WIDENING / mixing)[:, None]
+        whitened = with_tails(rng.standard_normal((count, mean.shape[-1])), rng)
         upper = np.swapaxes(factor, -1, -2)
         if self.factorised:
             step = np.linalg.solve(upper, whitened[..., None])[..., 0]
@@ -121,17 +153,8 @@ class LaplaceProposal:
 
     def _density(self, eta: FloatArray, whitened: FloatArray, factor: FloatArray) -> FloatArray:
         """Return the log density (n,) of noise (n, e) and parameters at whitened places (n, f)."""
-        folded = len(self.mode.eta) - self._unfolded
-        # |x| has the density of x and of -x together.
-        signs = itertools.product((1.0, -1.0), repeat=folded)
-        images = [eta * np.array((*(1.0,) * self._unfolded, *sign)) for sign in signs]
-        noise = np.logaddexp.reduce([self._noise.log_density(image) for image in images])
-        f = whitened.shape[1]
-        square = np.sum(whitened**2, axis=-1)
-        centre = np.log1p(-TAIL_SHARE) - 0.5 * square - 0.5 * f * np.log(2.0 * np.pi)
-        tail = np.log(TAIL_SHARE) - f * np.log(TAIL_WIDENING)
-        tail += _log_student_t(square / TAIL_WIDENING**2, f, TAIL_FREEDOM)
-        return noise + np.logaddexp(centre, tail) + log_determinant(factor)
+        noise = folded_density(self._noise, eta, len(self.mode.eta) - self._unfolded)
+        return noise + tail_density(whitened) + log_determinant(factor)
 
     def _folded(self, eta: FloatArray) -> FloatArray:
         """Return noise coordinates with the negative half of those of pose_sigma mirrored."""
@@ -147,6 +170,35 @@ class LaplaceProposal:
     def _noise(self) -> StudentT:
         factor = np.asarray(np.linalg.cholesky(self.mode.eta_covariance))
         return StudentT(self.mode.eta, factor, NOISE_FREEDOM)
+
+
+def with_tails(normal: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return standard normal draws (n, f), some of them replaced by those of a wider Student t."""
+    tail = np.flatnonzero(rng.random(len(normal)) < TAIL_SHARE)
+    mixing = np.sqrt(rng.chisquare(TAIL_FREEDOM, len(tail)) / TAIL_FREEDOM)
+    normal[tail] *= (TAIL_WIDENING / mixing)[:, None]
+    return normal
+
+
+def tail_density(whitened: FloatArray) -> FloatArray:
+    """Return the log density (n,) of what `with_tails` returns, (n, f)."""
+    f = whitened.shape[1]
+    square = np.sum(whitened**2, axis=-1)
+    centre = np.log1p(-TAIL_SHARE) - 0.5 * square - 0.5 * f * np.log(2.0 * np.pi)
+    tail = np.log(TAIL_SHARE) - f * np.log(TAIL_WIDENING)
+    tail += _log_student_t(square / TAIL_WIDENING**2, f, TAIL_FREEDOM)
+    density: FloatArray = np.logaddexp(centre, tail)
+    return density
+
+
+def folded_density(distribution: StudentT, points: FloatArray, folded: int) -> FloatArray:
+    """Return the log density of points (n, d) whose last coordinates are without their sign."""
+    # |x| has the density of x and of -x together.
+    kept = (1.0,) * (points.shape[1] - folded)
+    signs = itertools.product((1.0, -1.0), repeat=folded)
+    images = [points * np.array((*kept, *sign)) for sign in signs]
+    density: FloatArray = np.logaddexp.reduce([distribution.log_density(one) for one in images])
+    return density
 
 
 def _log_student_t(square: FloatArray, d: int, freedom: float) -> FloatArray:

@@ -1,8 +1,9 @@
 """Draws from the exact posterior of a fit, by the cheapest sampler that works on it.
 
 `sample_posterior` is the one interface of the samplers: `metropolis` has the two kernels,
-`proposal` the densities that are proposed from, `surrogate` the density that costs the same for
-any number of observations, `importance` what remains where chains are not worth their length.
+`proposal` and `conditional_proposal` the densities that are proposed from, `surrogate` the density
+that costs the same for any number of observations, `importance` what remains where chains are not
+worth their length.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from remaster_ros.calibration import convergence
+from remaster_ros.calibration.conditional_proposal import ConditionalProposal
 from remaster_ros.calibration.convergence import ESS_LIMIT, R_HAT_LIMIT
 from remaster_ros.calibration.importance import Weighted, adaptive_importance
 from remaster_ros.calibration.laplace import Mode
@@ -47,7 +49,7 @@ EVALUATED_ROWS = 100_000_000
 ROWS_OF_AN_EVALUATION = 100
 FEWEST_EVALUATIONS = 4000
 # Chains are given up that promise to take so many times the draws they may have.
-HOPELESS = 4.0
+HOPELESS = 1.5
 # Share of them for chains of independent proposals that are not adapted, and of what is then left
 # for importance sampling; the rest is for the random walk.
 CHAINS_SHARE, IMPORTANCE_SHARE = 0.25, 0.5
@@ -62,6 +64,9 @@ MANY_PARAMETERS = 60
 TRIAL_DRAWS = 1000
 WALKS = 32
 WALK_STEPS_PER_DRAW = 20
+# The first draws of each walk, by which it is judged: a draw costs as much as twenty of a chain.
+# Walks begin at weighted draws, so that they need hardly any warm-up.
+FIRST_WALKED, WALK_WARM_UP = 100, 25
 # Shares of a Gaussian's best step that are tried for the walk, for so many steps each.
 STEP_SCALES = (1.0, 0.7, 0.5, 0.35, 0.25)
 SCALE_STEPS = 200
@@ -177,28 +182,32 @@ def _exact(
 ) -> Sampling:
     """Sample by the exact density, with the evaluations that there are."""
     chains, rng = len(starts), task.rng
-    most = int(CHAINS_SHARE * task.evaluations) // chains
-    run, enough = task.independent(log_density, laplace, starts, most)
-    if enough:
-        return Sampling(
-            run,
-            'independence Metropolis-Hastings on the exact density, Laplace proposal '
-            '(the density is not near enough to its second order)',
-        )
+    conditional = ConditionalProposal.of(laplace.mode)
+    if conditional is None:
+        most = int(CHAINS_SHARE * task.evaluations) // chains
+        run, enough = task.independent(log_density, laplace, starts, most)
+        if enough:
+            return Sampling(
+                run,
+                'independence Metropolis-Hastings on the exact density, Laplace proposal '
+                '(the density is not near enough to its second order)',
+            )
 
     weighted = adaptive_importance(
         log_density,
-        laplace,
+        conditional or laplace,
         wanted=task.wanted,
         evaluations=int(IMPORTANCE_SHARE * task.evaluations),
         rng=rng,
         progress=lambda share: task.report('adapting the sampler', share),
     )
     if weighted.reliable and weighted.effective >= task.enough:
+        how = 'chains of independent proposals are worth too few draws'
+        if conditional is not None:
+            how = 'effects drawn given the other parameters and the noise'
         return Sampling(
             task.by_weights(weighted, chains),
-            'importance sampling, Student t proposal adapted to the weighted draws '
-            '(chains of independent proposals are worth too few draws)',
+            f'importance sampling, proposal adapted to the weighted draws ({how})',
         )
 
     # All walks go on side by side: a batch of many costs hardly more than a few.
@@ -206,7 +215,7 @@ def _exact(
     most = task.evaluations // (walks * WALK_STEPS_PER_DRAW) if task.draws is None else task.draws
     if most >= FIRST_DRAWS or task.draws is not None:
         start = weighted.resampled(walks, rng)
-        factor = weighted.adapted().factor
+        factor = weighted.factor()
         run, enough = task.walk(
             log_density, _step_scale(log_density, factor, start, rng) * factor, start, most
         )
@@ -288,7 +297,7 @@ class _Task:
                 progress=lambda share: self.report('sampling', share),
             )
 
-        return self._long_enough(more, start, POOR_ACCEPTANCE, most)
+        return self._long_enough(more, start, most, poor=POOR_ACCEPTANCE)
 
     def walk(
         self, target: LogDensity, factor: FloatArray, start: FloatArray, most: int
@@ -308,22 +317,26 @@ class _Task:
                 progress=lambda share: self.report('sampling by random walk', share),
             )
 
-        return self._long_enough(more, start, 0.0, most)
+        return self._long_enough(more, start, most, first=FIRST_WALKED, warm_up=WALK_WARM_UP)
 
     def _long_enough(
         self,
         more: Callable[[FloatArray, int, int], Chains],
         start: FloatArray,
-        poor: float,
         most: int,
+        *,
+        poor: float = 0.0,
+        first: int = FIRST_DRAWS,
+        warm_up: int = WARM_UP,
     ) -> tuple[Chains, bool]:
         """Sample in batches until the length is reached, and return whether that is enough.
 
-        ``more`` continues from a state: (start, draws, warm-up) to chains. Chains with a poor
-        acceptance are given up, as are those that ``most`` draws each will not make long enough.
+        ``more`` continues from a state: (start, draws, warm-up) to chains, which begins with
+        ``first`` draws. Chains with a poor acceptance are given up, as are those that ``most``
+        draws each will not make long enough.
         """
-        most = max(FIRST_DRAWS, min(most, ALLOWANCE, LARGEST_CHAINS // start.size))
-        run = more(start, self.draws or FIRST_DRAWS, WARM_UP)
+        most = max(first, min(most, ALLOWANCE, LARGEST_CHAINS // start.size))
+        run = more(start, self.draws or first, warm_up)
         if self.draws is not None:
             return run, run.acceptance_rate >= poor
         while run.acceptance_rate >= poor:

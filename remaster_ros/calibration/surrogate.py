@@ -132,13 +132,13 @@ def _data_parts(mode: Mode, width: FloatArray) -> list[_Part]:
     posterior = mode.linearisation.posterior
     model, free, f = posterior.model, posterior.free, len(posterior.free)
     noise = posterior.noise_model
-    pairs = _bent_pairs(model, free)
+    pairs = bent_pairs(model, free)
     first, second = (np.searchsorted(free, [pair[side] for pair in pairs]) for side in (0, 1))
 
     def joined(rows: Rows, _: slice) -> FloatArray:
         errors = rows.target - model.predict(mode.z, rows)
         straight = model.jacobian(mode.z, rows)[:, :, free]
-        bent = _second_derivatives(model, mode.z, rows, pairs)
+        bent = second_derivatives(model, mode.z, rows, pairs)
         return np.concatenate((straight, errors[:, :, None], bent), axis=2)
 
     grams = noise.gram(joined, f + 1 + len(pairs))
@@ -226,7 +226,7 @@ def _part(
     return _Part(line[:-1], first[chosen], second[chosen], groups, straight, strong, products)
 
 
-def _bent_pairs(model: Model, free: IntArray) -> list[tuple[int, int]]:
+def bent_pairs(model: Model, free: IntArray) -> list[tuple[int, int]]:
     """Return the pairs of free parameters, by model index, whose product moves a prediction."""
     inner = [i for i in range(1, model.joints - 1) if i in free]
     markers = [i for i in range(model.marker(0).start, model.core) if i in free]
@@ -239,7 +239,7 @@ def _bent_pairs(model: Model, free: IntArray) -> list[tuple[int, int]]:
     return pairs
 
 
-def _second_derivatives(
+def second_derivatives(
     model: Model, z: FloatArray, rows: Rows, pairs: list[tuple[int, int]]
 ) -> FloatArray:
     """Return the factors of products of parameters in the prediction, (n, 3, p).

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN, MARKERS, URDF, extension, scene, sensors
+from calibration_scenes import CHAIN, extension, one_tool_direction, scene
 
 from remaster_ros.calibration import sampling
 from remaster_ros.calibration.estimate import Problem, estimate
@@ -14,35 +14,7 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.laplace import find_mode
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.errors import InsufficientDataError
-from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
-from remaster_ros.simulation.session_simulator import simulate_session
 from remaster_ros.types import FloatArray, Session
-
-
-def one_tool_direction(seed: int, turned: float = 0.01, noise_m: float = 1e-3) -> Session:
-    """Poses in a small cube, the tool always turned the same way, its marker unknown."""
-    print('seed', seed)
-    rng = np.random.default_rng(seed)
-    inverse = InverseKinematics(CHAIN, held={2: (0.0,)})
-    start = np.array([0.3, 0.6, 0.0, -1.2, 0.2, 0.9, 0.4])
-    poses = []
-    while len(poses) < 40:
-        T = CHAIN.forward(start)
-        T[:3, 3] += rng.uniform(-0.1, 0.1, 3)
-        found = inverse.solutions(T)
-        if len(found):
-            nearest = found[np.argmin(np.linalg.norm(found - start, axis=1))]
-            poses.append(nearest + turned * rng.standard_normal((2, 7)))
-    session, _ = simulate_session(
-        CHAIN,
-        URDF,
-        rng,
-        poses=poses,
-        validation_poses=[],
-        sensors=sensors(rng, 1, noise_m, noise_m),
-        markers={**MARKERS, 'sir': np.array([0.002, 0.0, 0.1])},
-    )
-    return replace(session, marker_std_m=0.2)
 
 
 @pytest.fixture(scope='module')

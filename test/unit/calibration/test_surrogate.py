@@ -16,7 +16,7 @@ from remaster_ros.calibration.laplace import find_mode
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.proposal import LaplaceProposal
 from remaster_ros.calibration.sampling import sample_posterior
-from remaster_ros.calibration.surrogate import Surrogate, _bent_pairs, _second_derivatives
+from remaster_ros.calibration.surrogate import Surrogate, bent_pairs, second_derivatives
 
 
 @pytest.fixture(scope='module')
@@ -28,8 +28,8 @@ def test_second_derivatives_are_those_of_the_prediction(found) -> None:
     """Against differences of the first ones, at a point well away from the reference."""
     model, rows = found.model, found.posterior.rows
     z = found.mode.z + 0.05 * np.random.default_rng(1).standard_normal(model.size)
-    pairs = _bent_pairs(model, np.arange(model.size))
-    bent = _second_derivatives(model, z, rows, pairs)
+    pairs = bent_pairs(model, np.arange(model.size))
+    bent = second_derivatives(model, z, rows, pairs)
     step = 1e-5
     for i in range(model.size):
         unit = step * np.eye(model.size)[i]

@@ -1,0 +1,242 @@
+"""A proposal for models with many effects: these given the arm, the arm by a Student t.
+
+Effects enter nearly linearly: given the zero-offsets, registrations, markers and the noise they
+are Gaussian. But where they lie, and how wide, depends on those: a curve of a joint moves a marker
+that is further out by more. Where the core (offsets, registrations, markers) is badly determined
+this is no small thing, and a Gaussian of all parameters together, or a Student t, has hardly a
+draw in the bulk of the posterior. Here only the core and the noise are drawn from a Student t,
+which can be adapted to a dozen dimensions; the effects from what the errors say given these.
+
+With steps d of the core and δ of the effects from the mode the errors are, to second order, ::
+
+    e = a(d) - B(d) δ,   a = e0 - J d - ½ d' H d,   B = B0 + Σ d_k ∂B/∂d_k
+
+and δ has the precision P = B' W B + Q and the mean P⁻¹ (B' W a + q), with W the weights of the
+noise, Q and q of the priors: sums of Gram matrices that are known before anything is drawn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.laplace import Mode, log_determinant
+from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.proposal import StudentT, folded_density, tail_density, with_tails
+from remaster_ros.calibration.surrogate import bent_pairs, second_derivatives
+from remaster_ros.types import FloatArray, IntArray
+
+# Tails of the core and the noise.
+FREEDOM = 10.0
+# Numbers in the Gram matrices, at most: 160 MB, some times that in what is made of them. With one
+# sensor and a dozen bending parameters 200 effects have so many.
+MOST_ENTRIES = 20_000_000
+# Steps of the core in the derivatives, in its standard deviations; not less than differences need.
+STEP, LEAST_STEP = 0.1, 1e-6
+# The effects of so many parameters cost as much as a density.
+EFFECTS_OF_A_DENSITY = 27.0
+# Numbers in the matrices of the draws that are made at a time.
+BLOCK_ENTRIES = 2_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionalProposal:
+    """Core and noise from a Student t, the effects from their Gaussian given both.
+
+    Attributes
+    ----------
+    mode
+        About which errors are expanded.
+    outer
+        Of the core's steps from the mode and the noise coordinates, (c + e) dimensions.
+    bending
+        Which of the core change what the effects do: all b but the shifts of registrations.
+    first, second
+        The pairs of the core's parameters whose product moves a prediction, (pairs,) each.
+    unit
+        Standard deviation of each effect given the core at the mode, (m,).
+    precision
+        Of pairs k <= l of 1 and the bending steps by error group, (error groups, k l, m, m), in
+        units.
+    pull
+        Products of the effects' derivatives for each of 1 and these steps with [e0, J, H] by error
+        group, (error groups, 1 + b, 1 + c + pairs, m), in units.
+    prior
+        Gram matrix of the priors: their rows of the effects, (m, f + 1), in units.
+    """
+
+    mode: Mode
+    outer: StudentT
+    bending: IntArray
+    first: IntArray
+    second: IntArray
+    unit: FloatArray
+    precision: FloatArray
+    pull: FloatArray
+    prior: FloatArray
+
+    # Few draws tell of so few dimensions, and each is dear.
+    first_draws = 1000
+
+    @classmethod
+    def of(cls, mode: Mode) -> ConditionalProposal | None:
+        """Expand about a mode; None where there are no effects, or too many."""
+        posterior = mode.linearisation.posterior
+        model, free = posterior.model, posterior.free
+        c = int(np.sum(free < model.core))
+        m = len(free) - c
+        bending = np.flatnonzero(~np.isin(free[:c], _shifts(model)))
+        size, groups = m * (1 + len(bending)), len(posterior.noise_model.error_groups)
+        if m == 0 or groups * size**2 > MOST_ENTRIES:
+            return None
+        covariance = mode.covariance
+        width = np.sqrt(np.diag(covariance))
+        pairs = bent_pairs(model, free)
+        first, second = (np.searchsorted(free, [pair[side] for pair in pairs]) for side in (0, 1))
+
+        def joined(rows: Rows, _: slice) -> FloatArray:
+            effects = [model.jacobian(mode.z, rows)[:, :, free]]
+            core, effects[0] = effects[0][:, :, :c], effects[0][:, :, c:]
+            for index in bending:
+                step = np.zeros(model.size)
+                step[free[index]] = max(STEP * width[index], LEAST_STEP)
+                ahead, behind = (
+                    model.jacobian(z, rows)[:, :, free[c:]] for z in (mode.z + step, mode.z - step)
+                )
+                effects.append((ahead - behind) / (2.0 * step[free[index]]))
+            errors = (rows.target - model.predict(mode.z, rows))[:, :, None]
+            bent = second_derivatives(model, mode.z, rows, pairs)
+            return np.concatenate((*effects, errors, core, bent), axis=2)
+
+        grams = posterior.noise_model.gram(joined, size + 1 + c + len(pairs))
+        prior = mode.linearisation.prior
+        unit = np.diag(mode.linearisation.gram(mode.eta))[c:-1] ** -0.5
+        lines = 1 + len(bending)
+        of_effects = grams[:, :size, :size].reshape(groups, lines, m, lines, m)
+        of_effects = of_effects * unit[:, None, None] * unit
+        of_effects += np.transpose(of_effects, (0, 3, 2, 1, 4))
+        upper = np.triu_indices(lines)
+        precision = of_effects[:, upper[0], :, upper[1], :].swapaxes(0, 1)
+        precision[:, upper[0] == upper[1]] *= 0.5
+        pull = grams[:, :size, size:].reshape(groups, lines, m, -1) * unit[:, None]
+        scale = np.zeros((c + len(mode.eta),) * 2)
+        scale[:c, :c], scale[c:, c:] = covariance[:c, :c], mode.eta_covariance
+        centre = np.concatenate((np.zeros(c), mode.eta))
+        return cls(
+            mode,
+            StudentT(centre, np.asarray(np.linalg.cholesky(scale)), FREEDOM),
+            bending,
+            first,
+            second,
+            unit,
+            np.ascontiguousarray(precision),
+            np.ascontiguousarray(pull.swapaxes(2, 3)),
+            unit[:, None] * prior[c:-1],
+        )
+
+    @property
+    def cost(self) -> float:
+        """Of a draw, in evaluations of a density, as measured."""
+        return 1.0 + (len(self.unit) / EFFECTS_OF_A_DENSITY) ** 2
+
+    @property
+    def dimension(self) -> int:
+        """Of what is adapted."""
+        return len(self.outer.mean)
+
+    def adapted(self, points: FloatArray, weight: FloatArray) -> ConditionalProposal:
+        """Return the proposal with core and noise as weighted points (n, d) have them."""
+        return replace(self, outer=StudentT.of(self._outside(points), weight, FREEDOM))
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Return points (count, d) of the posterior and their log density (count,)."""
+        outside = self.outer.sample(count, rng)[0]
+        folded = self._folded
+        outside[:, folded] = np.abs(outside[:, folded])
+        m = len(self.unit)
+        whitened = with_tails(rng.standard_normal((count, m)), rng)
+        inner, log_det = np.empty((count, m)), np.empty(count)
+        for part in self._blocks(count):
+            mean, factor = self._conditional(outside[part])
+            upper = np.swapaxes(factor, -1, -2)
+            inner[part] = mean + np.linalg.solve(upper, whitened[part, :, None])[..., 0]
+            log_det[part] = log_determinant(factor)
+        return self._points(outside, inner), self._density(outside, whitened, log_det)
+
+    def log_density(self, points: FloatArray) -> FloatArray:
+        """Return the normalised log density of points (n, d), (n,)."""
+        outside, c = self._outside(points), self._core
+        inner = (points[:, c : c + len(self.unit)] - self._centre[c:]) / self.unit
+        whitened, log_det = np.empty_like(inner), np.empty(len(points))
+        for part in self._blocks(len(points)):
+            mean, factor = self._conditional(outside[part])
+            whitened[part] = np.einsum('nji,nj->ni', factor, inner[part] - mean)
+            log_det[part] = log_determinant(factor)
+        return self._density(outside, whitened, log_det)
+
+    def _conditional(self, outside: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean (n, m) and Cholesky factor of the precision (n, m, m) of the effects."""
+        c, m, n = self._core, len(self.unit), len(outside)
+        step, eta = outside[:, :c], outside[:, c:]
+        weight = 1.0 / self.mode.linearisation.posterior.variances(eta)
+        line = np.concatenate((np.ones((n, 1)), step[:, self.bending]), axis=1)
+        upper = np.triu_indices(line.shape[1])
+        products = line[:, upper[0]] * line[:, upper[1]]
+        factors = (weight[:, :, None] * products[:, None]).reshape(n, -1)
+        precision = (factors @ self.precision.reshape(-1, m * m)).reshape(n, m, m)
+        precision += self.prior[:, c:-1] * self.unit
+        bent = np.concatenate(
+            (np.ones((n, 1)), -step, -step[:, self.first] * step[:, self.second]), axis=1
+        )
+        products = (line[:, :, None] * bent[:, None]).reshape(n, -1)
+        factors = (weight[:, :, None] * products[:, None]).reshape(n, -1)
+        pull = factors @ self.pull.reshape(-1, m) + self.prior[:, -1] - step @ self.prior[:, :c].T
+        factor = np.asarray(np.linalg.cholesky(precision))
+        half = np.linalg.solve(factor, pull[..., None])
+        return np.linalg.solve(np.swapaxes(factor, -1, -2), half)[..., 0], factor
+
+    def _density(
+        self, outside: FloatArray, whitened: FloatArray, log_det: FloatArray
+    ) -> FloatArray:
+        """Return the log density (n,) of core and noise, and of effects at whitened places."""
+        value = folded_density(self.outer, outside, len(self._folded))
+        value += tail_density(whitened) + log_det
+        return value - float(np.sum(np.log(self.unit)))
+
+    def _points(self, outside: FloatArray, inner: FloatArray) -> FloatArray:
+        c = self._core
+        parameters = np.concatenate((outside[:, :c], inner * self.unit), axis=1) + self._centre
+        return np.concatenate((parameters, outside[:, c:]), axis=1)
+
+    def _outside(self, points: FloatArray) -> FloatArray:
+        """Return the core's steps and the noise of points (n, d), (n, c + e)."""
+        c = self._core
+        core = points[:, :c] - self._centre[:c]
+        return np.concatenate((core, points[:, c + len(self.unit) :]), axis=1)
+
+    def _blocks(self, count: int) -> list[slice]:
+        factors = self.pull.shape[0] * self.pull.shape[1] * self.pull.shape[2]
+        size = max(1, BLOCK_ENTRIES // max(factors, len(self.unit) ** 2))
+        return [slice(start, start + size) for start in range(0, count, size)]
+
+    @property
+    def _core(self) -> int:
+        return len(self.outer.mean) - len(self.mode.eta)
+
+    @property
+    def _centre(self) -> FloatArray:
+        return self.mode.z[self.mode.linearisation.posterior.free]
+
+    @property
+    def _folded(self) -> IntArray:
+        """Which coordinates of the outer ones cannot be negative: shared parts of the noise."""
+        shares = len(self.mode.linearisation.posterior.noise_model.shares)
+        return np.arange(self.dimension - shares, self.dimension)
+
+
+def _shifts(model: Model) -> IntArray:
+    """Return the parameters that displace all points of a sensor alike."""
+    starts = [model.registration(sensor).start for sensor in range(len(model.sensor_names))]
+    return np.concatenate([np.arange(start, start + 3) for start in starts])
