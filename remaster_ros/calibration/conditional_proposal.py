@@ -9,10 +9,12 @@ which can be adapted to a dozen dimensions; the effects from what the errors say
 
 With steps d of the core and δ of the effects from the mode the errors are, to second order, ::
 
-    e = a(d) - B(d) δ,   a = e0 - J d - ½ d' H d,   B = B0 + Σ d_k ∂B/∂d_k
+    e = a(d) - B(d) δ,   a = e0 - J d - ½ d' H d,   B = B0 + Σ u_k ∂B/∂u_k
 
 and δ has the precision P = B' W B + Q and the mean P⁻¹ (B' W a + q), with W the weights of the
-noise, Q and q of the priors: sums of Gram matrices that are known before anything is drawn.
+noise, Q and q of the priors: sums of Gram matrices that are known before anything is drawn. The
+u_k are steps along those principal axes of the core that change B by anything that counts: the
+badly determined ones.
 """
 
 from __future__ import annotations
@@ -20,23 +22,30 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.laplace import Mode, log_determinant
-from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.proposal import StudentT, folded_density, tail_density, with_tails
 from remaster_ros.calibration.surrogate import bent_pairs, second_derivatives
 from remaster_ros.types import FloatArray, IntArray
 
 # Tails of the core and the noise.
 FREEDOM = 10.0
-# Numbers in the Gram matrices, at most: 160 MB, some times that in what is made of them. With one
-# sensor and a dozen bending parameters 200 effects have so many.
+# Numbers in the Gram matrices, at most: 160 MB, some times that in what is made of them. And in
+# the derivatives of all rows.
 MOST_ENTRIES = 20_000_000
-# Steps of the core in the derivatives, in its standard deviations; not less than differences need.
-STEP, LEAST_STEP = 0.1, 1e-6
+MOST_DERIVATIVES = 5_000_000
+# With more effects a draw takes milliseconds, and where so many are in the model the core is not
+# what makes it hard: of 380 effects draws were worth as little as of a Gaussian.
+MOST_EFFECTS = 250
+# Of the core in the derivatives, in its standard deviations.
+STEP = 0.1
+# What an axis may change in the logarithm of the effects' volume, and leave out, a standard
+# deviation away.
+NEGLIGIBLE = 0.1
 # The effects of so many parameters cost as much as a density.
-EFFECTS_OF_A_DENSITY = 27.0
+EFFECTS_OF_A_DENSITY = 60.0
 # Numbers in the matrices of the draws that are made at a time.
 BLOCK_ENTRIES = 2_000_000
 
@@ -51,14 +60,14 @@ class ConditionalProposal:
         About which errors are expanded.
     outer
         Of the core's steps from the mode and the noise coordinates, (c + e) dimensions.
-    bending
-        Which of the core change what the effects do: all b but the shifts of registrations.
+    axes
+        Steps along the axes that change what the effects do, from the core's steps, (b, c).
     first, second
         The pairs of the core's parameters whose product moves a prediction, (pairs,) each.
     unit
         Standard deviation of each effect given the core at the mode, (m,).
     precision
-        Of pairs k <= l of 1 and the bending steps by error group, (error groups, k l, m, m), in
+        Of pairs k <= l of 1 and the steps along axes by error group, (error groups, k l, m, m), in
         units.
     pull
         Products of the effects' derivatives for each of 1 and these steps with [e0, J, H] by error
@@ -69,7 +78,7 @@ class ConditionalProposal:
 
     mode: Mode
     outer: StudentT
-    bending: IntArray
+    axes: FloatArray
     first: IntArray
     second: IntArray
     unit: FloatArray
@@ -87,33 +96,30 @@ class ConditionalProposal:
         model, free = posterior.model, posterior.free
         c = int(np.sum(free < model.core))
         m = len(free) - c
-        bending = np.flatnonzero(~np.isin(free[:c], _shifts(model)))
-        size, groups = m * (1 + len(bending)), len(posterior.noise_model.error_groups)
-        if m == 0 or groups * size**2 > MOST_ENTRIES:
+        if not 0 < m <= MOST_EFFECTS or 3 * len(posterior.rows) * m > MOST_DERIVATIVES:
             return None
         covariance = mode.covariance
-        width = np.sqrt(np.diag(covariance))
+        unit = np.diag(mode.linearisation.gram(mode.eta))[c:-1] ** -0.5
+        groups = len(posterior.noise_model.error_groups)
+        most = int(np.sqrt(MOST_ENTRIES / groups)) // m - 1
+        if most < 1:
+            return None
+        along, axes = _bending(mode, covariance[:c, :c], unit, most)
+        lines = 1 + len(axes)
+        size = m * lines
         pairs = bent_pairs(model, free)
         first, second = (np.searchsorted(free, [pair[side] for pair in pairs]) for side in (0, 1))
 
         def joined(rows: Rows, _: slice) -> FloatArray:
-            effects = [model.jacobian(mode.z, rows)[:, :, free]]
-            core, effects[0] = effects[0][:, :, :c], effects[0][:, :, c:]
-            for index in bending:
-                step = np.zeros(model.size)
-                step[free[index]] = max(STEP * width[index], LEAST_STEP)
-                ahead, behind = (
-                    model.jacobian(z, rows)[:, :, free[c:]] for z in (mode.z + step, mode.z - step)
-                )
-                effects.append((ahead - behind) / (2.0 * step[free[index]]))
+            straight = model.jacobian(mode.z, rows)[:, :, free]
+            bending = [_changed(mode, rows, axis) for axis in along]
             errors = (rows.target - model.predict(mode.z, rows))[:, :, None]
             bent = second_derivatives(model, mode.z, rows, pairs)
-            return np.concatenate((*effects, errors, core, bent), axis=2)
+            parts = (straight[:, :, c:], *bending, errors, straight[:, :, :c], bent)
+            return np.concatenate(parts, axis=2)
 
         grams = posterior.noise_model.gram(joined, size + 1 + c + len(pairs))
         prior = mode.linearisation.prior
-        unit = np.diag(mode.linearisation.gram(mode.eta))[c:-1] ** -0.5
-        lines = 1 + len(bending)
         of_effects = grams[:, :size, :size].reshape(groups, lines, m, lines, m)
         of_effects = of_effects * unit[:, None, None] * unit
         of_effects += np.transpose(of_effects, (0, 3, 2, 1, 4))
@@ -127,7 +133,7 @@ class ConditionalProposal:
         return cls(
             mode,
             StudentT(centre, np.asarray(np.linalg.cholesky(scale)), FREEDOM),
-            bending,
+            axes,
             first,
             second,
             unit,
@@ -159,9 +165,12 @@ class ConditionalProposal:
         whitened = with_tails(rng.standard_normal((count, m)), rng)
         inner, log_det = np.empty((count, m)), np.empty(count)
         for part in self._blocks(count):
-            mean, factor = self._conditional(outside[part])
-            upper = np.swapaxes(factor, -1, -2)
-            inner[part] = mean + np.linalg.solve(upper, whitened[part, :, None])[..., 0]
+            half, factor = self._conditional(outside[part])
+            right = half + whitened[part]
+            inner[part] = [
+                dtrtrs(one, row, lower=1, trans=1)[0]
+                for one, row in zip(factor, right, strict=True)
+            ]
             log_det[part] = log_determinant(factor)
         return self._points(outside, inner), self._density(outside, whitened, log_det)
 
@@ -171,17 +180,17 @@ class ConditionalProposal:
         inner = (points[:, c : c + len(self.unit)] - self._centre[c:]) / self.unit
         whitened, log_det = np.empty_like(inner), np.empty(len(points))
         for part in self._blocks(len(points)):
-            mean, factor = self._conditional(outside[part])
-            whitened[part] = np.einsum('nji,nj->ni', factor, inner[part] - mean)
+            half, factor = self._conditional(outside[part])
+            whitened[part] = np.einsum('nji,nj->ni', factor, inner[part]) - half
             log_det[part] = log_determinant(factor)
         return self._density(outside, whitened, log_det)
 
     def _conditional(self, outside: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean (n, m) and Cholesky factor of the precision (n, m, m) of the effects."""
+        """Return the Gaussian of the effects: L' mean, (n, m), and L with precision L L'."""
         c, m, n = self._core, len(self.unit), len(outside)
         step, eta = outside[:, :c], outside[:, c:]
         weight = 1.0 / self.mode.linearisation.posterior.variances(eta)
-        line = np.concatenate((np.ones((n, 1)), step[:, self.bending]), axis=1)
+        line = np.concatenate((np.ones((n, 1)), step @ self.axes.T), axis=1)
         upper = np.triu_indices(line.shape[1])
         products = line[:, upper[0]] * line[:, upper[1]]
         factors = (weight[:, :, None] * products[:, None]).reshape(n, -1)
@@ -193,9 +202,14 @@ class ConditionalProposal:
         products = (line[:, :, None] * bent[:, None]).reshape(n, -1)
         factors = (weight[:, :, None] * products[:, None]).reshape(n, -1)
         pull = factors @ self.pull.reshape(-1, m) + self.prior[:, -1] - step @ self.prior[:, :c].T
-        factor = np.asarray(np.linalg.cholesky(precision))
-        half = np.linalg.solve(factor, pull[..., None])
-        return np.linalg.solve(np.swapaxes(factor, -1, -2), half)[..., 0], factor
+        # One by one: of many matrices at once NumPy solves none as the triangle it is.
+        for one, right in zip(precision, pull, strict=True):
+            factor, fails = dpotrf(one.T, lower=1)
+            if fails:
+                raise np.linalg.LinAlgError('the effects are not determined')
+            one[...] = factor
+            right[...] = dtrtrs(factor, right, lower=1)[0]
+        return pull, precision
 
     def _density(
         self, outside: FloatArray, whitened: FloatArray, log_det: FloatArray
@@ -236,7 +250,54 @@ class ConditionalProposal:
         return np.arange(self.dimension - shares, self.dimension)
 
 
-def _shifts(model: Model) -> IntArray:
-    """Return the parameters that displace all points of a sensor alike."""
-    starts = [model.registration(sensor).start for sensor in range(len(model.sensor_names))]
-    return np.concatenate([np.arange(start, start + 3) for start in starts])
+def _bending(
+    mode: Mode, covariance: FloatArray, unit: FloatArray, most: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the axes of the core along which the effects' derivatives change.
+
+    Parameters
+    ----------
+    mode
+        About which errors are expanded.
+    covariance
+        Of the core, (c, c).
+    unit
+        Of each effect, (m,).
+    most
+        Axes, those that change most.
+
+    Returns
+    -------
+    along
+        One standard deviation of the core along each, (b, c).
+    inverse
+        From steps of the core to steps along them, (b, c).
+    """
+    posterior = mode.linearisation.posterior
+    noise = posterior.noise(mode.eta)
+    width = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(width, width))
+    root = np.sqrt(np.maximum(values, np.finfo(float).eps))
+    along = (width[:, None] * vectors * root).T
+    inverse = (vectors / width[:, None] / root).T
+    shares = []
+    for axis in along:
+        changed = posterior.noise_model.whitened(_changed(mode, posterior.rows, axis), noise)
+        norm = np.linalg.norm(changed.reshape(-1, len(unit)), axis=0)
+        shares.append(float(norm @ unit))
+    order = np.argsort(shares)[::-1][:most]
+    kept = order[np.array(shares)[order] > NEGLIGIBLE]
+    return along[kept], inverse[kept]
+
+
+def _changed(mode: Mode, rows: Rows, axis: FloatArray) -> FloatArray:
+    """Return how a step of the core (c,) changes the derivative by the effects, (n, 3, m)."""
+    posterior = mode.linearisation.posterior
+    model, free = posterior.model, posterior.free
+    step = np.zeros(model.size)
+    step[free[: len(axis)]] = STEP * axis
+    ahead, behind = (
+        model.jacobian(z, rows)[:, :, free[len(axis) :]] for z in (mode.z + step, mode.z - step)
+    )
+    difference: FloatArray = (ahead - behind) / (2.0 * STEP)
+    return difference

@@ -77,8 +77,13 @@ def test_the_density_is_normalised(proposal, mode) -> None:
     assert abs(ratio.mean() - 1.0) < 5.0 * ratio.std() / np.sqrt(len(ratio))
 
 
-def test_effects_are_where_a_linearisation_of_their_own_has_them(proposal, mode) -> None:
-    """Against the tangent there: what is left out is of third order, of the precision second."""
+def test_effects_are_where_a_linearisation_of_their_own_has_them(mode, monkeypatch) -> None:
+    """Against the tangent there: what is left out is of third order, of the precision second.
+
+    Also the axes that hardly matter are followed here, as they are not where time counts.
+    """
+    monkeypatch.setattr(conditional_proposal, 'NEGLIGIBLE', 0.0)
+    proposal = ConditionalProposal.of(mode)
     posterior = mode.linearisation.posterior
     free, core = posterior.free, posterior.model.core
     c = int(np.sum(free < core))
@@ -94,9 +99,10 @@ def test_effects_are_where_a_linearisation_of_their_own_has_them(proposal, mode)
             there = linearise(posterior, z).gram(mode.eta)
             precision, pull = there[c:-1, c:-1], there[c:-1, -1]
             expected = np.linalg.solve(precision, pull)
-            mean, factor = proposal._conditional(outside[None])
+            half, factor = proposal._conditional(outside[None])
+            mean = np.linalg.solve(factor[0].T, half[0])
             root = np.linalg.cholesky(precision).T
-            apart.append(np.linalg.norm(root @ (mean[0] * proposal.unit - expected)))
+            apart.append(np.linalg.norm(root @ (mean * proposal.unit - expected)))
             moved = max(moved, float(np.linalg.norm(root @ expected)))
             scale = np.sqrt(np.diag(precision))
             ours = factor[0] @ factor[0].T / np.outer(proposal.unit * scale, proposal.unit * scale)
@@ -134,6 +140,21 @@ def test_the_sampler_uses_it_and_agrees_with_another_route(mode, monkeypatch) ->
     width = theirs.std(axis=0)
     assert np.max(np.abs(ours.mean(axis=0) - theirs.mean(axis=0)) / width) < 5 * np.sqrt(2 / 400)
     assert np.max(np.abs(np.log(ours.std(axis=0) / width))) < 5 * np.sqrt(1 / 400)
+
+
+def test_axes_that_hardly_matter_cost_hardly_a_draw(proposal, mode, monkeypatch) -> None:
+    """Effective draws with the axes that count and with all of them."""
+    monkeypatch.setattr(conditional_proposal, 'NEGLIGIBLE', 0.0)
+    every = ConditionalProposal.of(mode)
+    assert len(proposal.axes) < len(every.axes)
+    posterior = mode.linearisation.posterior
+    effective = []
+    for one in (proposal, every):
+        points, log_proposal = one.sample(4000, np.random.default_rng(7))
+        log_weight = posterior.log_density(points) - log_proposal
+        effective.append(Weighted.of(points, log_weight, one).effective)
+    print('effective draws', effective)
+    assert effective[0] > 0.7 * effective[1]
 
 
 def test_without_effects_or_with_too_many_there_is_none(mode, monkeypatch) -> None:
