@@ -25,7 +25,8 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from remaster_ros.calibration.grouped_rows import Rows
-from remaster_ros.calibration.laplace import Mode, log_determinant
+from remaster_ros.calibration.laplace import Mode
+from remaster_ros.calibration.linearisation import log_determinant
 from remaster_ros.calibration.proposal import StudentT, folded_density, tail_density, with_tails
 from remaster_ros.calibration.surrogate import bent_pairs, second_derivatives
 from remaster_ros.types import FloatArray, IntArray

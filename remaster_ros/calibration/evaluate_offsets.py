@@ -9,7 +9,8 @@ import numpy as np
 
 from remaster_ros.calibration.accuracy import accuracy_of
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate, hold_offsets
-from remaster_ros.calibration.laplace import Mode, linearise
+from remaster_ros.calibration.laplace import Mode
+from remaster_ros.calibration.linearisation import linearise
 from remaster_ros.calibration.orientation_accuracy import tool_orientations
 from remaster_ros.calibration.predictive_accuracy import Predictive
 from remaster_ros.calibration.result import predicted_rows

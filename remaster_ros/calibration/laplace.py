@@ -1,8 +1,7 @@
-"""The posterior of a model that is linear about a point: its mode, its width, draws from it.
+"""The mode of a posterior, and its width there.
 
-Given the noise, the parameters are then Gaussian, with a mean and a precision that follow from
-a handful of Gram matrices whatever the noise: a rotation of well under a degree bends so little
-that this is nearly the exact posterior, so it serves as proposal of the exact sampler.
+Gauss-Newton steps to where the linearised posterior (`linearisation`) peaks, the noise at the peak
+of its marginal density.
 """
 
 from __future__ import annotations
@@ -11,14 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dpotri
 
 from remaster_ros.calibration.gauge_words import hardly_seen
-from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.linearisation import Linearisation, linearise
 from remaster_ros.calibration.noise import RESOLUTION_M
 from remaster_ros.calibration.posterior import Posterior
-from remaster_ros.calibration.priors import prior_rows
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.types import BoolArray, FloatArray
 
@@ -34,133 +30,6 @@ HALVINGS = 10
 # The density of the noise is even in a shared part's coordinate: at zero it has no slope, whether
 # it rises or falls from there, and a search that begins at zero would stay.
 OFF_ZERO = 0.1
-
-
-def linearise(posterior: Posterior, z: FloatArray) -> Linearisation:
-    """Return the posterior with the predictions replaced by their tangent at z (size,)."""
-    model, free = posterior.model, posterior.free
-
-    def joined(rows: Rows, _: slice) -> FloatArray:
-        # One matrix holds derivative and error: its Gram matrix holds all the products needed.
-        errors = rows.target - model.predict(z, rows)
-        return np.concatenate((model.jacobian(z, rows)[:, :, free], errors[:, :, None]), axis=2)
-
-    residual, by_z = prior_rows(model, posterior.priors, z)
-    rows = np.column_stack((-by_z[:, free], residual))
-    return Linearisation(
-        posterior, z, posterior.noise_model.gram(joined, len(free) + 1), rows.T @ rows
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class Linearisation:
-    """The posterior of a model that is linear about ``z``: Gaussian given the noise.
-
-    Attributes
-    ----------
-    posterior
-        The one it approximates.
-    z
-        Pinned parameters, (size,).
-    grams
-        Gram matrix of [derivative | error] in each error group, (error groups, f+1, f+1).
-    prior
-        Gram matrix of the priors, (f+1, f+1).
-    """
-
-    posterior: Posterior
-    z: FloatArray
-    grams: FloatArray
-    prior: FloatArray
-
-    def gram(self, eta: FloatArray) -> FloatArray:
-        """Return the weighted Gram matrices (..., f+1, f+1) for noise coordinates (..., e)."""
-        return np.tensordot(1.0 / self.posterior.variances(eta), self.grams, axes=1) + self.prior
-
-    def conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the Gaussian of the free parameters given the noise, and the noise's density.
-
-        Parameters
-        ----------
-        eta
-            (..., e).
-
-        Returns
-        -------
-        mean
-            Free pinned parameters, (..., f).
-        cholesky
-            Lower Cholesky factor of the precision, (..., f, f).
-        log_marginal
-            Log density of the noise coordinates with the parameters integrated out, (...).
-        """
-        factor, pull, log_marginal = self.whitened(eta)
-        step = np.linalg.solve(np.swapaxes(factor, -1, -2), pull[..., None])[..., 0]
-        return self.z[self.posterior.free] + step, factor, log_marginal
-
-    def whitened(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the same Gaussian as its factor L and the vector L' (mean - z), and the density.
-
-        All follow from one factor of the bordered matrix: its last row holds the vector, its last
-        entry the root of what the parameters leave of the weighted sum of squares.
-        """
-        posterior = self.posterior
-        gram = self.gram(eta)
-        f = len(posterior.free)
-        # The scale of the parameters (rad, m) and of their information differs by many powers.
-        information = np.diagonal(gram, axis1=-2, axis2=-1).copy()
-        if not np.all(information[..., :f] > 0.0):
-            raise np.linalg.LinAlgError('a parameter without any information')
-        # Data without any noise leave nothing, and rounding may leave less than that.
-        gram[..., f, f] += 1e-9 + 1e-12 * information[..., f]
-        information[..., f] = 1.0
-        scale = np.sqrt(information)
-        factor = np.linalg.cholesky(gram / (scale[..., :, None] * scale[..., None, :]))
-        factor *= scale[..., :, None]
-        inner = factor[..., :f, :f]
-        log_scale = np.log(posterior.variances(eta)) @ posterior.noise_model.freedom
-        log_marginal = (
-            posterior.log_noise_prior(eta)
-            - 0.5 * (log_scale + factor[..., f, f] ** 2)
-            - log_determinant(inner)
-        )
-        return inner, factor[..., f, :f], log_marginal
-
-    def by_variances(self, eta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Return the noise's log density, and how it depends on the log variance of each group.
-
-        All from one factor, where differences would take dozens.
-
-        Parameters
-        ----------
-        eta
-            (e,).
-
-        Returns
-        -------
-        log_marginal
-            As `conditional` gives it.
-        slope
-            Gradient without the prior of the noise, (error groups,).
-        information
-            Average of observed and expected information (Gilmour, Thompson & Cullis 1995,
-            Biometrics 51), (error groups, error groups).
-        """
-        factor, pull, log_marginal = self.whitened(eta)
-        root = np.asfortranarray(factor)
-        lower, _ = dpotri(root, lower=1)
-        # Beside the diagonal twice: products with symmetric matrices are then those of the whole.
-        inverse = 2.0 * lower.T
-        np.fill_diagonal(inverse, np.diag(lower))
-        f = len(pull)
-        error = np.append(-solve_triangular(root, pull, lower=True, trans='T'), 1.0)
-        trace = np.array([np.vdot(gram[:f, :f], inverse) for gram in self.grams])
-        pulls = (self.grams @ error) / self.posterior.variances(eta)[:, None]
-        square = pulls @ error
-        left = solve_triangular(root, pulls[:, :f].T, lower=True)
-        slope = 0.5 * (square + trace / self.posterior.variances(eta))
-        slope -= 0.5 * self.posterior.noise_model.freedom
-        return float(log_marginal), slope, 0.5 * (np.diag(square) - left.T @ left)
 
 
 @dataclass(frozen=True, eq=False)
@@ -417,8 +286,3 @@ def _curvature(
     mixed = (four[0] - four[1] - four[2] + four[3]) / (4.0 * step**2)
     curvature[first, second] = curvature[second, first] = mixed
     return float(value[0]), (plus - minus) / (2.0 * step), -curvature
-
-
-def log_determinant(factor: FloatArray) -> FloatArray:
-    """Return the log determinant of triangular factors (..., f, f), (...)."""
-    return np.sum(np.log(np.diagonal(factor, axis1=-2, axis2=-1)), axis=-1)

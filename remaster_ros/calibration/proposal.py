@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from remaster_ros.calibration.laplace import Mode, log_determinant
+from remaster_ros.calibration.laplace import Mode
+from remaster_ros.calibration.linearisation import log_determinant
 from remaster_ros.types import FloatArray
 
 # Tails of the proposal: of the noise always, of the parameters in this share of the draws. They

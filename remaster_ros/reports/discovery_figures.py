@@ -105,7 +105,7 @@ def drivers(discovery: Discovery) -> Figure:
     axes = figure.subplots(len(kept), joints, squeeze=False, sharey=True)
     figure.subplots_adjust(
         left=0.07,
-        right=0.995,
+        right=0.985,
         bottom=0.4 / height,
         top=1.0 - 0.38 / height,
         hspace=0.7,

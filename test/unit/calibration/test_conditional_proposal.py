@@ -11,7 +11,8 @@ from remaster_ros.calibration.conditional_proposal import ConditionalProposal
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.extension import Extension
 from remaster_ros.calibration.importance import Weighted
-from remaster_ros.calibration.laplace import Mode, linearise
+from remaster_ros.calibration.laplace import Mode
+from remaster_ros.calibration.linearisation import linearise
 from remaster_ros.calibration.proposal import LaplaceProposal
 from remaster_ros.calibration.sampling import sample_posterior
 from remaster_ros.types import Session

@@ -13,6 +13,7 @@ from remaster_ros.calibration import convergence, importance, laplace, sampling
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.laplace import find_mode
+from remaster_ros.calibration.linearisation import linearise
 from remaster_ros.calibration.metropolis import random_walk_sampler
 from remaster_ros.calibration.noise import RESOLUTION_M
 from remaster_ros.calibration.priors import base_prior, marker_prior
@@ -110,7 +111,7 @@ def test_the_density_of_the_noise_depends_on_each_variance_as_is_said(found, alo
     p = found.posterior
     split = type(p).of(p.model, p.rows, p.priors, p.free, found.mode.z, split=along)
     eta = find_mode(split).eta + 0.2
-    linearisation = laplace.linearise(split, found.mode.z)
+    linearisation = linearise(split, found.mode.z)
     _, slope, _ = linearisation.by_variances(eta)
     of_groups = split.variances(eta)
 
