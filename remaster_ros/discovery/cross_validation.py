@@ -112,7 +112,8 @@ class LeftOut:
 
         With S = X H⁻¹ X' of the rows X left out and H of all rows, the variance is (I − S)⁻¹, and
         the error the product of it and what the fit to all rows leaves (Cook & Weisberg 1982,
-        Residuals and Influence in Regression, section 2.2).
+        Residuals and Influence in Regression, section 2.2). With X = Z L' and H = L L' that is
+        I + Z (I − Z'Z)⁻¹ Z', which inverts a matrix of the parameters where they are fewer.
         """
         p = self.data.base.shape[2]
         edges = p + np.cumsum([0, *(cell.size for cell in self.cells)])
@@ -132,9 +133,17 @@ class LeftOut:
         variance = np.empty((len(self.data), 3, 3))
         for fold in self.folds:
             own, rows = X[:, fold], np.arange(len(fold) // 3)
-            inverse = _inverse(np.eye(len(fold)) - own.T @ own)
-            errors[fold] = inverse @ left[fold]
-            variance[fold[::3] // 3] = inverse.reshape(len(rows), 3, len(rows), 3)[rows, :, rows]
+            if len(own) < len(fold):
+                pulled = _inverse(np.eye(len(own)) - own @ own.T) @ own
+                errors[fold] = left[fold] + own.T @ (pulled @ left[fold])
+                axes = (-1, len(rows), 3)
+                of_rows = np.einsum('pri,prj->rij', own.reshape(axes), pulled.reshape(axes))
+                of_rows += np.eye(3)
+            else:
+                inverse = _inverse(np.eye(len(fold)) - own.T @ own)
+                errors[fold] = inverse @ left[fold]
+                of_rows = inverse.reshape(len(rows), 3, len(rows), 3)[rows, :, rows]
+            variance[fold[::3] // 3] = of_rows
         return errors.reshape(-1, 3), variance
 
 

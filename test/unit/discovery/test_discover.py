@@ -323,22 +323,25 @@ def test_a_sensor_that_only_poses_left_out_show_is_no_trouble():
     assert np.median(deviance[3:]) < 100.0
 
 
-def test_the_deviance_of_poses_left_out_is_that_of_fits_without_them():
-    data = residuals()
-    cell = cells_named('joint_compliance')[1]
+@pytest.mark.parametrize(('sensors', 'folds'), [(1, 20), (2, 20), (2, 3)])
+def test_the_deviance_of_poses_left_out_is_that_of_fits_without_them(sensors, folds):
+    """Of one pose alone, with no more numbers than parameters, and of more."""
+    data = residuals_of(session_with(26, poses=20, sensor_count=sensors))
+    others = list(EFFECTS['joint_compliance'].cells(data.context))[1:4]
+    cell = others.pop(0)
     fit = solve(data, (cell,))
     assert fit is not None
-    folds = np.arange(data.poses)
-    others = cells_named('joint_compliance')[2:4]
-    left_out = LeftOut.of(data, (*others, cell), fit.noise, folds)
+    fold_of_pose = np.arange(data.poses) % folds
+    left_out = LeftOut.of(data, (*others, cell), fit.noise, fold_of_pose)
+    parameters, pose = data.base.shape[2] + cell.size, 4
+    assert (len(left_out.folds[fold_of_pose[pose]]) > parameters) == (sensors == 2)
     deviance = left_out.deviance(fit)
-    pose = 4
     columns = np.concatenate((data.base, data.columns([cell]), data.errors[:, :, None]), axis=2)
     white = data.noise_model.whitened(columns, fit.noise)
-    out = data.pose_of_row == pose
+    out = fold_of_pose[data.pose_of_row] == fold_of_pose[pose]
     kept = white[~out].reshape(-1, white.shape[2])
     beta = np.linalg.lstsq(kept[:, :-1], kept[:, -1], rcond=None)[0]
-    left = white[out].reshape(-1, white.shape[2])
+    left = white[data.pose_of_row == pose].reshape(-1, white.shape[2])
     errors = left[:, -1] - left[:, :-1] @ beta
     scale = np.linalg.norm(kept[:, :-1], axis=0)
     spread = left[:, :-1] / scale @ np.linalg.inv(np.linalg.qr(kept[:, :-1] / scale, mode='r'))
