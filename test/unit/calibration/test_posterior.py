@@ -252,6 +252,19 @@ def test_a_random_walk_to_a_precision_is_as_long_as_it_takes(found, monkeypatch)
     assert shift.max() < 5 * np.sqrt(2) * 0.1
 
 
+@pytest.mark.parametrize(('step', 'enough'), [(1.0, True), (0.01, False)])
+def test_a_walk_that_promises_too_little_ends_early(step, enough) -> None:
+    """Of a Gaussian, with its best steps and with a hundredth of them."""
+    d, rng = 6, np.random.default_rng(10)
+    task = sampling._Task(None, 0.05, lambda x: x, rng, lambda stage, share: None, 10**6)
+    start = rng.standard_normal((sampling.WALKS, d))
+    run, found_enough = task.walk(
+        lambda x: -0.5 * np.sum(x**2, axis=1), step * np.eye(d), start, 2000
+    )
+    assert found_enough == enough
+    assert run.draws.shape[1] <= 500
+
+
 def test_the_step_of_a_walk_suits_the_bulk_of_what_has_long_tails() -> None:
     """A Gaussian takes its own best step; a narrow core in a wide shell a shorter one."""
     rng, d = np.random.default_rng(9), 6
