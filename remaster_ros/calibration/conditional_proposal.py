@@ -27,7 +27,13 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.linearisation import log_determinant
-from remaster_ros.calibration.proposal import StudentT, folded_density, tail_density, with_tails
+from remaster_ros.calibration.proposal import (
+    StudentT,
+    folded,
+    folded_density,
+    tail_density,
+    with_tails,
+)
 from remaster_ros.calibration.surrogate import bent_pairs, second_derivatives
 from remaster_ros.types import FloatArray, IntArray
 
@@ -159,9 +165,7 @@ class ConditionalProposal:
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Return points (count, d) of the posterior and their log density (count,)."""
-        outside = self.outer.sample(count, rng)[0]
-        folded = self._folded
-        outside[:, folded] = np.abs(outside[:, folded])
+        outside = folded(self.outer.sample(count, rng)[0], self._shares)
         m = len(self.unit)
         whitened = with_tails(rng.standard_normal((count, m)), rng)
         inner, log_det = np.empty((count, m)), np.empty(count)
@@ -216,7 +220,7 @@ class ConditionalProposal:
         self, outside: FloatArray, whitened: FloatArray, log_det: FloatArray
     ) -> FloatArray:
         """Return the log density (n,) of core and noise, and of effects at whitened places."""
-        value = folded_density(self.outer, outside, len(self._folded))
+        value = folded_density(self.outer, outside, self._shares)
         value += tail_density(whitened) + log_det
         return value - float(np.sum(np.log(self.unit)))
 
@@ -245,10 +249,9 @@ class ConditionalProposal:
         return self.mode.z[self.mode.linearisation.posterior.free]
 
     @property
-    def _folded(self) -> IntArray:
-        """Which coordinates of the outer ones cannot be negative: shared parts of the noise."""
-        shares = len(self.mode.linearisation.posterior.noise_model.shares)
-        return np.arange(self.dimension - shares, self.dimension)
+    def _shares(self) -> int:
+        """Number of noise coordinates that cannot be negative."""
+        return len(self.mode.linearisation.posterior.noise_model.shares)
 
 
 def _bending(

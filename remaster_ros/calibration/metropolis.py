@@ -14,6 +14,9 @@ from remaster_ros.types import FloatArray
 
 # Proposals evaluated between two reports of progress.
 REPORTED = 2000
+# Shares of a Gaussian's best step that are tried for a walk, for so many steps each.
+STEP_SCALES = (1.0, 0.7, 0.5, 0.35, 0.25)
+SCALE_STEPS = 200
 LogDensity = Callable[[FloatArray], FloatArray]
 Method = Literal['metropolis', 'importance', 'laplace']
 
@@ -176,3 +179,32 @@ def random_walk_sampler(
             if progress is not None:
                 progress(count / steps)
     return Chains(np.stack(kept, axis=1), taken / (steps * len(start)), np.stack(trace, axis=1))
+
+
+def step_scale(
+    log_density: LogDensity, factor: FloatArray, start: FloatArray, rng: np.random.Generator
+) -> float:
+    """Return the share of a Gaussian's best step that moves a walk farthest (Pasarica 2010).
+
+    The widths of a posterior with long tails are too long a step for its bulk.
+    """
+
+    def squared_jump(scale: float) -> float:
+        run = random_walk_sampler(
+            log_density,
+            gaussian_step(scale * factor, len(start)),
+            start=start,
+            steps=SCALE_STEPS,
+            burn_in=0,
+            rng=rng,
+        )
+        return scale**2 * run.acceptance_rate
+
+    return max(STEP_SCALES, key=squared_jump)
+
+
+def gaussian_step(factor: FloatArray, chains: int) -> Callable[[np.random.Generator], FloatArray]:
+    """Return moves of 2.38 / sqrt(d) widths, best for Gaussians (Gelman, Roberts, Gilks 1996)."""
+    d = len(factor)
+    scaled = 2.38 / np.sqrt(d) * factor
+    return lambda rng: rng.standard_normal((chains, d)) @ scaled.T

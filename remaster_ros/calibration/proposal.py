@@ -122,7 +122,7 @@ class LaplaceProposal:
         return np.concatenate(points), np.concatenate(densities)
 
     def _sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        eta = self._folded(self._noise.sample(count, rng)[0])
+        eta = folded(self._noise.sample(count, rng)[0], self._shares)
         mean, factor, _ = self._conditional(eta)
         whitened = with_tails(rng.standard_normal((count, mean.shape[-1])), rng)
         upper = np.swapaxes(factor, -1, -2)
@@ -145,8 +145,7 @@ class LaplaceProposal:
         free = self.mode.linearisation.posterior.free
         centre = np.concatenate((self.mode.z[free], self.mode.eta))
         starts = centre + 2.0 * (points - centre)
-        starts[:, len(free) :] = self._folded(starts[:, len(free) :])
-        return starts
+        return folded(starts, self._shares)
 
     def _conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return `Linearisation.conditional` of every draw's noise, or of the mode's."""
@@ -154,18 +153,13 @@ class LaplaceProposal:
 
     def _density(self, eta: FloatArray, whitened: FloatArray, factor: FloatArray) -> FloatArray:
         """Return the log density (n,) of noise (n, e) and parameters at whitened places (n, f)."""
-        noise = folded_density(self._noise, eta, len(self.mode.eta) - self._unfolded)
+        noise = folded_density(self._noise, eta, self._shares)
         return noise + tail_density(whitened) + log_determinant(factor)
 
-    def _folded(self, eta: FloatArray) -> FloatArray:
-        """Return noise coordinates with the negative half of those of pose_sigma mirrored."""
-        count = self._unfolded
-        return np.concatenate((eta[:, :count], np.abs(eta[:, count:])), axis=1)
-
     @property
-    def _unfolded(self) -> int:
-        """Number of noise coordinates that may be negative: those of sigma."""
-        return len(self.mode.linearisation.posterior.noise_model.channels)
+    def _shares(self) -> int:
+        """Number of noise coordinates that cannot be negative: all but those of sigma."""
+        return len(self.mode.linearisation.posterior.noise_model.shares)
 
     @property
     def _noise(self) -> StudentT:
@@ -192,11 +186,17 @@ def tail_density(whitened: FloatArray) -> FloatArray:
     return density
 
 
-def folded_density(distribution: StudentT, points: FloatArray, folded: int) -> FloatArray:
-    """Return the log density of points (n, d) whose last coordinates are without their sign."""
+def folded(points: FloatArray, count: int) -> FloatArray:
+    """Return points (n, d), the last coordinates without their sign: shared parts of a noise."""
+    points[:, points.shape[1] - count :] = np.abs(points[:, points.shape[1] - count :])
+    return points
+
+
+def folded_density(distribution: StudentT, points: FloatArray, count: int) -> FloatArray:
+    """Return the log density (n,) of what `folded` makes of draws."""
     # |x| has the density of x and of -x together.
-    kept = (1.0,) * (points.shape[1] - folded)
-    signs = itertools.product((1.0, -1.0), repeat=folded)
+    kept = (1.0,) * (points.shape[1] - count)
+    signs = itertools.product((1.0, -1.0), repeat=count)
     images = [points * np.array((*kept, *sign)) for sign in signs]
     density: FloatArray = np.logaddexp.reduce([distribution.log_density(one) for one in images])
     return density

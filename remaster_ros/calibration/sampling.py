@@ -17,14 +17,16 @@ import numpy as np
 from remaster_ros.calibration import convergence
 from remaster_ros.calibration.conditional_proposal import ConditionalProposal
 from remaster_ros.calibration.convergence import ESS_LIMIT, R_HAT_LIMIT
-from remaster_ros.calibration.importance import Weighted, adaptive_importance
+from remaster_ros.calibration.importance import Adaptable, Weighted, adaptive_importance
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.metropolis import (
     Chains,
     LogDensity,
     Proposal,
+    gaussian_step,
     independence_sampler,
     random_walk_sampler,
+    step_scale,
 )
 from remaster_ros.calibration.proposal import LaplaceProposal
 from remaster_ros.calibration.surrogate import Surrogate
@@ -67,9 +69,6 @@ WALK_STEPS_PER_DRAW = 20
 # The first draws of each walk, by which it is judged: a draw costs as much as twenty of a chain.
 # Walks begin at weighted draws, so that they need hardly any warm-up.
 FIRST_WALKED, WALK_WARM_UP = 100, 25
-# Shares of a Gaussian's best step that are tried for the walk, for so many steps each.
-STEP_SCALES = (1.0, 0.7, 0.5, 0.35, 0.25)
-SCALE_STEPS = 200
 # The second-order density may differ by this from the exact one on the draws it gave, of which so
 # many are checked (fewer where there are so many observations that it would take seconds).
 DENSITY_ERROR_LIMIT = 0.05
@@ -182,8 +181,9 @@ def _exact(
 ) -> Sampling:
     """Sample by the exact density, with the evaluations that there are."""
     chains, rng = len(starts), task.rng
-    conditional = ConditionalProposal.of(laplace.mode)
-    if conditional is None:
+    weighted = _by_conditional(task, log_density, laplace.mode)
+    how = 'effects drawn given the other parameters and the noise'
+    if weighted is None:
         most = int(CHAINS_SHARE * task.evaluations) // chains
         run, enough = task.independent(log_density, laplace, starts, most)
         if enough:
@@ -192,19 +192,9 @@ def _exact(
                 'independence Metropolis-Hastings on the exact density, Laplace proposal '
                 '(the density is not near enough to its second order)',
             )
-
-    weighted = adaptive_importance(
-        log_density,
-        conditional or laplace,
-        wanted=task.wanted,
-        evaluations=int(IMPORTANCE_SHARE * task.evaluations),
-        rng=rng,
-        progress=lambda share: task.report('adapting the sampler', share),
-    )
-    if weighted.reliable and weighted.effective >= task.enough:
+        weighted = task.weighted(log_density, laplace)
         how = 'chains of independent proposals are worth too few draws'
-        if conditional is not None:
-            how = 'effects drawn given the other parameters and the noise'
+    if weighted.reliable and weighted.effective >= task.enough:
         return Sampling(
             task.by_weights(weighted, chains),
             f'importance sampling, proposal adapted to the weighted draws ({how})',
@@ -217,7 +207,7 @@ def _exact(
         start = weighted.resampled(walks, rng)
         factor = weighted.factor()
         run, enough = task.walk(
-            log_density, _step_scale(log_density, factor, start, rng) * factor, start, most
+            log_density, step_scale(log_density, factor, start, rng) * factor, start, most
         )
         if enough:
             return Sampling(
@@ -240,6 +230,16 @@ def _exact(
         ),
         'Gaussian about the mode (no sampler reached the precision with the evaluations allowed)',
     )
+
+
+def _by_conditional(task: _Task, log_density: LogDensity, mode: Mode) -> Weighted | None:
+    """Return weighted draws with the effects given the rest; None where that cannot be done."""
+    try:
+        conditional = ConditionalProposal.of(mode)
+        return None if conditional is None else task.weighted(log_density, conditional)
+    except np.linalg.LinAlgError:
+        # Far out rounding may leave nothing that determines an effect.
+        return None
 
 
 @dataclass(frozen=True)
@@ -265,6 +265,17 @@ class _Task:
     def enough(self) -> float:
         """Effective draws without which another sampler is tried."""
         return min(self.wanted, ESS_LIMIT)
+
+    def weighted(self, log_density: LogDensity, proposal: Adaptable) -> Weighted:
+        """Return draws of a proposal that is adapted, with their weights."""
+        return adaptive_importance(
+            log_density,
+            proposal,
+            wanted=self.wanted,
+            evaluations=int(IMPORTANCE_SHARE * self.evaluations),
+            rng=self.rng,
+            progress=lambda share: self.report('adapting the sampler', share),
+        )
 
     def by_weights(self, weighted: Weighted, chains: int) -> Chains:
         """Return weighted draws as draws of equal weight, in as many parts as there are chains."""
@@ -307,7 +318,7 @@ class _Task:
         def more(start: FloatArray, draws: int, warm_up: int) -> Chains:
             return random_walk_sampler(
                 target,
-                _gaussian_step(factor, len(start)),
+                gaussian_step(factor, len(start)),
                 start=start,
                 steps=(draws + warm_up) * WALK_STEPS_PER_DRAW,
                 burn_in=warm_up * WALK_STEPS_PER_DRAW,
@@ -364,32 +375,3 @@ class _Task:
                 np.concatenate((run.trace, part.trace[:, -added:]), axis=1),
             )
         return run, False
-
-
-def _step_scale(
-    log_density: LogDensity, factor: FloatArray, start: FloatArray, rng: np.random.Generator
-) -> float:
-    """Return the share of a Gaussian's best step that moves a walk farthest (Pasarica 2010).
-
-    The widths of a posterior with long tails are too long a step for its bulk.
-    """
-
-    def squared_jump(scale: float) -> float:
-        run = random_walk_sampler(
-            log_density,
-            _gaussian_step(scale * factor, len(start)),
-            start=start,
-            steps=SCALE_STEPS,
-            burn_in=0,
-            rng=rng,
-        )
-        return scale**2 * run.acceptance_rate
-
-    return max(STEP_SCALES, key=squared_jump)
-
-
-def _gaussian_step(factor: FloatArray, chains: int) -> Callable[[np.random.Generator], FloatArray]:
-    """Return moves of 2.38 / sqrt(d) widths, best for Gaussians (Gelman, Roberts, Gilks 1996)."""
-    d = len(factor)
-    scaled = 2.38 / np.sqrt(d) * factor
-    return lambda rng: rng.standard_normal((chains, d)) @ scaled.T

@@ -143,6 +143,18 @@ def test_the_sampler_uses_it_and_agrees_with_another_route(mode, monkeypatch) ->
     assert np.max(np.abs(np.log(ours.std(axis=0) / width))) < 5 * np.sqrt(1 / 400)
 
 
+def test_where_it_fails_the_sampler_does_without(mode, monkeypatch) -> None:
+    """A draw so far out that rounding leaves an effect undetermined ends nothing."""
+
+    def fails(self: ConditionalProposal, outside: np.ndarray) -> None:
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(ConditionalProposal, '_conditional', fails)
+    found = sample_posterior(mode, chains=4, precision=0.1, rng=np.random.default_rng(8))
+    assert 'effects drawn' not in found.name
+    assert np.all(np.isfinite(found.run.draws))
+
+
 def test_axes_that_hardly_matter_cost_hardly_a_draw(proposal, mode, monkeypatch) -> None:
     """Effective draws with the axes that count and with all of them."""
     monkeypatch.setattr(conditional_proposal, 'NEGLIGIBLE', 0.0)

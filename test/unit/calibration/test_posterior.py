@@ -9,7 +9,7 @@ import pytest
 from calibration_scenes import scene
 from scipy.stats import kstest, multivariate_normal, norm
 
-from remaster_ros.calibration import convergence, importance, laplace, sampling
+from remaster_ros.calibration import convergence, importance, laplace, metropolis, sampling
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.laplace import find_mode
@@ -269,9 +269,11 @@ def test_the_step_of_a_walk_suits_the_bulk_of_what_has_long_tails() -> None:
     """A Gaussian takes its own best step; a narrow core in a wide shell a shorter one."""
     rng, d = np.random.default_rng(9), 6
     start = rng.standard_normal((32, d))
-    gaussian = sampling._step_scale(lambda x: -0.5 * np.sum(x**2, axis=1), np.eye(d), start, rng)
+    gaussian = metropolis.step_scale(lambda x: -0.5 * np.sum(x**2, axis=1), np.eye(d), start, rng)
     assert gaussian >= 0.7
-    core = sampling._step_scale(lambda x: -0.5 * np.sum(x**2, axis=1), 5.0 * np.eye(d), start, rng)
+    core = metropolis.step_scale(
+        lambda x: -0.5 * np.sum(x**2, axis=1), 5.0 * np.eye(d), start, rng
+    )
     assert core == 0.25
 
 
