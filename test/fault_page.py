@@ -1,7 +1,8 @@
 """The tables of docs/faults.md, which the tests write (FAULTS_PAGE=write or add) or compare.
 
 ``write`` replaces the rows that were tried; ``add`` keeps what they were before as well: where a
-fault ends differently from time to time, the page has a line for each.
+fault ends differently from time to time, the page has a line for each. ``none`` tries every row,
+as these two do, and compares.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from pathlib import Path
 PAGE = Path(__file__).parents[1] / 'docs' / 'faults.md'
 BEGIN, END = '<!-- observed by the tests: {} -->', '<!-- end -->'
 MODE = os.environ.get('FAULTS_PAGE', '')
+WRITES = MODE in ('write', 'add')
 
 
 def body(name: str) -> str:
@@ -39,6 +41,24 @@ def table(heading: tuple[str, ...], cells: list[tuple[str, ...]]) -> str:
     """Return a table."""
     lines = ['| ' + ' | '.join(heading) + ' |', '|---' * len(heading) + '|']
     return '\n'.join([*lines, *('| ' + ' | '.join(row) + ' |' for row in cells)])
+
+
+def cells(name: str) -> dict[str, dict[str, str]]:
+    """Return a section's rows by their first cells, each by the heading of its column."""
+    heading = [cell.strip() for cell in body(name).splitlines()[0].strip('|').split(' | ')]
+    return {row[0]: dict(zip(heading[1:], row[1:], strict=True)) for row in rows(name)}
+
+
+def compare(name: str, heading: tuple[str, ...], row: str, column: str, seen: str) -> None:
+    """See that a cell of the page is what was seen, or write it there."""
+    known = cells(name)
+    if WRITES:
+        known.setdefault(row, {})[column] = seen
+        lines = [(key, *(known[key].get(c, '') for c in heading[1:])) for key in known]
+        replace(name, table(heading, lines))
+        return
+    page = known.get(row, {}).get(column, 'nothing')
+    assert page == seen, f'docs/faults.md is not what was observed (make faults): {row}, {column}'
 
 
 def same(first: tuple[str, ...], second: tuple[str, ...]) -> bool:

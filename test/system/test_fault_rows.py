@@ -98,7 +98,7 @@ def is_on_page(section, row):
 
 def compare(section, row):
     """See that the page has this row, or write it there."""
-    if fault_page.MODE:
+    if fault_page.WRITES:
         write(section, row)
         return
     known, page = is_on_page(section, row)
@@ -133,7 +133,7 @@ def test_row(benches, row):
         benches.broken = False
         section, line = cells(row, seen)
         print(line)
-        if fault_page.MODE or tried == TRIES or is_on_page(section, line)[0]:
+        if fault_page.WRITES or tried == TRIES or is_on_page(section, line)[0]:
             break
     compare(section, line)
 
