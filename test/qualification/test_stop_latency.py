@@ -16,6 +16,7 @@ SLOW = """
 import os, sys, time
 seconds, sys.argv = float(sys.argv[1]), sys.argv[1:]
 from remaster_ros.nodes import pose_planner
+from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session import journal
 append = journal.Journal.append
 def slow_append(self, record):
@@ -24,13 +25,13 @@ def slow_append(self, record):
     append(self, record)
     print('written', flush=True)
 journal.Journal.append = slow_append
-registration = pose_planner.TourPlanner.registration
+registration = TourPlanner.registration
 def plan(self):
     print('planning', flush=True)
     tour = registration(self)
     print('planned', flush=True)
     return tour
-pose_planner.TourPlanner.registration = plan
+TourPlanner.registration = plan
 sys.exit(pose_planner.main(sys.argv))
 """
 
@@ -49,16 +50,17 @@ class Around:
         self.names = list(read_cell('demo').chain().joint_names)
         self.joints = client.create_publisher(JointState, 'joint_states', RELIABLE)
         self.solutions = []
-        for _ in range(2):
-            client.create_subscription(
-                JointTrajectory, 'remaster/joint_solutions', self.solutions.append, RELIABLE
-            )
         facts = {
             'robot_bridge': BridgeState(halted='', joints_age_s=0.0),
             'recorder': RecorderState(waiting_for='', require='mocap', read_age_s={'mocap': 0.0}),
             'bar': SensorReport(sensor='mocap', ready=True),
         }
         self.nodes = [rclpy.create_node(name, context=client.context) for name in facts]
+        # The planner waits until these two listen; what it says is heard here.
+        for node in (client, *self.nodes[:2]):
+            node.create_subscription(
+                JointTrajectory, 'remaster/joint_solutions', self.solutions.append, RELIABLE
+            )
         self.statuses = [
             NodeStatus(node, lambda state=state: Summary('ok', '', {}, state))
             for node, state in zip(self.nodes, facts.values())

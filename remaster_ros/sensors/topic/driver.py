@@ -28,7 +28,9 @@ SILENT_S = 1.0
 JUDGED = 200
 """Messages that rate and stillness are judged by, at most,"""
 JUDGED_S = 1.0
-"""and how far they go back, by their stamps."""
+RATED_S = 3.0
+"""and how far back they go for stillness and for the rate, by their stamps. Messages that come
+less often than every second, but not so seldom that they seem to have ended, have a rate too."""
 EARLY_S = 0.1
 """A stamp further in the future is of another clock. A simulated clock advances in steps, and a
 message may come before the step: there it may be as early as it may be late."""
@@ -172,10 +174,13 @@ class TopicDriver(StreamDriver):
         with self._lock:
             came, counts = self._came_wall, dict(self._counts)
             trouble, hidden, age_s = self._trouble, self._hidden, self._age_s
-            recent = [r for r in self._recent if r.stamp_s > self._stamp_s - JUDGED_S]
+            still, rated = (
+                [r for r in self._recent if r.stamp_s > self._stamp_s - back_s]
+                for back_s in (JUDGED_S, RATED_S)
+            )
             same = [r.position for r in list(self._recent)[-FROZEN:]]
         ready, level = True, 'ok'
-        rate_hz, std_m = _rate_hz(recent), _std_m(recent)
+        rate_hz, std_m = _rate_hz(rated), _std_m(still)
         silent_s = np.inf if came is None else time.monotonic() - came
         if silent_s > SILENT_S:
             trouble = self._unpublished()
@@ -220,9 +225,10 @@ class TopicDriver(StreamDriver):
 
 
 def _rate_hz(recent: Sequence[MarkerReading]) -> float | None:
+    """Return how often messages come, by the median: the marker may have been hidden meanwhile."""
     if len(recent) < 2:
         return None
-    return (len(recent) - 1) / (recent[-1].stamp_s - recent[0].stamp_s)
+    return float(1.0 / np.median(np.diff([reading.stamp_s for reading in recent])))
 
 
 def _std_m(recent: Sequence[MarkerReading]) -> float | None:

@@ -123,6 +123,22 @@ def test_a_slow_stream_is_reported_and_read(rig):
     assert len(r.read()) == 8
 
 
+def test_a_stream_of_less_than_a_message_per_second_has_a_rate(rig):
+    r = rig()
+    r.stream(4, period_s=1.4)
+    state = r.driver.state()
+    assert (state.level, state.values['rate_hz']) == ('warn', '0.7')
+    assert 'fewer than min_rate_hz (5)' in state.trouble
+
+
+def test_a_marker_that_was_hidden_does_not_make_a_stream_slow(rig):
+    r = rig()
+    r.stream(20)
+    r.clock.now += 2.5
+    r.stream(20)
+    assert (r.driver.state().level, r.driver.state().values['rate_hz']) == ('ok', '100.0')
+
+
 @pytest.mark.parametrize('always_sends', [False, True])
 def test_silence_is_a_hidden_marker_or_a_fault(rig, always_sends):
     r = rig(always_sends=always_sends)
