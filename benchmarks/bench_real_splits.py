@@ -150,9 +150,8 @@ def split(session: Session, part: Part) -> tuple[Session, dict[str, BoolArray]]:
     )
 
 
-def one(part: Part, whole_file: Path) -> dict[str, Any]:
+def one(part: Part, session: Session, whole_file: Path) -> dict[str, Any]:
     """Search a part of a session; return a line of the results file."""
-    session = read_session(DATA / SETS[part.data])
     fitted, third = split(session, part)
     start = time.process_time()
     found = discover_session(fitted, rng=np.random.default_rng(part.seed))
@@ -366,7 +365,8 @@ def main() -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (args.limit, args.limit))
         part = todo[args.run]
         whole_file = args.results.with_suffix(f'.{part.data}.npz')
-        print(json.dumps(one(part, whole_file)))
+        session = read_session(DATA / SETS[part.data])
+        print(json.dumps(one(part, session, whole_file)))
         return
     wanted = [name for name in todo if name.startswith(tuple(args.only) or '')]
     commands = {

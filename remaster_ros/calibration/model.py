@@ -191,6 +191,9 @@ class Model:
 
     def _turned(self, x: FloatArray, sign: float) -> FloatArray:
         """Turn registrations with joint 1 and markers with joint k."""
+        if not np.any(x[..., [0, self.joints - 1]]):
+            # Nothing turns, as where neither joint has a prior.
+            return x.copy()
         base = _rotation_about(*self.base_axis, sign * x[..., 0])
         result = self.with_corrections(x, self.corrections(x) @ base[..., None, :, :])
         tool = _rotation_about(*self.tool_axis, sign * x[..., self.joints - 1])

@@ -261,9 +261,10 @@ def _scores(
     if cells[0].penalty is None:
         values, vectors = np.linalg.eigh(gram)
         seen = values > ABSORBED
-        # The prior on their size, the same for all of a cell's directions.
-        largest = np.array([cell.largest or np.inf for cell in cells])
+        # The prior on their size, the same for all of a cell's directions; none without a size.
+        largest = np.array([cell.largest or np.nan for cell in cells])
         ridge = (largest**2 * np.mean(norm**2, axis=1) + np.finfo(float).tiny) ** -1.0
+        ridge[np.isnan(largest)] = 0.0
         strength = np.maximum(values, ABSORBED) + ridge[:, None]
         root = vectors * np.where(seen, strength**-0.5, 0.0)[:, None]
         if m == 1:

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from calibration_scenes import CHAIN
+from calibration_scenes import CHAIN, MARKERS, URDF, random_poses, sensors
 from discovery_scenes import at_joint, residuals_of, session_with
 from scipy.stats import multivariate_normal
 
@@ -21,6 +21,7 @@ from remaster_ros.discovery.evidence import _System, solve
 from remaster_ros.discovery.findings import Findings
 from remaster_ros.discovery.screening import Catalogue, screen
 from remaster_ros.errors import InsufficientDataError
+from remaster_ros.simulation.session_simulator import simulate_session
 from remaster_ros.types import Session
 
 ARC_MINUTE = np.radians(1.0 / 60.0)
@@ -363,3 +364,22 @@ def test_a_direction_that_rounding_leaves_nothing_of_has_a_variance_and_not_a_ne
         information = turn @ np.diag([1.0, 2.0, least]) @ turn.T
         ours = cross_validation._inverse(information)
         np.testing.assert_allclose(ours, np.linalg.inv(information), rtol=1e-6, atol=1e-6 / least)
+
+
+def test_a_joint_that_moves_only_in_gross_errors_suggests_nothing():
+    """Its columns are zero in all rows that are searched; a warning would end this test."""
+    print('seed', seed := 5)
+    rng = np.random.default_rng(seed)
+    poses = [pose[:3] for pose in random_poses(30, rng)]
+    for pose in poses[1:]:
+        pose[:, 4] = 0.0
+    session, _ = simulate_session(
+        CHAIN, URDF, rng, poses=poses, sensors=sensors(rng, 1, 0.1e-3, 0.0), markers=MARKERS
+    )
+    position = session.measurements.position.copy()
+    moved = session.measurements.q[:, 4] != 0.0
+    position[moved] += 0.02 * rng.standard_normal((moved.sum(), 3))
+    spoilt = replace(session, measurements=replace(session.measurements, position=position))
+    found = findings(spoilt)
+    assert not np.isin(np.flatnonzero(moved), found.residuals.rows.source).any()
+    assert not found.effects
