@@ -172,24 +172,32 @@ def adaptive_importance(
         progress(min(1.0, spent / evaluations))
         return points, log_weight
 
+    def enough(weighted: Weighted) -> Weighted:
+        while weighted.reliable and weighted.effective < wanted and spent < evaluations:
+            # A tenth more than the rate so far promises.
+            missing = len(weighted.points) * (1.1 * wanted / weighted.effective - 1.0)
+            further = int(np.clip(missing, count // 4, evaluations - spent + 1))
+            points, log_weight = drawn(weighted.proposal, further)
+            points = np.concatenate((weighted.points, points))
+            log_weight = np.concatenate((weighted.log_weight, log_weight))
+            weighted = Weighted.of(points, log_weight, weighted.proposal)
+        return weighted
+
     count = int(np.clip(ADAPTING * evaluations / ROUNDS, FEWEST_DRAWS, MOST_DRAWS))
     best = last = Weighted.of(*drawn(proposal, min(count, proposal.first_draws)), proposal)
     needed = DRAWS_PER_DIMENSION * proposal.dimension
     for _ in range(ROUNDS - 1):
-        good = best.pareto_k < GOOD_SHAPE
-        if good or needed > LARGEST_NEED * count or spent >= ADAPTING * evaluations:
+        if best.pareto_k < GOOD_SHAPE:
+            best = last = enough(best)
+            if best.reliable:
+                break
+            # More draws have shown a longer tail: they tell better how to adapt.
+        if needed > LARGEST_NEED * count or spent >= ADAPTING * evaluations:
             break
         proposal = last.adapted()
         last = Weighted.of(*drawn(proposal, count), proposal)
         best = min(best, last, key=lambda weighted: weighted.pareto_k)
-    while best.reliable and best.effective < wanted and spent < evaluations:
-        # A tenth more than the rate so far promises.
-        missing = len(best.points) * (1.1 * wanted / best.effective - 1.0)
-        more = drawn(best.proposal, int(np.clip(missing, count // 4, evaluations - spent + 1)))
-        points = np.concatenate((best.points, more[0]))
-        log_weight = np.concatenate((best.log_weight, more[1]))
-        best = Weighted.of(points, log_weight, best.proposal)
-    return best
+    return enough(best)
 
 
 def _effective(weight: FloatArray) -> float:

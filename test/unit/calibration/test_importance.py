@@ -52,6 +52,41 @@ def test_the_check_fails_where_the_proposal_misses_the_tails() -> None:
     assert not found.reliable
 
 
+class LongTailed:
+    """Draws are their own log weights: harmless at first, with a long tail from then on."""
+
+    dimension, first_draws, cost = 1, 1000, 1.0
+
+    def __init__(self, *, better: bool = False) -> None:
+        self.better, self.asked = better, 0
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        self.asked += 1
+        harmless = self.better or self.asked == 1
+        weight = 0.3 * rng.standard_normal(count) if harmless else np.log(rng.pareto(0.8, count))
+        return weight[:, None], np.zeros(count)
+
+    def log_density(self, points: FloatArray) -> FloatArray:
+        return np.zeros(len(points))
+
+    def adapted(self, points: FloatArray, weight: FloatArray) -> LongTailed:
+        return LongTailed(better=True)
+
+
+def test_a_tail_that_only_more_draws_show_is_adapted_to() -> None:
+    found = adaptive_importance(
+        lambda points: points[:, 0],
+        LongTailed(),
+        wanted=3000.0,
+        evaluations=100_000,
+        rng=np.random.default_rng(4),
+        progress=lambda share: None,
+    )
+    assert found.proposal.better
+    assert found.reliable
+    assert found.effective >= 3000.0
+
+
 def test_evaluations_are_limited_and_counted() -> None:
     count = 0
 
