@@ -74,8 +74,8 @@ class ConditionalProposal:
     unit
         Standard deviation of each effect given the core at the mode, (m,).
     precision
-        Of pairs k <= l of 1 and the steps along axes by error group, (error groups, k l, m, m), in
-        units.
+        Of pairs k <= l of 1 and the steps along axes by error group, in units: what stands on and
+        above the diagonal, (error groups, k l, m (m + 1) / 2).
     pull
         Products of the effects' derivatives for each of 1 and these steps with [e0, J, H] by error
         group, (error groups, 1 + b, 1 + c + pairs, m), in units.
@@ -131,7 +131,9 @@ class ConditionalProposal:
         of_effects = of_effects * unit[:, None, None] * unit
         of_effects += np.transpose(of_effects, (0, 3, 2, 1, 4))
         upper = np.triu_indices(lines)
-        precision = of_effects[:, upper[0], :, upper[1], :].swapaxes(0, 1)
+        above = np.triu_indices(m)
+        pairs_of_lines = of_effects[:, upper[0], :, upper[1], :].swapaxes(0, 1)
+        precision = pairs_of_lines[:, :, above[0], above[1]]
         precision[:, upper[0] == upper[1]] *= 0.5
         pull = grams[:, :size, size:].reshape(groups, lines, m, -1) * unit[:, None]
         scale = np.zeros((c + len(mode.eta),) * 2)
@@ -199,8 +201,12 @@ class ConditionalProposal:
         upper = np.triu_indices(line.shape[1])
         products = line[:, upper[0]] * line[:, upper[1]]
         factors = (weight[:, :, None] * products[:, None]).reshape(n, -1)
-        precision = (factors @ self.precision.reshape(-1, m * m)).reshape(n, m, m)
-        precision += self.prior[:, c:-1] * self.unit
+        # Symmetric: what stands below the diagonal is neither computed nor read.
+        above = np.triu_indices(m)
+        precision = np.zeros((n, m, m))
+        packed = factors @ self.precision.reshape(-1, len(above[0]))
+        packed += (self.prior[:, c:-1] * self.unit)[above]
+        precision.reshape(n, -1)[:, np.ravel_multi_index(above, (m, m))] = packed
         bent = np.concatenate(
             (np.ones((n, 1)), -step, -step[:, self.first] * step[:, self.second]), axis=1
         )
