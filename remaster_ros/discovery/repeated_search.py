@@ -38,7 +38,7 @@ from remaster_ros.discovery.undetected import natural_parameters
 from remaster_ros.types import FloatArray
 
 GROUPS = 5
-FEWEST_POSES = 20
+FEWEST_POSES = 10
 # A search of so many rows takes a second or two.
 MOST_ROWS = 160
 # Causes whose effective parameters are fewer than this share of the coordinates are no choice by

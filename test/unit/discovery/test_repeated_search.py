@@ -159,3 +159,11 @@ def test_where_the_mean_does_not_hold_the_search_of_all_rows_stands(monkeypatch)
     assert len(found.fit.theta) == size
     content = discovery_content(found)
     assert all(one.named for one in content.repeated_search.found)
+
+
+def test_fifteen_poses_are_searched_again():
+    session = session_with(72, waves_of_all_joints, poses=15, validation=5, pose_sigma_m=0.0)
+    found = discover_session(session, rng=np.random.default_rng(1))
+    assert found.effects
+    assert found.repeated is not None
+    assert found.repeated.widening >= 1.0

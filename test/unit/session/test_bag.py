@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import logging
-import os
-import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
+import bag_messages
 import numpy as np
 import pytest
+from bag_messages import START_NS, STORE, TOPICS, joint_state, messages, part
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
-from rosbags.typesys import Stores, get_typestore
 
 from remaster_ros.errors import DiskError, InputError
 from remaster_ros.session import bag_writer
@@ -25,66 +25,6 @@ from remaster_ros.session.bag import BagReader
 from remaster_ros.session.bag_metadata import LATCHED_DEPTH, METADATA_FILE
 from remaster_ros.session.bag_writer import BagWriter, recover_bag
 from remaster_ros.session.manifest import MANIFEST
-
-STORE = get_typestore(Stores.ROS2_JAZZY)
-START_NS = 1_700_000_000_000_000_000
-
-
-def header(i):
-    time = STORE.types['builtin_interfaces/msg/Time'](sec=i, nanosec=7)
-    return STORE.types['std_msgs/msg/Header'](stamp=time, frame_id=f'frame_{i}')
-
-
-def joint_state(i):
-    rng = np.random.default_rng(i)
-    message = STORE.types['sensor_msgs/msg/JointState'](
-        header=header(i),
-        name=['joint_1', 'joint_2'],
-        position=rng.normal(size=2),
-        velocity=np.zeros(0),
-        effort=rng.normal(size=2),
-    )
-    return 'sensor_msgs/msg/JointState', message
-
-
-def point(i):
-    x, y, z = np.random.default_rng(i).normal(size=3)
-    message = STORE.types['geometry_msgs/msg/PointStamped'](
-        header=header(i), point=STORE.types['geometry_msgs/msg/Point'](x=x, y=y, z=z)
-    )
-    return 'geometry_msgs/msg/PointStamped', message
-
-
-def diagnostics(i):
-    status = STORE.types['diagnostic_msgs/msg/DiagnosticStatus'](
-        level=1, name='recorder', message=f'{i}', hardware_id='', values=[]
-    )
-    array = STORE.types['diagnostic_msgs/msg/DiagnosticArray'](header=header(i), status=[status])
-    return 'diagnostic_msgs/msg/DiagnosticArray', array
-
-
-TOPICS = {
-    '/joint_states': joint_state,
-    '/optitrack/marker': point,
-    '/remaster/status': diagnostics,
-    '/remaster/joint_offsets': joint_state,
-}
-
-
-def messages(count=40):
-    for i in range(count):
-        topic = list(TOPICS)[i % len(TOPICS)]
-        msgtype, message = TOPICS[topic](i)
-        cdr = bytes(STORE.serialize_cdr(message, msgtype))
-        yield topic, msgtype, cdr, START_NS + i * 10_000_000
-
-
-@pytest.fixture
-def bag(tmp_path):
-    with BagWriter(tmp_path / 'bag') as writer:
-        for message in messages():
-            writer.write(*message)
-    return tmp_path / 'bag'
 
 
 def test_what_is_written_is_read(bag):
@@ -179,7 +119,7 @@ def test_bags_of_other_recorders_are_read(tmp_path):
 KILLED = """
 import sys
 sys.path.insert(0, {tests!r})
-from test_bag import messages
+from bag_messages import messages
 from remaster_ros.session.bag_writer import BagWriter
 writer = BagWriter({folder!r})
 for i, message in enumerate(messages()):
@@ -191,7 +131,7 @@ sys.stdin.read()
 
 def test_a_killed_writer_leaves_all_it_wrote(tmp_path, caplog):
     folder = tmp_path / 'bag'
-    script = KILLED.format(tests=str(__file__).rpartition('/')[0], folder=str(folder))
+    script = KILLED.format(tests=str(Path(bag_messages.__file__).parent), folder=str(folder))
     with subprocess.Popen(
         [sys.executable, '-c', script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -361,147 +301,3 @@ def test_a_full_disk_delays_messages_until_memory_is_full_too(tmp_path, full_dis
     assert list(reader) == [*given[:kept], given[-1]]
     with AnyReader([tmp_path / 'bag']) as whole:
         assert {connection.topic for connection in whole.connections} == set(TOPICS)
-
-
-def part(writer, first, last):
-    for message in list(messages())[first:last]:
-        writer.write(*message)
-
-
-def abandon(folder, first, last, **options):
-    """Write as a process that is killed: nothing is closed."""
-    writer = BagWriter(folder, **options)
-    part(writer, first, last)
-    writer._file.close()
-
-
-# What these readers import warns of its own age.
-@pytest.mark.filterwarnings('ignore::DeprecationWarning')
-def test_a_resumed_bag_is_one_bag_of_several_files(tmp_path):
-    folder = tmp_path / 'bag'
-    abandon(folder, 0, 15)
-    abandon(folder, 15, 15, resume=True)
-    abandon(folder, 15, 31, resume=True)
-    with BagWriter(folder, resume=True) as writer:
-        part(writer, 31, 40)
-    files = [f'bag_{i}.mcap' for i in range(4)]
-    assert sorted(p.name for p in folder.iterdir()) == [MANIFEST, *files, METADATA_FILE]
-    reader = BagReader(folder)
-    assert reader.complete
-    assert [file.count for file in reader.files] == [15, 0, 16, 9]
-    wanted = list(messages())
-    assert list(reader) == wanted
-    with Reader(folder) as other:
-        assert other.message_count == 40
-        assert other.start_time == wanted[0][3]
-        assert [bytes(raw) for _, _, raw in other.messages()] == [m[2] for m in wanted]
-        counts = {c.topic: c.msgcount for c in other.connections}
-    assert counts == reader.counts
-    check = subprocess.run(
-        ['sha256sum', '--check', '--strict', MANIFEST], cwd=folder, capture_output=True, text=True
-    )
-    assert check.returncode == 0, check.stderr
-    assert check.stdout.count(': OK') == 4
-
-
-def test_a_clock_begun_anew_shifts_the_next_file(tmp_path):
-    topic, kind, data, stamp_ns = next(iter(messages()))
-    for _ in range(2):
-        with BagWriter(tmp_path / 'bag', resume=True) as writer:
-            for i in range(3):
-                writer.write(topic, kind, data, stamp_ns + i * 10**8)
-    stamps = [message.stamp_ns - stamp_ns for message in BagReader(tmp_path / 'bag')]
-    assert stamps == [0, 10**8, 2 * 10**8, 12 * 10**8, 13 * 10**8, 14 * 10**8]
-
-
-def test_a_kill_at_any_step_of_a_recovery_is_recovered(tmp_path, monkeypatch):
-    """Stop before each change of a file in turn; the next recovery always gets there."""
-    whole = tmp_path / 'whole'
-    abandon(whole, 0, 15)
-    steps = 0
-    while True:
-        steps += 1
-        folder = tmp_path / str(steps) / 'bag'
-        shutil.copytree(whole, folder)
-        (folder / 'whole_0.mcap').rename(folder / 'bag_0.mcap')
-        left = steps
-
-        def stop(function):
-            def count(*args, **kwargs):
-                nonlocal left
-                left -= 1
-                if left == 0:
-                    raise KeyboardInterrupt
-                return function(*args, **kwargs)
-
-            return count
-
-        with monkeypatch.context() as patch:
-            for name in ('replace', 'unlink', 'rmdir', 'fsync'):
-                patch.setattr(os, name, stop(getattr(os, name)))
-            try:
-                recover_bag(folder)
-            except KeyboardInterrupt:
-                stopped = True
-            else:
-                stopped = False
-        recover_bag(folder)
-        reader = BagReader(folder)
-        assert reader.complete
-        assert list(reader) == list(messages())[:15]
-        assert sorted(p.name for p in folder.iterdir()) == [
-            MANIFEST, 'bag_0.mcap', METADATA_FILE,
-        ]  # fmt: skip
-        if not stopped:
-            break
-    assert steps > 10
-
-
-def test_a_closed_bag_is_itself_or_refused(bag, tmp_path):
-    """Flips, cuts and garbage behind: with its checksum nothing else than the bag comes out."""
-    seed = 11
-    print('seed', seed)
-    rng = np.random.default_rng(seed)
-    path = bag / 'bag_0.mcap'
-    whole = path.read_bytes()
-    for _ in range(300):
-        data = bytearray(whole)
-        kind = rng.integers(3)
-        if kind == 0:
-            data[rng.integers(len(data))] ^= 1 << rng.integers(8)
-        elif kind == 1:
-            del data[rng.integers(len(data)) :]
-        else:
-            data += rng.bytes(int(rng.integers(1, 50)))
-        path.write_bytes(data)
-        with pytest.raises(InputError, match=r'bag_0\.mcap'):
-            BagReader(bag)
-
-
-def test_only_the_one_error_comes_out_of_a_bag_without_its_checksum(bag):
-    seed = 12
-    print('seed', seed)
-    rng = np.random.default_rng(seed)
-    (bag / MANIFEST).unlink()
-    path = bag / 'bag_0.mcap'
-    whole = path.read_bytes()
-    refused = 0
-    for _ in range(1000):
-        data = bytearray(whole)
-        for _ in range(rng.integers(1, 5)):
-            i = int(rng.integers(len(data)))
-            kind = rng.integers(4)
-            if kind == 0:
-                data[i] = rng.integers(256)
-            elif kind == 1:
-                del data[i : i + int(rng.integers(1, 50))]
-            elif kind == 2:
-                data[i:i] = data[i : i + int(rng.integers(1, 50))]
-            else:
-                data[i : i + 8] = b'\xff' * 8
-        path.write_bytes(data)
-        try:
-            list(BagReader(bag))
-        except InputError:
-            refused += 1
-    assert refused > 300
