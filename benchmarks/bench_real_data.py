@@ -76,9 +76,9 @@ def coverage(folder: Path) -> Coverage:
     )
     group, size = rows.group_of_row, rows.group_size
     errors = rows.target - predicted.mean(axis=0)
-    mean = rows.group_sum(errors, axis=0) / size[:, None]
+    mean = rows.group_sum(errors) / size[:, None]
     spread = predicted - predicted.mean(axis=0)
-    spread_of_mean = rows.group_sum(spread, axis=1) / size[:, None]
+    spread_of_mean = np.swapaxes(rows.group_sum(np.swapaxes(spread, 0, 1)), 0, 1) / size[:, None]
 
     of_points = _squares(errors, spread, (sigma**2 + pose_sigma**2)[group])
     of_poses = _squares(mean, spread_of_mean, sigma**2 / size + pose_sigma**2)
@@ -105,7 +105,7 @@ def coverage(folder: Path) -> Coverage:
 def _correlation(errors: FloatArray, rows: Rows) -> float:
     """Return the intraclass correlation of errors (n, 3) of one sensor at one pose."""
     size = rows.group_size
-    products = rows.group_sum(errors, axis=0) ** 2 - rows.group_sum(errors**2, axis=0)
+    products = rows.group_sum(errors) ** 2 - rows.group_sum(errors**2)
     pairs = np.sum(size * (size - 1))
     if pairs == 0:
         return np.nan

@@ -201,11 +201,16 @@ def write_session(folder: Path, arm: Arm, clones: Path) -> None:
     folder.mkdir()
     (folder / 'robot.urdf').write_text(urdf(arm), encoding='utf-8')
     markers = [f'  m{i}: {[value / 1e3 for value in at]}' for i, at in enumerate(arm.markers)]
-    head = (
-        'format: remaster-session/1\nrobot: {urdf: robot.urdf, base_link: base, tip_link: link_6}'
-    )
-    lines = [head, 'markers:', *markers, 'marker_std_m: 0.1', 'sensors: {tracker: {marker: m0}}']
-    (folder / 'session.yaml').write_text('\n'.join([*lines, 'settle_s: 3.0\n']), encoding='utf-8')
+    lines = [
+        'format: remaster-session/1',
+        f'robot: {{urdf: robot.urdf, base_link: base, tip_link: link_{len(arm.links)}}}',
+        'markers:',
+        *markers,
+        'marker_std_m: 0.1',
+        'sensors: {tracker: {marker: m0}}',
+        'settle_s: 3.0',
+    ]
+    (folder / 'session.yaml').write_text('\n'.join(lines), encoding='utf-8')
     degrees, places = arm.read(clones)
     q = np.radians(degrees + [link[3] for link in arm.links])
     columns = ['observation', 'pose', 'configuration', 'split', 'stamp_s', 'sensor', 'marker']

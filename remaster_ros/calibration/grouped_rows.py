@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import FloatArray, IntArray, Measurements
@@ -83,9 +84,9 @@ class Rows:
         """Return the number of rows."""
         return len(self.source)
 
-    def group_sum(self, values: FloatArray, axis: int) -> FloatArray:
-        """Sum over the rows of each group; `axis` (the rows) becomes the groups."""
-        return np.add.reduceat(values, self.group_start, axis=axis)
+    def group_sum(self, values: FloatArray) -> FloatArray:
+        """Sum over the rows of each group, (groups, ...), of values (n, ...)."""
+        return _sum(self._rows_of_groups, values)
 
     def blocks(self, rows: int) -> list[tuple[int, int]]:
         """Cut the groups into runs (first, behind the last) of about so many rows each."""
@@ -155,12 +156,37 @@ class Rows:
         # Groups alike have the same number to the last digit.
         return np.round(self.group_frames / inverse, 9)
 
-    def frame_sum(self, values: FloatArray, axis: int) -> FloatArray:
-        """Sum over the rows of each frame; `axis` (the rows) becomes the frames."""
-        if self.frame is None:
-            return values
-        return np.add.reduceat(values, self.frame_start, axis=axis)
+    def frame_sum(self, values: FloatArray) -> FloatArray:
+        """Sum over the rows of each frame, (frames, ...), of values (n, ...)."""
+        return _sum(self._rows_of_frames, values)
 
-    def sum_of_frames(self, values: FloatArray, axis: int) -> FloatArray:
-        """Sum over the frames of each group; `axis` (the frames) becomes the groups."""
-        return np.add.reduceat(values, self.first_frame, axis=axis)
+    def sum_of_frames(self, values: FloatArray) -> FloatArray:
+        """Sum over the frames of each group, (groups, ...), of values (frames, ...)."""
+        return _sum(self._frames_of_groups, values)
+
+    @cached_property
+    def _rows_of_groups(self) -> csr_array:
+        return _members(self.group_start, len(self))
+
+    @cached_property
+    def _rows_of_frames(self) -> csr_array:
+        return _members(self.frame_start, len(self))
+
+    @cached_property
+    def _frames_of_groups(self) -> csr_array:
+        return _members(self.first_frame, len(self.frame_start))
+
+
+def _members(start: IntArray, count: int) -> csr_array:
+    """Return which of so many neighbours are of each run, (runs, count)."""
+    edges = np.append(start, count)
+    return csr_array((np.ones(count, np.int8), np.arange(count), edges), (len(start), count))
+
+
+def _sum(members: csr_array, values: FloatArray) -> FloatArray:
+    """Return the sums of runs of values, or these where each is a run by itself."""
+    if members.shape[0] == members.shape[1]:
+        return values
+    # A tenth of the time of `np.add.reduceat`.
+    total: FloatArray = members @ values.reshape(len(values), -1)
+    return total.reshape(-1, *values.shape[1:])

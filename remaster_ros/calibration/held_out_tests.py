@@ -166,7 +166,7 @@ def parts_of(mode: Mode, measurements: Measurements, rows: Rows) -> dict[tuple[i
     rows = spread_poses(rows)
     white = whitened(mode, rows, {})
     columns = np.concatenate((white['model'], white['errors']), axis=2)
-    mean = rows.group_sum(columns, axis=0) / np.sqrt(rows.group_size)[:, None, None]
+    mean = rows.group_sum(columns) / np.sqrt(rows.group_size)[:, None, None]
     of_means = np.swapaxes(mean, 1, 2) @ mean
     pose = measurements.pose[rows.source[rows.group_start]]
     stops = rows.group_start + rows.group_size

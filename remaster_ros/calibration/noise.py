@@ -271,9 +271,9 @@ class NoiseModel:
         shape = (-1, *(1,) * (values.ndim - 1))
         means = frames = values
         if rows.frame is not None:
-            means = rows.frame_sum(values, axis=0) / rows.frame_size.reshape(shape)
+            means = rows.frame_sum(values) / rows.frame_size.reshape(shape)
             frames = means * np.sqrt(rows.mean_frame_size[rows.group_of_frame]).reshape(shape)
-        poses = rows.sum_of_frames(frames, axis=0) / np.sqrt(rows.group_frames).reshape(shape)
+        poses = rows.sum_of_frames(frames) / np.sqrt(rows.group_frames).reshape(shape)
         spans = dict(rows.spans)
         for index, group in enumerate(self.error_groups):
             channel = self.channels[group.channel]
@@ -328,8 +328,8 @@ class NoiseModel:
         ratio = np.sqrt(size[of_frame] / rows.frame_size[:, None])
         means = flat
         if rows.frame is not None:
-            means = rows.frame_sum(flat, axis=0) / rows.frame_size[:, None, None].astype(kind)
-        of_poses = rows.sum_of_frames(means.reshape(len(of_frame), -1), axis=0)
+            means = rows.frame_sum(flat) / rows.frame_size[:, None, None].astype(kind)
+        of_poses = rows.sum_of_frames(means.reshape(len(of_frame), -1))
         of_poses = of_poses.reshape(len(size), 3, -1) / count[:, :, None].astype(kind)
         of_poses *= (1.0 / inner - 1.0 / outer)[:, :, None].astype(kind)
         white = flat * (1.0 / sigma)[rows.group_of_row][:, :, None].astype(kind)
@@ -346,7 +346,7 @@ class NoiseModel:
 
 def _frames(rows: Rows, reference: FloatArray) -> FloatArray:
     """Return the line of sight of each row's group, and two directions across it, (n, 3, 3)."""
-    middle = rows.group_sum(rows.target, axis=0) / rows.group_size[:, None]
+    middle = rows.group_sum(rows.target) / rows.group_size[:, None]
     sight = middle - reference[rows.group_sensor, :3, 3]
     sight /= np.maximum(np.linalg.norm(sight, axis=1), np.finfo(float).tiny)[:, None]
     # The base axis least along the line of sight gives a first direction across it.

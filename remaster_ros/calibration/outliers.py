@@ -105,8 +105,8 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
     group = rows.group_of_row
     sensor = rows.group_sensor[group]
     good = ~gross
-    count = rows.group_sum(good.astype(float), axis=0)
-    total = rows.group_sum(errors * good[:, None], axis=0)
+    count = rows.group_sum(good.astype(float))
+    total = rows.group_sum(errors * good[:, None])
     sigma, pose_sigma = robust_noise(rows, errors, good)
 
     # The error that the pose has in common, by its other good rows.
@@ -190,8 +190,8 @@ def robust_noise(rows: Rows, errors: FloatArray, good: BoolArray) -> tuple[Float
     Where poses have one row each all of the error counts as sigma.
     """
     group = rows.group_of_row
-    count = rows.group_sum(good.astype(float), axis=0)
-    mean = rows.group_sum(errors * good[:, None], axis=0) / np.maximum(count, 1.0)[:, None]
+    count = rows.group_sum(good.astype(float))
+    mean = rows.group_sum(errors * good[:, None]) / np.maximum(count, 1.0)[:, None]
     # Deviations from the mean of n rows are smaller than sigma by (n - 1) / n in variance.
     inflation = np.sqrt(count / np.maximum(count - 1.0, 1.0))[group]
     deviation = np.linalg.norm(errors - mean[group], axis=1) * inflation

@@ -164,7 +164,7 @@ def residual_structure(mode: Mode, measurements: Measurements) -> ResidualStruct
     families = _families(mode, rows, seconds)
     white = whitened(mode, rows, families)
     size = rows.group_size[:, None, None]
-    middle = {name: rows.group_sum(part, axis=0) / size for name, part in white.items()}
+    middle = {name: rows.group_sum(part) / size for name, part in white.items()}
     apart = {name: part - middle[name][rows.group_of_row] for name, part in white.items()}
     between = {name: _flat(part * np.sqrt(size)) for name, part in middle.items()}
     within = {name: _flat(part) for name, part in apart.items()}
@@ -285,7 +285,7 @@ def explained_of_poses(
 
     def of_poses(columns: FloatArray) -> FloatArray:
         size = rows.group_size[:, None, None]
-        return _flat(rows.group_sum(columns, axis=0) / np.sqrt(size))
+        return _flat(rows.group_sum(columns) / np.sqrt(size))
 
     basis = _basis(of_poses(model))
     return _f_test(of_poses(family), _without(basis, of_poses(errors[:, :, None])), basis)
@@ -323,7 +323,7 @@ def _from_pose_to_pose(
     either neighbour, mean and variance follow from traces; its distribution is nearly a beta one
     (Durbin and Watson 1951, doi:10.1093/biomet/38.1-2.159).
     """
-    time = rows.group_sum(seconds, axis=0) / rows.group_size
+    time = rows.group_sum(seconds) / rows.group_size
     order = np.lexsort((time, rows.group_sensor))
     neighbours = np.diff(rows.group_sensor[order], prepend=-1) == 0
 
@@ -365,7 +365,7 @@ def _within_poses(errors: FloatArray, rows: Rows, seconds: FloatArray) -> Struct
     product = np.sum(errors[order][1:] * errors[order][:-1], axis=1)
     product[np.diff(group[order]) != 0] = 0.0
     chained = np.bincount(group[order][1:], product, len(rows.group_size))
-    squares = rows.group_sum(np.sum(errors**2, axis=1), axis=0)
+    squares = rows.group_sum(np.sum(errors**2, axis=1))
     several = rows.group_size > 2
     if np.sum(several) < FEWEST_POSES:
         return None

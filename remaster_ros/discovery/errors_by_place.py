@@ -37,7 +37,7 @@ def errors_by_place(
     white = data.noise_model.whitened(np.concatenate(parts, axis=2), solution.noise)
     fitted = parts[0].shape[2] + parts[1].shape[2]
     model, errors, places = np.split(white, [fitted, fitted + 1], axis=2)
-    left = rows.group_sum(data.left(solution), axis=0) / rows.group_size[:, None]
+    left = rows.group_sum(data.left(solution)) / rows.group_size[:, None]
     noise_m = data.noise_model.sensor_noise(solution.noise).total
     located = {cell.subject for cell in cells if cell.name == SENSOR_FIELD.name}
     families = np.split(places, len(rows.spans), axis=2)

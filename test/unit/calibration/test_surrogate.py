@@ -84,7 +84,7 @@ def test_proposals_fit_a_pose_sigma_that_is_surely_zero() -> None:
     rows = found.posterior.rows
     # Take most of each pose's mean error away.
     errors = rows.target - found.model.predict(found.mode.z, rows)
-    means = rows.group_sum(errors, axis=0) / rows.group_size[:, None]
+    means = rows.group_sum(errors) / rows.group_size[:, None]
     calmer = replace(rows, target=rows.target - 0.8 * means[rows.group_of_row])
     posterior = found.posterior
     mode = find_mode(
