@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import msgspec
+import numpy as np
 
 from remaster_ros.calibration.measured_again import MeasuredAgain
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.explain import UNCERTAIN
+from remaster_ros.discovery.undetected import DETECTED
 from remaster_ros.discovery.words import called
 from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.effect_words import STEP
@@ -18,6 +20,9 @@ from remaster_ros.reports.schemas import Judgement
 FEWEST_INSIDE = 0.92
 # So many times the noise the error on held-out poses may be, and more by chance with few rows.
 MOST_OVER_NOISE = 1.25
+# Where a cause could move the marker by more than this share of the noise and not be found, it
+# proves nothing that none is.
+MOST_UNSEEN = 0.5
 
 
 def judgement(
@@ -81,8 +86,18 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
     if before is None or after is None:
         return False
     if discovery.verdict == 'none':
-        return True
+        return least_seen_m(discovery) < MOST_UNSEEN * discovery.gain.noise_floor_m
     return after < before and (confirmation is None or confirmation.confirmed)
+
+
+def least_seen_m(discovery: Discovery) -> float:
+    """Return how far, RMS, a cause moves the marker that is about to be found, m.
+
+    Where everything else is fitted anew it leaves `DETECTED` standard deviations of all rows
+    together.
+    """
+    numbers = discovery.residuals.errors.size
+    return float(DETECTED * discovery.gain.noise_floor_m / np.sqrt(numbers))
 
 
 def _other_choices(discovery: Discovery) -> str:
@@ -126,7 +141,17 @@ def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> 
                 'Nothing was found beyond the zero-offsets and the noise, but no poses were held '
                 f'out to check it: measure some and search again.{doubt}'
             )
-        return f'Nothing is there beyond the zero-offsets and the noise.{doubt}'
+        seen = f'that moves the marker by less than {1e3 * least_seen_m(discovery):.2f} mm RMS'
+        if least_seen_m(discovery) >= MOST_UNSEEN * gain.noise_floor_m:
+            return (
+                'Nothing was found beyond the zero-offsets and the noise, but '
+                f'{len(discovery.residuals)} readings would not show a cause {seen}: measure more '
+                f'poses.{doubt}'
+            )
+        return (
+            'Nothing is there beyond the zero-offsets and the noise; a cause '
+            f'{seen} would not show.{doubt}'
+        )
     if discovery.verdict == 'unexplained':
         return f'Something is there that no cause explains.{change}'
     count = len(discovery.effects)

@@ -81,6 +81,19 @@ def test_nothing_found_is_a_page_without_a_figure_of_causes(found, tmp_path):
     assert 'None. Every combination' in page
 
 
+def test_few_readings_do_not_show_that_nothing_is_there(found, tmp_path):
+    """The page has from what size on a cause shows; it is amber where that is half the noise."""
+    healthy = found['healthy']
+    rows = len(healthy.residuals)
+    seen = 4.5 * 1e3 * healthy.gain.noise_floor_m / np.sqrt(3 * rows)
+    page, _, _ = saved(healthy, tmp_path / 'all')
+    assert f'by less than {seen:.2f} mm RMS would not show' in page
+    few = replace(healthy, residuals=healthy.residuals.only(healthy.residuals.rows.source[:26]))
+    page, mood, _ = saved(few, tmp_path / 'few')
+    assert mood == 'caution'
+    assert '26 readings would not show a cause' in page
+
+
 @pytest.mark.parametrize('scene', ['bent', 'scale', 'unproven'])
 def test_causes_are_drawn(found, scene, tmp_path):
     page, mood, names = saved(found[scene], tmp_path)
