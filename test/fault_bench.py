@@ -148,10 +148,20 @@ class Bench:
         self._thread.start()
 
     def _open_relays(self) -> None:
+        import rclpy
         from geometry_msgs.msg import PointStamped
         from sensor_msgs.msg import JointState
         from trajectory_msgs.msg import JointTrajectory
 
+        from remaster_ros.nodes.status import RELIABLE
+
+        # The planner waits until nodes of these names listen to it.
+        self._listeners = [
+            rclpy.create_node(name, namespace='bench', context=self._context)
+            for name in ('robot_bridge', 'recorder')
+        ]
+        for node in self._listeners:
+            node.create_subscription(JointTrajectory, RELAYED['pose_planner'], print, RELIABLE)
         kinds = {'pose_planner': JointTrajectory, 'robot_bridge': JointState}
         for name, topic in RELAYED.items():
             self.relays[name] = Relay(self.node, topic, kinds.get(name, PointStamped))

@@ -23,9 +23,7 @@ class Relay:
         self.spoil: Callable | None = None
         self.delay_s, self._last = 0.0, None
         self._publisher = node.create_publisher(kind, topic, LEASED)
-        # The planner counts two that listen to it: bridge and recorder.
-        for callback in (self._take, lambda message: None):
-            node.create_subscription(kind, f'bench/{topic}', callback, RELIABLE)
+        node.create_subscription(kind, f'bench/{topic}', self._take, RELIABLE)
 
     def _take(self, message) -> None:
         self._last = message

@@ -139,6 +139,9 @@ def supply(word: str, own: Path, here: Path) -> None:
         supply('s1', own, here)
         assert main(['discover', 's1', '--out', 'causes', '--no-figures', '--quiet']) == 0
         shutil.copy('causes/discovery.json', 'discovery.json')
+        # The cell is of the same arm, also where the page has made one of another.
+        (here / 'my_cell.yaml').unlink(missing_ok=True)
+        supply('my_cell.yaml', own, here)
     elif name == 'my_cell.yaml':
         cell = (ROOT / 'config/cells/demo.yaml').read_text('utf-8')
         Path(name).write_text(cell.replace('../robots', str(ROOT / 'config/robots')), 'utf-8')
