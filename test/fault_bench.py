@@ -22,7 +22,7 @@ import numpy as np
 from fault_observer import Observer
 from fault_relay import Relay
 
-from remaster_ros.collection.events import ConfigurationEnded, PoseAnnounced
+from remaster_ros.collection.events import ConfigurationEnded, PoseAnnounced, SolutionSettled
 from remaster_ros.nodes.demo import free_ports
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.workcell import config_path, read_cell
@@ -277,7 +277,7 @@ class Bench:
         """Wait until a reading begins."""
         began = time.monotonic()
         found = self.observer.find
-        self.until(lambda: found('robot_bridge', 'settled', since_s=began), 60, 'a reading')
+        self.until(lambda: found(SolutionSettled, since_s=began), 60, 'a reading')
 
     def left(self) -> int:
         """Return how many configurations are still to be visited."""
