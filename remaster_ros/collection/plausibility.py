@@ -29,6 +29,9 @@ UNUSUAL_PLACES = 8.0
 """Nor one below so many times what the markers' places are known to."""
 MOVED_M = 1e-3
 """A marker that should have moved further than this cannot have the same reading, m."""
+TURNED_RAD = 0.01
+"""Nor one of an arm whose joints have turned by more: all solutions of a pose have their marker at
+one place of the model, and none of the real arm at the same one to the last bit."""
 
 
 class Plausibility:
@@ -109,6 +112,9 @@ class Plausibility:
             moved = float(np.linalg.norm(marker_R - self._place(last)))
             if moved > MOVED_M:
                 detail = f'the same to the last bit, though the arm moved it {1e3 * moved:.0f} mm'
+                return Rejection(name, 'frozen', detail)
+            if np.max(np.abs(reading.q - last.q)) > TURNED_RAD:
+                detail = 'the same to the last bit as at the configuration before'
                 return Rejection(name, 'frozen', detail)
         if T_R_N is not None:
             measured_R = transforms.apply(T_R_N, reading.position)

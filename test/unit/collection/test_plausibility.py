@@ -8,6 +8,7 @@ import pytest
 from remaster_ros.collection.pairing import PairedReading, Rejection
 from remaster_ros.collection.plausibility import Plausibility
 from remaster_ros.kinematics import transforms
+from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.session.workcell import read_cell
 
 CELL = read_cell('demo')
@@ -104,6 +105,24 @@ def test_a_reading_that_repeats_the_last_one_though_the_arm_moved_is_frozen():
     assert f'the arm moved it {1e3 * moved:.0f} mm' in verdict.detail
     # Where the arm did not move, the same reading is possible.
     assert isinstance(plausibility.judge(reading(first, shot), None), PairedReading)
+
+
+def test_solutions_of_one_pose_do_not_share_a_reading(scene):
+    """By the model their marker is at one place; 3 mm beside the true one was recorded once."""
+    rng, plausibility, T_R_N, measure = scene
+    (first,) = poses(rng, 1)
+    inverse = InverseKinematics(CHAIN, held=CELL.held(CHAIN))
+    found = inverse.solutions(CHAIN.forward(first))
+    second = found[np.argmax(np.max(np.abs(found - first), axis=1))]
+    np.testing.assert_allclose(
+        CHAIN.positions(first, MARKER), CHAIN.positions(second, MARKER), atol=1e-6
+    )
+    shot = measure(first)
+    assert isinstance(plausibility.judge(reading(first, shot), T_R_N), PairedReading)
+    verdict = plausibility.judge(reading(second, shot.copy()), T_R_N)
+    assert verdict.reason == 'frozen'
+    # At the same configuration once more, as a coarse sensor may have it.
+    assert isinstance(plausibility.judge(reading(first + 1e-4, shot), T_R_N), PairedReading)
 
 
 def test_not_a_number_is_not_the_marker():
