@@ -43,7 +43,7 @@ def judgement(
     points = in_words(discovery, confirmation) if confirmation is not None else []
     return Judgement(
         mood='good' if proven else 'caution',
-        headline=headline(discovery, confirmation) + (f' {more}' if more else ''),
+        headline=headline(discovery, confirmation, more),
         points=[*points, again.words] if again.again else points,
     )
 
@@ -86,7 +86,7 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
     if before is None or after is None:
         return False
     if discovery.verdict == 'none':
-        return least_seen_m(discovery) < MOST_UNSEEN * discovery.gain.noise_floor_m
+        return _would_show(discovery)
     return after < before and (confirmation is None or confirmation.confirmed)
 
 
@@ -98,6 +98,11 @@ def least_seen_m(discovery: Discovery) -> float:
     """
     numbers = discovery.residuals.errors.size
     return float(DETECTED * discovery.gain.noise_floor_m / np.sqrt(numbers))
+
+
+def _would_show(discovery: Discovery) -> bool:
+    """Whether a cause that matters beside the noise would have been found."""
+    return least_seen_m(discovery) < MOST_UNSEEN * discovery.gain.noise_floor_m
 
 
 def _other_choices(discovery: Discovery) -> str:
@@ -121,8 +126,15 @@ def _uncertain(discovery: Discovery) -> str:
     return f' Not certain by its own standard deviation: {", ".join(names)}.' if names else ''
 
 
-def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> str:
-    """Return the result in one or a few sentences."""
+def headline(
+    discovery: Discovery, confirmation: Confirmation | None = None, more: str = ''
+) -> str:
+    """Return the result in one or a few sentences; `more` is what held-out rows show beside it."""
+    result = _result(discovery, confirmation, left=bool(more))
+    return f'{result} {more}' if more else result
+
+
+def _result(discovery: Discovery, confirmation: Confirmation | None, *, left: bool) -> str:
     gain = discovery.gain
     change = ''
     if gain.held_out_rms_before_m is not None and gain.held_out_rms_after_m is not None:
@@ -142,15 +154,16 @@ def headline(discovery: Discovery, confirmation: Confirmation | None = None) -> 
                 f'out to check it: measure some and search again.{doubt}'
             )
         seen = f'that moves the marker by less than {1e3 * least_seen_m(discovery):.2f} mm RMS'
-        if least_seen_m(discovery) >= MOST_UNSEEN * gain.noise_floor_m:
+        if not _would_show(discovery):
             return (
                 'Nothing was found beyond the zero-offsets and the noise, but '
                 f'{len(discovery.residuals)} readings would not show a cause {seen}: measure more '
                 f'poses.{doubt}'
             )
+        nothing = 'Nothing was found' if left else 'Nothing is there'
         return (
-            'Nothing is there beyond the zero-offsets and the noise; a cause '
-            f'{seen} would not show.{doubt}'
+            f'{nothing} beyond the zero-offsets and the noise; a cause {seen} would not '
+            f'show.{doubt}'
         )
     if discovery.verdict == 'unexplained':
         return f'Something is there that no cause explains.{change}'

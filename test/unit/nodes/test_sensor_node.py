@@ -319,13 +319,15 @@ def test_a_fault_of_the_driver_ends_the_node(rig):
 
 
 def test_a_measurement_is_published_before_its_answer(rig, monkeypatch):
-    monkeypatch.setattr(Device, 'refusals', 3)
+    # Until it was asked: on a busy machine a service is found late.
+    monkeypatch.setattr(Device, 'refusals', 1000)
     r = rig(Probe)
     refused = r.measure()
     assert not refused.success
     assert refused.message == 'the gauge is connecting: gauge: the cable is out'
+    monkeypatch.setattr(Device, 'refusals', 0)
     r.wait(lambda: r.values()['ready'] == 'yes', 'the connection')
-    assert r.driver.closed == 3
+    assert r.driver.closed == r.driver.opened - 1 > 0
     answer = r.measure()
     assert (answer.success, answer.message) == (True, 'measured')
     r.wait(lambda: r.points and r.temperatures, 'the point')

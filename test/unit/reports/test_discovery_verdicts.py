@@ -94,6 +94,17 @@ def test_few_readings_do_not_show_that_nothing_is_there(found, tmp_path):
     assert '26 readings would not show a cause' in page
 
 
+def test_what_held_out_poses_show_is_not_said_to_be_nothing(found, tmp_path):
+    healthy = found['healthy']
+    after = 2.0 * healthy.gain.noise_floor_m
+    gain = replace(healthy.gain, held_out_rms_before_m=after, held_out_rms_after_m=after)
+    page, mood, _ = saved(replace(healthy, gain=gain), tmp_path)
+    assert mood == 'caution'
+    assert 'Nothing was found beyond' in page
+    assert 'Nothing is there' not in page
+    assert '2.0 times that of the noise alone' in page
+
+
 @pytest.mark.parametrize('scene', ['bent', 'scale', 'unproven'])
 def test_causes_are_drawn(found, scene, tmp_path):
     page, mood, names = saved(found[scene], tmp_path)
