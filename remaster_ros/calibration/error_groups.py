@@ -55,7 +55,7 @@ class ErrorGroup:
         m M for m frames in a pose, which is the number of its rows where the frames are of one
         size; 0 but of 'poses'.
     groups
-        The rows' groups that these errors belong to, (g,).
+        The rows' groups that these errors belong to, (g,): of 'frames' those with several.
     freedom
         Number of independent errors.
     """
@@ -92,7 +92,7 @@ def error_groups(channels: Sequence[Channel], rows: Rows) -> tuple[ErrorGroup, .
         for value in np.unique(size).tolist():
             alike = mine[size == value]
             number = frames[size == value]
-            add('frames', value, 0.0, alike, int(np.sum(number - 1)))
+            add('frames', value, 0.0, alike[number > 1], int(np.sum(number - 1)))
             for count in np.unique(number).tolist():
                 groups = alike[number == count]
                 add('poses', value, count * value, groups, len(groups))

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from remaster_ros.calibration.gauge_words import hardly_seen
+from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.linearisation import Linearisation, linearise
 from remaster_ros.calibration.noise import RESOLUTION_M
 from remaster_ros.calibration.posterior import Posterior
@@ -27,9 +29,13 @@ FIRST_STEPS, MOST_STEPS = 12, 60
 # rises, so many times at most.
 TRUSTED = 0.1
 HALVINGS = 10
+# Share of a step by which the bend of the predictions along it is judged.
+BENT = 0.05
 # The density of the noise is even in a shared part's coordinate: at zero it has no slope, whether
 # it rises or falls from there, and a search that begins at zero would stay.
 OFF_ZERO = 0.1
+# Of the noise's coordinates, to take derivatives by.
+DIFFERENCE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,16 +48,18 @@ class Mode:
         Pinned parameters, (size,).
     eta
         (e,).
-    eta_covariance
-        (e, e).
     linearisation
         About z.
     """
 
     z: FloatArray
     eta: FloatArray
-    eta_covariance: FloatArray
     linearisation: Linearisation
+
+    @cached_property
+    def eta_covariance(self) -> FloatArray:
+        """Covariance of the noise's coordinates, (e, e)."""
+        return _noise_covariance(self.linearisation, self.eta)
 
     @property
     def log_evidence(self) -> float:
@@ -116,7 +124,7 @@ def find_mode(posterior: Posterior, eta: FloatArray | None = None) -> Mode:
                 damping /= 1.0 + back / float(previous @ previous)
             previous = whitened
             if size > TRUSTED:
-                mean = _uphill(posterior, z[posterior.free], damping * step, eta)
+                mean = _uphill(linearisation, z[posterior.free], damping * step, eta)
             else:
                 mean = z[posterior.free] + damping * step
             z = posterior.parameters(mean)
@@ -124,7 +132,7 @@ def find_mode(posterior: Posterior, eta: FloatArray | None = None) -> Mode:
             if size < (SETTLED if count < FIRST_STEPS else NEAR_ENOUGH):
                 break
         if size < NEAR_ENOUGH:
-            return Mode(z, eta, _noise_covariance(linearisation, eta), linearisation)
+            return Mode(z, eta, linearisation)
     except np.linalg.LinAlgError:
         # A parameter without any information: the same remedy as steps that never end.
         pass
@@ -136,21 +144,50 @@ def find_mode(posterior: Posterior, eta: FloatArray | None = None) -> Mode:
 
 
 def _uphill(
-    posterior: Posterior, free: FloatArray, step: FloatArray, eta: FloatArray
+    linearisation: Linearisation, free: FloatArray, step: FloatArray, eta: FloatArray
 ) -> FloatArray:
     """Return the free parameters after the longest of step, step / 2, … that raises the density.
 
-    Given the noise each Gauss-Newton step points uphill.
+    Given the noise each Gauss-Newton step points uphill. A shorter one than the whole follows the
+    bend of the predictions (Transtrum & Sethna 2012, arXiv:1201.5885).
     """
-    at, halved = free, step * 0.5 ** np.arange(HALVINGS)[:, None]
-    height = posterior.log_density(np.concatenate((at, eta))[None])
-    # Most often the first will do.
-    for tries in (at + halved[:1], at + halved[1:]):
+    posterior = linearisation.posterior
+
+    def heights(tries: FloatArray) -> FloatArray:
         at_noise = np.broadcast_to(eta, (len(tries), len(eta)))
-        heights = posterior.log_density(np.concatenate((tries, at_noise), axis=1))
-        if np.any(heights > height):
-            return tries[np.argmax(heights > height)]
-    return tries[-1]
+        return posterior.log_density(np.concatenate((tries, at_noise), axis=1))
+
+    height, first = heights(np.stack((free, free + step)))
+    # Most often the first will do.
+    if first > height:
+        return free + step
+    share = 0.5 ** np.arange(HALVINGS)[:, None]
+    straight = free + share * step
+    tries = np.concatenate((straight + share**2 * _bend(linearisation, step, eta), straight))
+    raised = heights(tries)
+    if not np.any(raised > height):
+        return tries[-1]
+    return tries[np.argmax(raised)]
+
+
+def _bend(linearisation: Linearisation, step: FloatArray, eta: FloatArray) -> FloatArray:
+    """Return what the free parameters change by, to second order of a step (f,), beside it, (f,).
+
+    Where the predictions bend, the errors along the step are then as small as its own.
+    """
+    posterior, z = linearisation.posterior, linearisation.z
+    model, free, f = posterior.model, posterior.free, len(step)
+    near = posterior.parameters(z[free] + BENT * np.stack((-step, 0.0 * step, step)))
+
+    def joined(rows: Rows, _: slice) -> FloatArray:
+        before, here, after = (model.predict(point, rows) for point in near)
+        second = (before - 2.0 * here + after) / BENT**2
+        return np.concatenate((model.jacobian(z, rows)[:, :, free], second[:, :, None]), axis=2)
+
+    grams = posterior.noise_model.gram(joined, f + 1, f)
+    pull = (1.0 / posterior.variances(eta)) @ grams[:, 0, :f]
+    bend: FloatArray = -0.5 * np.linalg.solve(linearisation.gram(eta)[:f, :f], pull)
+    return bend
 
 
 def _open_direction(linearisation: Linearisation, eta: FloatArray, step: FloatArray) -> FloatArray:
@@ -263,8 +300,17 @@ def _noise_slope(
 
 
 def _noise_curvature(linearisation: Linearisation, at: FloatArray) -> FloatArray:
-    """Return the negative second derivative of the noise's log density."""
-    return _curvature(lambda points: linearisation.whitened(points)[2], at)[2]
+    """Return the negative second derivative of the noise's log density.
+
+    By differences of its gradient, which takes one factor where the density itself takes one for
+    each of dozens of points.
+    """
+    around = DIFFERENCE * np.stack((np.eye(len(at)), -np.eye(len(at))))
+    plus, minus = (
+        np.array([_noise_slope(linearisation, at + step)[1] for step in steps]) for steps in around
+    )
+    curvature: FloatArray = (minus - plus) / (2.0 * DIFFERENCE)
+    return 0.5 * (curvature + curvature.T)
 
 
 def _curvature(
@@ -274,7 +320,7 @@ def _curvature(
 
     All in one batch: the density costs microseconds, its derivative a page.
     """
-    e, step = len(at), 0.02
+    e, step = len(at), DIFFERENCE
     unit = step * np.eye(e)
     first, second = np.triu_indices(e, 1)
     corners = [at + a * unit[first] + b * unit[second] for a in (1, -1) for b in (1, -1)]

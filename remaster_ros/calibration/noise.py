@@ -281,12 +281,9 @@ class NoiseModel:
             groups = group.groups[(group.groups >= first) & (group.groups < first + len(poses))]
             if group.kind == 'poses':
                 yield index, poses[groups - first, axes]
-            elif rows.frame is None:
-                # Every row is a frame: those of a sensor are of one size.
-                yield index, (values[span, axes] if group.kind == 'frames' else values[:0, axes])
             elif group.kind == 'frames':
                 yield index, frames[np.isin(rows.group_of_frame, groups - first), axes]
-            else:
+            elif rows.frame is not None:
                 mean = np.repeat(means[:, axes], rows.frame_size, axis=0)
                 yield index, values[span, axes] - mean[span]
 
@@ -298,6 +295,8 @@ class NoiseModel:
                 other
                 for other, poses in enumerate(self.error_groups)
                 if poses.kind == 'poses'
+                # Where a pose has one frame, that has no deviation from the pose's mean.
+                and poses.size > poses.frame_size
                 and (poses.channel, poses.frame_size) == (group.channel, group.frame_size)
             ]
             for index, group in enumerate(self.error_groups)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,19 +102,81 @@ class LeftOut:
             Of each pose −2 log of its density, without the constants, which are those of the
             noise, (poses,).
         """
-        errors, variance = self._predicted(solution)
-        scaled = np.linalg.solve(variance, errors[:, :, None])[:, :, 0]
-        deviance = np.sum(errors * scaled, axis=1) + np.linalg.slogdet(variance)[1]
+        deviance = np.empty(len(self.data))
+        for fold, errors, first, second in self._left_out(self._orthogonal(solution)):
+            own, axes = errors.reshape(-1, 3), (-1, len(fold) // 3, 3)
+            of_rows = np.einsum('pri,prj->rij', first.reshape(axes), second.reshape(axes))
+            of_rows += np.eye(3)
+            scaled = np.linalg.solve(of_rows, own[:, :, None])[:, :, 0]
+            deviance[fold[::3] // 3] = np.sum(own * scaled, axis=1) + np.linalg.slogdet(of_rows)[1]
         return np.bincount(self.data.pose_of_row, deviance).astype(float)
 
-    def _predicted(self, solution: Solution) -> tuple[FloatArray, FloatArray]:
-        """Return the error of each row by the fit to others, (n, 3), and its variance.
+    def squares(self, solution: Solution) -> FloatArray:
+        """Return how large the errors are on poses that are left out.
 
-        With S = X H⁻¹ X' of the rows X left out and H of all rows, the variance is (I − S)⁻¹, and
-        the error the product of it and what the fit to all rows leaves (Cook & Weisberg 1982,
-        Residuals and Influence in Regression, section 2.2). With X = Z L' and H = L L' that is
-        I + Z (I − Z'Z)⁻¹ Z', which inverts a matrix of the parameters where they are fewer.
+        By the noise of the others: what is left of the squares of all rows is the sum of what is
+        left without a fold, and of the squares of that in units of what is uncertain of its
+        prediction.
+
+        Parameters
+        ----------
+        solution
+            Which cells, with which smoothness and noise, but for its scale.
+
+        Returns
+        -------
+        ndarray
+            Mean squared error of each pose in units of what is uncertain of its prediction:
+            chi-square over its degrees of freedom, (poses,); NaN where the others leave none to
+            judge the noise by.
         """
+        X, y = self._orthogonal(solution), self.white[:, -1]
+        rss = y @ y - np.sum((X @ y) ** 2)
+        free = sum(cell.size for cell in solution.cells if cell.penalty is None)
+        freedom = len(y) - self.data.base.shape[2] - free
+        squares = np.full(self.data.poses, np.nan)
+        for fold, errors, first, second in self._left_out(X):
+            variance = np.eye(len(fold)) + first.T @ second
+            others = freedom - len(fold)
+            if others <= 0:
+                continue
+            noise = (rss - errors @ np.linalg.solve(variance, errors)) / others
+            pose = self.data.pose_of_row[fold // 3]
+            for number in np.unique(pose):
+                mine = pose == number
+                scaled = np.linalg.solve(variance[np.ix_(mine, mine)], errors[mine])
+                squares[number] = errors[mine] @ scaled / (noise * len(scaled))
+        return squares
+
+    def _left_out(
+        self, X: FloatArray
+    ) -> Iterator[tuple[IntArray, FloatArray, FloatArray, FloatArray]]:
+        """Give the coordinates of each fold, their errors by the fit to others, and matrices A, B.
+
+        The variance of the prediction is I + A'B, noise included. With S = X'X of the rows X left
+        out, in parameters whose posterior covariance is the identity, it is (I − S)⁻¹, and the
+        error the product of it and what the fit to all rows leaves (Cook & Weisberg 1982,
+        Residuals and Influence in Regression, section 2.2). That is I + X' (I − XX')⁻¹ X, which
+        inverts a matrix of the parameters where they are fewer.
+
+        Parameters
+        ----------
+        X
+            As `_orthogonal` gives it.
+        """
+        y = self.white[:, -1]
+        left = y - (X @ y) @ X
+        for fold in self.folds:
+            own = X[:, fold]
+            if len(own) < len(fold):
+                pulled = _inverse(np.eye(len(own)) - own @ own.T) @ own
+            else:
+                pulled = _inverse(np.eye(len(fold)) - own.T @ own) - np.eye(len(fold))
+                own = np.eye(len(fold))
+            yield fold, left[fold] + own.T @ (pulled @ left[fold]), own, pulled
+
+    def _orthogonal(self, solution: Solution) -> FloatArray:
+        """Return the columns of parameters whose posterior covariance is the identity, (P, 3n)."""
         p = self.data.base.shape[2]
         edges = p + np.cumsum([0, *(cell.size for cell in self.cells)])
         first = dict(zip(self.cells, edges, strict=False))
@@ -126,25 +188,8 @@ class LeftOut:
         H[:p, :p] += self.data.base_precision / np.outer(base, base)
         np.einsum('ii->i', H)[:] += 1e-12
         root = np.linalg.cholesky(H)
-        X = solve_triangular(root, self.white[:, chosen].T, lower=True, check_finite=False)
-        y = self.white[:, -1]
-        left = y - (X @ y) @ X
-        errors = np.empty(3 * len(self.data))
-        variance = np.empty((len(self.data), 3, 3))
-        for fold in self.folds:
-            own, rows = X[:, fold], np.arange(len(fold) // 3)
-            if len(own) < len(fold):
-                pulled = _inverse(np.eye(len(own)) - own @ own.T) @ own
-                errors[fold] = left[fold] + own.T @ (pulled @ left[fold])
-                axes = (-1, len(rows), 3)
-                of_rows = np.einsum('pri,prj->rij', own.reshape(axes), pulled.reshape(axes))
-                of_rows += np.eye(3)
-            else:
-                inverse = _inverse(np.eye(len(fold)) - own.T @ own)
-                errors[fold] = inverse @ left[fold]
-                of_rows = inverse.reshape(len(rows), 3, len(rows), 3)[rows, :, rows]
-            variance[fold[::3] // 3] = of_rows
-        return errors.reshape(-1, 3), variance
+        columns = self.white[:, chosen].T
+        return np.asarray(solve_triangular(root, columns, lower=True, check_finite=False))
 
 
 class Comparisons:

@@ -318,10 +318,14 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
     )
     selection = search.run()
     solution = withstanding_memory(search, selection.solution)
-    selection = replace(selection, solution=plainest(solution, search.cells, search.fit))
+    solution = plainest(solution, search.data, search.catalogue, search.fit)
+    selection = replace(selection, solution=solution)
     residuals = search.data
     groups, described = describe(
-        residuals, selection, cells, lambda share: progress('comparing look-alikes', share)
+        residuals,
+        selection,
+        search.catalogue,
+        lambda share: progress('comparing look-alikes', share),
     )
     causes = [EFFECTS[group[0].name].is_cause for group in groups]
     effects = tuple(itertools.compress(described, causes))

@@ -35,7 +35,9 @@ ABSORBED = 1e-4
 # Of the noise and smoothness coordinates, which are logarithms.
 STEPS = 60
 # Where Newton's step is to raise L by less than half of this, it is at its maximum.
-GAIN = 0.02
+GAIN = 0.05
+# A step that is to raise L by less than half of this is the last: what is left is of second order.
+LAST = 0.25
 # Longest step, of these logarithms.
 STRIDE = 2.0
 # Step that no longer raises L by more than rounding.
@@ -166,11 +168,15 @@ class _System:
         count = len(self.model.channels)
         return self.model.noise(np.exp(eta[:count]), np.exp(eta[count : len(self.entering)]))
 
-    def evaluate(self, eta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Return L, its gradient and its average information.
+    def value(self, eta: FloatArray) -> float:
+        """Return L, by eta: logarithms of the sigmas, of what rows share, and of the smoothness."""
+        weights, factors = self._precisions(eta)
+        total, root, beta, _ = self._solved(eta)
+        value = self._likelihood(total, weights, beta) - np.sum(np.log(np.diag(root)))
+        return float(value + self._smooth(factors, beta))
 
-        By eta: the logarithms of the sigmas, of what rows share, and of the smoothness.
-        """
+    def derivatives(self, eta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the gradient of L and its average information."""
         count = len(self.entering)
         weights, factors = self._precisions(eta)
         total, root, beta, lower = self._solved(eta)
@@ -186,8 +192,6 @@ class _System:
             pulls[index] = gram @ error
         rss = pulls @ error
         n = self.model.freedom
-        value = 0.5 * n @ np.log(weights) - np.sum(np.log(np.diag(root))) - 0.5 * weights @ rss
-        value -= 0.5 * self._implausible(beta)
         by_variance = 0.5 * weights * (weights * (trace + rss) - n)
         # d variance / d log sigma = 2 sigma², of what rows share times its share.
         change = 2.0 * np.exp(2.0 * eta[:count, None]) * self.entering
@@ -201,7 +205,6 @@ class _System:
             smooth = np.sum(factor * self.spectra[i] / prior)
             quadratic = factor * beta[where] @ penalty @ beta[where]
             spread = factor * np.sum(inverse[where, where] * penalty)
-            value += 0.5 * (np.sum(np.log(prior)) - quadratic)
             slope[count + i] = 0.5 * (smooth - spread - quadratic)
             # Roughly, beside a ridge: it decides how far to step, not where to end.
             turns[where, i] = beta[where] * smooth / len(prior)
@@ -215,7 +218,7 @@ class _System:
         square[count:, :count] = square[:count, count:].T
         square[count:, count:] = turns.T @ moved
         information = 0.5 * (square - both.T @ cho_solve((root, True), both, check_finite=False))
-        return value, slope, information
+        return slope, information
 
     def _precisions(self, eta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the weight of each error group, and the factor of each penalty."""
@@ -272,22 +275,26 @@ class _System:
 
     def _most_likely(self, eta: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
         """Return the noise and smoothness, as logarithms, that maximise L."""
-        value, slope, information = self.evaluate(eta)
+        value = self.value(eta)
         for _ in range(STEPS):
+            slope, information = self.derivatives(eta)
             free = np.where(slope > 0.0, eta < high, eta > low)
             step = _step(slope[free], information[np.ix_(free, free)])
-            if step @ slope[free] < GAIN:
+            promised = step @ slope[free]
+            if promised < GAIN:
                 break
             while True:
                 trial = eta.copy()
                 trial[free] = np.clip(eta[free] + step, low[free], high[free])
-                new = self.evaluate(trial)
-                if new[0] > value:
+                new = self.value(trial)
+                if new > value:
                     break
                 step *= 0.25
                 if np.max(np.abs(step)) < SHORTEST:
                     return eta
-            eta, (value, slope, information) = trial, new
+            eta, value = trial, new
+            if promised < LAST:
+                break
         return eta
 
     def _evidence(
@@ -300,18 +307,26 @@ class _System:
     ) -> float:
         """Return L with ½ log N for each unpenalised parameter in place of its determinant."""
         logs = np.log(np.diag(root))
+        value = self._likelihood(total, weights, beta) - logs[: self.p].sum()
+        value -= 0.5 * (self.unpenalised - self.p) * np.log(self.model.freedom.sum() - self.p)
+        return float(value - logs[self.unpenalised :].sum() + self._smooth(factors, beta))
+
+    def _likelihood(self, total: FloatArray, weights: FloatArray, beta: FloatArray) -> float:
+        """Return the log likelihood at an estimate, with the priors but the smoothness."""
         error = np.append(-beta, 1.0)
-        n = self.model.freedom
-        value = 0.5 * n @ np.log(weights) - 0.5 * error @ total @ error - logs[: self.p].sum()
-        value -= 0.5 * (self.unpenalised - self.p) * np.log(n.sum() - self.p)
-        value -= logs[self.unpenalised :].sum() + 0.5 * self._implausible(beta)
+        value = 0.5 * self.model.freedom @ np.log(weights) - 0.5 * error @ total @ error
+        return float(value - 0.5 * self._implausible(beta))
+
+    def _smooth(self, factors: FloatArray, beta: FloatArray) -> float:
+        """Return the log density of the penalised parameters by their smoothness."""
+        value = 0.0
         for index, penalty, spectrum, ridge, factor in zip(
             self.penalised, self.penalties, self.spectra, self.ridges, factors, strict=True
         ):
             where = self.where[index]
-            value += 0.5 * np.sum(np.log(factor * spectrum + ridge))
-            value -= 0.5 * factor * beta[where] @ penalty @ beta[where]
-        return float(value)
+            value += 0.5 * float(np.sum(np.log(factor * spectrum + ridge)))
+            value -= 0.5 * factor * float(beta[where] @ penalty @ beta[where])
+        return value
 
     def _implausible(self, beta: FloatArray) -> float:
         """Return the squared parameters in units of their priors, the smoothness not counted."""

@@ -14,7 +14,7 @@ from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.families import WHOLE, family_log_prior, grouped
 from remaster_ros.discovery.gain import shares
-from remaster_ros.discovery.plain_forms import AS_WELL, is_special_case
+from remaster_ros.discovery.plain_forms import AS_WELL, SCREENING_ERROR, is_special_case
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, screen
 from remaster_ros.discovery.selection import Selection
@@ -26,8 +26,6 @@ CONFUSABLE = 5.0
 # Odds of exp(3), twenty to one, do not decide between two causes.
 TIED = AS_WELL
 SHORTLIST = 10
-# The screening keeps the noise fixed, which costs it this much of the evidence.
-SCREENING_ERROR = 5.0
 # A cause of a smaller size, in its standard deviations, was as often wrong as right in the hidden
 # world (benchmarks/RESULTS.md).
 UNCERTAIN = 2.0
@@ -163,14 +161,13 @@ def with_sizes(cause: str, sizes: Sequence[str]) -> str:
 def describe(
     data: Residuals,
     selection: Selection,
-    cells: Sequence[Cell],
+    catalogue: Catalogue,
     progress: Callable[[float], None],
 ) -> tuple[tuple[tuple[Cell, ...], ...], tuple[FoundEffect, ...]]:
     """Return the chosen cells grouped to causes, and the causes, the largest first."""
     solution = selection.solution
     if not solution.cells:
         return (), ()
-    catalogue = Catalogue.of(data, [cell for cell in cells if not EFFECTS[cell.name].costly])
     groups = sorted(grouped(solution.cells), key=lambda group: -_size(data, solution, group))
     parts = shares(data, groups, solution)
     effects = []
@@ -268,7 +265,8 @@ def _look_alikes(
 
     Of one cell; those of two cells may be one of the two alone.
     """
-    score = screen(data, catalogue, replace(without, noise=solution.noise)).score
+    rest = replace(without, noise=solution.noise)
+    score = screen(data, catalogue, rest, chosen=catalogue.cheap).score
     best: dict[tuple[str, tuple[int, ...]], LookAlike] = {}
     cell, own = group[0], solution.log_evidence - without.log_evidence
     if len(group) == 1:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from remaster_ros.discovery.evidence import solve
+from remaster_ros.discovery.cross_validation import LeftOut
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray, IntArray
@@ -55,16 +55,9 @@ def compare_held_out(data: Residuals, solution: Solution, source: IntArray) -> H
     if min(data.poses, len(np.unique(pose))) < FEWEST_POSES:
         return None
     found = predicted_squares(data.only(source), solution)
-    count = min(FOLDS, data.poses)
-    fold = (np.arange(data.poses) % count)[data.pose_of_row]
-    expected = []
-    for mine in (fold == index for index in range(count)):
-        others = data.only(data.rows.source[~mine])
-        without = solve(others, solution.cells, solution)
-        if without is not None:
-            expected.append(predicted_squares(data.only(data.rows.source[mine]), without))
-    left_out = np.concatenate(expected) if expected else np.zeros(0)
-    if min(len(found), len(left_out)) < FEWEST_POSES:
+    fold = np.arange(data.poses) % min(FOLDS, data.poses)
+    left_out = LeftOut.of(data, solution.cells, solution.noise, fold).squares(solution)
+    if np.any(np.isnan(left_out)):
         return None
     return HeldOutPoses(
         float(np.sqrt(np.median(found) / np.median(left_out))),

@@ -11,10 +11,14 @@ from collections.abc import Callable, Sequence
 
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.screening import Catalogue, scores_in_place
 from remaster_ros.discovery.solution import Solution
 
 AS_WELL = 3.0
 """Log evidence by which a free form has to be better: odds of twenty to one."""
+SCREENING_ERROR = 5.0
+"""The screening keeps the noise fixed, which costs it this much of the evidence."""
 
 
 def is_special_case(cell: Cell, other: Cell) -> bool:
@@ -26,7 +30,8 @@ def is_special_case(cell: Cell, other: Cell) -> bool:
 
 def plainest(
     solution: Solution,
-    cells: Sequence[Cell],
+    data: Residuals,
+    catalogue: Catalogue,
     fit: Callable[[Sequence[Cell], Solution], Solution | None],
 ) -> Solution:
     """Return a solution with named shapes in place of free forms that are not better.
@@ -37,19 +42,28 @@ def plainest(
     ----------
     solution
         What a search found.
-    cells
-        All that were tried.
+    data, catalogue
+        The residuals, and all cells that were tried.
     fit
         Fits a set of cells.
     """
     for form in solution.cells:
         rest = [cell for cell in solution.cells if cell is not form]
-        named = [
-            found
-            for cell in cells
+        plain = [
+            cell
+            for cell in catalogue.cells
             if EFFECTS[form.name].is_cause
             and is_special_case(cell, form)
             and not EFFECTS[cell.name].costly
+        ]
+        if not plain:
+            continue
+        # Most often none comes near it: fits would cost ten times as much as to see that.
+        own, *others = scores_in_place(data, catalogue, solution, form, plain)
+        named = [
+            found
+            for cell, gained in zip(plain, others, strict=True)
+            if gained > own - AS_WELL - SCREENING_ERROR
             if (found := fit((*rest, cell), solution)) is not None and not found.unphysical()
         ]
         best = max(named, key=lambda found: found.log_evidence, default=None)

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from scipy.linalg import solve_triangular
 
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray, IntArray
@@ -97,15 +99,22 @@ class Catalogue:
             context.jacobian.astype(np.float32),
         )
 
+    @cached_property
+    def cheap(self) -> BoolArray:
+        """Which cells are not too many to be tried again and again, (cells,)."""
+        return np.array([not EFFECTS[cell.name].costly for cell in self.cells], dtype=bool)
+
     def block(self, columns: IntArray) -> NDArray[np.float32]:
         """Return displacements of the given columns, (n, 3, c), single precision."""
         at, position = self.at[columns], self.position[columns]
-        block = np.empty((len(self.jacobian), 3, len(columns)), np.float32)
         angle = at >= 0
-        block[:, :, angle] = (
-            self.jacobian[:, :, at[angle]] * self.features[:, None, position[angle]]
-        )
-        block[:, :, ~angle] = self.shifts[:, :, position[~angle]]
+        turned = np.take(self.jacobian, at[angle], axis=2)
+        turned *= np.take(self.features, position[angle], axis=1)[:, None]
+        if angle.all():
+            return turned
+        block = np.empty((len(self.jacobian), 3, len(columns)), np.float32)
+        block[:, :, angle] = turned
+        block[:, :, ~angle] = np.take(self.shifts, position[~angle], axis=2)
         return block
 
     def batches(self, chosen: IntArray) -> Iterator[IntArray]:
@@ -188,6 +197,22 @@ def screen(
         scores[batch] = value[:, 0]
         best = np.maximum(best, value.max(axis=0))
     return Screening(scores, best[1:].reshape(2, -1) if draws else np.zeros((2, 0)))
+
+
+def scores_in_place(
+    data: Residuals, catalogue: Catalogue, solution: Solution, cell: Cell, others: Sequence[Cell]
+) -> FloatArray:
+    """Return the score of a cell beside the rest of a set, and of others in its place.
+
+    With the noise and the smoothness of the whole set, (1 + others,); -inf for what is not among
+    all that are tried.
+    """
+    without = solution.less(solution.cells.index(cell), len(data))
+    keys = [one.key for one in (cell, *others)]
+    tried = [one.key for one in catalogue.cells]
+    score = screen(data, catalogue, without, chosen=np.array([key in keys for key in tried])).score
+    known = dict(zip(tried, score, strict=True))
+    return np.array([known.get(key, -np.inf) for key in keys])
 
 
 class _Projection:

@@ -93,18 +93,16 @@ class Solution:
         """
         cell, p, where = self.cells[index], len(self.base), self.slices()[index]
         every = np.concatenate((self.base, self.parameters))
-        out = p + np.arange(where.start, where.stop)
+        out = slice(p + where.start, p + where.stop)
         covariance, pull, determinant = _conditioned(self.full_covariance, out)
-        worth = (
-            0.5 * every[out] @ np.linalg.solve(self.full_covariance[np.ix_(out, out)], every[out])
-        )
+        worth = 0.5 * every[out] @ np.linalg.solve(self.full_covariance[out, out], every[out])
         unpenalised = self.unpenalised_covariance
         if cell.penalty is not None:
             prior = self.smoothness[index] * cell.roughness + self.ridge[where.start]
             price = 0.5 * (determinant + np.sum(np.log(prior)))
         else:
             before = sum(other.size for other in self.cells[:index] if other.penalty is None)
-            among = p + before + np.arange(cell.size)
+            among = slice(p + before, p + before + cell.size)
             unpenalised, _, alone = _conditioned(unpenalised, among)
             # Half log N in place of the determinant that the unpenalised ones have by themselves.
             price = 0.5 * (determinant - alone - cell.size * np.log(3.0 * rows - p))
@@ -117,7 +115,7 @@ class Solution:
             base=every[:p],
             full_covariance=covariance,
             smoothness=np.delete(self.smoothness, index),
-            ridge=np.delete(self.ridge, out - p),
+            ridge=np.delete(self.ridge, where),
             unpenalised_covariance=unpenalised,
             log_evidence=float(self.log_evidence - worth - price),
         )
@@ -141,13 +139,13 @@ class Solution:
         return precision
 
 
-def _conditioned(covariance: FloatArray, out: IntArray) -> tuple[FloatArray, FloatArray, float]:
+def _conditioned(covariance: FloatArray, out: slice) -> tuple[FloatArray, FloatArray, float]:
     """Return the covariance of the others were some parameters known, and what follows from these.
 
     Their regression on these, and the log determinant of the covariance of these.
     """
-    kept = np.delete(np.arange(len(covariance)), out)
-    own, across = covariance[np.ix_(out, out)], covariance[np.ix_(out, kept)]
+    own, across = covariance[out, out], np.delete(covariance[out], out, axis=1)
     pull: FloatArray = np.linalg.solve(own, across).T.astype(float, copy=False)
-    conditioned = covariance[np.ix_(kept, kept)] - pull @ across
+    conditioned = np.delete(np.delete(covariance, out, axis=0), out, axis=1)
+    conditioned -= pull @ across
     return conditioned, pull, float(np.linalg.slogdet(own)[1])

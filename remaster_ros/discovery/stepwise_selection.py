@@ -13,7 +13,7 @@ are chosen anew, and the rounds go on from there.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,6 +45,8 @@ DRAWS = 300
 SIGNIFICANCE_OF_ONE = 0.05
 DRAWS_OF_ONE = 200
 SHORTLIST = 8
+# A fit gains at most about so many times what the screening shows, and so much more.
+SHOWN, FURTHER = 2.0, 20.0
 ROUNDS = 8
 FOLDS = 10
 # What leaves less than this share of the held-out error out is not worth a parameter.
@@ -62,6 +64,8 @@ MOST_MERGED = 4
 TOGETHER = 10.0
 # A member of a family has to raise the evidence by this: a free form of no size costs nothing.
 MEMBER = 1.0
+# Fits kept, each with the covariance of all its parameters.
+KEPT_FITS = 16
 # A cell whose removal would cost this much evidence is kept without a test by itself.
 BEYOND_DOUBT = 20.0
 
@@ -91,7 +95,6 @@ class Search:
     progress: Callable[[float], None]
 
     def __post_init__(self) -> None:
-        self._cheap = np.array([not EFFECTS[cell.name].costly for cell in self.cells])
         self._structure = np.array([not EFFECTS[cell.name].is_cause for cell in self.cells])
         self._look_at(self.data)
 
@@ -100,6 +103,9 @@ class Search:
         self.catalogue = Catalogue.of(data, self.cells)
         fold_of_pose = self.rng.permutation(data.poses) % min(FOLDS, data.poses)
         self._left_out = Comparisons(data, fold_of_pose)
+        # The last fits, the latest at the end, and the sets whose members have been tested.
+        self._fits: dict[frozenset[Cell], Solution | None] = {}
+        self._withstood: set[frozenset[Cell]] = set()
 
     def run(self, given: Solution | None = None) -> Selection:
         """Search until nothing passes both tests."""
@@ -174,39 +180,76 @@ class Search:
             return None
         if not self.data.leaves_noise(cells):
             return None
-        return solve(self.data, cells, start, prior=family_log_prior(cells, self.catalogue.cells))
+        # Different ways lead to one set again and again.
+        wanted = frozenset(cells)
+        if wanted in self._fits:
+            found = self._fits.pop(wanted)
+        else:
+            prior = family_log_prior(cells, self.catalogue.cells)
+            found = solve(self.data, cells, start, prior=prior)
+        self._fits[wanted] = found
+        while len(self._fits) > KEPT_FITS:
+            del self._fits[next(iter(self._fits))]
+        return found
 
-    def propose(self, solution: Solution, screening: Screening) -> list[Proposal]:
-        """Return sets one step on that raise the evidence, the best first."""
-        shortlist = np.argsort(-screening.score)[:SHORTLIST]
+    def propose(self, solution: Solution, screening: Screening) -> Iterator[Proposal]:
+        """Give sets one step on that raise the evidence, the best first.
+
+        What the screening shows to gain far less than another is fitted once that has failed.
+        """
+        score = screening.score
         # Structure that hides in the noise common to a pose shows only when that is fitted again.
-        hidden = np.setdiff1d(np.flatnonzero(self._structure), shortlist)
-        found = []
-        for index in np.concatenate((shortlist, hidden)):
-            score, located = float(screening.score[index]), self._structure[index]
-            # One cell alone has this p-value, however well it fits.
-            if not (located and np.isfinite(score)) and screening.p_value(score) > SIGNIFICANCE:
-                continue
-            candidate = self.fit((*solution.cells, self.catalogue.cells[index]), solution)
-            if candidate is not None and not candidate.unphysical():
-                if located:
-                    score = max(score, candidate.log_evidence - solution.log_evidence)
-                found.append(Proposal(candidate, screening.p_value(score)))
-        for family in FAMILIES:
-            candidate = self.grown(solution, family)
-            if candidate is not None:
-                gain = candidate.log_evidence - solution.log_evidence
-                mine = [cell.name in family for cell in self.catalogue.cells]
-                if gain > TOGETHER or np.any(screening.score[mine] > 0.0):
-                    found.append(Proposal(candidate, screening.p_value(gain)))
-        found = [
-            one
-            for one in found
-            if one.solution.log_evidence > solution.log_evidence
-            # What is left of a family is judged anew.
-            and (one.p_value <= SIGNIFICANCE or len(one.solution.cells) > len(solution.cells) + 1)
+        hidden = np.flatnonzero(self._structure & np.isfinite(score))
+        tried = [self._with_one(solution, screening, index) for index in hidden]
+        tried += [self._with_family(solution, screening, family) for family in FAMILIES]
+        found = [one for one in tried if one is not None]
+        # One cell alone has this p-value, however well it fits. The best is the last.
+        waiting = [
+            index
+            for index in np.argsort(-score)[:SHORTLIST][::-1]
+            if not self._structure[index] and screening.p_value(score[index]) <= SIGNIFICANCE
         ]
-        return sorted(found, key=lambda one: -one.solution.log_evidence)
+        while True:
+            best = max(found, key=lambda one: one.solution.log_evidence, default=None)
+            gain = best.solution.log_evidence - solution.log_evidence if best else -np.inf
+            if waiting and SHOWN * score[waiting[-1]] + FURTHER > gain:
+                one = self._with_one(solution, screening, waiting.pop())
+                found += [] if one is None else [one]
+            elif best is not None:
+                found.remove(best)
+                yield best
+            else:
+                return
+
+    def _with_one(
+        self, solution: Solution, screening: Screening, index: np.intp
+    ) -> Proposal | None:
+        """Return the set with one cell of the catalogue more; None where that is no proposal."""
+        score, located = screening.score[index], self._structure[index]
+        candidate = self.fit((*solution.cells, self.catalogue.cells[index]), solution)
+        if candidate is None or candidate.unphysical():
+            return None
+        gain = candidate.log_evidence - solution.log_evidence
+        p_value = screening.p_value(max(score, gain) if located else score)
+        return Proposal(candidate, p_value) if gain > 0.0 and p_value <= SIGNIFICANCE else None
+
+    def _with_family(
+        self, solution: Solution, screening: Screening, family: tuple[str, ...]
+    ) -> Proposal | None:
+        """Return the set with a family; None where that is no proposal."""
+        candidate = self.grown(solution, family)
+        if candidate is None:
+            return None
+        gain = candidate.log_evidence - solution.log_evidence
+        mine = [cell.name in family for cell in self.catalogue.cells]
+        p_value = screening.p_value(gain)
+        # What is left of a family is judged anew.
+        whole = len(candidate.cells) > len(solution.cells) + 1
+        if gain <= 0.0 or not (whole or p_value <= SIGNIFICANCE):
+            return None
+        if gain > TOGETHER or np.any(screening.score[mine] > 0.0):
+            return Proposal(candidate, p_value)
+        return None
 
     def grown(self, solution: Solution, family: tuple[str, ...]) -> Solution | None:
         """Return the set with all of a family whose members each raise the evidence.
@@ -331,6 +374,9 @@ class Search:
         predict poses left out, and to beat itself on surrogate residuals. So has what joined a
         given solution without relatives.
         """
+        if given is None and frozenset(solution.cells) in self._withstood:
+            # Chance would have one more try at them.
+            return solution
         price = np.log(3.0 * len(self.data))
         tested: set[Cell] = set()
         while True:
@@ -344,6 +390,7 @@ class Search:
                 and (worth := worth_of(solution, cell, where, price)) < BEYOND_DOUBT
             ]
             if not weak:
+                self._withstood.add(frozenset(solution.cells))
                 return solution
             _, index = min(weak)
             cell = solution.cells[index]
@@ -371,7 +418,8 @@ class Search:
         if without is None:
             return []
         without = replace(without, noise=solution.noise)
-        chosen = self._cheap & np.array([other not in cells for other in self.catalogue.cells])
+        others = np.array([other not in cells for other in self.catalogue.cells])
+        chosen = self.catalogue.cheap & others
         score = screen(self.data, self.catalogue, without, chosen=chosen).score
         found = []
         for index in np.argsort(-score)[:count]:

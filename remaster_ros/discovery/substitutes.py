@@ -16,6 +16,9 @@ from remaster_ros.discovery.solution import Solution
 
 # Families join one after another: this often at most.
 JOINS = 6
+# Together families gain about the sum of what each does by itself. Where that, so many times, and
+# so much more does not make up for the structure, the others are not tried beside the best.
+AT_MOST, FURTHER = 2.0, 10.0
 
 
 def named_instead(
@@ -45,6 +48,9 @@ def named_instead(
         if better is None:
             return solution
         joined = [one for family in FAMILIES if (one := grown(better, family)) is not None]
+        gains = [max(0.0, one.log_evidence - better.log_evidence) for one in joined]
+        if solution.log_evidence - better.log_evidence > AT_MOST * sum(gains) + FURTHER:
+            return solution
         best = max(joined, key=lambda one: one.log_evidence, default=better)
         if best.log_evidence <= better.log_evidence + least:
             break

@@ -222,11 +222,11 @@ def test_restricted_likelihood_has_the_gradient_it_says(name, split):
     ridge = np.where(np.arange(len(unit)) < p, 0.0, 0.5)
     system = _System(model, grams, noise, cells, data.base_precision, unit, ridge)
     eta, _, _ = system._start(None)
-    _, gradient, information = system.evaluate(eta)
+    gradient, information = system.derivatives(eta)
     for i in range(len(eta)):
         step = np.zeros(len(eta))
         step[i] = 1e-5
-        numeric = (system.evaluate(eta + step)[0] - system.evaluate(eta - step)[0]) / 2e-5
+        numeric = (system.value(eta + step) - system.value(eta - step)) / 2e-5
         assert gradient[i] == pytest.approx(numeric, rel=1e-3, abs=1e-3)
     # The average of observed and expected information has no negative direction.
     assert np.linalg.eigvalsh(information).min() > -1e-9 * np.trace(information)

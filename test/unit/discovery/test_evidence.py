@@ -107,7 +107,7 @@ def test_noise_and_smoothness_are_where_no_small_step_raises_the_likelihood(scen
         patch.setattr(evidence._System, 'solution', kept)
         assert solve(data, scene[1]) is not None
     ((system, eta),) = systems
-    most = system.evaluate(eta)[0]
+    most = system.value(eta)
     for step in 0.3 * np.eye(len(eta)):
-        assert system.evaluate(eta + step)[0] < most + 0.05
-        assert system.evaluate(eta - step)[0] < most + 0.05
+        assert system.value(eta + step) < most + 0.05
+        assert system.value(eta - step) < most + 0.05

@@ -1,7 +1,7 @@
 """The decision between look-alikes: of two cells, of one of them, and of a free form."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from discovery_scenes import at_joint, residuals_of, session_with
@@ -14,6 +14,7 @@ from remaster_ros.discovery.explain import TIED, LookAlike, describe
 from remaster_ros.discovery.model_averaging import moved_by_look_alikes
 from remaster_ros.discovery.plain_forms import is_special_case, plainest
 from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.screening import Catalogue
 from remaster_ros.discovery.selection import Selection, Step
 from remaster_ros.types import Session
 
@@ -45,6 +46,14 @@ def fitted(data: Residuals, cells) -> Solution:
     return found
 
 
+def described(data: Residuals, selection: Selection, cells):
+    return describe(data, selection, Catalogue.of(data, cells), lambda share: None)
+
+
+def plain(data: Residuals, cells, before: Solution) -> Solution:
+    return plainest(before, data, Catalogue.of(data, cells), partial(solve, data))
+
+
 def selected(data: Residuals, cells) -> Selection:
     solution = fitted(data, cells)
     gain = solution.log_evidence - fitted(data, ()).log_evidence
@@ -61,7 +70,7 @@ def test_a_free_form_gives_way_to_the_shape_that_explains_as_much():
     ]
     assert not is_special_case(curve, named[0])
     before = fitted(data, [curve])
-    found = plainest(before, cells, lambda chosen, start: solve(data, tuple(chosen), start))
+    found = plain(data, cells, before)
     assert [(cell.name, cell.joints) for cell in found.cells] == [('encoder_eccentricity', (2,))]
     assert found.log_evidence > before.log_evidence - TIED
 
@@ -74,16 +83,14 @@ def test_a_free_form_that_is_better_stays():
     )
     cells = [*cells_of(data, 'encoder_eccentricity', 2), *cells_of(data, 'joint_error_curve', 2)]
     before = fitted(data, cells[-1:])
-    assert (
-        plainest(before, cells, lambda chosen, start: solve(data, tuple(chosen), start)) is before
-    )
+    assert plain(data, cells, before) is before
 
 
 def test_a_free_form_leaves_the_shape_that_was_found_in_no_doubt():
     data = eccentric()
     (curve,) = cells_of(data, 'joint_error_curve', 2)
     shapes = cells_of(data, 'encoder_eccentricity', 2)
-    _, (effect,) = describe(data, selected(data, shapes[:1]), [*shapes, curve], lambda share: None)
+    _, (effect,) = described(data, selected(data, shapes[:1]), [*shapes, curve])
     listed = {other.name: other for other in effect.confusable_with}
     if curve.name in listed:
         assert listed[curve.name].general
@@ -95,7 +102,7 @@ def test_what_two_cells_explain_may_be_one_other_or_one_of_them():
     data = eccentric()
     both = cells_of(data, 'encoder_scale', 2, 6)
     others = [*both, *cells_of(data, 'encoder_eccentricity', 2)]
-    _, (effect,) = describe(data, selected(data, both), others, lambda share: None)
+    _, (effect,) = described(data, selected(data, both), others)
     assert effect.joints == (2, 6)
     listed = {(other.name, other.joints) for other in effect.confusable_with}
     assert ('encoder_scale', (2,)) in listed
@@ -126,7 +133,7 @@ def test_a_look_alike_widens_the_posterior_by_how_likely_it_is():
     data = Residuals.of(found)
     selection = selected(data, cells_of(data, 'encoder_eccentricity', 2)[:1])
     solution = selection.solution
-    groups, (effect,) = describe(data, selection, solution.cells, lambda share: None)
+    groups, (effect,) = described(data, selection, solution.cells)
     assert effect.confusable_with == ()
     gain = effect.log_evidence_gain
     alike = LookAlike('joint_compliance', (3,), gain - 1.0, '')
