@@ -25,8 +25,7 @@ from remaster_ros.types import BoolArray, FloatArray
 # proposals, which the sampler corrects.
 SETTLED, NEAR_ENOUGH = 1e-2, 0.1
 FIRST_STEPS, MOST_STEPS = 12, 60
-# A longer step may lead to where the tangent no longer holds: it is halved until the density
-# rises, so many times at most.
+# A longer step may lead to where the tangent no longer holds: it is halved then, so many times.
 TRUSTED = 0.1
 HALVINGS = 10
 # Share of a step by which the bend of the predictions along it is judged.
@@ -146,10 +145,10 @@ def find_mode(posterior: Posterior, eta: FloatArray | None = None) -> Mode:
 def _uphill(
     linearisation: Linearisation, free: FloatArray, step: FloatArray, eta: FloatArray
 ) -> FloatArray:
-    """Return the free parameters after the longest of step, step / 2, … that raises the density.
+    """Return the free parameters after a step, or the best of shorter ones, at a higher density.
 
-    Given the noise each Gauss-Newton step points uphill. A shorter one than the whole follows the
-    bend of the predictions (Transtrum & Sethna 2012, arXiv:1201.5885).
+    Given the noise each Gauss-Newton step points uphill. A shorter one than the whole may follow
+    the bend of the predictions (Transtrum & Sethna 2012, arXiv:1201.5885).
     """
     posterior = linearisation.posterior
 
@@ -186,8 +185,7 @@ def _bend(linearisation: Linearisation, step: FloatArray, eta: FloatArray) -> Fl
 
     grams = posterior.noise_model.gram(joined, f + 1, f)
     pull = (1.0 / posterior.variances(eta)) @ grams[:, 0, :f]
-    bend: FloatArray = -0.5 * np.linalg.solve(linearisation.gram(eta)[:f, :f], pull)
-    return bend
+    return np.asarray(-0.5 * np.linalg.solve(linearisation.gram(eta)[:f, :f], pull))
 
 
 def _open_direction(linearisation: Linearisation, eta: FloatArray, step: FloatArray) -> FloatArray:

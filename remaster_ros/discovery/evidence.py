@@ -169,7 +169,7 @@ class _System:
         return self.model.noise(np.exp(eta[:count]), np.exp(eta[count : len(self.entering)]))
 
     def value(self, eta: FloatArray) -> float:
-        """Return L, by eta: logarithms of the sigmas, of what rows share, and of the smoothness."""
+        """Return L, by eta: logarithms of the sigmas, of what rows share, of the smoothness."""
         weights, factors = self._precisions(eta)
         total, root, beta, _ = self._solved(eta)
         value = self._likelihood(total, weights, beta) - np.sum(np.log(np.diag(root)))

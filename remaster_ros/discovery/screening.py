@@ -108,7 +108,7 @@ class Catalogue:
         """Return displacements of the given columns, (n, 3, c), single precision."""
         at, position = self.at[columns], self.position[columns]
         angle = at >= 0
-        turned = np.take(self.jacobian, at[angle], axis=2)
+        turned: NDArray[np.float32] = np.take(self.jacobian, at[angle], axis=2)
         turned *= np.take(self.features, position[angle], axis=1)[:, None]
         if angle.all():
             return turned

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from calibration_scenes import CHAIN, extension, one_tool_direction, scene
 
-from remaster_ros.calibration import sampling
+from remaster_ros.calibration import laplace, sampling
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.laplace import find_mode
@@ -127,3 +127,20 @@ def test_effects_that_do_not_hold_are_blamed_not_the_units() -> None:
     with pytest.raises(InsufficientDataError, match='further effects do not hold') as caught:
         estimate(Problem.of(session), given)
     assert 'units' not in str(caught.value)
+
+
+def test_a_bend_is_what_a_step_leaves_to_second_order(session) -> None:
+    mode = estimate(Problem.of(session)).mode
+    posterior = mode.linearisation.posterior
+    free = posterior.free
+    values, vectors = np.linalg.eigh(mode.covariance)
+    # Ten standard deviations along what is known worst.
+    step = 10.0 * np.sqrt(values[-1]) * vectors[:, -1]
+    bend = laplace._bend(mode.linearisation, step, mode.eta)
+
+    def density(share: float, bent: float) -> float:
+        point = mode.z[free] + share * step + bent * share**2 * bend
+        return float(posterior.log_density(np.concatenate((point, mode.eta))[None])[0])
+
+    for share in (0.25, 0.5, 1.0):
+        assert density(share, 1.0) > max(density(share, 0.0), density(share, 2.0))

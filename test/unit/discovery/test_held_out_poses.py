@@ -5,6 +5,7 @@ import pytest
 from discovery_scenes import residuals_of, session_with
 from scipy.stats import multivariate_normal
 
+from remaster_ros.discovery.cross_validation import LeftOut
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.held_out_poses import compare_held_out, predicted_squares
 from remaster_ros.discovery.residuals import Residuals
@@ -56,6 +57,35 @@ def test_errors_are_in_units_of_what_is_uncertain_of_the_prediction():
         density = multivariate_normal(cov=uncertain).logpdf(errors)
         at_most = multivariate_normal(cov=uncertain).logpdf(np.zeros(len(errors)))
         assert squares[pose] == pytest.approx(2.0 * (at_most - density) / len(errors))
+
+
+def test_poses_left_out_are_judged_as_by_a_fit_to_the_others():
+    """By one factor of all rows, against least squares of the others alone."""
+    data, solution, _ = fitted(session_with(3, poses=12))
+    fold = np.arange(data.poses) % 5
+    squares = LeftOut.of(data, (), solution.noise, fold).squares(solution)
+    X = data.noise_model.whitened(data.base, solution.noise)
+    y = data.noise_model.whitened(data.errors, solution.noise)
+    for index in range(5):
+        mine = fold[data.pose_of_row] == index
+        columns, errors = X[~mine].reshape(-1, X.shape[2]), y[~mine].ravel()
+        H = columns.T @ columns + data.base_precision
+        estimate = np.linalg.solve(H, columns.T @ errors)
+        left = errors @ errors - estimate @ H @ estimate
+        noise = left / (len(errors) - X.shape[2])
+        for pose in np.unique(data.pose_of_row[mine]):
+            own = data.pose_of_row == pose
+            rows, error = X[own].reshape(-1, X.shape[2]), y[own].ravel()
+            error = error - rows @ estimate
+            uncertain = np.eye(len(error)) + rows @ np.linalg.solve(H, rows.T)
+            expected = error @ np.linalg.solve(uncertain, error) / (noise * len(error))
+            assert squares[pose] == pytest.approx(expected, rel=1e-3)
+
+
+def test_poses_that_leave_no_noise_to_judge_by_have_no_squares():
+    data, solution, _ = fitted(session_with(3, poses=12))
+    fold = np.zeros(data.poses, dtype=np.int64)
+    assert np.all(np.isnan(LeftOut.of(data, (), solution.noise, fold).squares(solution)))
 
 
 def test_a_sensor_that_was_moved_before_the_held_out_poses_is_seen():

@@ -85,6 +85,11 @@ def test_a_free_form_that_is_better_stays():
     before = fitted(data, cells[-1:])
     assert plain(data, cells, before) is before
 
+    def hopeless(*_: object) -> Solution:
+        raise AssertionError('a shape was fitted that explains next to nothing')
+
+    assert plainest(before, data, Catalogue.of(data, cells), hopeless) is before
+
 
 def test_a_free_form_leaves_the_shape_that_was_found_in_no_doubt():
     data = eccentric()

@@ -13,6 +13,7 @@ from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.discovery import stepwise_selection
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
+from remaster_ros.discovery.families import FAMILIES
 from remaster_ros.discovery.residuals import STEP_STD, Residuals
 from remaster_ros.discovery.screening import screen
 from remaster_ros.discovery.stepwise_selection import (
@@ -221,3 +222,63 @@ def test_a_cell_alone_that_chance_explains_is_not_proposed_and_a_family_is_tried
     for one in search.propose(empty, higher):
         assert len(one.solution.cells) > 1 or one.p_value <= SIGNIFICANCE
         assert one.solution.log_evidence > empty.log_evidence
+
+
+def test_what_waits_for_others_to_fail_is_proposed_in_the_same_order(monkeypatch):
+    search = searching(residuals_of(session_with(5, angles=waves_of_three_joints)))
+    empty = search.fit(())
+    rng = np.random.default_rng(8)
+    screening = screen(search.data, search.catalogue, empty, rng=rng, draws=DRAWS)
+    fitted = []
+
+    def counted(*args, **options):
+        fitted.append(args[1])
+        return solve(*args, **options)
+
+    monkeypatch.setattr(stepwise_selection, 'solve', counted)
+    best = next(search.propose(empty, screening))
+    first = len(fitted)
+    proposed = [one.solution.cells for one in search.propose(empty, screening)]
+    assert best.solution.cells == proposed[0]
+    assert len(fitted) > first
+    monkeypatch.setattr(stepwise_selection, 'FURTHER', np.inf)
+    assert [one.solution.cells for one in search.propose(empty, screening)] == proposed
+
+
+def test_what_was_fitted_or_tested_is_not_fitted_or_tested_again(monkeypatch):
+    search = searching(residuals_of(session_with(5, angles=waves_of_three_joints)))
+    curves = [cell for cell in search.cells if cell.name == 'joint_error_curve']
+    found = search.backward_elimination(search.fit(curves))
+    assert 3 <= len(found.cells) < len(curves)
+
+    def again(*_, **__):
+        raise AssertionError('computed again')
+
+    monkeypatch.setattr(stepwise_selection, 'solve', again)
+    monkeypatch.setattr(stepwise_selection, 'screen', again)
+    assert search.fit(found.cells[::-1]) is search.fit(found.cells)
+    assert search.backward_elimination(found) is found
+    # Other rows are another matter.
+    search._look_at(search.data.only(search.data.rows.source[1:]))
+    with pytest.raises(AssertionError, match='computed again'):
+        search.fit(found.cells)
+
+
+@pytest.mark.parametrize(('behind', 'tried'), [(200.0, 1), (40.0, 3)])
+def test_families_that_cannot_make_up_for_structure_are_not_tried_beside_the_best(behind, tried):
+    search = searching(residuals_of(session_with(5, sensor=bent)))
+    named = search.fit([cell for cell in search.cells if cell.name == 'joint_error_curve'][:1])
+    field = next(cell for cell in search.cells if cell.name == 'sensor_field')
+    begun = replace(named, cells=(*named.cells, field), log_evidence=named.log_evidence + behind)
+    passes = []
+
+    def grown(solution, family):
+        if family is FAMILIES[0]:
+            passes.append(family)
+        # Two families that gain something, in the first two passes.
+        if family not in FAMILIES[:2] or len(passes) > 2:
+            return None
+        return replace(solution, log_evidence=solution.log_evidence + 15.0 / len(passes))
+
+    assert named_instead(begun, lambda cells, start: named, grown, HYSTERESIS) is begun
+    assert len(passes) == tried
