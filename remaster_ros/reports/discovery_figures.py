@@ -54,7 +54,7 @@ def draw_discovery(discovery: Discovery) -> dict[str, str]:
 
 
 def gain(discovery: Discovery) -> Figure:
-    """Draw the errors before and after, and their pose-common and within-pose parts."""
+    """Draw the errors before and after, and what a pose's readings share of them, where known."""
     figure = Figure(figsize=(WIDTH_IN, 2.6), layout='constrained')
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     data, selection = discovery.residuals, discovery.selection
@@ -64,25 +64,31 @@ def gain(discovery: Discovery) -> Figure:
     lengths = [1e3 * np.linalg.norm(error[rows], axis=1) for error in errors]
     error_histograms(left, *(np.maximum(values, 1e-4) for values in lengths))
     left.set_title('Held-out poses' if held_out.any() else 'Fitted poses')
-    left.legend(loc='upper left')
+    left.legend(loc='best')
 
-    names = data.context.sensor_names
+    model = data.noise_model
     fits = selection.empty, selection.solution
-    noises = [data.noise_model.sensor_noise(fit.noise) for fit in fits]
-    # By sensor, before or after, and part: shared by a pose, or within.
-    values = 1e3 * np.array(
-        [(noise.pose_sigma, np.hypot(noise.sigma, noise.frame_sigma)) for noise in noises]
-    )
-    values = values.transpose(2, 1, 0).reshape(-1, 2)
+    noises = [model.sensor_noise(fit.noise) for fit in fits]
+    # Where a sensor has one reading at every pose, what they share is not known.
+    separable = {model.channels[index].sensor for index in model.separable}
+    labels, values = [], []
+    for sensor, name in enumerate(data.context.sensor_names):
+        within = [np.hypot(noise.sigma, noise.frame_sigma)[sensor] for noise in noises]
+        if sensor in separable:
+            labels += [f'{name[:20]}, shared', f'{name[:20]}, within']
+            values += [[noise.pose_sigma[sensor] for noise in noises], within]
+        else:
+            labels.append(name[:20])
+            values.append(within)
     y = np.arange(len(values))
     for column, (color, label) in enumerate(((BEFORE, 'before'), (AFTER, 'after'))):
-        right.barh(y + 0.36 * column - 0.18, values[:, column], 0.34, color=color, label=label)
-    parts = ('shared', 'within')
-    right.set_yticks(y.tolist(), [f'{name[:20]}, {part}' for name in names for part in parts])
+        lengths_mm = 1e3 * np.array(values)[:, column]
+        right.barh(y + 0.36 * column - 0.18, lengths_mm, 0.34, color=color, label=label)
+    right.set_yticks(y.tolist(), labels)
     right.invert_yaxis()
     right.grid(False, axis='y')
     right.set_xlabel('RMS per axis (mm)')
-    right.set_title('Errors shared by a pose, and within')
+    right.set_title('Shared by a pose, and within' if separable else 'Errors of a reading')
     return figure
 
 
