@@ -52,3 +52,11 @@ def across_and_along(error: np.ndarray, position: np.ndarray) -> tuple[float, fl
     ray = position / np.linalg.norm(position)
     along = float(error @ ray)
     return float(np.linalg.norm(error - along * ray)), along
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+    """Wait until a condition holds."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, 'waited in vain'
+        time.sleep(0.005)
