@@ -24,7 +24,10 @@ WELL_CONDITIONED = 1e-6
 def worth_of(solution: Solution, cell: Cell, where: slice, price: float) -> float:
     """Estimate how much log evidence would be lost without a cell."""
     values, covariance = solution.parameters[where], solution.covariance[where, where]
-    drop = 0.5 * values @ np.linalg.solve(covariance, values)
+    if cell.size == 1:
+        drop = 0.5 * values[0] ** 2 / covariance[0, 0]
+    else:
+        drop = 0.5 * values @ np.linalg.solve(covariance, values)
     if cell.penalty is None:
         return float(drop - 0.5 * cell.size * price)
     return float(drop - 0.5 * cell.size)
@@ -205,14 +208,18 @@ class Comparisons:
 
     def __init__(self, data: Residuals, fold_of_pose: IntArray) -> None:
         self.data, self.fold_of_pose = data, fold_of_pose
-        # The larger set is compared with many smaller ones in turn.
+        # The larger set is compared with many smaller ones in turn, some of them again later.
         self._last: tuple[Solution, LeftOut, FloatArray] | None = None
+        self._known: dict[tuple[object, ...], tuple[float, float]] = {}
 
     def saved(self, smaller: Solution, larger: Solution) -> tuple[float, float]:
         """Return the share of the smaller set's deviance that the larger one saves.
 
         And the standard error that it has by the choice of poses.
         """
+        both = tuple((frozenset(one.cells), one.log_evidence) for one in (smaller, larger))
+        if both in self._known:
+            return self._known[both]
         last = self._last
         if last is None or last[0] is not larger or not set(smaller.cells) <= set(last[1].cells):
             cells = tuple(dict.fromkeys((*larger.cells, *smaller.cells)))
@@ -222,7 +229,9 @@ class Comparisons:
         before = last[1].deviance(smaller)
         saved = before - last[2]
         error = np.sqrt(len(saved)) * saved.std()
-        return float(saved.sum() / before.sum()), float(error / before.sum())
+        found = float(saved.sum() / before.sum()), float(error / before.sum())
+        self._known[both] = found
+        return found
 
 
 def _inverse(information: FloatArray) -> FloatArray:

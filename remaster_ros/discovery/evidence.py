@@ -254,7 +254,10 @@ class _System:
         weights, factors = self._precisions(eta)
         total, root, beta, lower = self._solved(eta)
         evidence = self._evidence(total, root, weights, factors, beta)
-        covariance = (lower + np.tril(lower, -1).T) / np.outer(self.unit, self.unit)
+        covariance = lower + lower.T
+        np.einsum('ii->i', covariance)[:] *= 0.5
+        covariance /= self.unit[:, None]
+        covariance /= self.unit
         part, unit = slice(self.unpenalised), self.unit[: self.unpenalised]
         unpenalised = cho_solve((root[part, part], True), np.eye(len(unit))) / np.outer(unit, unit)
         beta = beta / self.unit

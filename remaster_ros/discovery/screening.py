@@ -104,6 +104,16 @@ class Catalogue:
         """Which cells are not too many to be tried again and again, (cells,)."""
         return np.array([not EFFECTS[cell.name].costly for cell in self.cells], dtype=bool)
 
+    def which(self, cells: Sequence[Cell]) -> BoolArray:
+        """Return which cells of the catalogue are among others, (cells,)."""
+        found = np.zeros(len(self.cells), dtype=bool)
+        found[[self._places[cell.key] for cell in cells if cell.key in self._places]] = True
+        return found
+
+    @cached_property
+    def _places(self) -> dict[object, int]:
+        return {cell.key: index for index, cell in enumerate(self.cells)}
+
     def block(self, columns: IntArray) -> NDArray[np.float32]:
         """Return displacements of the given columns, (n, 3, c), single precision."""
         at, position = self.at[columns], self.position[columns]
@@ -189,9 +199,8 @@ def screen(
     n_eff = 3 * len(data) - data.base.shape[2]
     scores = np.full(len(catalogue.cells), -np.inf)
     best = np.full(surrogates.shape[1], -np.inf)
-    wanted = np.arange(len(catalogue.cells)) if chosen is None else np.flatnonzero(chosen)
-    present = {cell.key for cell in given.cells}
-    wanted = np.array([i for i in wanted if catalogue.cells[i].key not in present], dtype=int)
+    others = ~catalogue.which(given.cells)
+    wanted = np.flatnonzero(others if chosen is None else others & chosen)
     for batch in catalogue.batches(wanted):
         value = _scores(data, catalogue, batch, project, surrogates, noise, n_eff)
         scores[batch] = value[:, 0]
@@ -208,11 +217,9 @@ def scores_in_place(
     all that are tried.
     """
     without = solution.less(solution.cells.index(cell), len(data))
-    keys = [one.key for one in (cell, *others)]
-    tried = [one.key for one in catalogue.cells]
-    score = screen(data, catalogue, without, chosen=np.array([key in keys for key in tried])).score
-    known = dict(zip(tried, score, strict=True))
-    return np.array([known.get(key, -np.inf) for key in keys])
+    score = screen(data, catalogue, without, chosen=catalogue.which((cell, *others))).score
+    known = dict(zip((one.key for one in catalogue.cells), score, strict=True))
+    return np.array([known.get(one.key, -np.inf) for one in (cell, *others)])
 
 
 class _Projection:

@@ -65,7 +65,7 @@ TOGETHER = 10.0
 # A member of a family has to raise the evidence by this: a free form of no size costs nothing.
 MEMBER = 1.0
 # Fits kept, each with the covariance of all its parameters.
-KEPT_FITS = 16
+KEPT_FITS = 48
 # A cell whose removal would cost this much evidence is kept without a test by itself.
 BEYOND_DOUBT = 20.0
 
@@ -103,9 +103,8 @@ class Search:
         self.catalogue = Catalogue.of(data, self.cells)
         fold_of_pose = self.rng.permutation(data.poses) % min(FOLDS, data.poses)
         self._left_out = Comparisons(data, fold_of_pose)
-        # The last fits, the latest at the end, and the sets whose members have been tested.
+        # The last fits, the latest at the end.
         self._fits: dict[frozenset[Cell], Solution | None] = {}
-        self._withstood: set[frozenset[Cell]] = set()
 
     def run(self, given: Solution | None = None) -> Selection:
         """Search until nothing passes both tests."""
@@ -374,9 +373,6 @@ class Search:
         predict poses left out, and to beat itself on surrogate residuals. So has what joined a
         given solution without relatives.
         """
-        if given is None and frozenset(solution.cells) in self._withstood:
-            # Chance would have one more try at them.
-            return solution
         price = np.log(3.0 * len(self.data))
         tested: set[Cell] = set()
         while True:
@@ -390,7 +386,6 @@ class Search:
                 and (worth := worth_of(solution, cell, where, price)) < BEYOND_DOUBT
             ]
             if not weak:
-                self._withstood.add(frozenset(solution.cells))
                 return solution
             _, index = min(weak)
             cell = solution.cells[index]
@@ -405,7 +400,7 @@ class Search:
             return False
         if not self.predicts(solution, without):
             return False
-        own = np.array([other.key == cell.key for other in self.catalogue.cells])
+        own = self.catalogue.which([cell])
         screening = screen(
             self.data, self.catalogue, without, rng=self.rng, draws=DRAWS_OF_ONE, chosen=own
         )
