@@ -14,10 +14,11 @@ from dataclasses import replace
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.families import grouped
 from remaster_ros.discovery.memory import Memory
+from remaster_ros.discovery.proposals import SIGNIFICANCE
 from remaster_ros.discovery.screening import screen
 from remaster_ros.discovery.set_aside import is_memory, remembering
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.stepwise_selection import SIGNIFICANCE, Search
+from remaster_ros.discovery.stepwise_selection import Search
 
 DRAWS = 200
 

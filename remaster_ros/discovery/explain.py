@@ -270,8 +270,7 @@ def _look_alikes(
     best: dict[tuple[str, tuple[int, ...]], LookAlike] = {}
     cell, own = group[0], solution.log_evidence - without.log_evidence
     if len(group) == 1:
-        mine = [i for i, other in enumerate(catalogue.cells) if other.key == cell.key]
-        own = score[mine[0]] if mine else -np.inf
+        own = float(np.max(score[catalogue.which([cell])], initial=-np.inf))
     least = own - SCREENING_ERROR - CONFUSABLE
     for index in np.argsort(-score)[:SHORTLIST]:
         other = catalogue.cells[index]

@@ -104,14 +104,20 @@ class Catalogue:
         """Which cells are not too many to be tried again and again, (cells,)."""
         return np.array([not EFFECTS[cell.name].costly for cell in self.cells], dtype=bool)
 
+    @cached_property
+    def structure(self) -> BoolArray:
+        """Which cells locate structure and claim no cause, (cells,)."""
+        return np.array([not EFFECTS[cell.name].is_cause for cell in self.cells], dtype=bool)
+
     def which(self, cells: Sequence[Cell]) -> BoolArray:
         """Return which cells of the catalogue are among others, (cells,)."""
         found = np.zeros(len(self.cells), dtype=bool)
-        found[[self._places[cell.key] for cell in cells if cell.key in self._places]] = True
+        found[[self.places[cell.key] for cell in cells if cell.key in self.places]] = True
         return found
 
     @cached_property
-    def _places(self) -> dict[object, int]:
+    def places(self) -> dict[object, int]:
+        """Index of each cell by its key."""
         return {cell.key: index for index, cell in enumerate(self.cells)}
 
     def block(self, columns: IntArray) -> NDArray[np.float32]:
@@ -218,8 +224,8 @@ def scores_in_place(
     """
     without = solution.less(solution.cells.index(cell), len(data))
     score = screen(data, catalogue, without, chosen=catalogue.which((cell, *others))).score
-    known = dict(zip((one.key for one in catalogue.cells), score, strict=True))
-    return np.array([known.get(one.key, -np.inf) for one in (cell, *others)])
+    places = [catalogue.places.get(one.key) for one in (cell, *others)]
+    return np.array([-np.inf if place is None else score[place] for place in places])
 
 
 class _Projection:

@@ -13,7 +13,7 @@ are chosen anew, and the rounds go on from there.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +24,6 @@ from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.families import (
-    FAMILIES,
     WHOLE,
     family_log_prior,
     grouped,
@@ -32,21 +31,17 @@ from remaster_ros.discovery.families import (
     relatives,
     visible,
 )
+from remaster_ros.discovery.proposals import SIGNIFICANCE, propose
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Catalogue, Screening, screen
 from remaster_ros.discovery.selection import Proposal, Selection, Step
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.substitutes import named_instead, regrown
 
-# Family-wise error of one round.
-SIGNIFICANCE = 0.01
 DRAWS = 300
 # Error of keeping a member of a family that has passed as a whole.
 SIGNIFICANCE_OF_ONE = 0.05
 DRAWS_OF_ONE = 200
-SHORTLIST = 8
-# A fit gains at most about so many times what the screening shows, and so much more.
-SHOWN, FURTHER = 2.0, 20.0
 ROUNDS = 8
 FOLDS = 10
 # What leaves less than this share of the held-out error out is not worth a parameter.
@@ -60,8 +55,6 @@ EVIDENT = 5.0
 HYSTERESIS = 0.5
 MOST_EXCHANGED = 6
 MOST_MERGED = 4
-# Members of a family of which none raises the evidence alone have to raise it by this together.
-TOGETHER = 10.0
 # A member of a family has to raise the evidence by this: a free form of no size costs nothing.
 MEMBER = 1.0
 # Fits kept, each with the covariance of all its parameters.
@@ -95,7 +88,6 @@ class Search:
     progress: Callable[[float], None]
 
     def __post_init__(self) -> None:
-        self._structure = np.array([not EFFECTS[cell.name].is_cause for cell in self.cells])
         self._look_at(self.data)
 
     def _look_at(self, data: Residuals) -> None:
@@ -121,7 +113,7 @@ class Search:
             seen.add(state)
             self.progress(count / (count + 2.0))
             screening = screen(self.data, self.catalogue, solution, rng=self.rng, draws=DRAWS)
-            for proposal in self.propose(solution, screening):
+            for proposal in propose(solution, screening, self.catalogue, self.fit, self.grown):
                 candidate, step = self._tested(solution, proposal, screening)
                 # What needs no more parameters than the set it replaces has only to do no worse: a
                 # family of curves that stood in for a weaker cause gives way to it.
@@ -190,65 +182,6 @@ class Search:
         while len(self._fits) > KEPT_FITS:
             del self._fits[next(iter(self._fits))]
         return found
-
-    def propose(self, solution: Solution, screening: Screening) -> Iterator[Proposal]:
-        """Give sets one step on that raise the evidence, the best first.
-
-        What the screening shows to gain far less than another is fitted once that has failed.
-        """
-        score = screening.score
-        # Structure that hides in the noise common to a pose shows only when that is fitted again.
-        hidden = np.flatnonzero(self._structure & np.isfinite(score))
-        tried = [self._with_one(solution, screening, index) for index in hidden]
-        tried += [self._with_family(solution, screening, family) for family in FAMILIES]
-        found = [one for one in tried if one is not None]
-        # One cell alone has this p-value, however well it fits. The best is the last.
-        waiting = [
-            index
-            for index in np.argsort(-score)[:SHORTLIST][::-1]
-            if not self._structure[index] and screening.p_value(score[index]) <= SIGNIFICANCE
-        ]
-        while True:
-            best = max(found, key=lambda one: one.solution.log_evidence, default=None)
-            gain = best.solution.log_evidence - solution.log_evidence if best else -np.inf
-            if waiting and SHOWN * score[waiting[-1]] + FURTHER > gain:
-                one = self._with_one(solution, screening, waiting.pop())
-                found += [] if one is None else [one]
-            elif best is not None:
-                found.remove(best)
-                yield best
-            else:
-                return
-
-    def _with_one(
-        self, solution: Solution, screening: Screening, index: np.intp
-    ) -> Proposal | None:
-        """Return the set with one cell of the catalogue more; None where that is no proposal."""
-        score, located = screening.score[index], self._structure[index]
-        candidate = self.fit((*solution.cells, self.catalogue.cells[index]), solution)
-        if candidate is None or candidate.unphysical():
-            return None
-        gain = candidate.log_evidence - solution.log_evidence
-        p_value = screening.p_value(max(score, gain) if located else score)
-        return Proposal(candidate, p_value) if gain > 0.0 and p_value <= SIGNIFICANCE else None
-
-    def _with_family(
-        self, solution: Solution, screening: Screening, family: tuple[str, ...]
-    ) -> Proposal | None:
-        """Return the set with a family; None where that is no proposal."""
-        candidate = self.grown(solution, family)
-        if candidate is None:
-            return None
-        gain = candidate.log_evidence - solution.log_evidence
-        mine = [cell.name in family for cell in self.catalogue.cells]
-        p_value = screening.p_value(gain)
-        # What is left of a family is judged anew.
-        whole = len(candidate.cells) > len(solution.cells) + 1
-        if gain <= 0.0 or not (whole or p_value <= SIGNIFICANCE):
-            return None
-        if gain > TOGETHER or np.any(screening.score[mine] > 0.0):
-            return Proposal(candidate, p_value)
-        return None
 
     def grown(self, solution: Solution, family: tuple[str, ...]) -> Solution | None:
         """Return the set with all of a family whose members each raise the evidence.

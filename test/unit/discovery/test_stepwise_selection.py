@@ -10,10 +10,11 @@ from calibration_scenes import CHAIN, MARKERS, URDF, sensors
 from discovery_scenes import residuals_of, session_with
 
 from remaster_ros.calibration.estimate import Problem, estimate
-from remaster_ros.discovery import stepwise_selection
+from remaster_ros.discovery import proposals, stepwise_selection
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.families import FAMILIES
+from remaster_ros.discovery.proposals import SIGNIFICANCE
 from remaster_ros.discovery.residuals import STEP_STD, Residuals
 from remaster_ros.discovery.screening import screen
 from remaster_ros.discovery.stepwise_selection import (
@@ -21,7 +22,6 @@ from remaster_ros.discovery.stepwise_selection import (
     EVIDENT,
     HYSTERESIS,
     LEAST_GAIN,
-    SIGNIFICANCE,
     Search,
 )
 from remaster_ros.discovery.substitutes import named_instead, regrown
@@ -43,6 +43,10 @@ def searching(data: Residuals) -> Search:
     return Search(
         data, cells, np.random.default_rng(7), lambda data, solution: data, lambda share: None
     )
+
+
+def proposed_by(search: Search, solution, screening):
+    return proposals.propose(solution, screening, search.catalogue, search.fit, search.grown)
 
 
 @pytest.mark.qualify
@@ -214,12 +218,12 @@ def test_a_cell_alone_that_chance_explains_is_not_proposed_and_a_family_is_tried
     empty = search.fit(())
     rng = np.random.default_rng(8)
     screening = screen(search.data, search.catalogue, empty, rng=rng, draws=DRAWS)
-    sizes = {len(one.solution.cells) for one in search.propose(empty, screening)}
+    sizes = {len(one.solution.cells) for one in proposed_by(search, empty, screening)}
     assert 1 in sizes
     assert max(sizes) > 1
     # As if surrogates scored as high as the best cell, but not as a family.
     higher = replace(screening, null=np.full_like(screening.null, screening.score.max()))
-    for one in search.propose(empty, higher):
+    for one in proposed_by(search, empty, higher):
         assert len(one.solution.cells) > 1 or one.p_value <= SIGNIFICANCE
         assert one.solution.log_evidence > empty.log_evidence
 
@@ -237,15 +241,15 @@ def test_what_waits_for_others_to_fail_is_proposed_after_them(monkeypatch):
 
     monkeypatch.setattr(stepwise_selection, 'solve', counted)
     # As if a fit never gained more than the screening shows.
-    monkeypatch.setattr(stepwise_selection, 'SHOWN', 1.0)
-    best = next(search.propose(empty, screening))
+    monkeypatch.setattr(proposals, 'SHOWN', 1.0)
+    best = next(proposed_by(search, empty, screening))
     first = len(fitted)
-    proposed = [one.solution.cells for one in search.propose(empty, screening)]
+    proposed = [one.solution.cells for one in proposed_by(search, empty, screening)]
     assert best.solution.cells == proposed[0]
     assert len(fitted) > first
     # All fitted before the first is proposed.
-    monkeypatch.setattr(stepwise_selection, 'FURTHER', np.inf)
-    ordered = list(search.propose(empty, screening))
+    monkeypatch.setattr(proposals, 'FURTHER', np.inf)
+    ordered = list(proposed_by(search, empty, screening))
     assert ordered[0].solution.cells == proposed[0]
     assert {one.solution.cells for one in ordered} == set(proposed)
     gains = [one.solution.log_evidence for one in ordered]
