@@ -205,8 +205,8 @@ class Effect:
     is_cause
         False for structure that is located without a cause: it is reported as unexplained.
     between
-        For what happened at one moment: its cells at all moments between two, s since the first
-        row.
+        For what happened at one moment: its cells in all gaps between rows that reach between two
+        moments, s since the first row.
     driven_by_joint
         Its cells' second joint is the one that drives; the sentence is about the first.
     """

@@ -1,7 +1,9 @@
 """Step: something slipped or was bumped at one moment and stayed there.
 
-A moment lies midway between two successive configurations. The search tries moments spread over
-the session, and then all of them near the best (`Effect.between`).
+A moment lies midway in the gap between two successive configurations. The search tries moments
+spread over the session, and then all of them near the best (`Effect.between`), in the gaps of the
+rows worked on. Nothing tells when in such a gap it was: a row held out there is predicted by the
+mean over the gap.
 """
 
 from __future__ import annotations
@@ -29,7 +31,13 @@ LEAST_SHARE = 0.04
 
 
 def moments_of(context: Context) -> FloatArray:
-    """Return the moments between successive configurations, s since the first row, ascending."""
+    """Return the middles of the gaps between configurations, s since the first row, (m,)."""
+    middles: FloatArray = _gaps(context).mean(axis=1)
+    return middles
+
+
+def _gaps(context: Context) -> FloatArray:
+    """Return start and end of gaps between configurations, s since the first row, (m, 2)."""
     _, row = np.unique(context.measurements.configuration, return_inverse=True)
     first, last = np.full(row.max() + 1, np.inf), np.full(row.max() + 1, -np.inf)
     np.minimum.at(first, row, context.elapsed_s)
@@ -39,35 +47,35 @@ def moments_of(context: Context) -> FloatArray:
     apart = first[1:] > last[:-1]
     edge = max(2, int(LEAST_SHARE * len(first)))
     inside = (np.arange(1, len(first)) >= edge) & (np.arange(1, len(first)) <= len(first) - edge)
-    moments: FloatArray = 0.5 * (first[1:] + last[:-1])[apart & inside]
-    return moments
+    return np.column_stack([last[:-1], first[1:]])[apart & inside]
 
 
 def cells(context: Context) -> Iterator[Cell]:
     """Every place, at moments spread evenly over the configurations."""
-    moments = moments_of(context)
-    if len(moments):
-        chosen = np.linspace(0, len(moments) - 1, min(MOMENTS, len(moments)))
-        yield from _at(context, moments[chosen.round().astype(int)])
+    gaps = _gaps(context)
+    if len(gaps):
+        chosen = np.linspace(0, len(gaps) - 1, min(MOMENTS, len(gaps)))
+        yield from _in(context, gaps[chosen.round().astype(int)])
 
 
 def between(context: Context, low: float, high: float) -> Iterator[Cell]:
-    """Every place, at every moment between two."""
-    moments = moments_of(context)
-    yield from _at(context, moments[(moments > low) & (moments < high)])
+    """Every place, in every gap that reaches between two moments."""
+    gaps = _gaps(context)
+    yield from _in(context, gaps[(gaps[:, 1] > low) & (gaps[:, 0] < high)])
 
 
-def _at(context: Context, moments: FloatArray) -> Iterator[Cell]:
+def _in(context: Context, gaps: FloatArray) -> Iterator[Cell]:
     """Zero-offsets; markers; sensors, which shift or also turn; the base where several see it."""
     sensors: list[tuple[int, ...]] = [(index,) for index in range(len(context.sensor_names))]
     if len(sensors) > 1:
         sensors.append(tuple(range(len(sensors))))
     places = context.joints + len(context.marker_names) + 2 * len(sensors)
-    for moment in map(float, moments):
+    for gap in gaps:
+        moment = float(gap.mean())
         at = partial(EFFECT.cell, moment=moment, drawn_from=MOMENTS * places)
         for joint in range(1, context.joints + 1):
             yield at(
-                partial(_slipped, joint=joint, moment=moment),
+                partial(_slipped, joint=joint, gap=gap),
                 [f'joint_{joint}_step'],
                 joints=(joint,),
                 unit='rad',
@@ -75,7 +83,7 @@ def _at(context: Context, moments: FloatArray) -> Iterator[Cell]:
             )
         for index, name in enumerate(context.marker_names):
             yield at(
-                partial(_marker_moved, marker=index, moment=moment),
+                partial(_marker_moved, marker=index, gap=gap),
                 [f'marker_{name}_step_{axis}' for axis in 'xyz'],
                 place='marker',
                 subject=name,
@@ -90,7 +98,7 @@ def _at(context: Context, moments: FloatArray) -> Iterator[Cell]:
                     partial(
                         _sensor_moved,
                         sensors=seen_by,
-                        moment=moment,
+                        gap=gap,
                         turning=parameters != shifts,
                     ),
                     parameters,
@@ -100,23 +108,26 @@ def _at(context: Context, moments: FloatArray) -> Iterator[Cell]:
                 )
 
 
-def _after(context: Context, moment: float) -> FloatArray:
-    return (context.elapsed_s > moment).astype(float)[:, None]
+def _after(context: Context, gap: FloatArray) -> FloatArray:
+    """Return how probably each row is after what happened at some moment in a gap, (n, 1)."""
+    start, end = gap
+    share: FloatArray = np.clip((context.elapsed_s - start) / (end - start), 0.0, 1.0)
+    return share[:, None]
 
 
-def _slipped(context: Context, joint: int, moment: float) -> Design:
-    return Design(joint - 1, _after(context, moment))
+def _slipped(context: Context, joint: int, gap: FloatArray) -> Design:
+    return Design(joint - 1, _after(context, gap))
 
 
-def _marker_moved(context: Context, marker: int, moment: float) -> Design:
-    mine = _after(context, moment) * (context.marker == marker)[:, None]
+def _marker_moved(context: Context, marker: int, gap: FloatArray) -> Design:
+    mine = _after(context, gap) * (context.marker == marker)[:, None]
     return displaced(*along_axes(mine, context.tool[:, :3, :3]))
 
 
 def _sensor_moved(
-    context: Context, sensors: tuple[int, ...], moment: float, turning: bool
+    context: Context, sensors: tuple[int, ...], gap: FloatArray, turning: bool
 ) -> Design:
-    mine = _after(context, moment) * np.isin(context.sensor, sensors)[:, None]
+    mine = _after(context, gap) * np.isin(context.sensor, sensors)[:, None]
     # Along the axes of the sensor, or of the base where all of them are concerned.
     turn = context.sensor_turn if len(sensors) == 1 else np.eye(3)[None]
     shifts = along_axes(mine, turn)

@@ -113,11 +113,12 @@ def test_a_step_is_dated_also_where_held_out_readings_lie_between():
     session = session_with(32, pose_sigma_m=0.05e-3)
     m = session.measurements
     when = np.unique(m.stamp_s[~m.is_validation])
-    # All held-out readings within the gap between the fitted ones in which the sensor is moved.
+    # A third of the held-out readings between the fitted ones between which the sensor is moved.
     low, high = when[len(when) // 2 - 1 : len(when) // 2 + 1]
     stamp_s = m.stamp_s.copy()
-    count = int(m.is_validation.sum())
-    stamp_s[m.is_validation] = np.linspace(low, high, count + 2)[1:-1]
+    held_out = np.flatnonzero(m.is_validation)
+    here = held_out[: len(held_out) // 3]
+    stamp_s[here] = np.linspace(low, high, len(here) + 2)[1:-1]
     moved = (stamp_s >= high)[:, None] * np.array([0.6e-3, 0.0, 0.0])
     m = replace(m, stamp_s=stamp_s, position=m.position + moved)
     found = discover_session(replace(session, measurements=m), rng=np.random.default_rng(0))
@@ -129,6 +130,12 @@ def test_a_step_is_dated_also_where_held_out_readings_lie_between():
     # Nothing tells when in the gap.
     assert moment.std >= (high - low) / np.sqrt(12.0) * 0.99
     assert discovery_content(found).effects[0].parameters[-1].std == moment.std
+    # A reading in the gap is predicted by the mean over the moments: half way in its middle.
+    ((cell,),) = found.groups
+    share = (stamp_s[here] - low) / (high - low)
+    context = residuals_of(replace(session, measurements=m)).context
+    along = np.linalg.norm(cell.columns(context).values[here, :, 0], axis=1)
+    np.testing.assert_allclose(along, share, atol=1e-9)
 
 
 def test_a_marker_that_slips_on_the_tool_is_located():
