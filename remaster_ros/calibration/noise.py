@@ -312,12 +312,7 @@ class NoiseModel:
         flat = values.reshape(len(rows), 3, -1)
         if self.frames is not None:
             flat = self.frames.astype(kind) @ flat
-        sigma, pose_sigma, frame_sigma = np.ones((3, len(rows.group_size), 3))
-        for index, channel in enumerate(self.channels):
-            mine, axes = rows.group_sensor == channel.sensor, slice(*channel.axes)
-            sigma[mine, axes] = noise.sigma[index]
-            pose_sigma[mine, axes] = noise.pose_sigma[index]
-            frame_sigma[mine, axes] = noise.frame_sigma[index]
+        sigma, pose_sigma, frame_sigma = self._of_groups(noise)
         size, count = rows.mean_frame_size[:, None], rows.group_frames[:, None]
         inner = np.sqrt(sigma**2 + size * frame_sigma**2)
         outer = np.sqrt(inner**2 + count * size * pose_sigma**2)
@@ -341,6 +336,35 @@ class NoiseModel:
             less += of_poses[of_frame] * ratio[:, :, None].astype(kind)
             white -= np.repeat(less, rows.frame_size, axis=0)
         return white.reshape(values.shape)
+
+    def precisions(self, noise: Noise) -> tuple[FloatArray, FloatArray]:
+        """Return the precision of errors e of frames of one row each, without cross terms.
+
+        In the axes of `frames` it is W'W of `whitened`: Σ own e² − Σ shared (Σ e)², the inner sum
+        over the rows of a group.
+
+        Returns
+        -------
+        own
+            Of each row, 1/m², (n, 3).
+        shared
+            Of each group, 1/m², (groups, 3).
+        """
+        sigma, pose_sigma, _ = self._of_groups(noise)
+        count = self.rows.group_frames[:, None]
+        mean = 1.0 / (sigma**2 + count * pose_sigma**2)
+        return (sigma**-2.0)[self.rows.group_of_row], (sigma**-2.0 - mean) / count
+
+    def _of_groups(self, noise: Noise) -> FloatArray:
+        """Return sigma, pose_sigma and frame_sigma of each group and axis, m, (3, groups, 3)."""
+        rows, parts = self.rows, np.ones((3, len(self.rows.group_size), 3))
+        for index, channel in enumerate(self.channels):
+            mine, axes = rows.group_sensor == channel.sensor, slice(*channel.axes)
+            for part, of_channel in zip(
+                parts, (noise.sigma, noise.pose_sigma, noise.frame_sigma), strict=True
+            ):
+                part[mine, axes] = of_channel[index]
+        return parts
 
 
 def _frames(rows: Rows, reference: FloatArray) -> FloatArray:

@@ -64,6 +64,9 @@ POOR_ACCEPTANCE = 0.15
 POOR_WEIGHTS = 0.8
 MANY_PARAMETERS = 60
 TRIAL_DRAWS = 1000
+# Where they are worth less than this share of themselves, chains of them are not tried: too few
+# would be taken.
+HOPELESS_WEIGHTS = 0.01
 WALKS = 32
 WALK_STEPS_PER_DRAW = 20
 # The first draws of each walk, by which it is judged: a draw costs as much as twenty of a chain.
@@ -157,7 +160,8 @@ def sample_posterior(
     starts = laplace.dispersed(chains, rng)
     likely = trial.resampled(FIRST_CHECKED, rng.spawn(1)[0])
     if surrogate.log_density_error(likely) > DENSITY_ERROR_LIMIT:
-        return _exact(task, posterior.log_density, laplace, starts)
+        hopeless = trial.effective < HOPELESS_WEIGHTS * TRIAL_DRAWS
+        return _exact(task, posterior.log_density, laplace, starts, hopeless=hopeless)
     run, enough = task.independent(surrogate.log_density, laplace, starts)
     checked = max(20, min(CHECKED_DRAWS, CHECKED_ROWS // len(posterior.rows)))
     points = run.draws.reshape(-1, posterior.size)
@@ -177,21 +181,30 @@ def _proposed(
 
 
 def _exact(
-    task: _Task, log_density: LogDensity, laplace: LaplaceProposal, starts: FloatArray
+    task: _Task,
+    log_density: LogDensity,
+    laplace: LaplaceProposal,
+    starts: FloatArray,
+    *,
+    hopeless: bool = False,
 ) -> Sampling:
-    """Sample by the exact density, with the evaluations that there are."""
+    """Sample by the exact density, with the evaluations that there are.
+
+    Where chains of independent proposals are hopeless none are tried.
+    """
     chains, rng = len(starts), task.rng
     weighted = _by_conditional(task, log_density, laplace.mode)
     how = 'effects drawn given the other parameters and the noise'
     if weighted is None:
-        most = int(CHAINS_SHARE * task.evaluations) // chains
-        run, enough = task.independent(log_density, laplace, starts, most)
-        if enough:
-            return Sampling(
-                run,
-                'independence Metropolis-Hastings on the exact density, Laplace proposal '
-                '(the density is not near enough to its second order)',
-            )
+        if not hopeless:
+            most = int(CHAINS_SHARE * task.evaluations) // chains
+            run, enough = task.independent(log_density, laplace, starts, most)
+            if enough:
+                return Sampling(
+                    run,
+                    'independence Metropolis-Hastings on the exact density, Laplace proposal '
+                    '(the density is not near enough to its second order)',
+                )
         weighted = task.weighted(log_density, laplace)
         how = 'chains of independent proposals are worth too few draws'
     if weighted.reliable and weighted.effective >= task.enough:

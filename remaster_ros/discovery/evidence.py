@@ -22,11 +22,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve
+from scipy.linalg.blas import dspmv
 from scipy.linalg.lapack import dpotrf, dpotri
 
 from remaster_ros.calibration.noise import RESOLUTION_M, Noise, NoiseModel
+from remaster_ros.discovery import packed
 from remaster_ros.discovery.effects.base import LARGEST_M, Cell
-from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.residuals import Residuals, units
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray
 
@@ -75,16 +77,10 @@ def solve(
     cells = tuple(cells[index] for index in order)
     norms, grams = data.gram_matrices(cells)
     p = data.base.shape[2]
-    scale = norms[p:-1]
     free = np.array([cell.penalty is None for cell in cells for _ in cell.parameters], dtype=bool)
-    if np.any(scale[free] == 0.0):
+    if np.any(norms[p:-1][free] == 0.0):
         return None
-    # The penalty compares neighbours: one unit for all of a cell's splines, also for those at the
-    # edge, where no row has more than a rounding error.
-    edges = np.cumsum([0, *(cell.size for cell in cells)])
-    for cell, (first, last) in zip(cells, itertools.pairwise(edges), strict=True):
-        if cell.penalty is not None:
-            scale[first:last] = np.max(scale[first:last]) or 1.0
+    scale = units(cells, norms[p:-1])
     largest = np.array([cell.largest or np.nan for cell in cells for _ in cell.parameters])
     typical = LARGEST_M * np.sqrt(len(data)) / scale
     std = np.where(np.isnan(largest), typical, largest)
@@ -99,8 +95,6 @@ def solve(
     )
     ridge = np.concatenate((np.zeros(p), np.where(sized, (std * scale) ** -2.0, 0.0)))
     unit = np.concatenate((np.ones(p), scale))
-    inverse_unit = 1.0 / np.append(unit, 1.0)
-    grams *= inverse_unit[:, None] * inverse_unit
     system = _System(data.noise_model, grams, data.noise, cells, data.base_precision, unit, ridge)
     if not system.visible():
         return None
@@ -115,7 +109,10 @@ def solve(
 
 @dataclass(eq=False)
 class _System:
-    """The mixed-model equations of one set of cells, in scaled columns."""
+    """The mixed-model equations of one set of cells, in scaled columns.
+
+    The Gram matrices are `packed`, (groups, length of size + 1).
+    """
 
     model: NoiseModel
     grams: FloatArray
@@ -154,15 +151,15 @@ class _System:
         )
         self._last: tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray, FloatArray]] | None
         self._last = None
+        # The errors are the last row.
+        self.of_parameters = packed.length(self.size)
 
     def visible(self) -> bool:
         """Return whether the unpenalised columns add something to the others and to the base."""
-        part = self.grams[:, : self.unpenalised, : self.unpenalised].sum(axis=0)
-        try:
-            root = np.linalg.cholesky(part + 1e-14 * np.eye(len(part)))
-        except np.linalg.LinAlgError:
-            return False
-        return bool(np.all(np.diag(root)[self.p :] > ABSORBED))
+        part = self.grams[:, : packed.length(self.unpenalised)].sum(axis=0)
+        part[packed.diagonal(self.unpenalised)] += 1e-14
+        root, wrong = dpotrf(packed.upper(part, self.unpenalised), overwrite_a=1)
+        return not wrong and bool(np.all(np.diag(root)[self.p :] > ABSORBED))
 
     def noise(self, eta: FloatArray) -> Noise:
         count = len(self.model.channels)
@@ -179,17 +176,17 @@ class _System:
         """Return the gradient of L and its average information."""
         count = len(self.entering)
         weights, factors = self._precisions(eta)
-        total, root, beta, lower = self._solved(eta)
+        total, root, beta, inverse = self._solved(eta)
         # Beside the diagonal twice: products with symmetric matrices are then those of the whole.
-        inverse = np.zeros_like(total)
-        np.multiply(lower.T, 2.0, out=inverse[:-1, :-1])
-        np.fill_diagonal(inverse[:-1, :-1], np.diag(lower))
+        twice = packed.of_upper(inverse)
+        twice *= 2.0
+        twice[packed.diagonal(self.size)] *= 0.5
         error = np.append(-beta, 1.0)
         trace, pulls = np.empty(len(weights)), np.empty((len(weights), len(error)))
         # Both of one matrix after the other: it is read from memory once.
         for index, gram in enumerate(self.grams):
-            trace[index] = np.vdot(gram, inverse)
-            pulls[index] = gram @ error
+            trace[index] = gram[: self.of_parameters] @ twice
+            pulls[index] = dspmv(len(error), 1.0, gram, error)
         rss = pulls @ error
         n = self.model.freedom
         by_variance = 0.5 * weights * (weights * (trace + rss) - n)
@@ -204,12 +201,15 @@ class _System:
             prior = factor * self.spectra[i] + self.ridges[i]
             smooth = np.sum(factor * self.spectra[i] / prior)
             quadratic = factor * beta[where] @ penalty @ beta[where]
-            spread = factor * np.sum(inverse[where, where] * penalty)
+            own = inverse[where, where] * penalty
+            spread = factor * (2.0 * np.sum(own) - np.trace(own))
             slope[count + i] = 0.5 * (smooth - spread - quadratic)
             # Roughly, beside a ridge: it decides how far to step, not where to end.
             turns[where, i] = beta[where] * smooth / len(prior)
         # ½ q_j' P q_k with q_j = (∂V/∂eta_j) P y and P = W − W X H⁻¹ X' W.
-        moved = total[:-1, :-1] @ turns
+        moved = np.zeros_like(turns)
+        for i, turn in enumerate(turns.T):
+            moved[:, i] = dspmv(self.size, 1.0, total[: self.of_parameters], turn)
         noise_part = (change * weights**2) @ pulls[:, :-1]
         both = np.concatenate((noise_part.T, -moved), axis=1)
         square = np.zeros((len(eta), len(eta)))
@@ -217,7 +217,7 @@ class _System:
         square[:count, count:] = -noise_part @ turns
         square[count:, :count] = square[:count, count:].T
         square[count:, count:] = turns.T @ moved
-        information = 0.5 * (square - both.T @ cho_solve((root, True), both, check_finite=False))
+        information = 0.5 * (square - both.T @ cho_solve((root, False), both, check_finite=False))
         return slope, information
 
     def _precisions(self, eta: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -226,40 +226,42 @@ class _System:
         return 1.0 / (np.exp(2.0 * eta[:count]) @ self.entering), np.exp(eta[count:])
 
     def _solved(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return the weighted sum of the Gram matrices, and what follows from H.
+        """Return the weighted sum of the Gram matrices, `packed`, and what follows from H.
 
-        Its lower Cholesky factor, the estimate, and H⁻¹ with zeros above the diagonal.
+        Its upper Cholesky factor, the estimate, and H⁻¹ with zeros below the diagonal.
         """
         if self._last is not None and np.array_equal(self._last[0], eta):
             return self._last[1]
         weights, factors = self._precisions(eta)
-        total = (weights @ self.grams.reshape(len(weights), -1)).reshape(self.grams.shape[1:])
-        # In LAPACK's order, and in the memory of H.
-        H = np.array(total[:-1, :-1], order='F')
+        total = weights @ self.grams
+        H = packed.upper(total, self.size)
         np.einsum('ii->i', H)[:] += self.ridge
         H[: self.p, : self.p] += self.base_precision
         for index, penalty, factor in zip(self.penalised, self.penalties, factors, strict=True):
             where = self.where[index]
             H[where, where] += factor * penalty
-        root, wrong = dpotrf(H, lower=1, overwrite_a=1)
+        root, wrong = dpotrf(H, overwrite_a=1)
         if wrong:
             raise np.linalg.LinAlgError
-        beta = cho_solve((root, True), total[:-1, -1], check_finite=False)
-        lower, _ = dpotri(root, lower=1)
-        self._last = eta.copy(), (total, root, beta, lower)
+        pull = total[self.of_parameters : -1]
+        beta = cho_solve((root, False), pull, check_finite=False)
+        inverse, _ = dpotri(root)
+        self._last = eta.copy(), (total, root, beta, inverse)
         return self._last[1]
 
     def solution(self, start: Solution | None, prior: float) -> Solution:
         eta = self._most_likely(*self._start(start))
         weights, factors = self._precisions(eta)
-        total, root, beta, lower = self._solved(eta)
+        total, root, beta, inverse = self._solved(eta)
         evidence = self._evidence(total, root, weights, factors, beta)
-        covariance = lower + lower.T
+        covariance = inverse + inverse.T
         np.einsum('ii->i', covariance)[:] *= 0.5
         covariance /= self.unit[:, None]
         covariance /= self.unit
         part, unit = slice(self.unpenalised), self.unit[: self.unpenalised]
-        unpenalised = cho_solve((root[part, part], True), np.eye(len(unit))) / np.outer(unit, unit)
+        unpenalised = cho_solve((root[part, part], False), np.eye(len(unit))) / np.outer(
+            unit, unit
+        )
         beta = beta / self.unit
         smoothness = np.full(len(self.cells), np.nan)
         smoothness[self.penalised] = factors
@@ -317,7 +319,8 @@ class _System:
     def _likelihood(self, total: FloatArray, weights: FloatArray, beta: FloatArray) -> float:
         """Return the log likelihood at an estimate, with the priors but the smoothness."""
         error = np.append(-beta, 1.0)
-        value = 0.5 * self.model.freedom @ np.log(weights) - 0.5 * error @ total @ error
+        square = error @ dspmv(len(error), 1.0, total, error)
+        value = 0.5 * self.model.freedom @ np.log(weights) - 0.5 * square
         return float(value - 0.5 * self._implausible(beta))
 
     def _smooth(self, factors: FloatArray, beta: FloatArray) -> float:
@@ -369,7 +372,7 @@ class _System:
     def _typical(self, which: int, noise: Noise) -> float:
         """Return the factor at which a penalty and the data weigh about the same."""
         where = self.where[self.penalised[which]]
-        diagonal = np.einsum('gii->gi', self.grams)[:, where].sum(axis=1)
+        diagonal = self.grams[:, packed.diagonal(self.size)[where]].sum(axis=1)
         data = diagonal @ (1.0 / self.model.variances(noise))
         return float(data / np.trace(self.penalties[which]))
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from remaster_ros.calibration.result import FitResult
+from remaster_ros.discovery.catalogue import Catalogue
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
@@ -16,7 +17,7 @@ from remaster_ros.discovery.families import WHOLE, family_log_prior, grouped
 from remaster_ros.discovery.gain import shares
 from remaster_ros.discovery.plain_forms import AS_WELL, SCREENING_ERROR, is_special_case
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.screening import Catalogue, screen
+from remaster_ros.discovery.screening import screen
 from remaster_ros.discovery.selection import Selection
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.words import called, clock_time, joint_words

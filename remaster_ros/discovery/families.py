@@ -55,11 +55,19 @@ def _members(catalogue: tuple[Cell, ...], family: tuple[str, ...]) -> int:
     return len({(cell.name, cell.joints) for cell in catalogue if cell.name in family})
 
 
+def evidence_without(
+    solution: Solution, index: int, rows: int, catalogue: Sequence[Cell]
+) -> float:
+    """Return `Solution.evidence_without` with the prior of the smaller set."""
+    smaller = (*solution.cells[:index], *solution.cells[index + 1 :])
+    priors = [family_log_prior(cells, catalogue) for cells in (smaller, solution.cells)]
+    return solution.evidence_without(index, rows) + priors[0] - priors[1]
+
+
 def less(solution: Solution, index: int, rows: int, catalogue: Sequence[Cell]) -> Solution:
     """Return the fit without one cell as `Solution.less`, with the prior of the smaller set."""
-    smaller = solution.less(index, rows)
-    priors = [family_log_prior(one.cells, catalogue) for one in (smaller, solution)]
-    return replace(smaller, log_evidence=smaller.log_evidence + priors[0] - priors[1])
+    evidence = evidence_without(solution, index, rows, catalogue)
+    return replace(solution.less(index, rows), log_evidence=evidence)
 
 
 def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:

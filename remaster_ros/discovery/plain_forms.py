@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from remaster_ros.discovery.catalogue import Catalogue
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.screening import Catalogue, scores_in_place
+from remaster_ros.discovery.screening import scores_in_place
 from remaster_ros.discovery.solution import Solution
 
 AS_WELL = 3.0

@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
+from remaster_ros.discovery.catalogue import Catalogue
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.families import FAMILIES
-from remaster_ros.discovery.screening import Catalogue, Screening
+from remaster_ros.discovery.screening import Screening
 from remaster_ros.discovery.selection import Proposal
 from remaster_ros.discovery.solution import Solution
 

@@ -21,6 +21,7 @@ from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.noise import Noise, NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
+from remaster_ros.discovery import packed
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import BLOCK_ROWS, Context
 from remaster_ros.types import FloatArray, IntArray
@@ -242,7 +243,8 @@ class Residuals:
         norms
             Of the columns over all rows, (p + c + 1,).
         grams
-            In each error group of the noise model, (groups, p + c + 1, p + c + 1); a copy.
+            In each error group of the noise model, of the columns of cells in their units
+            (`units`), `packed`, (groups, length of p + c + 1); a copy.
         """
         wanted = set(cells)
         known, norms, grams = max(
@@ -252,17 +254,13 @@ class Residuals:
             part = [cell for cell in known if cell in wanted]
             chosen = self._positions(known, part)
             known = (*part, *(cell for cell in cells if cell not in part))
-            norms, more = self._more_grams(known, old := len(chosen))
-            grown = np.empty((len(grams), len(norms), len(norms)))
-            grown[:, :old, :old] = _picked(grams, chosen)
-            grown[:, old:] = more
-            grown[:, :old, old:] = more[:, :, :old].transpose(0, 2, 1)
-            grams = grown
+            norms, more = self._more_grams(known, len(chosen))
+            grams = np.concatenate((packed.picked(grams, chosen), more), axis=1)
             self._grams.insert(0, (known, norms, grams))
             del self._grams[KEPT_GRAMS:]
         p = self.base.shape[2]
         order = np.append(np.delete(self._positions(known, cells), p), p)
-        return norms[order], _picked(grams, order)
+        return norms[order], packed.picked(grams, order)
 
     def _positions(self, known: Sequence[Cell], cells: Sequence[Cell]) -> IntArray:
         """Return where base, errors and some cells are among the columns of a set of `_grams`."""
@@ -273,11 +271,13 @@ class Residuals:
 
     def _more_grams(self, cells: Sequence[Cell], known: int) -> tuple[FloatArray, FloatArray]:
         """Return the norms of base, errors and cells, and the Gram matrices but the known part."""
+        p = self.base.shape[2]
         columns = self.base, self.errors[:, :, None], self.columns(cells)
         joined = np.concatenate(columns, axis=2)
         norms = np.sqrt(np.einsum('nim,nim->m', joined, joined))
+        joined[:, :, p + 1 :] /= units(cells, norms[p + 1 :])
         grams = self.noise_model.gram(lambda _, where: joined[where], joined.shape[2], known)
-        return norms, grams
+        return norms, packed.of_rows(grams, known)
 
     def displaced(self, cells: Sequence[Cell], parameters: FloatArray) -> FloatArray:
         """Return what cells with these parameters displace in every row, m, (all rows, 3)."""
@@ -301,15 +301,18 @@ class Residuals:
         return self.errors - explained
 
 
-def _picked(grams: FloatArray, order: IntArray) -> FloatArray:
-    """Return the rows and columns of Gram matrices in some order, run by run: runs are long."""
-    starts = np.flatnonzero(np.diff(order, prepend=-2) != 1)
-    runs = list(zip(starts, np.append(starts[1:], len(order)), strict=True))
-    picked = np.empty((len(grams), len(order), len(order)))
-    for (i, i_end), (j, j_end) in itertools.product(runs, runs):
-        rows = slice(order[i], order[i_end - 1] + 1)
-        picked[:, i:i_end, j:j_end] = grams[:, rows, order[j] : order[j_end - 1] + 1]
-    return picked
+def units(cells: Sequence[Cell], norms: FloatArray) -> FloatArray:
+    """Return the units of the columns of cells, in which a fit has them, (c,).
+
+    The norms of columns; where they are 0, 1. The penalty compares neighbours: one unit for all of
+    a cell's splines, also for those at the edge, where no row has more than a rounding error.
+    """
+    unit = norms.copy()
+    edges = np.cumsum([0, *(cell.size for cell in cells)])
+    for cell, (first, last) in zip(cells, itertools.pairwise(edges), strict=True):
+        if cell.penalty is not None:
+            unit[first:last] = np.max(unit[first:last])
+    return np.where(unit > 0.0, unit, 1.0)
 
 
 def _quadratic(precision: FloatArray, combinations: FloatArray) -> FloatArray:

@@ -16,9 +16,8 @@ whitened rows are flipped one by one, which relies on the noise model's independ
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,15 +25,15 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from remaster_ros.calibration.noise import Noise
+from remaster_ros.discovery.at_joints import AtJoints, Products, suit
+from remaster_ros.discovery.catalogue import Catalogue
 from remaster_ros.discovery.effects.base import Cell
-from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 # Number and generator to that many sets of errors of all rows, m, (n, 3, draws).
 Draw = Callable[[int, np.random.Generator], FloatArray]
-CHUNK = 1024
 # With fewer, flips of whole poses meet the observed pattern, or its like, by chance.
 FEWEST_POSES = 12
 # Smoothness tried for free forms: penalty over data, in the trace.
@@ -42,107 +41,6 @@ SMOOTHNESS = (0.1, 1.0, 10.0)
 # Directions of a cell that the others explain to this share of its variance are dropped.
 ABSORBED = 1e-6
 SINGLE_ROUNDING = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class Catalogue:
-    """All cells that can be tried on these rows, with their columns at hand.
-
-    Attributes
-    ----------
-    cells
-        As the effects gave them.
-    starts
-        First column of each cell, and the number of columns, (cells + 1,).
-    at
-        Joint of each column, -1 where it displaces, (columns,).
-    features
-        Added angles of the columns at joints, (n, joint columns), in order.
-    shifts
-        Displacements of the other columns, (n, 3, others), in order.
-    position
-        Where each column is among the features or the shifts, (columns,).
-    """
-
-    cells: tuple[Cell, ...]
-    starts: IntArray
-    at: IntArray
-    features: FloatArray
-    shifts: FloatArray
-    position: IntArray
-    jacobian: FloatArray
-
-    @classmethod
-    def of(cls, data: Residuals, cells: Sequence[Cell]) -> Catalogue:
-        """Compute all columns on the rows of the residuals, in single precision."""
-        context = data.part
-        at, features, shifts = [], [], []
-        for cell in cells:
-            columns = cell.columns(context)
-            values = columns.values.astype(np.float32)
-            if columns.at is None:
-                at += [-1] * cell.size
-                shifts.append(values)
-            else:
-                at += [columns.at] * cell.size
-                features.append(values)
-        joint = np.array(at, dtype=np.int64)
-        position = np.where(joint >= 0, np.cumsum(joint >= 0), np.cumsum(joint < 0)) - 1
-        n = len(data)
-        return cls(
-            tuple(cells),
-            np.cumsum([0, *(cell.size for cell in cells)]),
-            joint,
-            np.concatenate([np.zeros((n, 0), np.float32), *features], axis=1),
-            np.concatenate([np.zeros((n, 3, 0), np.float32), *shifts], axis=2),
-            position,
-            context.jacobian.astype(np.float32),
-        )
-
-    @cached_property
-    def cheap(self) -> BoolArray:
-        """Which cells are not too many to be tried again and again, (cells,)."""
-        return np.array([not EFFECTS[cell.name].costly for cell in self.cells], dtype=bool)
-
-    @cached_property
-    def structure(self) -> BoolArray:
-        """Which cells locate structure and claim no cause, (cells,)."""
-        return np.array([not EFFECTS[cell.name].is_cause for cell in self.cells], dtype=bool)
-
-    def which(self, cells: Sequence[Cell]) -> BoolArray:
-        """Return which cells of the catalogue are among others, (cells,)."""
-        found = np.zeros(len(self.cells), dtype=bool)
-        found[[self.places[cell.key] for cell in cells if cell.key in self.places]] = True
-        return found
-
-    @cached_property
-    def places(self) -> dict[object, int]:
-        """Index of each cell by its key."""
-        return {cell.key: index for index, cell in enumerate(self.cells)}
-
-    def block(self, columns: IntArray) -> NDArray[np.float32]:
-        """Return displacements of the given columns, (n, 3, c), single precision."""
-        at, position = self.at[columns], self.position[columns]
-        angle = at >= 0
-        turned: NDArray[np.float32] = np.take(self.jacobian, at[angle], axis=2)
-        turned *= np.take(self.features, position[angle], axis=1)[:, None]
-        if angle.all():
-            return turned
-        block = np.empty((len(self.jacobian), 3, len(columns)), np.float32)
-        block[:, :, angle] = turned
-        block[:, :, ~angle] = np.take(self.shifts, position[~angle], axis=2)
-        return block
-
-    def batches(self, chosen: IntArray) -> Iterator[IntArray]:
-        """Give batches of cells of equal size and kind, about `CHUNK` columns each."""
-        sizes = np.array([self.cells[i].size for i in chosen], dtype=int)
-        penalised = np.array([self.cells[i].penalty is not None for i in chosen], dtype=bool)
-        for size in np.unique(sizes):
-            for kind in (False, True):
-                mine = chosen[(sizes == size) & (penalised == kind)]
-                step = max(1, CHUNK // int(size))
-                for start in range(0, len(mine), step):
-                    yield mine[start : start + step]
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,10 +105,26 @@ def screen(
     best = np.full(surrogates.shape[1], -np.inf)
     others = ~catalogue.which(given.cells)
     wanted = np.flatnonzero(others if chosen is None else others & chosen)
-    for batch in catalogue.batches(wanted):
-        value = _scores(data, catalogue, batch, project, surrogates, noise, n_eff)
+
+    def take(batch: IntArray, products: Products) -> None:
+        value = _scores([catalogue.cells[i] for i in batch], products, n_eff)
         scores[batch] = value[:, 0]
-        best = np.maximum(best, value.max(axis=0))
+        np.maximum(best, value.max(axis=0), out=best)
+
+    suiting = suit(data, catalogue)[wanted]
+    few = wanted[suiting]
+    # For fewer columns it is more work than it saves.
+    if catalogue.sizes[few].sum() > surrogates.shape[1] + project.top.shape[1]:
+        wanted = wanted[~suiting]
+        pulled = project.residual(surrogates)
+        at_joints = AtJoints.of(data, catalogue, noise, pulled, project.twice())
+        for batch in catalogue.batches(few, by_joint=True):
+            products, clear = at_joints.products(batch)
+            if clear.any():
+                take(batch[clear], products.of(clear))
+            wanted = np.append(wanted, batch[~clear])
+    for batch in catalogue.batches(wanted):
+        take(batch, _products(data, catalogue, batch, project, surrogates, noise))
     return Screening(scores, best[1:].reshape(2, -1) if draws else np.zeros((2, 0)))
 
 
@@ -245,6 +159,13 @@ class _Projection:
         self.top = solve_triangular(root, (white / scale).T, lower=True, check_finite=False).T
         self.single = self.top.astype(np.float32)
 
+    def twice(self) -> NDArray[np.float32]:
+        """T with M'M = I − T T', (3n, p)."""
+        # M = I − Q Q' is no projection where there are penalties: M'M = I − Q (2 I − Q'Q) Q'.
+        inner = np.linalg.cholesky(2.0 * np.eye(self.top.shape[1]) - self.top.T @ self.top)
+        twice: NDArray[np.float32] = self.single @ inner.astype(np.float32)
+        return twice
+
     def residual(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return (M v) of values (3n, c), M = I − Z (Z'Z + Λ)⁻¹ Z' restricted to the rows."""
         top = self.single if values.dtype == np.float32 else self.top
@@ -270,30 +191,33 @@ def _surrogates(
     return np.concatenate((flipped, drawn), axis=1, dtype=np.float32)
 
 
-def _scores(
+def _products(
     data: Residuals,
     catalogue: Catalogue,
     batch: IntArray,
     project: _Projection,
     residuals: NDArray[np.float32],
     noise: Noise,
-    n_eff: int,
-) -> FloatArray:
-    """Return the score of each cell of a batch on each residual, (cells, residuals)."""
-    cells = [catalogue.cells[i] for i in batch]
-    m, count = cells[0].size, len(cells)
-    columns = np.concatenate(
-        [np.arange(catalogue.starts[i], catalogue.starts[i + 1]) for i in batch]
-    )
-    white = data.noise_model.whitened(catalogue.block(columns), noise).reshape(3 * len(data), -1)
+) -> Products:
+    """Return the products of the columns of a batch, from what they displace in every row."""
+    count, m = len(batch), int(catalogue.sizes[batch[0]])
+    block = catalogue.block(catalogue.columns(batch))
+    white = data.noise_model.whitened(block, noise).reshape(3 * len(data), -1)
     norm = np.linalg.norm(white, axis=0).reshape(count, m)
-    if cells[0].penalty is not None:
+    if catalogue.penalised[batch[0]]:
         # The penalty compares neighbours: one unit for all of a cell's splines.
         norm = np.repeat(norm.max(axis=1, keepdims=True), m, axis=1)
     left = project.residual(white / np.where(norm > 0.0, norm, 1.0).ravel())
     pull = (left.T @ residuals).reshape(count, m, -1)
     blocks = left.reshape(len(left), count, m).transpose(1, 2, 0)
     gram = np.asarray(blocks @ blocks.transpose(0, 2, 1), dtype=float)
+    return Products(norm, gram, pull)
+
+
+def _scores(cells: Sequence[Cell], products: Products, n_eff: int) -> FloatArray:
+    """Return the score of each cell of a batch on each residual, (cells, residuals)."""
+    norm, gram, pull = products
+    count, m = norm.shape
     prior = np.array([np.log(cell.drawn_from) for cell in cells])
     sign = np.array([cell.sign for cell in cells])
     if cells[0].penalty is None:
@@ -313,7 +237,7 @@ def _scores(
         score = _explained(gain, n_eff) - price[:, None]
         score[rank == 0] = -np.inf
         return score
-    score = np.full((count, residuals.shape[1]), -np.inf)
+    score = np.full((count, pull.shape[2]), -np.inf)
     for index, cell in enumerate(cells):
         assert cell.penalty is not None
         weight = np.trace(gram[index])

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from remaster_ros.discovery.catalogue import Catalogue
 from remaster_ros.discovery.cross_validation import Comparisons, worth_of
 from remaster_ros.discovery.dating import refine_moments
 from remaster_ros.discovery.effects.base import Cell
@@ -25,6 +26,7 @@ from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.families import (
     WHOLE,
+    evidence_without,
     family_log_prior,
     grouped,
     less,
@@ -33,7 +35,7 @@ from remaster_ros.discovery.families import (
 )
 from remaster_ros.discovery.proposals import SIGNIFICANCE, propose
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.screening import Catalogue, Screening, screen
+from remaster_ros.discovery.screening import Screening, screen
 from remaster_ros.discovery.selection import Proposal, Selection, Step
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.substitutes import named_instead, regrown
@@ -249,10 +251,12 @@ class Search:
         Where the evidence rises with the noise as it is, the best noise for the smaller set can
         wait; the cell is kept only by settled evidences.
         """
-        smaller = less(solution, index, len(self.data), self.catalogue.cells)
-        if unphysical or smaller.log_evidence > solution.log_evidence:
-            return smaller, False
-        again = self.fit(smaller.cells, solution) if settled else None
+        rows, catalogue = len(self.data), self.catalogue.cells
+        gains = evidence_without(solution, index, rows, catalogue) > solution.log_evidence
+        if unphysical or gains:
+            return less(solution, index, rows, catalogue), False
+        smaller = (*solution.cells[:index], *solution.cells[index + 1 :])
+        again = self.fit(smaller, solution) if settled else None
         if again is None or again.log_evidence <= solution.log_evidence:
             return None
         return again, True

@@ -12,14 +12,15 @@ from scipy.stats import multivariate_normal
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise import NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
-from remaster_ros.discovery import cross_validation, discover
+from remaster_ros.discovery import cross_validation, discover, packed
+from remaster_ros.discovery.catalogue import Catalogue
 from remaster_ros.discovery.cross_validation import LeftOut
 from remaster_ros.discovery.discover import discover_session, find_causes
 from remaster_ros.discovery.effects.base import Design
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import _System, solve
 from remaster_ros.discovery.findings import Findings
-from remaster_ros.discovery.screening import Catalogue, screen
+from remaster_ros.discovery.screening import screen
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.simulation.session_simulator import simulate_session
 from remaster_ros.types import Session
@@ -220,6 +221,7 @@ def test_restricted_likelihood_has_the_gradient_it_says(name, split):
     unit = np.concatenate((np.ones(p), scale))
     noise = model.of_sensors(*robust_noise(data.rows, data.errors, np.ones(len(data), bool)))
     ridge = np.where(np.arange(len(unit)) < p, 0.0, 0.5)
+    grams = packed.of_rows(grams, 0)
     system = _System(model, grams, noise, cells, data.base_precision, unit, ridge)
     eta, _, _ = system._start(None)
     gradient, information = system.derivatives(eta)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from discovery_scenes import residuals_of, session_with
 
-from remaster_ros.discovery import evidence
+from remaster_ros.discovery import evidence, packed
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import log_prior_one_by_one, solve
 from remaster_ros.discovery.families import visible
-from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.residuals import Residuals, units
 from remaster_ros.discovery.solution import Solution
 
 
@@ -28,6 +28,13 @@ def scene() -> tuple[Any, list[Cell]]:
     return session, cells
 
 
+def assert_near(grams, others, size):
+    """Packed Gram matrices agree to rounding, in units of their columns."""
+    unit = np.sqrt(others[:, packed.diagonal(size)])
+    i, j = np.tril_indices(size)
+    assert np.max(np.abs(grams - others) / (1e-300 + unit[:, i] * unit[:, j])) < 1e-9
+
+
 def test_gram_matrices_of_a_part_in_any_order_are_those_computed_for_it_alone(scene):
     session, cells = scene
     data = residuals_of(session)
@@ -36,9 +43,28 @@ def test_gram_matrices_of_a_part_in_any_order_are_those_computed_for_it_alone(sc
     norms, grams = data.gram_matrices(part)
     fresh_norms, fresh_grams = residuals_of(session).gram_matrices(part)
     assert norms == pytest.approx(fresh_norms, rel=1e-12)
-    size = np.sqrt(np.einsum('gii->gi', fresh_grams))
-    error = np.abs(grams - fresh_grams) / (1e-300 + size[:, :, None] * size[:, None, :])
-    assert error.max() < 1e-9
+    assert_near(grams, fresh_grams, len(norms))
+
+
+def test_gram_matrices_are_of_columns_in_their_units(scene):
+    data, cells = residuals_of(scene[0]), scene[1]
+    norms, grams = data.gram_matrices(cells)
+    joined = np.concatenate((data.base, data.columns(cells), data.errors[:, :, None]), axis=2)
+    assert norms == pytest.approx(np.sqrt(np.sum(joined**2, axis=(0, 1))))
+    unit = np.ones(len(norms))
+    unit[data.base.shape[2] : -1] = units(cells, norms[data.base.shape[2] : -1])
+    joined = joined / unit
+    plain = data.noise_model.gram(lambda _, where: joined[where], len(norms))
+    assert_near(grams, packed.of_rows(plain, 0), len(norms))
+
+
+def test_a_column_without_rows_has_the_unit_of_its_spline_or_one(scene):
+    curve = next(cell for cell in scene[1] if cell.penalty is not None)
+    plain = next(cell for cell in scene[1] if cell.penalty is None)
+    norms = np.zeros(plain.size + curve.size)
+    assert np.array_equal(units((plain, curve), norms), np.ones(len(norms)))
+    norms[-2] = 4.0
+    assert np.array_equal(units((plain, curve), norms)[plain.size :], np.full(curve.size, 4.0))
 
 
 def test_what_a_caller_does_to_the_norms_stays_with_the_caller(scene):
@@ -57,9 +83,7 @@ def test_gram_matrices_of_a_known_set_with_other_cells_are_those_computed_for_it
     norms, grams = data.gram_matrices(wanted)
     fresh_norms, fresh_grams = residuals_of(session).gram_matrices(wanted)
     assert norms == pytest.approx(fresh_norms, rel=1e-12)
-    size = np.sqrt(np.einsum('gii->gi', fresh_grams))
-    error = np.abs(grams - fresh_grams) / (1e-300 + size[:, :, None] * size[:, None, :])
-    assert error.max() < 1e-9
+    assert_near(grams, fresh_grams, len(norms))
 
 
 @pytest.mark.parametrize('dropped', range(6))

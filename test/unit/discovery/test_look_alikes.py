@@ -8,13 +8,13 @@ from discovery_scenes import at_joint, residuals_of, session_with
 
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.discovery import discover
+from remaster_ros.discovery.catalogue import Catalogue
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import Solution, solve
 from remaster_ros.discovery.explain import TIED, LookAlike, describe
 from remaster_ros.discovery.model_averaging import moved_by_look_alikes
 from remaster_ros.discovery.plain_forms import is_special_case, plainest
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.screening import Catalogue
 from remaster_ros.discovery.selection import Selection, Step
 from remaster_ros.types import Session
 

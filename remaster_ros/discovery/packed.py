@@ -1,0 +1,79 @@
+"""Symmetric matrices of which one half is kept, row by row up to the diagonal.
+
+Matrices of some hundred parameters are read again and again; half of each is read in half the
+time. In the words of LAPACK this is the upper half, column by column.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.linalg.lapack import dtpttr, dtrttp
+
+from remaster_ros.types import FloatArray, IntArray
+
+
+def length(size: int) -> int:
+    """Return how many numbers a matrix of so many rows takes."""
+    return size * (size + 1) // 2
+
+
+def diagonal(size: int) -> IntArray:
+    """Return where the diagonal is, (size,)."""
+    return np.cumsum(np.arange(1, size + 1)) - 1
+
+
+def of_rows(rows: FloatArray, first: int) -> FloatArray:
+    """Return the rows from the first on of symmetric matrices, packed.
+
+    Parameters
+    ----------
+    rows
+        (..., size - first, size).
+    first
+        The rows before are left out, as they are packed already.
+    """
+    size = rows.shape[-1]
+    up_to_diagonal = np.arange(size) <= np.arange(first, size)[:, None]
+    return rows[..., up_to_diagonal]
+
+
+def picked(matrices: FloatArray, order: IntArray) -> FloatArray:
+    """Return the rows and columns of packed matrices in some order.
+
+    Parameters
+    ----------
+    matrices
+        (m, length).
+    order
+        Row of each row of the result, (size,).
+    """
+    if np.array_equal(order, np.arange(len(order))):
+        return matrices[:, : length(len(order))].copy()
+    i, j = _half(len(order))
+    one, other = order[i], order[j]
+    high = np.maximum(one, other)
+    chosen: FloatArray = np.take(matrices, high * (high + 1) // 2 + np.minimum(one, other), axis=1)
+    return chosen
+
+
+def upper(matrix: FloatArray, size: int) -> FloatArray:
+    """Return the upper half of the first rows of a packed matrix, (size, size), column-major.
+
+    What is below the diagonal is of no meaning.
+    """
+    whole: FloatArray = dtpttr(size, matrix[: length(size)])[0]
+    return whole
+
+
+def of_upper(matrix: FloatArray) -> FloatArray:
+    """Return a matrix packed of which only the upper half counts, column-major, (size, size)."""
+    half: FloatArray = dtrttp(matrix)[0]
+    return half
+
+
+@lru_cache(maxsize=8)
+def _half(size: int) -> tuple[IntArray, IntArray]:
+    i, j = np.tril_indices(size)
+    return i.astype(np.int32), j.astype(np.int32)

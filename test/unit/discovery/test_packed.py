@@ -1,0 +1,47 @@
+"""Symmetric matrices of which one half is kept."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from remaster_ros.discovery import packed
+
+
+def symmetric(size: int, count: int, seed: int):
+    matrices = np.random.default_rng(seed).normal(size=(count, size, size))
+    return matrices + matrices.transpose(0, 2, 1)
+
+
+@given(st.integers(1, 12), st.integers(0, 2**32 - 1))
+def test_a_packed_matrix_is_half_of_itself(size, seed):
+    whole = symmetric(size, 3, seed)
+    half = packed.of_rows(whole, 0)
+    assert half.shape == (3, packed.length(size))
+    assert np.array_equal(half[:, packed.diagonal(size)], np.einsum('gii->gi', whole))
+    for one, its_half in zip(whole, half, strict=True):
+        assert np.array_equal(np.triu(packed.upper(its_half, size)), np.triu(one))
+        assert np.array_equal(packed.of_upper(np.asfortranarray(np.triu(one))), its_half)
+
+
+@given(st.data(), st.integers(1, 12), st.integers(0, 2**32 - 1))
+def test_rows_and_columns_are_picked_in_any_order(data, size, seed):
+    whole = symmetric(size, 2, seed)
+    order = np.array(
+        data.draw(st.permutations(range(size)))[: data.draw(st.integers(1, size))], dtype=int
+    )
+    chosen = packed.picked(packed.of_rows(whole, 0), order)
+    assert np.array_equal(chosen, packed.of_rows(whole[:, order][:, :, order], 0))
+
+
+@pytest.mark.parametrize('first', [0, 1, 4, 6])
+def test_further_rows_follow_those_that_are_packed(first):
+    whole = symmetric(6, 2, 5)
+    parts = packed.of_rows(whole[:, :first, :first], 0), packed.of_rows(whole[:, first:], first)
+    assert np.array_equal(np.concatenate(parts, axis=1), packed.of_rows(whole, 0))
+
+
+def test_what_is_picked_is_a_copy():
+    half = packed.of_rows(symmetric(4, 2, 1), 0)
+    packed.picked(half, np.arange(3))[:] = np.nan
+    assert np.all(np.isfinite(half))
