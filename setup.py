@@ -91,6 +91,7 @@ setup(
         'mcap>=1.2',
         'python-dateutil>=2.8',
         'rosbags>=0.10',
+        'threadpoolctl>=3.1',
         'tornado>=6.4',
         'xacro>=2.0.8',
     ],

@@ -16,6 +16,7 @@ PIP_ONLY = {
     'msgspec': 'msgspec',
     'plotly': 'plotly',
     'rosbags': 'rosbags',
+    'threadpoolctl': 'threadpoolctl',
     'trimesh': 'trimesh',
 }
 

@@ -27,6 +27,7 @@ from remaster_ros.calibration.priors import (
 )
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.linear_algebra import one_thread
 from remaster_ros.types import (
     BoolArray,
     FloatArray,
@@ -225,6 +226,7 @@ class Estimate:
         return hold_offsets(self.mode, np.zeros(self.model.joints))
 
 
+@one_thread
 def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
     """Find the mode, with the parameters of an extension where one is given.
 

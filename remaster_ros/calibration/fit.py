@@ -15,6 +15,7 @@ from remaster_ros.calibration.paper import BURN_IN_SHARE, STEPS, fit_paper
 from remaster_ros.calibration.result import FitResult, Sampled, build_result, sampled_columns
 from remaster_ros.calibration.sampling import PRECISION, Progress, sample_posterior, silent
 from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.linear_algebra import one_thread
 from remaster_ros.types import FloatArray, Priors, Session
 
 __all__ = ['PRECISION', 'FitResult', 'fit_session']
@@ -26,6 +27,7 @@ COARSEST_PRECISION = 0.1
 FINEST_PRECISION = 0.002
 
 
+@one_thread
 def fit_session(
     session: Session,
     *,

@@ -31,6 +31,7 @@ from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stretches import compare_stretches
 from remaster_ros.discovery.undetected import undetected
 from remaster_ros.errors import InputError
+from remaster_ros.linear_algebra import one_thread
 from remaster_ros.types import BoolArray, FloatArray, Session
 
 # Zero-offsets with which a session's error is so many times that with its own, and which differ
@@ -124,6 +125,7 @@ class Confirmation:
         return rms_sigmas([row for effect in self.effects for row in effect.parameters])
 
 
+@one_thread
 def confirm(discovery: Discovery, session: Session) -> Confirmation:
     """Compare a discovery with another session of the same arm.
 

@@ -21,6 +21,7 @@ from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.explain import TIED
 from remaster_ros.discovery.families import family_log_prior
 from remaster_ros.discovery.words import called
+from remaster_ros.linear_algebra import one_thread
 
 
 class Named(NamedTuple):
@@ -74,6 +75,7 @@ def sigma_of(log_odds: float) -> float:
     return max(0.0, float(-ndtri_exp(-np.logaddexp(0.0, abs(log_odds)))))
 
 
+@one_thread
 def decisions(found: Discovery, pairs: Sequence[tuple[Named, Named]]) -> tuple[Decision, ...]:
     """Compare two causes of each pair by what was measured since.
 

@@ -52,6 +52,7 @@ from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
 from remaster_ros.discovery.to_extension import extension_of
 from remaster_ros.discovery.undetected import Undetected, undetected
 from remaster_ros.errors import InsufficientDataError
+from remaster_ros.linear_algebra import one_thread
 from remaster_ros.types import FloatArray, IntArray, Priors, Session
 
 Verdict = Literal['effects', 'none', 'undetermined', 'unexplained']
@@ -136,6 +137,7 @@ class Discovery:
         return max(self.repeated.widening, self.stretches.widening or 1.0)
 
 
+@one_thread
 def discover_session(
     session: Session,
     *,

@@ -10,6 +10,7 @@ import numpy as np
 
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.free_paths import is_straight_free
+from remaster_ros.linear_algebra import one_thread
 from remaster_ros.planning.candidates import Plan, PlannedPose, PlanningScene
 from remaster_ros.planning.design_information import DesignInformation
 from remaster_ros.planning.expected_sensors import ExpectedSensor, ToolBox
@@ -119,6 +120,7 @@ class Designed:
         )
 
 
+@one_thread
 def designed_plans(
     scene: PlanningScene,
     settings: DesignSettings,

@@ -20,6 +20,7 @@ import numpy as np
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.linear_algebra import one_thread
 from remaster_ros.planning.candidates import PlannedPose, PlanningScene
 from remaster_ros.planning.design_information import DesignInformation, nominal_context
 from remaster_ros.planning.expected_sensors import (
@@ -148,6 +149,7 @@ def measured_so_far(rows: Measurements) -> tuple[tuple[PlannedPose, ...], Measur
     )
 
 
+@one_thread
 def separate(
     chain: SerialChain,
     planned: Sequence[PlannedPose],

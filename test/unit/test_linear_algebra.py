@@ -1,0 +1,71 @@
+"""What estimates works in one thread of linear algebra, also where nothing else has said so."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from calibration_scenes import scene
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from remaster_ros.calibration.fit import fit_session
+from remaster_ros.discovery.discover import discover_session
+from remaster_ros.linear_algebra import one_thread
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """As a program finds them that did not ask for one: as many as the machine has."""
+    with threadpool_limits(limits=2, user_api='blas'):
+        yield
+
+
+def threads() -> set[int]:
+    return {
+        library['num_threads'] for library in threadpool_info() if library['user_api'] == 'blas'
+    }
+
+
+@pytest.mark.parametrize('work', [fit_session, discover_session])
+def test_fits_and_searches_take_one_thread_and_leave_the_others_as_they_were(two_threads, work):
+    session, _ = scene(3, poses=12, validation=4)
+    seen: set[int] = set()
+    work(session, rng=np.random.default_rng(1), progress=lambda *_: seen.update(threads()))
+    assert seen == {1}
+    assert threads() == {2}
+
+
+def test_also_after_an_error(two_threads):
+    @one_thread
+    def failing() -> None:
+        assert threads() == {1}
+        raise ArithmeticError
+
+    with pytest.raises(ArithmeticError):
+        failing()
+    assert threads() == {2}
+
+
+def test_a_library_that_was_loaded_later_counts():
+    """SciPy has one of its own, which nothing has loaded when the decorator is made."""
+    code = (
+        'import json, numpy\n'
+        'from threadpoolctl import threadpool_info\n'
+        'from remaster_ros.linear_algebra import one_thread\n'
+        'limited = one_thread(lambda: [one["num_threads"] for one in threadpool_info()])\n'
+        'before = len(threadpool_info())\n'
+        'import scipy.linalg\n'
+        'print(json.dumps([before, limited()]))\n'
+    )
+    environment = {**os.environ, 'OMP_NUM_THREADS': '2'}
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=True, env=environment
+    )
+    before, counts = json.loads(done.stdout)
+    assert len(counts) >= before
+    assert set(counts) == {1}
