@@ -30,6 +30,8 @@ ADAPTING = 0.5
 # draws nothing is adapted.
 DRAWS_PER_DIMENSION = 5.0
 LARGEST_NEED = 0.25
+# Where nothing can be adapted and draws are worth less than this share, more of them are no use.
+HOPELESS = 0.01
 # Of the weights, tried one after the other.
 POWERS = 0.7 ** np.arange(1.0, 25.0)
 
@@ -104,6 +106,14 @@ class Weighted(NamedTuple):
         """Whether the weights' tail passes its check."""
         return self.pareto_k < PARETO_LIMIT
 
+    def with_draws(self, points: FloatArray, log_weight: FloatArray) -> Weighted:
+        """Return these and further draws of the same proposal, smoothed together."""
+        return Weighted.of(
+            np.concatenate((self.points, points)),
+            np.concatenate((self.log_weight, log_weight)),
+            self.proposal,
+        )
+
     def adapted(self) -> Adaptable:
         """Return a proposal nearer to the density: with the moments of the weighted draws."""
         return self.proposal.adapted(self.points, self._with_moments(self.proposal.dimension))
@@ -177,22 +187,24 @@ def adaptive_importance(
             # A tenth more than the rate so far promises.
             missing = len(weighted.points) * (1.1 * wanted / weighted.effective - 1.0)
             further = int(np.clip(missing, count // 4, evaluations - spent + 1))
-            points, log_weight = drawn(weighted.proposal, further)
-            points = np.concatenate((weighted.points, points))
-            log_weight = np.concatenate((weighted.log_weight, log_weight))
-            weighted = Weighted.of(points, log_weight, weighted.proposal)
+            weighted = weighted.with_draws(*drawn(weighted.proposal, further))
         return weighted
 
     count = int(np.clip(ADAPTING * evaluations / ROUNDS, FEWEST_DRAWS, MOST_DRAWS))
-    best = last = Weighted.of(*drawn(proposal, min(count, proposal.first_draws)), proposal)
-    needed = DRAWS_PER_DIMENSION * proposal.dimension
+    adaptable = DRAWS_PER_DIMENSION * proposal.dimension <= LARGEST_NEED * count
+    first = min(count, proposal.first_draws)
+    best = last = Weighted.of(
+        *drawn(proposal, first if adaptable else min(first, FEWEST_DRAWS)), proposal
+    )
+    if len(best.points) < first and best.effective >= HOPELESS * len(best.points):
+        best = last = best.with_draws(*drawn(proposal, first - len(best.points)))
     for _ in range(ROUNDS - 1):
         if best.pareto_k < GOOD_SHAPE:
             best = last = enough(best)
             if best.reliable:
                 break
             # More draws have shown a longer tail: they tell better how to adapt.
-        if needed > LARGEST_NEED * count or spent >= ADAPTING * evaluations:
+        if not adaptable or spent >= ADAPTING * evaluations:
             break
         proposal = last.adapted()
         last = Weighted.of(*drawn(proposal, count), proposal)

@@ -64,9 +64,10 @@ POOR_ACCEPTANCE = 0.15
 POOR_WEIGHTS = 0.8
 MANY_PARAMETERS = 60
 TRIAL_DRAWS = 1000
-# Where they are worth less than this share of themselves, chains of them are not tried: too few
-# would be taken.
-HOPELESS_WEIGHTS = 0.01
+# Where they are worth less than this share of themselves, chains of them are not tried: log
+# weights of variance v leave a share of exp(-v), and a chain takes 2 Φ(-√(v / 2)) of its proposals,
+# which is then a poor acceptance.
+HOPELESS_WEIGHTS = 0.016
 WALKS = 32
 WALK_STEPS_PER_DRAW = 20
 # The first draws of each walk, by which it is judged: a draw costs as much as twenty of a chain.
@@ -160,8 +161,7 @@ def sample_posterior(
     starts = laplace.dispersed(chains, rng)
     likely = trial.resampled(FIRST_CHECKED, rng.spawn(1)[0])
     if surrogate.log_density_error(likely) > DENSITY_ERROR_LIMIT:
-        hopeless = trial.effective < HOPELESS_WEIGHTS * TRIAL_DRAWS
-        return _exact(task, posterior.log_density, laplace, starts, hopeless=hopeless)
+        return _exact(task, posterior.log_density, laplace, starts)
     run, enough = task.independent(surrogate.log_density, laplace, starts)
     checked = max(20, min(CHECKED_DRAWS, CHECKED_ROWS // len(posterior.rows)))
     points = run.draws.reshape(-1, posterior.size)
@@ -185,18 +185,18 @@ def _exact(
     log_density: LogDensity,
     laplace: LaplaceProposal,
     starts: FloatArray,
-    *,
-    hopeless: bool = False,
 ) -> Sampling:
     """Sample by the exact density, with the evaluations that there are.
 
-    Where chains of independent proposals are hopeless none are tried.
+    Chains of independent proposals are begun only where draws on trial show that enough of them
+    would be taken.
     """
     chains, rng = len(starts), task.rng
     weighted = _by_conditional(task, log_density, laplace.mode)
     how = 'effects drawn given the other parameters and the noise'
     if weighted is None:
-        if not hopeless:
+        trial = Weighted.of(*_proposed(laplace, log_density, rng.spawn(1)[0]), laplace)
+        if trial.effective >= HOPELESS_WEIGHTS * TRIAL_DRAWS:
             most = int(CHAINS_SHARE * task.evaluations) // chains
             run, enough = task.independent(log_density, laplace, starts, most)
             if enough:

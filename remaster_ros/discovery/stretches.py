@@ -142,7 +142,8 @@ class _Part:
     Attributes
     ----------
     values, vectors
-        Of G_b, (P,) and (P, P).
+        Of G_b, (v,) and (P, v); a stretch of fewer numbers than parameters leaves the other values
+        at 0.
     pull
         L' X_b' e_b, (P,).
     """
@@ -154,14 +155,20 @@ class _Part:
     @classmethod
     def of(cls, X: FloatArray, errors: FloatArray) -> _Part:
         """Summarise whitened rows X (3 n, P) and errors (3 n,)."""
-        values, vectors = np.linalg.eigh(X.T @ X)
+        if len(X) < X.shape[1]:
+            _, singular, rows = np.linalg.svd(X, full_matrices=False)
+            values, vectors = singular**2, rows.T
+        else:
+            values, vectors = np.linalg.eigh(X.T @ X)
         return cls(np.clip(values, 0.0, 1.0), vectors, X.T @ errors)
 
     def times(self, power: float, columns: FloatArray) -> FloatArray:
         """Return (I − G_b) to a negative power times columns (P, s)."""
         apart = self.values < ALONE
         factor = np.where(apart, (1.0 - np.where(apart, self.values, 0.0)) ** power, 0.0)
-        product: FloatArray = self.vectors @ (factor[:, None] * (self.vectors.T @ columns))
+        # Along all other directions G_b is 0.
+        further = (factor - 1.0)[:, None] * (self.vectors.T @ columns)
+        product: FloatArray = columns + self.vectors @ further
         return product
 
     def moved(self, pull: FloatArray) -> FloatArray:
@@ -175,14 +182,16 @@ def _simulated(parts: list[_Part], rng: np.random.Generator) -> list[FloatArray]
     With u_b = L' X_b' ε_b of the noise and v of the prior, the solution moves by Σ u_b − v, and
     the residuals by X_b times that.
     """
-    size = (len(parts[0].values), SIMULATED)
+    size = len(parts[0].vectors)
     noise = [
-        part.vectors @ (np.sqrt(part.values)[:, None] * rng.standard_normal(size))
+        part.vectors
+        @ (np.sqrt(part.values)[:, None] * rng.standard_normal((len(part.values), SIMULATED)))
         for part in parts
     ]
     inner = np.sum([(part.vectors * part.values) @ part.vectors.T for part in parts], axis=0)
-    values, vectors = np.linalg.eigh(np.eye(size[0]) - inner)
-    prior = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * rng.standard_normal(size))
+    values, vectors = np.linalg.eigh(np.eye(size) - inner)
+    drawn = rng.standard_normal((size, SIMULATED))
+    prior = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * drawn)
     moved = np.sum(noise, axis=0) - prior
     return [
         u - part.vectors @ (part.values[:, None] * (part.vectors.T @ moved))
