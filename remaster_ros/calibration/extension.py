@@ -62,6 +62,9 @@ class Extension:
         Gaussian prior (plausible size, smoothness); zeros where flat, (m, m).
     prior_mean
         What it is about, (m,); None for 0.
+    joint_offsets, joint_offsets_std
+        Where the effects were searched, and how far from there zero-offsets beside them may be:
+        a Gaussian prior, rad, (k,) each; None for that of a fit without effects.
     """
 
     names: tuple[str, ...]
@@ -71,6 +74,8 @@ class Extension:
     theta0: FloatArray
     prior_precision: FloatArray
     prior_mean: FloatArray | None = None
+    joint_offsets: FloatArray | None = None
+    joint_offsets_std: FloatArray | None = None
 
     def turns(self, theta: FloatArray, rows: IntArray) -> dict[int, FloatArray]:
         """Return the angles that theta (..., m) adds in n rows: joint -> rad, (..., n)."""

@@ -22,6 +22,9 @@ TIGHTEST_PRIOR = 1e-6
 # A mastering is off by tenths of a degree. This prior keeps an offset that the data leave open
 # from running away; one that they determine to 0.05 degrees it moves by 1 in 10,000 of its size.
 OFFSET_STD = np.radians(5.0)
+# Standard deviation of a zero-offset's step beside effects, rad: a marker 1 m from the axis is
+# then 0.15 mm off the tangent, on which the effects were searched.
+STEP_STD = np.radians(1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +63,21 @@ def offset_prior(model: Model, joint: int, mean: float, std: float) -> Prior:
 
 
 def plausible_offsets(model: Model, joints: Sequence[int]) -> Prior:
-    """Return what is known of any joint's offset: it is no more than some degrees."""
+    """Return what is known of any joint's offset: it is no more than some degrees.
+
+    Beside effects it is near the one that they were searched with.
+    """
     which = list(joints)
+    effects = model.extension
+    if effects is None or effects.joint_offsets is None or effects.joint_offsets_std is None:
+        return Prior(
+            f'the size of a mastering error, {np.degrees(OFFSET_STD):g} deg',
+            lambda x: x[..., which] / OFFSET_STD,
+        )
+    mean, width = effects.joint_offsets[which], effects.joint_offsets_std[which]
     return Prior(
-        f'the size of a mastering error, {np.degrees(OFFSET_STD):g} deg',
-        lambda x: x[..., which] / OFFSET_STD,
+        'the zero-offsets that the effects were searched with',
+        lambda x: (x[..., which] - mean) / width,
     )
 
 

@@ -65,8 +65,8 @@ POOR_WEIGHTS = 0.8
 MANY_PARAMETERS = 60
 TRIAL_DRAWS = 1000
 # Where they are worth less than this share of themselves, chains of them are not tried: log
-# weights of variance v leave a share of exp(-v), and a chain takes 2 Φ(-√(v / 2)) of its proposals,
-# which is then a poor acceptance.
+# weights of variance v leave a share of exp(-v), and a chain takes 2 Φ(-√(v / 2)) of its
+# proposals, which is then a poor acceptance.
 HOPELESS_WEIGHTS = 0.016
 WALKS = 32
 WALK_STEPS_PER_DRAW = 20

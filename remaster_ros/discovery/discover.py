@@ -49,7 +49,7 @@ from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stepwise_selection import Search
 from remaster_ros.discovery.stretches import Stretches, compare_stretches
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
-from remaster_ros.discovery.to_extension import extension_of
+from remaster_ros.discovery.to_extension import extension_of, offsets_of
 from remaster_ros.discovery.undetected import Undetected, undetected
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.linear_algebra import one_thread
@@ -212,7 +212,7 @@ def discover_session(
         noise_by_range=noise_by_range(residuals, solution),
         outliers=fit.left_out + gross,
         untestable=findings.untestable,
-        offsets_before=_offsets(findings.before),
+        offsets_before=offsets_of(findings.before),
         groups=findings.groups,
         selection=findings.selection,
         residuals=residuals,
@@ -280,7 +280,7 @@ def _sampled(
         clock=clock,
         priors=loosened(session, findings.effects) if priors is None else priors,
         precision=PRECISION,
-        extension=extension_of(residuals, solution) if solution.cells else None,
+        extension=extension_of(residuals, solution, found) if solution.cells else None,
         unmodelled=np.concatenate(unmodelled, axis=1),
         progress=lambda _, share: report('sampling the extended model', share),
     )
@@ -368,16 +368,6 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         aside,
         repeated,
     )
-
-
-def _offsets(found: Estimate) -> tuple[FloatArray, FloatArray]:
-    """Return the zero-offsets of the fit without effects and their stds, rad, (k,) each."""
-    joints = found.model.joints
-    std = np.full(joints, np.nan)
-    free = found.posterior.free
-    angles = free < joints
-    std[free[angles]] = np.sqrt(np.diag(found.mode.covariance)[: len(free)][angles])
-    return found.model.offsets(found.mode.z), std
 
 
 def _judged(

@@ -21,6 +21,7 @@ from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.noise import Noise, NoiseModel
 from remaster_ros.calibration.outliers import robust_noise
+from remaster_ros.calibration.priors import STEP_STD
 from remaster_ros.discovery import packed
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import BLOCK_ROWS, Context
@@ -28,9 +29,6 @@ from remaster_ros.types import FloatArray, IntArray
 
 # Directions of the offsets model below this share of the largest are its gauge.
 ROUNDING = 1e-8
-# Standard deviation of a zero-offset's step, rad: a marker 1 m from the axis is then 0.15 mm off
-# the tangent.
-STEP_STD = np.radians(1.0)
 # With more unpenalised parameters than this share of the numbers measured nothing is left to judge
 # the noise by.
 MOST_PARAMETERS = 0.75

@@ -116,6 +116,27 @@ def test_an_effect_that_is_a_zero_offset_in_disguise_is_held_and_named(sagging) 
     assert direction.fixed_by == 'the prior on the effects'
 
 
+@pytest.mark.parametrize('std_deg', [0.5, 2.0])
+def test_an_offset_that_an_effect_leaves_open_stays_where_the_effects_were_searched(
+    sagging, std_deg
+) -> None:
+    session, arrays = sagging
+    joint = arrays['joint'].copy()
+    joint[:, 2, 0], joint[:, 1, 0] = 1.0, 0.0
+    twin = extension(**{**arrays, 'joint': joint, 'prior_precision': np.diag([1.0, 0.0, 0.0])})
+    free = estimate(Problem.of(session), twin)
+    searched = free.model.offsets(free.mode.z) + np.radians(3.0)
+    near = replace(twin, joint_offsets=searched, joint_offsets_std=np.full(7, np.radians(std_deg)))
+    found = estimate(Problem.of(session), near)
+    # The effect, of 1 rad, takes up what the offset does not.
+    index = int(np.flatnonzero(found.posterior.free == 2)[0])
+    std = np.sqrt(found.mode.covariance[index, index])
+    assert std == pytest.approx(np.radians(std_deg), rel=0.02)
+    assert found.model.offsets(found.mode.z)[2] == pytest.approx(searched[2], abs=0.05 * std)
+    # It is no knowledge of the arm: what no data determine is held as before.
+    assert found.gauge.held.tolist() == free.gauge.held.tolist() == [0]
+
+
 def test_the_paper_s_model_takes_no_effects(sagging) -> None:
     session, arrays = sagging
     with pytest.raises(InputError, match='fast sampler'):

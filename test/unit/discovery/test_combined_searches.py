@@ -73,12 +73,11 @@ def test_its_predictions_are_the_mean_of_those_of_the_sets():
 
 
 def test_what_is_sampled_has_this_mean_and_the_mean_of_the_covariances():
-    session, _, search = scene()
+    session, found, search = scene()
     chosen, others = sets()
     both = combined(search, chosen, others)
-    fit = fit_session(
-        session, rng=np.random.default_rng(3), extension=extension_of(search.data, both)
-    )
+    extension = extension_of(search.data, both, found)
+    fit = fit_session(session, rng=np.random.default_rng(3), extension=extension)
     std = np.sqrt(np.diag(both.covariance))
     print('deviations of the sampled from the mean, std', (fit.theta - both.parameters) / std)
     assert fit.sampler.converged
@@ -120,10 +119,11 @@ def test_what_remembers_is_of_the_readings_of_one_search():
 
 
 def test_a_mean_that_the_model_itself_does_not_have_is_not_taken():
-    session, _, search = scene()
+    session, found, search = scene()
     chosen, others = sets()
     both, data = combined(search, chosen, others), search.data
-    fit = fit_session(session, rng=np.random.default_rng(3), extension=extension_of(data, both))
+    extension = extension_of(data, both, found)
+    fit = fit_session(session, rng=np.random.default_rng(3), extension=extension)
     assert holds(data, both, fit.residuals_after)
     worse = fit.residuals_after.copy()
     worse[data.rows.source] *= 1.2

@@ -10,12 +10,13 @@ from calibration_scenes import CHAIN, MARKERS, URDF, sensors
 from discovery_scenes import residuals_of, session_with
 
 from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.priors import STEP_STD
 from remaster_ros.discovery import proposals, stepwise_selection
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.families import FAMILIES
 from remaster_ros.discovery.proposals import SIGNIFICANCE
-from remaster_ros.discovery.residuals import STEP_STD, Residuals
+from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import screen
 from remaster_ros.discovery.stepwise_selection import (
     DRAWS,
