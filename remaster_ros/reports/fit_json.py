@@ -46,6 +46,7 @@ def fit_content(result: FitResult) -> schemas.Fit:
     """Return a fit as fit.json has it."""
     session, sampler = result.session, result.sampler
     draws = result.draws.reshape(-1, result.draws.shape[-1])
+    limits = {'std_is_lower_limit': True} if result.other_errors else {}
     content: dict[str, Any] = {
         'format': schemas.FIT_FORMAT,
         'version': __version__,
@@ -72,11 +73,12 @@ def fit_content(result: FitResult) -> schemas.Fit:
                 'rotation_xyzw': quaternion_xyzw(T_R_N[:3, :3]),
                 'std_m': result.T_R_N_std_m[sensor],
                 'std_rad': result.T_R_N_std_rad[sensor],
+                **limits,
             }
             for sensor, T_R_N in result.T_R_N.items()
         },
         'markers': {
-            name: {'position_m': position, 'std_m': result.marker_std_m[name]}
+            name: {'position_m': position, 'std_m': result.marker_std_m[name], **limits}
             for name, position in result.marker_positions.items()
         },
         'noise': {sensor: _noise(noise) for sensor, noise in result.noise.items()},

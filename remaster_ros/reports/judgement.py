@@ -139,6 +139,11 @@ def _structure(result: FitResult) -> list[str]:
             'The standard deviations and intervals of the offsets include what the model leaves '
             f'out: they are up to {np.max(result.widening):.1f} times as wide as without it.'
         )
+    if result.other_errors:
+        lines.append(
+            'Those of registrations and markers do not: they are lower limits. What the model '
+            'leaves out may move these many times as far.'
+        )
     return lines
 
 

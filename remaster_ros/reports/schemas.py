@@ -75,19 +75,25 @@ class GaugeCombination(Struct):
 
 
 class Registration(Struct):
-    """T_R_N: the sensor's frame N in the robot base R."""
+    """T_R_N: the sensor's frame N in the robot base R.
+
+    ``std_is_lower_limit`` is true where errors are left that the model has not: they move
+    registrations and markers by more than it states, by how much no data show.
+    """
 
     translation_m: Triple
     rotation_xyzw: tuple[float, float, float, float]
     std_m: Triple
     std_rad: Triple
+    std_is_lower_limit: bool | UnsetType = UNSET
 
 
 class Marker(Struct):
-    """A marker's position in the tool frame T."""
+    """A marker's position in the tool frame T; ``std_is_lower_limit`` as of a registration."""
 
     position_m: Triple
     std_m: Triple
+    std_is_lower_limit: bool | UnsetType = UNSET
 
 
 class Noise(Struct):

@@ -29,6 +29,7 @@ from remaster_ros.reports.fit_json import (
     save_fit,
     write_fit,
 )
+from remaster_ros.reports.report import report_html
 
 
 def test_fit_json_is_the_fit(fit_result, tmp_path):
@@ -225,6 +226,14 @@ def test_wider_intervals_and_their_reason_are_in_the_file(fit_result):
     rows = content['joint_offsets']
     assert rows[2]['model_std_deg'] == pytest.approx(rows[2]['std_deg'] / 3.0)
     assert 'model_std_deg' not in rows[3]
+    places = (*content['registration'].values(), *content['markers'].values())
+    assert len(places) > 1
+    assert all(place['std_is_lower_limit'] for place in places)
+    assert 'lower limits' in report_html(found, {})
+    healthy = replace(found, structure=ResidualStructure(tests[1:]))
+    assert not healthy.other_errors
+    assert 'std_is_lower_limit' not in str(msgspec.to_builtins(fit_content(healthy)))
+    assert 'lower limits' not in report_html(healthy, {})
     assert 'intervals' not in msgspec.to_builtins(fit_content(replace(fit_result, structure=None)))
 
 
