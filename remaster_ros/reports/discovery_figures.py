@@ -25,6 +25,7 @@ from remaster_ros.reports.figures import (
     WIDTH_IN,
     as_svg,
     error_histograms,
+    legend_above,
 )
 from remaster_ros.types import FloatArray
 
@@ -64,7 +65,7 @@ def gain(discovery: Discovery) -> Figure:
     lengths = [1e3 * np.linalg.norm(error[rows], axis=1) for error in errors]
     error_histograms(left, *(np.maximum(values, 1e-4) for values in lengths))
     left.set_title('Held-out poses' if held_out.any() else 'Fitted poses')
-    left.legend(loc='best')
+    legend_above(left)
 
     model = data.noise_model
     fits = selection.empty, selection.solution

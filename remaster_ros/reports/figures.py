@@ -188,7 +188,7 @@ def errors_by_configuration(result: FitResult) -> Figure:
         ax.set_ylabel('3-D error (mm)')
         ax.set_xlabel('joint configuration, in the order measured')
         ax.margins(x=0.01)
-        _legend_above(ax, legend)
+        legend_above(ax, legend)
     return figure
 
 
@@ -200,7 +200,7 @@ def residual_distribution(result: FitResult) -> Figure:
     for ax, (title, rows) in zip(axes, splits, strict=True):
         error_histograms(ax, before[rows], after[rows])
         ax.set_title(title)
-        _legend_above(ax)
+        legend_above(ax)
     return figure
 
 
@@ -240,7 +240,7 @@ def _stacked(count: int, height_in: float) -> tuple[Figure, list[Axes]]:
     return figure, list(figure.subplots(count, 1, squeeze=False).flat)
 
 
-def _legend_above(ax: Axes, handles: list[Line2D] | None = None) -> None:
+def legend_above(ax: Axes, handles: list[Line2D] | None = None) -> None:
     """Put the legend at the right above the panel, in one row."""
     shown: Sequence[Artist] = ax.get_legend_handles_labels()[0] if handles is None else handles
     ax.legend(
