@@ -62,9 +62,11 @@ class Extension:
         Gaussian prior (plausible size, smoothness); zeros where flat, (m, m).
     prior_mean
         What it is about, (m,); None for 0.
-    joint_offsets, joint_offsets_std
-        Where the effects were searched, and how far from there zero-offsets beside them may be:
-        a Gaussian prior, rad, (k,) each; None for that of a fit without effects.
+    joint_offsets
+        Zero-offsets that the effects were searched with, those that the gauge held at 0, rad,
+        (k,); None where nothing is known of them.
+    step_std
+        How far from there offsets beside the effects may be: a Gaussian prior, rad.
     """
 
     names: tuple[str, ...]
@@ -75,7 +77,7 @@ class Extension:
     prior_precision: FloatArray
     prior_mean: FloatArray | None = None
     joint_offsets: FloatArray | None = None
-    joint_offsets_std: FloatArray | None = None
+    step_std: float = np.inf
 
     def turns(self, theta: FloatArray, rows: IntArray) -> dict[int, FloatArray]:
         """Return the angles that theta (..., m) adds in n rows: joint -> rad, (..., n)."""

@@ -69,15 +69,15 @@ def plausible_offsets(model: Model, joints: Sequence[int]) -> Prior:
     """
     which = list(joints)
     effects = model.extension
-    if effects is None or effects.joint_offsets is None or effects.joint_offsets_std is None:
+    if effects is None or effects.joint_offsets is None:
         return Prior(
             f'the size of a mastering error, {np.degrees(OFFSET_STD):g} deg',
             lambda x: x[..., which] / OFFSET_STD,
         )
-    mean, width = effects.joint_offsets[which], effects.joint_offsets_std[which]
+    searched, width = effects.joint_offsets[which], effects.step_std
     return Prior(
         'the zero-offsets that the effects were searched with',
-        lambda x: (x[..., which] - mean) / width,
+        lambda x: (x[..., which] - searched) / width,
     )
 
 

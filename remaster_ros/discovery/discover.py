@@ -49,7 +49,11 @@ from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stepwise_selection import Search
 from remaster_ros.discovery.stretches import Stretches, compare_stretches
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
-from remaster_ros.discovery.to_extension import extension_of, offsets_of
+from remaster_ros.discovery.to_extension import (
+    extension_of,
+    moved_by_open_offsets,
+    offsets_of,
+)
 from remaster_ros.discovery.undetected import Undetected, undetected
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.linear_algebra import one_thread
@@ -270,6 +274,8 @@ def _sampled(
     # The cells of the search come first in what combines it with others.
     more = len(solution.parameters) - len(chosen.parameters)
     unmodelled = [missed.moves, np.pad(stretches.moves, ((0, more), (0, 0))), alike]
+    if solution.cells:
+        unmodelled.append(moved_by_open_offsets(found, solution))
     if (aside := findings.aside) is not None:
         unmodelled.append(moved_by_memory(found, residuals, solution, aside.memory))
     if findings.repeated is not None:

@@ -6,16 +6,16 @@ import numpy as np
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.extension import Extension, Term
-from remaster_ros.calibration.priors import OFFSET_STD, STEP_STD
+from remaster_ros.calibration.priors import STEP_STD
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray
 
-# In standard deviations of the fit without effects, where that is more than a step may be: what
-# only a prior determines is not to be known better for it.
-AS_UNCERTAIN = 3.0
+# Of an offset with a larger share of the prior's standard deviation the prior takes more than a
+# twentieth off.
+OPEN = 1.0 / 3.0
 
 
 def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> Extension:
@@ -28,7 +28,6 @@ def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> E
     found
         The fit that the search began with.
     """
-    joint_offsets, std = offsets_of(found)
     terms = []
     displacement0 = np.zeros((len(residuals.context), 3))
     for cell, where in zip(solution.cells, solution.slices(), strict=True):
@@ -46,9 +45,35 @@ def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> E
         solution.parameters,
         solution.prior_precision(),
         solution.prior_mean,
-        joint_offsets,
-        np.where(np.isnan(std), OFFSET_STD, np.maximum(STEP_STD, AS_UNCERTAIN * std)),
+        offsets_of(found)[0],
+        STEP_STD,
     )
+
+
+def moved_by_open_offsets(found: Estimate, solution: Solution) -> FloatArray:
+    """Return how offsets that the fit leaves open move its parameters, one std of each.
+
+    Where the prior holds an offset near the one that was searched with, it is known no better.
+
+    Parameters
+    ----------
+    found
+        The fit that the search began with.
+    solution
+        What was found.
+
+    Returns
+    -------
+    ndarray
+        (size + m, c) for all parameters of the fit and the m of the solution's cells, which stay.
+    """
+    free, covariance = found.posterior.free, found.mode.covariance
+    std = np.sqrt(np.diag(covariance))
+    hardly_known = (free < found.model.joints) & (std > OPEN * STEP_STD)
+    moves = np.zeros((found.model.size + len(solution.parameters), int(hardly_known.sum())))
+    # All else goes along, so that the predictions stay.
+    moves[free] = covariance[:, hardly_known] / std[hardly_known]
+    return moves
 
 
 def offsets_of(found: Estimate) -> tuple[FloatArray, FloatArray]:

@@ -126,7 +126,7 @@ def test_an_offset_that_an_effect_leaves_open_stays_where_the_effects_were_searc
     twin = extension(**{**arrays, 'joint': joint, 'prior_precision': np.diag([1.0, 0.0, 0.0])})
     free = estimate(Problem.of(session), twin)
     searched = free.model.offsets(free.mode.z) + np.radians(3.0)
-    near = replace(twin, joint_offsets=searched, joint_offsets_std=np.full(7, np.radians(std_deg)))
+    near = replace(twin, joint_offsets=searched, step_std=np.radians(std_deg))
     found = estimate(Problem.of(session), near)
     # The effect, of 1 rad, takes up what the offset does not.
     index = int(np.flatnonzero(found.posterior.free == 2)[0])

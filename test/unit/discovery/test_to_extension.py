@@ -6,30 +6,69 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibration_scenes import one_tool_direction
 from discovery_scenes import session_with
 
-from remaster_ros.calibration.estimate import Problem, estimate
-from remaster_ros.calibration.priors import OFFSET_STD, STEP_STD
+from remaster_ros.calibration.estimate import Estimate, Problem, estimate
+from remaster_ros.calibration.priors import STEP_STD
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.to_extension import extension_of, offsets_of
+from remaster_ros.discovery.solution import Solution
+from remaster_ros.discovery.to_extension import (
+    extension_of,
+    moved_by_open_offsets,
+    offsets_of,
+)
 
 
-@pytest.mark.parametrize('marker_std_m', [0.5e-3, 5e-3])
-def test_offsets_stay_near_those_of_the_search_unless_they_were_hardly_known(marker_std_m):
+def searched(marker_std_m: float) -> tuple[Estimate, Residuals, Solution]:
+    """A fit of which the last joint is known as well as the marker, 100 mm beside its axis."""
     session = replace(session_with(7, poses=15), marker_std_m=marker_std_m)
     found = estimate(Problem.of(session))
     residuals = Residuals.of(found)
     nothing = solve(residuals, ())
     assert nothing is not None
+    return found, residuals, nothing
+
+
+def test_offsets_stay_near_those_of_the_search():
+    found, residuals, nothing = searched(0.5e-3)
     extension = extension_of(residuals, nothing, found)
     offsets, std = offsets_of(found)
-    np.testing.assert_array_equal(extension.joint_offsets, offsets)
-    allowed = extension.joint_offsets_std
-    assert allowed is not None
-    # Joint 1 is held; the last one is known as well as the marker, 100 mm beside its axis.
+    # Joint 1 is held.
     assert np.isnan(std[0])
-    assert allowed[0] == OFFSET_STD
-    np.testing.assert_allclose(allowed[1:6], STEP_STD)
+    assert offsets[0] == 0.0
+    np.testing.assert_array_equal(extension.joint_offsets, offsets)
+    assert extension.step_std == STEP_STD
+
+
+@pytest.mark.parametrize('marker_std_m', [0.5e-3, 5e-3])
+def test_an_offset_that_only_a_prior_determines_is_known_no_better_for_it(marker_std_m):
+    found, _, nothing = searched(marker_std_m)
+    std = offsets_of(found)[1]
     assert std[6] == pytest.approx(marker_std_m / 0.1, rel=0.3)
-    assert allowed[6] == pytest.approx(max(STEP_STD, 3.0 * std[6]))
+    moves = moved_by_open_offsets(found, nothing)
+    if std[6] < STEP_STD / 3.0:
+        assert moves.shape[1] == 0
+        return
+    (move,) = moves.T
+    assert move[6] == pytest.approx(std[6])
+
+
+def test_all_else_goes_along_with_an_open_offset():
+    """A marker of unknown place on a tool that is always turned the same way."""
+    found = estimate(Problem.of(one_tool_direction(3)))
+    nothing = solve(Residuals.of(found), ())
+    assert nothing is not None
+    moves = moved_by_open_offsets(found, nothing)
+    predict, rows = found.model.predict, found.posterior.rows
+    before = predict(found.mode.z, rows)
+    inner = [move for move in moves.T if np.argmax(np.abs(move[:7])) < 6]
+    assert inner
+    for move in inner:
+        alone = np.where(np.arange(len(move)) == np.argmax(np.abs(move[:7])), move, 0.0)
+        by_itself, together = (
+            np.abs(predict(found.mode.z + step, rows) - before).max() for step in (alone, move)
+        )
+        print('largest change, m: the offset by itself', by_itself, 'with all else', together)
+        assert together < 0.2 * by_itself
