@@ -68,6 +68,8 @@ TRIAL_DRAWS = 1000
 # weights of variance v leave a share of exp(-v), and a chain takes 2 Φ(-√(v / 2)) of its
 # proposals, which is then a poor acceptance.
 HOPELESS_WEIGHTS = 0.016
+# So many times the draws on trial the exact density has to be evaluated in all, or there are none.
+TRIALS = 10
 WALKS = 32
 WALK_STEPS_PER_DRAW = 20
 # The first draws of each walk, by which it is judged: a draw costs as much as twenty of a chain.
@@ -195,8 +197,11 @@ def _exact(
     weighted = _by_conditional(task, log_density, laplace.mode)
     how = 'effects drawn given the other parameters and the noise'
     if weighted is None:
-        trial = Weighted.of(*_proposed(laplace, log_density, rng.spawn(1)[0]), laplace)
-        if trial.effective >= HOPELESS_WEIGHTS * TRIAL_DRAWS:
+        worth = 1.0
+        if task.evaluations >= TRIALS * TRIAL_DRAWS:
+            trial = Weighted.of(*_proposed(laplace, log_density, rng.spawn(1)[0]), laplace)
+            worth = trial.effective / TRIAL_DRAWS
+        if worth >= HOPELESS_WEIGHTS:
             most = int(CHAINS_SHARE * task.evaluations) // chains
             run, enough = task.independent(log_density, laplace, starts, most)
             if enough:

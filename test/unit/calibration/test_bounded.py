@@ -50,6 +50,25 @@ def test_the_allowance_does_not_depend_on_the_machine(session, monkeypatch) -> N
     np.testing.assert_array_equal(first.draws, second.draws)
 
 
+@pytest.mark.parametrize('least', [0.0, 1.1])
+def test_chains_are_begun_only_where_enough_of_their_proposals_would_be_taken(
+    session, monkeypatch, least
+) -> None:
+    monkeypatch.setattr(sampling, 'HOPELESS_WEIGHTS', least)
+    monkeypatch.setattr(sampling, 'DENSITY_ERROR_LIMIT', -1.0)
+    begun = []
+    independent = sampling._Task.independent
+
+    def counted(task, *arguments):
+        begun.append(arguments)
+        return independent(task, *arguments)
+
+    monkeypatch.setattr(sampling._Task, 'independent', counted)
+    mode = estimate(Problem.of(session)).mode
+    sampling.sample_posterior(mode, chains=4, rng=np.random.default_rng(2))
+    assert len(begun) == (1 if least == 0.0 else 0)
+
+
 def test_hopeless_weights_leave_the_gaussian_about_the_mode(session, monkeypatch) -> None:
     monkeypatch.setattr(sampling, 'EVALUATED_ROWS', 1_000_000)
     monkeypatch.setattr(sampling, 'FEWEST_EFFECTIVE', np.inf)

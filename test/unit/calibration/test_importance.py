@@ -87,6 +87,33 @@ def test_a_tail_that_only_more_draws_show_is_adapted_to() -> None:
     assert found.effective >= 3000.0
 
 
+class OfManyParameters(LongTailed):
+    """More than moments of some thousand draws can be had of: nothing is adapted."""
+
+    dimension, first_draws = 400, 4000
+
+    def __init__(self, spread: float) -> None:
+        self.spread = spread
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        return self.spread * rng.standard_normal((count, 1)), np.zeros(count)
+
+
+@pytest.mark.parametrize(('spread', 'more'), [(5.0, False), (1.6, True)])
+def test_hopeless_draws_are_not_multiplied_where_nothing_can_be_adapted(spread, more) -> None:
+    found = adaptive_importance(
+        lambda points: points[:, 0],
+        OfManyParameters(spread),
+        wanted=1e5,
+        evaluations=100_000,
+        rng=np.random.default_rng(4),
+        progress=lambda share: None,
+    )
+    print('effective', found.effective, 'Pareto k', found.pareto_k)
+    assert (len(found.points) == 1000) != more
+    assert (len(found.points) >= 4000) == more
+
+
 def test_evaluations_are_limited_and_counted() -> None:
     count = 0
 
