@@ -33,6 +33,9 @@ WEAK_FACTOR = 5.0
 WEAK_SHARE = 0.1
 # A mastering is off by tenths of a degree: an offset known worse than this is not measured.
 OPEN_ANGLE = np.radians(1.0)
+# An offset that a prior determines counts as identifiable where its standard deviation is at most
+# so many times the median of those that the data determine.
+AS_GOOD_AS_SEEN = 2.0
 # Entries of a direction below this share of its largest are rounding errors.
 NEGLIGIBLE = 1e-5
 # Rows whose derivatives are at hand at a time.
@@ -124,6 +127,36 @@ def find_gauge(
             known = f'the data determine it only to {np.degrees(std):.2f} deg'
             why[worst] = f'{known}: {directions[-1].why}'
     return Gauge(tuple(directions), np.array(sorted(held), dtype=np.int64), tuple(why))
+
+
+def known_offsets(
+    why: tuple[str, ...], by_data: FloatArray, std: FloatArray
+) -> tuple[BoolArray, tuple[str, ...]]:
+    """Return which offsets are identifiable, (k,), and why the others are not.
+
+    Those that the data determine, or a prior nearly as well; none that is known to no better than
+    a degree once all is counted.
+
+    Parameters
+    ----------
+    why
+        Of each joint why the data do not determine its offset, '' where they do.
+    by_data, std
+        Standard deviation by the model, and with what is known to be left out of it, rad, (k,).
+    """
+    seen = np.array([not text for text in why])
+    if not seen.any():
+        return seen, why
+    known: BoolArray = seen | (by_data <= AS_GOOD_AS_SEEN * np.median(by_data[seen]))
+    left_open = std > OPEN_ANGLE
+    reasons = tuple(
+        f'with what the model leaves out it is known only to {np.degrees(width):.1f} deg: poses '
+        'that are spread further and turn the tool would tell more'
+        if hardly and not text
+        else text
+        for text, width, hardly in zip(why, std, left_open, strict=True)
+    )
+    return known & ~left_open, reasons
 
 
 def _entries(model: Model, combination: FloatArray) -> dict[str, float]:

@@ -13,7 +13,7 @@ from remaster_ros.calibration.convergence import SamplerInfo
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.held_out_tests import held_out_tests
-from remaster_ros.calibration.identifiability import Gauge, GaugeDirection
+from remaster_ros.calibration.identifiability import Gauge, GaugeDirection, known_offsets
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.metropolis import Chains
 from remaster_ros.calibration.model import Model
@@ -32,9 +32,6 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, inverse, matrix_to_rotation_vector
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Session
 
-# An offset that a prior determines counts as identifiable where its standard deviation is at most
-# so many times the median of those that the data determine.
-AS_GOOD_AS_SEEN = 2.0
 # A mastering is off by tenths of a degree. A larger offset is that of a joint that has lost its
 # mastering, or joints, signs or the robot model are not those of the arm that was measured.
 LARGEST_OFFSET = np.radians(5.0)
@@ -289,6 +286,7 @@ def build_result(
         if errors_are_left(noise_checks, structure):
             robust = robust_std(sampled.mode, measurements)
             widening = np.where(unfixed, 1.0, np.maximum(1.0, robust / std))
+    identifiable, why = known_offsets(gauge.why, std_by_data, widening * std)
     noise = posterior.noise(sampled.eta)
     total_noise = posterior.noise_model.total_noise(noise)
     predictive = Predictive(
@@ -317,8 +315,8 @@ def build_result(
         joint_offsets=mean,
         joint_offsets_std=widening * std,
         joint_offsets_interval95=mean[:, None] + widening[:, None] * (interval - mean[:, None]),
-        identifiable=_identifiable(gauge.why, std_by_data),
-        why=gauge.why,
+        identifiable=identifiable,
+        why=why,
         gauge=gauge.directions,
         T_R_N=by_sensor(T_R_N),
         T_R_N_std_m=by_sensor(T_draws[..., :3, 3].std(axis=0, ddof=1)),
@@ -376,15 +374,6 @@ def _offset_summary(
         np.where(unfixed, UNKNOWN_STD, std),
         np.where(unfixed[:, None], (-np.pi, np.pi), interval),
     )
-
-
-def _identifiable(why: tuple[str, ...], std: FloatArray) -> BoolArray:
-    """Return which offsets (k,) the data determine, or a prior nearly as well as the others."""
-    seen = np.array([not text for text in why])
-    if not seen.any():
-        return seen
-    known: BoolArray = std <= AS_GOOD_AS_SEEN * np.median(std[seen])
-    return seen | known
 
 
 def predicted_rows(problem: Problem, model: Model, z: FloatArray) -> FloatArray:

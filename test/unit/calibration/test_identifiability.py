@@ -9,6 +9,7 @@ import pytest
 from calibration_scenes import CHAIN, scene
 
 from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.identifiability import Gauge, find_gauge
 from remaster_ros.calibration.model import predict_in_sensor
 from remaster_ros.errors import InsufficientDataError
@@ -34,6 +35,19 @@ def test_one_sensor_leaves_the_first_and_the_last_joint() -> None:
     assert tool.fixed_by == 'the prior on marker sir, 0.5 mm per axis'
     assert gauge.held.tolist() == [0]
     assert [bool(why) for why in gauge.why] == [True, *[False] * 5, True]
+
+
+@pytest.mark.parametrize('open_deg', [0.5, 2.0])
+def test_an_offset_that_is_known_only_to_degrees_is_not_identifiable(open_deg: float) -> None:
+    """Whatever the data alone determine, if what the model leaves out moves it so far."""
+    session = scene(21, poses=15)[0]
+    moves = np.zeros((estimate(Problem.of(session)).model.size, 1))
+    moves[4] = np.radians(open_deg)
+    result = fit_session(session, rng=np.random.default_rng(1), draws=400, unmodelled=moves)
+    assert result.joint_offsets_std[4] == pytest.approx(np.radians(open_deg), rel=0.1)
+    assert result.identifiable[4] == (open_deg < 1.0)
+    assert ('it is known only to 2.0 deg' in result.why[4]) == (open_deg > 1.0)
+    assert np.all(result.identifiable[[1, 2, 3, 5]])
 
 
 def test_two_sensors_turn_together() -> None:
