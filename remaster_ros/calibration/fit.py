@@ -69,8 +69,8 @@ def fit_session(
     priors
         What is known beforehand, in place of the session's own priors; the paper's model has none.
     unmodelled
-        How c causes outside the model move its parameters, one standard deviation of each,
-        (size, c): the posterior is widened by them. Not in paper mode.
+        How c causes outside the model move its natural parameters, one standard deviation of
+        each, (size, c): the posterior is widened by them. Not in paper mode.
 
     Raises
     ------

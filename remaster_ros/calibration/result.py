@@ -188,8 +188,8 @@ class Sampled:
     mode
         Of the posterior; None where it was not sought.
     unmodelled
-        How c causes outside the model move the parameters, one standard deviation of each,
-        (size, c); None where none are expected.
+        How c causes outside the model move the natural parameters, one standard deviation of
+        each, (size, c); None where none are expected.
     """
 
     posterior: Posterior
@@ -213,7 +213,8 @@ class Sampled:
             return self
         causes = rng.standard_normal((*self.z.shape[:-1], self.unmodelled.shape[1]))
         causes -= causes.mean(axis=(0, 1))
-        return replace(self, z=self.z + causes @ self.unmodelled.T)
+        model = self.posterior.model
+        return replace(self, z=model.pinned(model.natural(self.z) + causes @ self.unmodelled.T))
 
 
 def sampled_columns(

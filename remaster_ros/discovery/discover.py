@@ -275,7 +275,7 @@ def _sampled(
     more = len(solution.parameters) - len(chosen.parameters)
     unmodelled = [missed.moves, np.pad(stretches.moves, ((0, more), (0, 0))), alike]
     if solution.cells:
-        unmodelled.append(moved_by_open_offsets(found, solution))
+        unmodelled.append(moved_by_open_offsets(found, residuals, solution))
     if (aside := findings.aside) is not None:
         unmodelled.append(moved_by_memory(found, residuals, solution, aside.memory))
     if findings.repeated is not None:

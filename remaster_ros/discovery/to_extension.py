@@ -6,16 +6,17 @@ import numpy as np
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.extension import Extension, Term
-from remaster_ros.calibration.priors import STEP_STD
+from remaster_ros.calibration.priors import OFFSET_STD, STEP_STD
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
+from remaster_ros.discovery.stretches import root_of_inverse
+from remaster_ros.discovery.undetected import fitted_columns
 from remaster_ros.types import FloatArray
 
-# Of an offset with a larger share of the prior's standard deviation the prior takes more than a
-# twentieth off.
-OPEN = 1.0 / 3.0
+# Where the prior on steps takes a smaller share of its variance off an offset nothing is added.
+NOTICEABLE = 0.1
 
 
 def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> Extension:
@@ -50,29 +51,46 @@ def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> E
     )
 
 
-def moved_by_open_offsets(found: Estimate, solution: Solution) -> FloatArray:
-    """Return how offsets that the fit leaves open move its parameters, one std of each.
+def moved_by_open_offsets(found: Estimate, data: Residuals, solution: Solution) -> FloatArray:
+    """Return how the parameters move with offsets that the prior on steps holds, one std of each.
 
-    Where the prior holds an offset near the one that was searched with, it is known no better.
+    It is no knowledge of the arm: an offset is known no better than by the data and by what is
+    known of any mastering.
 
     Parameters
     ----------
     found
         The fit that the search began with.
-    solution
-        What was found.
+    data, solution
+        What it worked on and found.
 
     Returns
     -------
     ndarray
-        (size + m, c) for all parameters of the fit and the m of the solution's cells, which stay.
+        (size + m, c) for all natural parameters of the fit and the m of the solution's cells.
     """
-    free, covariance = found.posterior.free, found.mode.covariance
-    std = np.sqrt(np.diag(covariance))
-    hardly_known = (free < found.model.joints) & (std > OPEN * STEP_STD)
-    moves = np.zeros((found.model.size + len(solution.parameters), int(hardly_known.sum())))
+    columns, precision, where = fitted_columns(found, data, solution)
+    white = data.noise_model.whitened(columns, solution.noise).reshape(3 * len(data), -1)
+    root = root_of_inverse(white.T @ white + precision)
+    names = found.problem.chain.joint_names
+    joints = np.array(
+        [
+            place
+            for place, joint in enumerate(found.posterior.free)
+            if joint < len(names) and names[joint] not in found.problem.priors.joint_offsets
+        ],
+        dtype=np.int64,
+    )
+    covariance = root @ root[joints].T
+    free = covariance[joints]
+    held = np.linalg.inv(
+        np.linalg.inv(free) + (STEP_STD**-2.0 - OFFSET_STD**-2.0) * np.eye(len(joints))
+    )
+    variance, less = np.diag(free), np.diag(free) - np.diag(held)
+    noticeable = less > NOTICEABLE * variance
+    moves = np.zeros((found.model.size + len(solution.parameters), int(noticeable.sum())))
     # All else goes along, so that the predictions stay.
-    moves[free] = covariance[:, hardly_known] / std[hardly_known]
+    moves[where] = (covariance / variance * np.sqrt(np.maximum(less, 0.0)))[:, noticeable]
     return moves
 
 

@@ -145,7 +145,8 @@ def fitted_columns(
     free, size = found.posterior.free, found.model.size
     own = data.columns(solution.cells)
     columns = np.concatenate((data.full_jacobian[data.rows.source][:, :, free], own), axis=2)
-    rows = prior_rows(found.model, found.posterior.priors, found.mode.z)[1][:, free]
+    x = found.model.natural(found.mode.z)
+    rows = prior_rows(found.model, found.posterior.priors, x, natural=True)[1][:, free]
     precision = np.zeros((columns.shape[2],) * 2)
     precision[: len(free), : len(free)] = rows.T @ rows
     precision[len(free) :, len(free) :] = solution.prior_precision()

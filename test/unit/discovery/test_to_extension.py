@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calibration_scenes import one_tool_direction
-from discovery_scenes import session_with
+from discovery_scenes import at_joint, session_with
 
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
-from remaster_ros.calibration.priors import STEP_STD
+from remaster_ros.calibration.priors import OFFSET_STD, STEP_STD
+from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
@@ -44,31 +45,55 @@ def test_offsets_stay_near_those_of_the_search():
 
 @pytest.mark.parametrize('marker_std_m', [0.5e-3, 5e-3])
 def test_an_offset_that_only_a_prior_determines_is_known_no_better_for_it(marker_std_m):
-    found, _, nothing = searched(marker_std_m)
-    std = offsets_of(found)[1]
-    assert std[6] == pytest.approx(marker_std_m / 0.1, rel=0.3)
-    moves = moved_by_open_offsets(found, nothing)
-    if std[6] < STEP_STD / 3.0:
+    """As well as by the marker, or by what is known of any mastering."""
+    found, data, nothing = searched(marker_std_m)
+    std = offsets_of(found)[1][6]
+    print('std by the fit, deg', np.degrees(std))
+    moves = moved_by_open_offsets(found, data, nothing)
+    held = (std**-2.0 + STEP_STD**-2.0 - OFFSET_STD**-2.0) ** -0.5
+    if held > 0.95 * std:
         assert moves.shape[1] == 0
         return
     (move,) = moves.T
-    assert move[6] == pytest.approx(std[6])
+    assert np.hypot(held, move[6]) == pytest.approx(std, rel=0.02)
+    # The marker goes along, so that it is seen where it was.
+    model = found.model
+    marker = model.natural(found.mode.z)[model.marker(0)]
+    lever = np.hypot(*marker[:2])
+    assert np.linalg.norm(move[model.marker(0)]) == pytest.approx(lever * abs(move[6]), rel=0.05)
 
 
 def test_all_else_goes_along_with_an_open_offset():
     """A marker of unknown place on a tool that is always turned the same way."""
     found = estimate(Problem.of(one_tool_direction(3)))
-    nothing = solve(Residuals.of(found), ())
+    data = Residuals.of(found)
+    nothing = solve(data, ())
     assert nothing is not None
-    moves = moved_by_open_offsets(found, nothing)
+    moves = moved_by_open_offsets(found, data, nothing)
     predict, rows = found.model.predict, found.posterior.rows
     before = predict(found.mode.z, rows)
+    x = found.model.natural(found.mode.z)
     inner = [move for move in moves.T if np.argmax(np.abs(move[:7])) < 6]
     assert inner
     for move in inner:
         alone = np.where(np.arange(len(move)) == np.argmax(np.abs(move[:7])), move, 0.0)
         by_itself, together = (
-            np.abs(predict(found.mode.z + step, rows) - before).max() for step in (alone, move)
+            np.abs(predict(found.model.pinned(x + step), rows) - before).max()
+            for step in (alone, move)
         )
         print('largest change, m: the offset by itself', by_itself, 'with all else', together)
         assert together < 0.2 * by_itself
+
+
+def test_an_offset_that_the_data_determine_beside_the_causes_needs_no_more():
+    """However little the fit without them knew of it, by the noise that it took them for."""
+    session = session_with(7, lambda s: at_joint(4, 2e-2 * np.sin(3.0 * s.measurements.q[:, 3])))
+    found = estimate(Problem.of(session))
+    data = Residuals.of(found)
+    waves = [one for one in EFFECTS['gear_periodic'].cells(data.context) if one.joints == (4,)]
+    (wave,) = (one for one in waves if one.parameters[0] == 'sin3_4')
+    solution = solve(data, (wave,))
+    assert solution is not None
+    std = offsets_of(found)[1][1:6]
+    print('std without the cause, deg', np.degrees(std))
+    assert moved_by_open_offsets(found, data, solution).shape[1] == 0
