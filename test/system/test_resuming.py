@@ -25,15 +25,17 @@ def planner(cell, key):
 
 def restart(cell, *others):
     """Kill the planner and others and start them again; wait for the new planner's decision."""
-    for name in (*others, 'pose_planner'):
+    restarted = (*others, 'pose_planner')
+    before = {name: cell.said[name]['started'] for name in restarted}
+    for name in restarted:
         cell.nodes[name].kill()
         cell.nodes[name].wait()
-        cell.said.pop(name)
-    for name in (*others, 'pose_planner'):
+    for name in restarted:
         cell.nodes[name] = cell._begin(name)
+    # What the killed ones had sent is on its way still, and must not pass for the new ones.
     cell.until(
         lambda: (
-            {*others} <= {*cell.said}
+            all(cell.said[name]['started'] != before[name] for name in restarted)
             and (planner(cell, 'state') == 'running' or planner(cell, 'resuming') == 'no')
         ),
         'the decision',
