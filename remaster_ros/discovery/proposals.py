@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
 from remaster_ros.discovery.catalogue import Catalogue
 from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.families import FAMILIES
 from remaster_ros.discovery.screening import Screening
 from remaster_ros.discovery.selection import Proposal
 from remaster_ros.discovery.solution import Solution
+from remaster_ros.types import FloatArray
 
 # Family-wise error of one round.
 SIGNIFICANCE = 0.01
 SHORTLIST = 8
-# A fit gains at most about so many times what the screening shows, and so much more.
-SHOWN, FURTHER = 2.0, 20.0
+# A fit gains at most about so many times what the screening shows, and so much more: structure hides
+# in the noise common to a pose and shows when that is fitted again, members of a family help each
+# other.
+SHOWN, FURTHER, FURTHER_STRUCTURE, FURTHER_FAMILY = 2.0, 20.0, 100.0, 50.0
 # Members of a family of which none raises the evidence alone have to raise it by this together.
 TOGETHER = 10.0
 
@@ -56,27 +61,48 @@ def propose(
         p_value = screening.p_value(shown)
         return Proposal(candidate, p_value) if gain > 0.0 and p_value <= SIGNIFICANCE else None
 
-    # Structure that hides in the noise common to a pose shows only when that is fitted again.
-    tried = [with_one(index) for index in np.flatnonzero(structure & np.isfinite(score)).tolist()]
-    tried += [_with_family(solution, screening, catalogue, grown, family) for family in FAMILIES]
-    found = [one for one in tried if one is not None]
-    # One cell alone has this p-value, however well it fits. The best is the last.
-    waiting = [
+    further = np.where(structure, FURTHER_STRUCTURE, FURTHER)
+    # Cells to try, each with the most that it may gain. One alone has the p-value that is screened
+    # however well it fits, but for structure.
+    tried = np.flatnonzero(structure & np.isfinite(score)).tolist()
+    tried += [
         index
-        for index in np.argsort(-score)[:SHORTLIST][::-1].tolist()
+        for index in np.argsort(-score)[:SHORTLIST].tolist()
         if not structure[index] and screening.p_value(score[index]) <= SIGNIFICANCE
     ]
+    waiting: list[tuple[float, Callable[[], Proposal | None]]] = [
+        (SHOWN * max(0.0, score[index]) + further[index], partial(with_one, index))
+        for index in tried
+    ]
+    for family in FAMILIES:
+        most = SHOWN * _together(catalogue, score, family) + FURTHER_FAMILY
+        one = partial(_with_family, solution, screening, catalogue, grown, family)
+        waiting.append((most, one))
+    waiting.sort(key=lambda option: option[0])
+    found: list[Proposal] = []
     while True:
         best = max(found, key=lambda one: one.solution.log_evidence, default=None)
         gain = best.solution.log_evidence - solution.log_evidence if best else -np.inf
-        if waiting and SHOWN * score[waiting[-1]] + FURTHER > gain:
-            one = with_one(waiting.pop())
-            found += [] if one is None else [one]
+        if waiting and waiting[-1][0] > gain:
+            _, fitted = waiting.pop()
+            found += [] if (proposal := fitted()) is None else [proposal]
         elif best is not None:
             found.remove(best)
             yield best
         else:
             return
+
+
+def _together(catalogue: Catalogue, score: FloatArray, family: tuple[str, ...]) -> float:
+    """Return what the screening shows the members of a family to gain, each by itself.
+
+    Each is in or out of a family that is there, whatever other cells are tried.
+    """
+    return sum(
+        max(0.0, float(score[index]) + np.log(0.5 * cell.drawn_from))
+        for index, cell in enumerate(catalogue.cells)
+        if cell.name in family and EFFECTS[cell.name].in_family(cell)
+    )
 
 
 def _with_family(
