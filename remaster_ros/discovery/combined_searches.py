@@ -32,7 +32,7 @@ from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.families import visible
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.solution import Solution
+from remaster_ros.discovery.solution import Covariances, Solution
 from remaster_ros.discovery.stepwise_selection import Search
 from remaster_ros.discovery.stretches import root_of_inverse
 from remaster_ros.types import FloatArray, IntArray
@@ -202,15 +202,13 @@ def _with_mean(data: Residuals, fits: Sequence[Solution], cells: tuple[Cell, ...
     precision[p:, p:] += drawn
     values, vectors = _principal(flat + drawn, unit)
     vectors = unit[:, None] * vectors
-    full_covariance = _inverse(precision)
     fixed = [np.full(cell.size, cell.penalty is None) for cell in cells]
     unpenalised = np.flatnonzero(np.concatenate((np.ones(p, bool), *fixed)))
+    covariances = _inverse(precision), _inverse(precision[np.ix_(unpenalised, unpenalised)])
     return replace(
         model,
-        covariance=full_covariance[p:, p:],
         base=base,
-        full_covariance=full_covariance,
-        unpenalised_covariance=_inverse(precision[np.ix_(unpenalised, unpenalised)]),
+        covariances=Covariances(lambda: covariances),
         drawn=drawn,
         prior_mean=(vectors / values) @ (vectors.T @ (drawn @ mean - slope)),
     )

@@ -19,6 +19,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.linalg import cho_solve
@@ -29,7 +30,7 @@ from remaster_ros.calibration.noise import RESOLUTION_M, Noise, NoiseModel
 from remaster_ros.discovery import packed
 from remaster_ros.discovery.effects.base import LARGEST_M, Cell
 from remaster_ros.discovery.residuals import Residuals, units
-from remaster_ros.discovery.solution import Solution
+from remaster_ros.discovery.solution import Covariances, Solution
 from remaster_ros.types import FloatArray
 
 # Columns whose norm falls below this share when the others are projected out add nothing.
@@ -40,6 +41,9 @@ STEPS = 60
 GAIN = 0.05
 # A step that is to raise L by less than half of this is the last: what is left is of second order.
 LAST = 0.25
+# A step that raises L by δ more or less than half of what was promised leaves δ² times this over
+# what was promised to the next: 9 of a cubic, 4 of a curvature that was wrong.
+NEXT = 9.0
 # Longest step, of these logarithms.
 STRIDE = 2.0
 # Step that no longer raises L by more than rounding.
@@ -149,8 +153,7 @@ class _System:
                 entering[list(model.framed)] * model.frame_size_of,
             )
         )
-        self._last: tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray, FloatArray]] | None
-        self._last = None
+        self._last: tuple[FloatArray, tuple[FloatArray, _Cholesky, FloatArray]] | None = None
         # The errors are the last row.
         self.of_parameters = packed.length(self.size)
 
@@ -168,15 +171,16 @@ class _System:
     def value(self, eta: FloatArray) -> float:
         """Return L, by eta: logarithms of the sigmas, of what rows share, of the smoothness."""
         weights, factors = self._precisions(eta)
-        total, root, beta, _ = self._solved(eta)
-        value = self._likelihood(total, weights, beta) - np.sum(np.log(np.diag(root)))
+        total, factor, beta = self._solved(eta)
+        value = self._likelihood(total, weights, beta) - np.sum(np.log(np.diag(factor.root)))
         return float(value + self._smooth(factors, beta))
 
     def derivatives(self, eta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the gradient of L and its average information."""
         count = len(self.entering)
         weights, factors = self._precisions(eta)
-        total, root, beta, inverse = self._solved(eta)
+        total, cholesky, beta = self._solved(eta)
+        inverse = cholesky.inverse
         # Beside the diagonal twice: products with symmetric matrices are then those of the whole.
         twice = packed.of_upper(inverse)
         twice *= 2.0
@@ -217,7 +221,7 @@ class _System:
         square[:count, count:] = -noise_part @ turns
         square[count:, :count] = square[:count, count:].T
         square[count:, count:] = turns.T @ moved
-        information = 0.5 * (square - both.T @ cho_solve((root, False), both, check_finite=False))
+        information = 0.5 * (square - both.T @ cholesky.solve(both))
         return slope, information
 
     def _precisions(self, eta: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -225,11 +229,8 @@ class _System:
         count = len(self.entering)
         return 1.0 / (np.exp(2.0 * eta[:count]) @ self.entering), np.exp(eta[count:])
 
-    def _solved(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return the weighted sum of the Gram matrices, `packed`, and what follows from H.
-
-        Its upper Cholesky factor, the estimate, and H⁻¹ with zeros below the diagonal.
-        """
+    def _solved(self, eta: FloatArray) -> tuple[FloatArray, _Cholesky, FloatArray]:
+        """Return the weighted sum of the Gram matrices, `packed`, H, and the estimate."""
         if self._last is not None and np.array_equal(self._last[0], eta):
             return self._last[1]
         weights, factors = self._precisions(eta)
@@ -243,38 +244,27 @@ class _System:
         root, wrong = dpotrf(H, overwrite_a=1)
         if wrong:
             raise np.linalg.LinAlgError
-        pull = total[self.of_parameters : -1]
-        beta = cho_solve((root, False), pull, check_finite=False)
-        inverse, _ = dpotri(root)
-        self._last = eta.copy(), (total, root, beta, inverse)
+        cholesky = _Cholesky(root)
+        beta = cholesky.solve(total[self.of_parameters : -1])
+        self._last = eta.copy(), (total, cholesky, beta)
         return self._last[1]
 
     def solution(self, start: Solution | None, prior: float) -> Solution:
         eta = self._most_likely(*self._start(start))
         weights, factors = self._precisions(eta)
-        total, root, beta, inverse = self._solved(eta)
-        evidence = self._evidence(total, root, weights, factors, beta)
-        covariance = inverse + inverse.T
-        np.einsum('ii->i', covariance)[:] *= 0.5
-        covariance /= self.unit[:, None]
-        covariance /= self.unit
-        part, unit = slice(self.unpenalised), self.unit[: self.unpenalised]
-        unpenalised = cho_solve((root[part, part], False), np.eye(len(unit))) / np.outer(
-            unit, unit
-        )
+        total, cholesky, beta = self._solved(eta)
+        evidence = self._evidence(total, cholesky.root, weights, factors, beta)
         beta = beta / self.unit
         smoothness = np.full(len(self.cells), np.nan)
         smoothness[self.penalised] = factors
         return Solution(
             self.cells,
             beta[self.p :],
-            covariance[self.p :, self.p :],
             beta[: self.p],
-            covariance,
             self.noise(eta),
             smoothness,
             (self.ridge * self.unit**2)[self.p :],
-            unpenalised,
+            Covariances(partial(_covariances, cholesky, self.unit, self.unpenalised)),
             evidence + prior,
         )
 
@@ -291,14 +281,14 @@ class _System:
             while True:
                 trial = eta.copy()
                 trial[free] = np.clip(eta[free] + step, low[free], high[free])
-                new = self.value(trial)
-                if new > value:
+                gain = self.value(trial) - value
+                if gain > 0.0:
                     break
                 step *= 0.25
                 if np.max(np.abs(step)) < SHORTEST:
                     return eta
-            eta, value = trial, new
-            if promised < LAST:
+            eta, value = trial, value + gain
+            if promised < LAST or NEXT * (gain - 0.5 * promised) ** 2 < GAIN * promised:
                 break
         return eta
 
@@ -375,6 +365,32 @@ class _System:
         diagonal = self.grams[:, packed.diagonal(self.size)[where]].sum(axis=1)
         data = diagonal @ (1.0 / self.model.variances(noise))
         return float(data / np.trace(self.penalties[which]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Cholesky:
+    """A positive definite matrix by its upper Cholesky factor, zeros below the diagonal."""
+
+    root: FloatArray
+
+    @cached_property
+    def inverse(self) -> FloatArray:
+        """The inverse, with zeros below the diagonal."""
+        return np.asarray(dpotri(self.root)[0])
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return the product of the inverse and columns."""
+        return np.asarray(cho_solve((self.root, False), right, check_finite=False))
+
+
+def _covariances(H: _Cholesky, unit: FloatArray, unpenalised: int) -> tuple[FloatArray, FloatArray]:
+    """Return the covariances by H in units, of all columns, and of the first by themselves."""
+    full = H.inverse + H.inverse.T
+    np.einsum('ii->i', full)[:] *= 0.5
+    full /= unit[:, None]
+    full /= unit
+    part, unit = slice(unpenalised), unit[:unpenalised]
+    return full, _Cholesky(H.root[part, part]).solve(np.eye(unpenalised)) / np.outer(unit, unit)
 
 
 def _step(slope: FloatArray, information: FloatArray) -> FloatArray:

@@ -19,9 +19,9 @@ from remaster_ros.types import FloatArray
 # Family-wise error of one round.
 SIGNIFICANCE = 0.01
 SHORTLIST = 8
-# A fit gains at most about so many times what the screening shows, and so much more: structure hides
-# in the noise common to a pose and shows when that is fitted again, members of a family help each
-# other.
+# A fit gains at most about so many times what the screening shows, and so much more: structure
+# hides in the noise common to a pose and shows when that is fitted again, members of a family help
+# each other.
 SHOWN, FURTHER, FURTHER_STRUCTURE, FURTHER_FAMILY = 2.0, 20.0, 100.0, 50.0
 # Members of a family of which none raises the evidence alone have to raise it by this together.
 TOGETHER = 10.0

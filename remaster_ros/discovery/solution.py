@@ -3,13 +3,35 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Covariances:
+    """Covariances of a fit, computed when asked for: most fits are compared by evidence alone.
+
+    Attributes
+    ----------
+    compute
+        Returns the covariance of everything together, (p + m, p + m), and that of the columns of
+        the offsets model and the unpenalised parameters, were the penalised ones known,
+        (p + u, p + u).
+    """
+
+    compute: Callable[[], tuple[FloatArray, FloatArray]]
+
+    @cached_property
+    def both(self) -> tuple[FloatArray, FloatArray]:
+        """What `compute` returns."""
+        return self.compute()
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,19 +42,18 @@ class Solution:
     ----------
     cells
         The set.
-    parameters, covariance
-        Of all the cells in order, SI, (m,) and (m, m).
-    base, base_covariance
-        Of the offsets model's columns, (p,); and of everything together, (p + m, p + m).
+    parameters
+        Of all the cells in order, SI, (m,).
+    base
+        Of the offsets model's columns, (p,).
     noise
         Re-estimated.
     smoothness
         Precision factor of each penalised cell, in order of the cells (NaN for the others).
     ridge
         Prior precision of each unpenalised parameter (0 for the others), (m,).
-    unpenalised_covariance
-        Of the columns of the offsets model and the unpenalised parameters, in order, were the
-        penalised ones known, (p + u, p + u).
+    covariances
+        Of base and parameters, in this order.
     log_evidence
         With the prior probability of the cells.
     drawn
@@ -44,16 +65,24 @@ class Solution:
 
     cells: tuple[Cell, ...]
     parameters: FloatArray
-    covariance: FloatArray
     base: FloatArray
-    full_covariance: FloatArray
     noise: Noise
     smoothness: FloatArray
     ridge: FloatArray
-    unpenalised_covariance: FloatArray
+    covariances: Covariances
     log_evidence: float
     drawn: FloatArray | None = None
     prior_mean: FloatArray | None = None
+
+    @property
+    def full_covariance(self) -> FloatArray:
+        """Covariance of base and parameters together, (p + m, p + m)."""
+        return self.covariances.both[0]
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the parameters, (m, m)."""
+        return self.full_covariance[len(self.base) :, len(self.base) :]
 
     def slices(self) -> list[slice]:
         """Return where each cell's parameters are."""
@@ -68,15 +97,17 @@ class Solution:
         m = [np.arange(len(self.parameters))[where[index]] for index in order]
         chosen = np.concatenate([np.zeros(0, dtype=int), *m])
         every = np.concatenate((np.arange(len(self.base)), len(self.base) + chosen))
-        full_covariance = self.full_covariance[np.ix_(every, every)]
+
+        def covariances(before: Covariances = self.covariances) -> tuple[FloatArray, FloatArray]:
+            return before.both[0][np.ix_(every, every)], before.both[1]
+
         return replace(
             self,
             cells=tuple(self.cells[index] for index in order),
             parameters=self.parameters[chosen],
-            covariance=full_covariance[len(self.base) :, len(self.base) :],
-            full_covariance=full_covariance,
             smoothness=self.smoothness[order],
             ridge=self.ridge[chosen],
+            covariances=Covariances(covariances),
         )
 
     def evidence_without(self, index: int, rows: int) -> float:
@@ -102,7 +133,7 @@ class Solution:
             price = 0.5 * (determinant + np.sum(np.log(prior)))
         else:
             among = self._among_unpenalised(index)
-            alone = np.linalg.slogdet(self.unpenalised_covariance[among, among])[1]
+            alone = np.linalg.slogdet(self.covariances.both[1][among, among])[1]
             # Half log N in place of the determinant that the unpenalised ones have by themselves.
             price = 0.5 * (determinant - alone - cell.size * np.log(3.0 * rows - p))
         return float(self.log_evidence - worth - price)
@@ -110,28 +141,24 @@ class Solution:
     def less(self, index: int, rows: int) -> Solution:
         """Return the fit without one cell, with its `evidence_without`."""
         p, where = len(self.base), self.slices()[index]
-        every = np.concatenate((self.base, self.parameters))
         out = slice(p + where.start, p + where.stop)
-        covariance, pull = _conditioned(self.full_covariance, out)
-        unpenalised = self.unpenalised_covariance
-        if self.cells[index].penalty is None:
-            unpenalised, _ = _conditioned(unpenalised, self._among_unpenalised(index))
+        pull = _regression(self.full_covariance, out)
+        every = np.concatenate((self.base, self.parameters))
         every = np.delete(every, out) - pull @ every[out]
+        among = self._among_unpenalised(index) if self.cells[index].penalty is None else None
         return replace(
             self,
             cells=(*self.cells[:index], *self.cells[index + 1 :]),
             parameters=every[p:],
-            covariance=covariance[p:, p:],
             base=every[:p],
-            full_covariance=covariance,
             smoothness=np.delete(self.smoothness, index),
             ridge=np.delete(self.ridge, where),
-            unpenalised_covariance=unpenalised,
+            covariances=Covariances(partial(_without, self.covariances, out, among)),
             log_evidence=self.evidence_without(index, rows),
         )
 
     def _among_unpenalised(self, index: int) -> slice:
-        """Return where an unpenalised cell is in `unpenalised_covariance`."""
+        """Return where an unpenalised cell is among the unpenalised ones."""
         before = sum(other.size for other in self.cells[:index] if other.penalty is None)
         first = len(self.base) + before
         return slice(first, first + self.cells[index].size)
@@ -155,14 +182,29 @@ class Solution:
         return precision
 
 
-def _conditioned(covariance: FloatArray, out: slice) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance of the others were some known, and their regression on these."""
+def _without(
+    before: Covariances, out: slice, among: slice | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return covariances were the parameters of a cell known: where it is in both of them."""
+    full, unpenalised = before.both
+    return _conditioned(full, out), unpenalised if among is None else _conditioned(
+        unpenalised, among
+    )
+
+
+def _regression(covariance: FloatArray, out: slice) -> FloatArray:
+    """Return the regression of the other parameters on some."""
+    across = np.delete(covariance[out], out, axis=1)
+    return np.asarray(np.linalg.solve(covariance[out, out], across).T)
+
+
+def _conditioned(covariance: FloatArray, out: slice) -> FloatArray:
+    """Return the covariance of the others were some parameters known."""
     size, first, last = len(covariance), out.start, out.stop
-    own, across = covariance[out, out], np.delete(covariance[out], out, axis=1)
-    pull: FloatArray = np.linalg.solve(own, across).T.astype(float, copy=False)
-    conditioned: FloatArray = pull @ -across
+    across = np.delete(covariance[out], out, axis=1)
+    conditioned: FloatArray = _regression(covariance, out) @ -across
     # In four parts: nothing is copied twice.
     for to, of in ((slice(first), slice(first)), (slice(first, None), slice(last, size))):
         conditioned[to, :first] += covariance[of, :first]
         conditioned[to, first:] += covariance[of, last:]
-    return conditioned, pull
+    return conditioned
