@@ -23,11 +23,11 @@ import numpy as np
 from calibration_scenes import scene
 from common import machine, progress, table
 
+from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.held_out_tests import held_out_tests
 from remaster_ros.calibration.noise_check import check_noise
 from remaster_ros.calibration.residual_structure import FAMILY_WISE_ERROR
-from remaster_ros.calibration.result import predicted_rows
 
 SIGMA_M, POSE_SIGMA_M, SOLUTIONS = 0.23e-3, 0.1e-3, 5
 OF_MEAN_M = float(np.hypot(SIGMA_M / np.sqrt(SOLUTIONS), POSE_SIGMA_M))

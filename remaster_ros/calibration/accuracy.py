@@ -96,7 +96,7 @@ def accuracy_of(
     fitted: IntArray,
     predicted_before: FloatArray,
     predicted_after: FloatArray,
-    predictive: Predictive | None,
+    predictive: tuple[Predictive, FloatArray] | None,
     rng: np.random.Generator,
     modelled: ToolOrientations | None = None,
 ) -> dict[str, Any]:
@@ -112,7 +112,8 @@ def accuracy_of(
     predicted_before, predicted_after
         Modelled markers in the sensors' frames with offsets at zero and as estimated, m, (n, 3).
     predictive
-        For the theoretical metric; None where no posterior is at hand.
+        For the theoretical metric, with the pinned parameters of the fit with offsets at zero;
+        None where no posterior is at hand.
     rng
         For the theoretical metric.
     modelled
@@ -121,10 +122,10 @@ def accuracy_of(
     """
     at_random: dict[str, Any] = {}
     if predictive is not None:
-        bare = predictive.without_extension()
+        bare = predictive[0].without_extension()
         rows = random_configurations(bare.model, measurements, RANDOM_CONFIGURATIONS, rng)
         everywhere = np.arange(RANDOM_CONFIGURATIONS)
-        both = theoretical_distances(bare, rows, everywhere, rng)
+        both = theoretical_distances(bare, predictive[1], rows, everywhere, rng)
         at_random = _theoretical(both, suffix='_random')
     result: dict[str, Any] = {}
     validation = np.flatnonzero(measurements.is_validation)
@@ -140,7 +141,7 @@ def accuracy_of(
             missing = unavailable(Distances._fields, 'it needs draws of the posterior')
             result[name] |= {key + s: missing for s in ('', '_random') for key in THEORETICAL}
         else:
-            both = theoretical_distances(predictive, measurements, chosen, rng)
+            both = theoretical_distances(*predictive, measurements, chosen, rng)
             result[name] |= _theoretical(both) | at_random
     return result
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.calibration.accuracy import accuracy_of
+from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate, hold_offsets
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.linearisation import linearise
 from remaster_ros.calibration.orientation_accuracy import tool_orientations
 from remaster_ros.calibration.predictive_accuracy import Predictive
-from remaster_ros.calibration.result import predicted_rows
 from remaster_ros.errors import InputError
 from remaster_ros.types import FloatArray, Session
 
@@ -92,7 +92,6 @@ def accuracy_with_offsets(
     if joint_offsets_std is not None:
         predictive = Predictive(
             model=model,
-            before=found.before.z,
             after=given.z,
             draws=_draws(found, given, joint_offsets_std, rng),
             sigma=np.tile(
@@ -105,7 +104,7 @@ def accuracy_with_offsets(
         found.kept,
         predicted_before,
         predicted_after,
-        predictive,
+        None if predictive is None else (predictive, found.before.z),
         rng,
         tool_orientations(model, problem.measurements, found.before.z, given.z),
     )

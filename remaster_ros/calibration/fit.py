@@ -108,7 +108,11 @@ def fit_session(
         if unmodelled is not None:
             sampled = replace(sampled, unmodelled=unmodelled)
     seconds = clock() - started if clock is not None else np.nan
-    return build_result(problem, sampled, seconds, rng)
+    result = build_result(problem, sampled, seconds, rng)
+    if extension is None:
+        # What cannot be compared is said now.
+        _ = result.comparison
+    return result
 
 
 def _fast(
@@ -151,7 +155,7 @@ def _fast(
         precision=precision if draws is None else None,
         gauge=found.gauge,
         taken_as_known=np.zeros(model.joints),
-        z_before=found.before.z,
+        z_before=lambda: found.before.z,
         left_out=found.left_out,
         mode=found.mode,
     )

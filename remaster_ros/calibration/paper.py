@@ -193,7 +193,7 @@ def fit_paper(
         precision=None,
         gauge=_paper_gauge(found, model),
         taken_as_known=_taken_as_known(found, model, problem.marker_std_m),
-        z_before=find_mode(posterior).z,
+        z_before=lambda: find_mode(posterior).z,
         left_out=(),
     )
 

@@ -52,8 +52,8 @@ class Predictive:
     ----------
     model
         Whose parameters were drawn.
-    before, after
-        Pinned parameters with offsets at zero and of the estimate, (size,).
+    after
+        Pinned parameters of the estimate, (size,).
     draws
         Pinned parameters of the posterior's draws, (draws, size).
     sigma
@@ -62,7 +62,6 @@ class Predictive:
     """
 
     model: Model
-    before: FloatArray
     after: FloatArray
     draws: FloatArray
     sigma: FloatArray
@@ -78,7 +77,6 @@ class Predictive:
         return replace(
             self,
             model=replace(self.model, extension=None),
-            before=self.before[:core],
             after=self.after[:core],
             draws=self.draws[:, :core],
         )
@@ -109,6 +107,7 @@ def random_configurations(
 
 def theoretical_distances(
     predictive: Predictive,
+    before: FloatArray,
     measurements: Measurements,
     chosen: IntArray,
     rng: np.random.Generator,
@@ -119,6 +118,8 @@ def theoretical_distances(
     ----------
     predictive
         The posterior.
+    before
+        Pinned parameters with offsets at zero, (size,); further ones are not looked at.
     measurements
         All rows of the session (those that an extension was made for).
     chosen
@@ -132,7 +133,7 @@ def theoretical_distances(
         m.
     """
     rows = rng.permutation(chosen)[:MOST_ROWS]
-    draws = len(predictive.draws)
+    draws, before = len(predictive.draws), before[: predictive.model.size]
     per_block = min(draws, -(-PAIRS // len(rows)))
     order = rng.permutation(draws)
     blocks = np.array_split(rows, -(-len(rows) // _BLOCK_ROWS))
@@ -141,13 +142,17 @@ def theoretical_distances(
         # Every block of rows takes other draws, so that all draws are used.
         taken = order[(index * per_block + np.arange(per_block)) % draws]
         seen = Rows.of(measurements, block, predictive.model.reference)
-        parts.append(_block(predictive, seen, taken, rng))
+        parts.append(_block(predictive, before, seen, taken, rng))
     invariant, paper = np.concatenate(parts, axis=-1)
     return Distances(*invariant), Distances(*paper)
 
 
 def _block(
-    predictive: Predictive, rows: Rows, taken: IntArray, rng: np.random.Generator
+    predictive: Predictive,
+    before: FloatArray,
+    rows: Rows,
+    taken: IntArray,
+    rng: np.random.Generator,
 ) -> FloatArray:
     """Return both versions of the four `Distances` of some rows and draws, (2, 4, pairs)."""
     model, draws = predictive.model, predictive.draws[taken]
@@ -159,20 +164,20 @@ def _block(
     raw = rng.standard_normal((len(taken), len(rows), 3))
     deeper = (along - across) * np.einsum('dni,ni->dn', raw, sight)
     noise = across[..., None] * raw + deeper[..., None] * sight
-    in_sensor = model.predict(predictive.before, rows), predicted, model.predict(draws, rows)
+    in_sensor = model.predict(before, rows), predicted, model.predict(draws, rows)
     markers = model.markers(model.natural(predictive.after))[rows.marker]
     in_base = (
         model.chain.positions(rows.q, markers, offsets)
         for offsets in (
-            model.offsets(predictive.before),
+            model.offsets(before),
             predictive.mean_offsets,
             model.offsets(draws)[:, None, :],
         )
     )
     distances = [
         np.linalg.norm(place - applied, axis=-1).ravel()
-        for before, after, drawn in (in_sensor, in_base)
-        for applied in (before, after)
+        for *points, drawn in (in_sensor, in_base)
+        for applied in points
         for place in (drawn + noise, drawn)
     ]
     return np.reshape(distances, (2, 4, -1))

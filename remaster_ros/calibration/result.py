@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 
-from remaster_ros.calibration.accuracy import accuracy_of
+from remaster_ros.calibration.comparison import Comparison, compared, predicted_rows
 from remaster_ros.calibration.convergence import SamplerInfo
 from remaster_ros.calibration.estimate import Problem
-from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.held_out_tests import held_out_tests
 from remaster_ros.calibration.identifiability import Gauge, GaugeDirection, known_offsets
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.metropolis import Chains
-from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.noise_check import NoiseCheck, check_noise
 from remaster_ros.calibration.noise_estimate import NoiseEstimate, noise_estimates
-from remaster_ros.calibration.orientation_accuracy import tool_orientations
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.calibration.predictive_accuracy import Predictive
 from remaster_ros.calibration.residual_structure import (
@@ -29,7 +27,7 @@ from remaster_ros.calibration.residual_structure import (
 )
 from remaster_ros.calibration.robust_intervals import robust_std
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.kinematics.transforms import apply, inverse, matrix_to_rotation_vector
+from remaster_ros.kinematics.transforms import matrix_to_rotation_vector
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Session
 
 # A mastering is off by tenths of a degree. A larger offset is that of a joint that has lost its
@@ -78,12 +76,10 @@ class FitResult:
         Markers in T, m, (3,) each.
     noise
         By sensor.
-    T_R_N_before
-        Registrations of the same fit with all offsets held at zero.
-    residuals_before, residuals_after
+    residuals_after
         Measured minus modelled position in N for every row of the session, m, (n, 3).
-    accuracy
-        The three metrics as fit.json has them.
+    compare
+        Returns the `comparison`: where there are further effects it is made when asked for.
     left_out
         (observation, reason) of every gross error.
     noise_checks
@@ -124,10 +120,8 @@ class FitResult:
     marker_std_m: Mapping[str, FloatArray]
     noise: Mapping[str, NoiseEstimate]
     sampler: SamplerInfo
-    T_R_N_before: Mapping[str, FloatArray]
-    residuals_before: FloatArray
     residuals_after: FloatArray
-    accuracy: Mapping[str, Any]
+    compare: Callable[[], Comparison]
     left_out: tuple[tuple[int, str], ...]
     noise_checks: tuple[NoiseCheck, ...]
     structure: ResidualStructure | None
@@ -137,6 +131,26 @@ class FitResult:
     theta_std: FloatArray
     theta_draws: FloatArray
     predictive: Predictive
+
+    @property
+    def comparison(self) -> Comparison:
+        """The same fit with all offsets held at zero beside this one."""
+        return self.compare()
+
+    @property
+    def T_R_N_before(self) -> Mapping[str, FloatArray]:
+        """Registrations of the same fit with all offsets held at zero."""
+        return self.comparison.T_R_N_before
+
+    @property
+    def residuals_before(self) -> FloatArray:
+        """Measured minus modelled position in N with all offsets held at zero, m, (n, 3)."""
+        return self.comparison.residuals_before
+
+    @property
+    def accuracy(self) -> Mapping[str, Any]:
+        """The three metrics as fit.json has them."""
+        return self.comparison.accuracy
 
     @property
     def other_errors(self) -> bool:
@@ -182,7 +196,7 @@ class Sampled:
         Standard deviation, rad, of what the sampler took as known exactly and the session does
         not, in each joint's offset, (k,); it is added to that of the draws.
     z_before
-        Pinned parameters of the fit with offsets at zero, (size,).
+        Returns the pinned parameters of the fit with offsets at zero, (size,).
     left_out
         (row of the measurements, reason) of the gross errors.
     mode
@@ -202,7 +216,7 @@ class Sampled:
     precision: float | None
     gauge: Gauge
     taken_as_known: FloatArray
-    z_before: FloatArray
+    z_before: Callable[[], FloatArray]
     left_out: tuple[tuple[int, str], ...]
     mode: Mode | None = None
     unmodelled: FloatArray | None = None
@@ -257,8 +271,7 @@ def build_result(
     z = sampled.z.copy()
     z[..., np.flatnonzero(unfixed)] = 0.0
     flat = z.reshape(-1, model.size)
-    x_after, x_before = model.natural(sampled.z_mean), model.natural(sampled.z_before)
-    predicted_before = predicted_rows(problem, model, sampled.z_before)
+    x_after = model.natural(sampled.z_mean)
     predicted_after = predicted_rows(problem, model, sampled.z_mean)
     mean, std, interval = _offset_summary(flat[:, : model.joints], unfixed, sampled.taken_as_known)
     std_by_data = _offset_summary(
@@ -292,7 +305,6 @@ def build_result(
     total_noise = posterior.noise_model.total_noise(noise)
     predictive = Predictive(
         model=model,
-        before=sampled.z_before,
         after=sampled.z_mean,
         draws=by_data.z.reshape(-1, model.size),
         sigma=total_noise.reshape(-1, *total_noise.shape[2:]),
@@ -301,6 +313,15 @@ def build_result(
 
     def by_sensor(values: FloatArray) -> dict[str, FloatArray]:
         return dict(zip(problem.sensor_names, values, strict=True))
+
+    # Its own generator: draws are the same whether or not it is asked for.
+    (own_rng,) = rng.spawn(1)
+
+    @cache
+    def compare() -> Comparison:
+        kept = np.setdiff1d(problem.fitted, left_rows)
+        after = sampled.z_mean
+        return compared(problem, kept, sampled.z_before(), after, predictive, own_rng)
 
     def by_marker(values: FloatArray) -> dict[str, FloatArray]:
         return dict(zip(problem.marker_names, values, strict=True))
@@ -333,18 +354,8 @@ def build_result(
             seconds=seconds,
             weakest='' if sampled.mode is None else sampled.mode.weakest,
         ),
-        T_R_N_before=by_sensor(model.T_R_N(x_before)),
-        residuals_before=measurements.position - predicted_before,
         residuals_after=residuals_after,
-        accuracy=accuracy_of(
-            measurements,
-            np.setdiff1d(problem.fitted, left_rows),
-            predicted_before,
-            predicted_after,
-            predictive,
-            rng,
-            tool_orientations(model, measurements, sampled.z_before, sampled.z_mean),
-        ),
+        compare=compare,
         left_out=tuple(zip(left_out.tolist(), (why for _, why in sampled.left_out), strict=True)),
         noise_checks=noise_checks,
         structure=structure,
@@ -375,12 +386,3 @@ def _offset_summary(
         np.where(unfixed, UNKNOWN_STD, std),
         np.where(unfixed[:, None], (-np.pi, np.pi), interval),
     )
-
-
-def predicted_rows(problem: Problem, model: Model, z: FloatArray) -> FloatArray:
-    """Return where the sensors should see the markers of all rows by pinned z, (n, 3)."""
-    measurements = problem.measurements
-    rows = Rows.of(measurements, np.arange(len(measurements)), model.reference)
-    predicted = np.empty((len(measurements), 3))
-    predicted[rows.source] = model.predict(z, rows)
-    return apply(inverse(model.reference)[measurements.sensor], predicted)

@@ -24,7 +24,10 @@ WELL_CONDITIONED = 1e-6
 def worth_of(solution: Solution, cell: Cell, where: slice, price: float) -> float:
     """Estimate how much log evidence would be lost without a cell."""
     values, covariance = solution.parameters[where], solution.covariance[where, where]
-    drop = 0.5 * values @ np.linalg.solve(covariance, values)
+    if cell.size == 1:
+        drop = 0.5 * values[0] ** 2 / covariance[0, 0]
+    else:
+        drop = 0.5 * values @ np.linalg.solve(covariance, values)
     if cell.penalty is None:
         return float(drop - 0.5 * cell.size * price)
     return float(drop - 0.5 * cell.size)

@@ -333,6 +333,7 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         residuals,
         selection,
         search.catalogue,
+        search.fit,
         lambda share: progress('comparing look-alikes', share),
     )
     causes = [EFFECTS[group[0].name].is_cause for group in groups]

@@ -383,14 +383,14 @@ class _Cholesky:
         return np.asarray(cho_solve((self.root, False), right, check_finite=False))
 
 
-def _covariances(H: _Cholesky, unit: FloatArray, unpenalised: int) -> tuple[FloatArray, FloatArray]:
-    """Return the covariances by H in units, of all columns, and of the first by themselves."""
+def _covariances(H: _Cholesky, unit: FloatArray, first: int) -> tuple[FloatArray, FloatArray]:
+    """Return the covariances by H in units, of all, and of the first were the others known."""
     full = H.inverse + H.inverse.T
     np.einsum('ii->i', full)[:] *= 0.5
     full /= unit[:, None]
     full /= unit
-    part, unit = slice(unpenalised), unit[:unpenalised]
-    return full, _Cholesky(H.root[part, part]).solve(np.eye(unpenalised)) / np.outer(unit, unit)
+    unit = unit[:first]
+    return full, _Cholesky(H.root[:first, :first]).solve(np.eye(first)) / np.outer(unit, unit)
 
 
 def _step(slope: FloatArray, information: FloatArray) -> FloatArray:

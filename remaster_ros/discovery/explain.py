@@ -12,10 +12,10 @@ from remaster_ros.discovery.catalogue import Catalogue
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.evidence import solve
-from remaster_ros.discovery.families import WHOLE, family_log_prior, grouped
+from remaster_ros.discovery.families import WHOLE, grouped
 from remaster_ros.discovery.gain import shares
 from remaster_ros.discovery.plain_forms import AS_WELL, SCREENING_ERROR, is_special_case
+from remaster_ros.discovery.proposals import Fit
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import screen
 from remaster_ros.discovery.selection import Selection
@@ -163,9 +163,20 @@ def describe(
     data: Residuals,
     selection: Selection,
     catalogue: Catalogue,
+    fit: Fit,
     progress: Callable[[float], None],
 ) -> tuple[tuple[tuple[Cell, ...], ...], tuple[FoundEffect, ...]]:
-    """Return the chosen cells grouped to causes, and the causes, the largest first."""
+    """Return the chosen cells grouped to causes, and the causes, the largest first.
+
+    Parameters
+    ----------
+    data, selection, catalogue
+        What was searched, what was found, and all cells that were tried.
+    fit
+        Fits a set of cells, as the search does.
+    progress
+        Called with the share that is done.
+    """
     solution = selection.solution
     if not solution.cells:
         return (), ()
@@ -174,7 +185,7 @@ def describe(
     effects = []
     for count, (group, share) in enumerate(zip(groups, parts, strict=True)):
         progress(count / len(groups))
-        effects.append(_described(data, selection, catalogue, group, share))
+        effects.append(_described(data, selection, catalogue, fit, group, share))
     return tuple(groups), tuple(effects)
 
 
@@ -182,6 +193,7 @@ def _described(
     data: Residuals,
     selection: Selection,
     catalogue: Catalogue,
+    fit: Fit,
     group: tuple[Cell, ...],
     share: float,
 ) -> FoundEffect:
@@ -205,7 +217,7 @@ def _described(
         std = float(np.hypot(first.moment_std, gap / np.sqrt(12.0)))
         parameters += (Parameter('moment', first.moment, std, 's'),)
     rest = tuple(cell for cell in solution.cells if cell not in group)
-    without = solve(data, rest, solution, prior=family_log_prior(rest, catalogue.cells))
+    without = fit(rest, solution)
     gain = sum(step.log_evidence_gain for step in selection.steps)
     if without is not None:
         gain = solution.log_evidence - without.log_evidence
@@ -215,7 +227,7 @@ def _described(
         p_values = [max(step.p_value for step in selection.steps)]
     alike: tuple[LookAlike, ...] = ()
     if without is not None and len(group) < WHOLE:
-        alike = _look_alikes(data, solution, without, catalogue, group)
+        alike = _look_alikes(data, solution, without, catalogue, fit, group)
     effect = FoundEffect(
         name=EFFECTS[first.name].reported_as or first.name,
         joints=_joints(group),
@@ -260,6 +272,7 @@ def _look_alikes(
     solution: Solution,
     without: Solution,
     catalogue: Catalogue,
+    fit: Fit,
     group: tuple[Cell, ...],
 ) -> tuple[LookAlike, ...]:
     """Return the other causes that explain nearly as much in a group's place.
@@ -279,11 +292,10 @@ def _look_alikes(
             break
         if (other.name, other.joints) == (cell.name, _joints(group)):
             continue
-        cells = (*without.cells, other)
-        fit = solve(data, cells, solution, prior=family_log_prior(cells, catalogue.cells))
-        if fit is None or fit.log_evidence < solution.log_evidence - CONFUSABLE:
+        found = fit((*without.cells, other), solution)
+        if found is None or found.log_evidence < solution.log_evidence - CONFUSABLE:
             continue
-        gain = fit.log_evidence - without.log_evidence
+        gain = found.log_evidence - without.log_evidence
         key = (other.name, other.joints)
         if key in best and best[key].log_evidence_gain >= gain:
             continue

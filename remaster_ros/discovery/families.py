@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -24,11 +25,12 @@ FAMILIES: tuple[tuple[str, ...], ...] = tuple(
     for family in dict.fromkeys(effect.family for effect in EFFECTS.values() if effect.family)
 )
 """Names of the effects of each family."""
+FAMILY_OF = {name: family for family in FAMILIES for name in family}
 
 
 def relatives(cells: Sequence[Cell], cell: Cell) -> int:
     """Return how many of the cells are of a cell's family; 1 where it has none."""
-    family = next((family for family in FAMILIES if cell.name in family), ())
+    family = FAMILY_OF.get(cell.name, ())
     return max(1, sum(other.name in family for other in cells))
 
 
@@ -38,16 +40,16 @@ def family_log_prior(cells: Sequence[Cell], catalogue: Sequence[Cell]) -> float:
     Cells of a family come together more often than each by its own chance: given the family, each
     of its members is in or out.
     """
-    total = 0.0
-    rest = list(cells)
-    for family in FAMILIES:
-        mine = [cell for cell in rest if cell.name in family]
-        if not mine:
-            continue
-        rest = [cell for cell in rest if cell.name not in family]
-        alone = -sum(np.log(cell.drawn_from) for cell in mine)
-        total += max(alone, -_members(tuple(catalogue), family) * np.log(2.0))
-    return float(total - sum(np.log(cell.drawn_from) for cell in rest))
+    alone: dict[tuple[str, ...], float] = {}
+    for cell in cells:
+        family = FAMILY_OF.get(cell.name, ())
+        alone[family] = alone.get(family, 0.0) - math.log(cell.drawn_from)
+    return sum(
+        max(log_prior, -_members(tuple(catalogue), family) * math.log(2.0))
+        if family
+        else log_prior
+        for family, log_prior in alone.items()
+    )
 
 
 @lru_cache(maxsize=2 * len(FAMILIES))

@@ -11,8 +11,9 @@ import numpy as np
 import scipy
 
 from remaster_ros.calibration.accuracy import accuracy_of
+from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Estimate
-from remaster_ros.calibration.result import FitResult, predicted_rows
+from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.residuals import Residuals

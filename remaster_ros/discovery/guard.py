@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Estimate
-from remaster_ros.calibration.result import FitResult, predicted_rows
+from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.gain import Gain
 from remaster_ros.errors import InsufficientDataError

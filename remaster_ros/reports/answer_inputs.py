@@ -10,8 +10,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Problem, estimate
-from remaster_ros.calibration.result import predicted_rows
 from remaster_ros.compensation.export import URDF_FILE
 from remaster_ros.errors import InputError
 from remaster_ros.reports.discovery_json import read_discovery

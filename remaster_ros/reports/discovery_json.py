@@ -23,7 +23,7 @@ from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.fit_json import (
     APPLY_FOLDER,
     DISCOVERY_FILE,
-    fit_content,
+    estimates,
     read_result,
     remove_report,
     table_rows,
@@ -50,13 +50,13 @@ def discovery_content(
 ) -> Discovered:
     """Return a discovery as discovery.json has it; predictions are made where none are given."""
     predictions = predictions_of(discovery) if predictions is None else predictions
-    fit = fit_content(discovery.fit)
+    fit = estimates(discovery.fit)
     before, before_std = discovery.offsets_before
     content: dict[str, Any] = {
         'format': schemas.DISCOVERY_FORMAT,
         'version': __version__,
-        'robot': fit.robot,
-        'session': fit.session,
+        'robot': fit['robot'],
+        'session': fit['session'],
         'verdict': discovery.verdict,
         'effects': discovery.effects,
         'gain': discovery.gain,
@@ -65,7 +65,7 @@ def discovery_content(
             'pose_common_fraction': discovery.pose_common_fraction,
             'outliers': [observation for observation, _ in discovery.outliers],
             'heteroscedastic': discovery.noise_by_range,
-            'sensors': fit.noise,
+            'sensors': fit['noise'],
         },
         'untestable': discovery.untestable,
         'unexplained': discovery.unexplained,
@@ -74,10 +74,10 @@ def discovery_content(
             mean_deg=np.degrees(before),
             std_deg=np.degrees(before_std),
         ),
-        'joint_offsets_after': fit.joint_offsets,
-        'sampler': fit.sampler,
-        'registration': fit.registration,
-        'markers': fit.markers,
+        'joint_offsets_after': fit['joint_offsets'],
+        'sampler': fit['sampler'],
+        'registration': fit['registration'],
+        'markers': fit['markers'],
         'covariance': _covariance(discovery),
         # That of a cause which no surrogate residuals reach: its p-value is below.
         'least_p_value': LEAST_P_VALUE,

@@ -42,14 +42,14 @@ WRITTEN = (REPORT_FILE, APPLY_FOLDER, 'figures', 'predictions.csv', RESIDUALS_FI
 FIT_LIMIT = 64 * 1024**2
 
 
-def fit_content(result: FitResult) -> schemas.Fit:
-    """Return a fit as fit.json has it."""
+def estimates(result: FitResult) -> dict[str, Any]:
+    """Return what was estimated of which arm and session, as fit.json and discovery.json have it.
+
+    Keys as there: robot, session, joint_offsets, registration, markers, noise, sampler.
+    """
     session, sampler = result.session, result.sampler
-    draws = result.draws.reshape(-1, result.draws.shape[-1])
     limits = {'std_is_lower_limit': True} if result.other_errors else {}
-    content: dict[str, Any] = {
-        'format': schemas.FIT_FORMAT,
-        'version': __version__,
+    return {
         'robot': {
             'name': result.chain.name,
             'urdf_sha256': session.urdf_sha256,
@@ -66,7 +66,6 @@ def fit_content(result: FitResult) -> schemas.Fit:
             identifiable=result.identifiable,
             why=result.why,
         ),
-        'gauge': result.gauge,
         'registration': {
             sensor: {
                 'translation_m': T_R_N[:3, 3],
@@ -89,6 +88,17 @@ def fit_content(result: FitResult) -> schemas.Fit:
             'log_density_error_max': sampler.log_density_error,
             'log_density_checked_draws': sampler.checked,
         },
+    }
+
+
+def fit_content(result: FitResult) -> schemas.Fit:
+    """Return a fit as fit.json has it."""
+    draws, sampler = result.draws.reshape(-1, result.draws.shape[-1]), result.sampler
+    content: dict[str, Any] = {
+        'format': schemas.FIT_FORMAT,
+        'version': __version__,
+        **estimates(result),
+        'gauge': result.gauge,
         'parameters': table_rows(
             name=result.parameter_names,
             mean=draws.mean(axis=0),

@@ -40,12 +40,13 @@ def predictive(size_of: dict[str, float], sigma_m: float = 0.0) -> Predictive:
     draws = np.tile(after, (DRAWS, 1))
     for name, std in size_of.items():
         draws[:, model.names.index(name)] += std * rng.standard_normal(DRAWS)
-    return Predictive(model, after.copy(), after, draws, np.full((DRAWS, 2, 2), sigma_m))
+    return Predictive(model, after, draws, np.full((DRAWS, 2, 2), sigma_m))
 
 
 def distances(given: Predictive, seen: Measurements, seed: int = 0):
     everything = np.arange(len(seen))
-    return theoretical_distances(given, seen, everything, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    return theoretical_distances(given, given.after, seen, everything, rng)
 
 
 def test_a_shift_of_the_registration_is_the_distance(seen: Measurements) -> None:
@@ -142,7 +143,6 @@ def test_further_effects_stay_out_of_random_configurations(seen: Measurements) -
     given = replace(
         bare,
         model=replace(bare.model, extension=shifting),
-        before=np.append(bare.before, 0.0),
         after=np.append(bare.after, 0.0),
         draws=np.column_stack((bare.draws, np.full(DRAWS, 1e-3))),
     )

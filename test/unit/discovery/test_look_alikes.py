@@ -47,7 +47,8 @@ def fitted(data: Residuals, cells) -> Solution:
 
 
 def described(data: Residuals, selection: Selection, cells):
-    return describe(data, selection, Catalogue.of(data, cells), lambda share: None)
+    catalogue = Catalogue.of(data, cells)
+    return describe(data, selection, catalogue, partial(solve, data), lambda share: None)
 
 
 def plain(data: Residuals, cells, before: Solution) -> Solution:

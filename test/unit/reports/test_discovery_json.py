@@ -127,9 +127,7 @@ def test_a_free_curve_is_drawn_where_it_was_measured_with_a_band_that_opens(save
         curve.columns(q[away]).T @ curve.columns(q[away]) + 1e-3 * curve.penalty
     )
     draws = np.random.default_rng(seed).multivariate_normal(0.0 * curve.places, covariance, 400)
-    solution = replace(
-        found.selection.solution, cells=(cell,), parameters=draws[0], covariance=covariance
-    )
+    solution = replace(found.selection.solution, cells=(cell,), parameters=draws[0])
     drawn = replace(
         found,
         groups=((cell,),),

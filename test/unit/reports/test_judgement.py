@@ -17,7 +17,8 @@ from remaster_ros.reports.report import report_html
 def with_accuracy(result, split, before, after):
     metric = {'before': {'mean_mm': before}, 'after': {'mean_mm': after}}
     accuracy = {'optimization': None, 'validation': None, split: {'post_registration': metric}}
-    return replace(result, accuracy=accuracy)
+    comparison = replace(result.comparison, accuracy=accuracy)
+    return replace(result, compare=lambda: comparison)
 
 
 @pytest.mark.parametrize(

@@ -194,12 +194,16 @@ def test_drawing_libraries_are_imported_only_for_a_report():
 
 def test_a_session_without_validation_has_a_report(fit_result):
     optimization = ~fit_result.session.measurements.is_validation
+    comparison = replace(
+        fit_result.comparison,
+        residuals_before=fit_result.residuals_before[optimization],
+        accuracy={**fit_result.accuracy, 'validation': None},
+    )
     result = replace(
         fit_result,
         session=fit_result.session.select(optimization),
-        residuals_before=fit_result.residuals_before[optimization],
         residuals_after=fit_result.residuals_after[optimization],
-        accuracy={**fit_result.accuracy, 'validation': None},
+        compare=lambda: comparison,
         left_out=(),
     )
     html = report_html(result, {})

@@ -1,0 +1,87 @@
+"""A fit beside the same one with all offsets held at zero."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.calibration.accuracy import accuracy_of
+from remaster_ros.calibration.estimate import Problem
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.orientation_accuracy import tool_orientations
+from remaster_ros.calibration.predictive_accuracy import Predictive
+from remaster_ros.kinematics.transforms import apply, inverse
+from remaster_ros.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What the offsets change.
+
+    Attributes
+    ----------
+    T_R_N_before
+        Registrations with the offsets at zero, by sensor.
+    residuals_before
+        Measured minus modelled position in N for every row of the session, m, (n, 3).
+    accuracy
+        The three metrics as fit.json has them.
+    """
+
+    T_R_N_before: Mapping[str, FloatArray]
+    residuals_before: FloatArray
+    accuracy: Mapping[str, Any]
+
+
+def compared(
+    problem: Problem,
+    kept: IntArray,
+    before: FloatArray,
+    after: FloatArray,
+    predictive: Predictive,
+    rng: np.random.Generator,
+) -> Comparison:
+    """Compare.
+
+    Parameters
+    ----------
+    problem
+        What was fitted.
+    kept
+        Indices of the fitted rows that count.
+    before, after
+        Pinned parameters with offsets at zero and as estimated, (size,).
+    predictive
+        The posterior as predictions take it.
+    rng
+        For the theoretical metric.
+    """
+    model, measurements = predictive.model, problem.measurements
+    predicted_before = predicted_rows(problem, model, before)
+    T_R_N = model.T_R_N(model.natural(before))
+    return Comparison(
+        dict(zip(problem.sensor_names, T_R_N, strict=True)),
+        measurements.position - predicted_before,
+        accuracy_of(
+            measurements,
+            kept,
+            predicted_before,
+            predicted_rows(problem, model, after),
+            (predictive, before),
+            rng,
+            tool_orientations(model, measurements, before, after),
+        ),
+    )
+
+
+def predicted_rows(problem: Problem, model: Model, z: FloatArray) -> FloatArray:
+    """Return where the sensors should see the markers of all rows by pinned z, (n, 3)."""
+    measurements = problem.measurements
+    rows = Rows.of(measurements, np.arange(len(measurements)), model.reference)
+    predicted = np.empty((len(measurements), 3))
+    predicted[rows.source] = model.predict(z, rows)
+    return apply(inverse(model.reference)[measurements.sensor], predicted)
