@@ -11,7 +11,7 @@ import numpy as np
 from remaster_ros.calibration.extension import Extension
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.identifiability import WEAK_ANGLE, Gauge, find_gauge
-from remaster_ros.calibration.initial_guess import robust_start
+from remaster_ros.calibration.initial_guess import given_start, robust_start
 from remaster_ros.calibration.laplace import Mode, find_mode
 from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.moved_since import moved_since
@@ -237,14 +237,18 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
     """
     measurements = problem.measurements
     empty = problem.empty_model(extension)
-    model, z = robust_start(
-        empty,
-        measurements,
-        problem.fitted,
-        problem.markers,
-        float(np.max(problem.marker_std_m)),
-        problem.marker_priors(empty) + problem.plausibility(empty, np.arange(len(problem.chain))),
-    )
+    if extension is not None and extension.start is not None:
+        model, z = given_start(empty, measurements, problem.fitted, extension.start)
+    else:
+        model, z = robust_start(
+            empty,
+            measurements,
+            problem.fitted,
+            problem.markers,
+            float(np.max(problem.marker_std_m)),
+            problem.marker_priors(empty)
+            + problem.plausibility(empty, np.arange(len(problem.chain))),
+        )
     priors = problem.marker_priors(model) + problem.other_priors(model)
     rows = Rows.of(measurements, problem.fitted, model.reference)
     gauge = find_gauge(model, model.natural(z), rows, priors)

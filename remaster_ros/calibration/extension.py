@@ -34,6 +34,25 @@ class Term:
     values: FloatArray
 
 
+@dataclass(frozen=True)
+class Start:
+    """Where the effects were found: a solution near the mode.
+
+    Attributes
+    ----------
+    joint_offsets
+        rad, (k,).
+    T_R_N
+        Registration of each sensor, (sensors, 4, 4).
+    markers
+        In T, m, (markers, 3).
+    """
+
+    joint_offsets: FloatArray
+    T_R_N: FloatArray
+    markers: FloatArray
+
+
 @dataclass(frozen=True, eq=False)
 class Extension:
     """Further parameters theta (m,): physical effects, each row deviating linearly in them.
@@ -67,6 +86,8 @@ class Extension:
         (k,); None where nothing is known of them.
     step_std
         How far from there offsets beside the effects may be: a Gaussian prior, rad.
+    start
+        Where to begin the search for the mode; None where that is to be found, too.
     """
 
     names: tuple[str, ...]
@@ -78,6 +99,7 @@ class Extension:
     prior_mean: FloatArray | None = None
     joint_offsets: FloatArray | None = None
     step_std: float = np.inf
+    start: Start | None = None
 
     def turns(self, theta: FloatArray, rows: IntArray) -> dict[int, FloatArray]:
         """Return the angles that theta (..., m) adds in n rows: joint -> rad, (..., n)."""

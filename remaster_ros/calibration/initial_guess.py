@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from remaster_ros.calibration.extension import Start
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.noise import RESOLUTION_M
@@ -76,6 +77,14 @@ def robust_start(
     _require_likeness(start, sorted_rows, sorted_rows.target - predicted)
     moved = referenced(model, measurements, everything, start.T_R_N(z))
     return moved, moved.vector(start.offsets(z), start.markers(z))
+
+
+def given_start(
+    model: Model, measurements: Measurements, rows: IntArray, start: Start
+) -> tuple[Model, FloatArray]:
+    """Return the model with its reference registrations at a known solution, and z there."""
+    moved = referenced(model, measurements, rows, start.T_R_N)
+    return moved, moved.pinned(moved.vector(start.joint_offsets, start.markers))
 
 
 def closest_start(

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from remaster_ros.calibration.estimate import Estimate
-from remaster_ros.calibration.extension import Extension, Term
+from remaster_ros.calibration.extension import Extension, Start, Term
 from remaster_ros.calibration.priors import OFFSET_STD, STEP_STD
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.stretches import root_of_inverse
-from remaster_ros.discovery.undetected import fitted_columns
+from remaster_ros.discovery.undetected import fitted_columns, natural_parameters
 from remaster_ros.types import FloatArray
 
 # Where the prior on steps takes a smaller share of its variance off an offset nothing is added.
@@ -36,6 +36,9 @@ def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> E
         if term.at is None:
             displacement0 += term.values @ solution.parameters[where]
         terms.append(term)
+    model = found.model
+    step = natural_parameters(found, residuals, solution, solution)[: model.size]
+    x = model.natural(found.mode.z) + step
     names = tuple(name for cell in solution.cells for name in cell.parameters)
     units = tuple(cell.unit for cell in solution.cells for _ in cell.parameters)
     return Extension(
@@ -48,6 +51,7 @@ def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> E
         solution.prior_mean,
         offsets_of(found)[0],
         STEP_STD,
+        Start(model.offsets(x), model.T_R_N(x), model.markers(x)),
     )
 
 
