@@ -77,8 +77,7 @@ def solve(
         Log prior probability of the set; by default that of its cells one by one.
     """
     # Penalised ones last: one Cholesky factor holds all determinants.
-    order = sorted(range(len(cells)), key=lambda index: cells[index].penalty is not None)
-    cells = tuple(cells[index] for index in order)
+    cells = tuple(sorted(cells, key=lambda cell: cell.penalty is not None))
     norms, grams = data.gram_matrices(cells)
     p = data.base.shape[2]
     free = np.array([cell.penalty is None for cell in cells for _ in cell.parameters], dtype=bool)
@@ -105,7 +104,7 @@ def solve(
     try:
         if prior is None:
             prior = log_prior_one_by_one(cells)
-        return system.solution(start, prior).reordered(np.argsort(order))
+        return system.solution(start, prior)
     except np.linalg.LinAlgError:
         # The columns agree up to rounding: they cannot be distinguished.
         return None

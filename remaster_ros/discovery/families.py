@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -64,12 +63,6 @@ def evidence_without(
     smaller = (*solution.cells[:index], *solution.cells[index + 1 :])
     priors = [family_log_prior(cells, catalogue) for cells in (smaller, solution.cells)]
     return solution.evidence_without(index, rows) + priors[0] - priors[1]
-
-
-def less(solution: Solution, index: int, rows: int, catalogue: Sequence[Cell]) -> Solution:
-    """Return the fit without one cell as `Solution.less`, with the prior of the smaller set."""
-    evidence = evidence_without(solution, index, rows, catalogue)
-    return replace(solution.less(index, rows), log_evidence=evidence)
 
 
 def grouped(cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:

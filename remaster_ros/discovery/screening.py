@@ -136,7 +136,8 @@ def scores_in_place(
     With the noise and the smoothness of the whole set, (1 + others,); -inf for what is not among
     all that are tried.
     """
-    without = solution.less(solution.cells.index(cell), len(data))
+    index = solution.cells.index(cell)
+    without = solution.less(index, solution.evidence_without(index, len(data)))
     score = screen(data, catalogue, without, chosen=catalogue.which((cell, *others))).score
     places = [catalogue.places.get(one.key) for one in (cell, *others)]
     return np.array([-np.inf if place is None else score[place] for place in places])

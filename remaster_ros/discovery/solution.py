@@ -11,7 +11,7 @@ import numpy as np
 
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import Cell
-from remaster_ros.types import FloatArray, IntArray
+from remaster_ros.types import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Solution:
     Attributes
     ----------
     cells
-        The set.
+        The set, those with a penalty last.
     parameters
         Of all the cells in order, SI, (m,).
     base
@@ -89,27 +89,6 @@ class Solution:
         edges = np.cumsum([0, *(cell.size for cell in self.cells)])
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
-    def reordered(self, order: IntArray) -> Solution:
-        """Return the same with the cells in another order, the unpenalised ones in the same."""
-        if np.all(np.diff(order) > 0):
-            return self
-        where = self.slices()
-        m = [np.arange(len(self.parameters))[where[index]] for index in order]
-        chosen = np.concatenate([np.zeros(0, dtype=int), *m])
-        every = np.concatenate((np.arange(len(self.base)), len(self.base) + chosen))
-
-        def covariances(before: Covariances = self.covariances) -> tuple[FloatArray, FloatArray]:
-            return before.both[0][np.ix_(every, every)], before.both[1]
-
-        return replace(
-            self,
-            cells=tuple(self.cells[index] for index in order),
-            parameters=self.parameters[chosen],
-            smoothness=self.smoothness[order],
-            ridge=self.ridge[chosen],
-            covariances=Covariances(covariances),
-        )
-
     def evidence_without(self, index: int, rows: int) -> float:
         """Return the log evidence without one cell, with noise and smoothness as they are.
 
@@ -138,8 +117,16 @@ class Solution:
             price = 0.5 * (determinant - alone - cell.size * np.log(3.0 * rows - p))
         return float(self.log_evidence - worth - price)
 
-    def less(self, index: int, rows: int) -> Solution:
-        """Return the fit without one cell, with its `evidence_without`."""
+    def less(self, index: int, log_evidence: float) -> Solution:
+        """Return the fit without one cell, with noise and smoothness as they are.
+
+        Parameters
+        ----------
+        index
+            Of the cell.
+        log_evidence
+            Of the fit without it, see `evidence_without`.
+        """
         p, where = len(self.base), self.slices()[index]
         out = slice(p + where.start, p + where.stop)
         pull = _regression(self.full_covariance, out)
@@ -154,7 +141,7 @@ class Solution:
             smoothness=np.delete(self.smoothness, index),
             ridge=np.delete(self.ridge, where),
             covariances=Covariances(partial(_without, self.covariances, out, among)),
-            log_evidence=self.evidence_without(index, rows),
+            log_evidence=log_evidence,
         )
 
     def _among_unpenalised(self, index: int) -> slice:

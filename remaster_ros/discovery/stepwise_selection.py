@@ -29,7 +29,6 @@ from remaster_ros.discovery.families import (
     evidence_without,
     family_log_prior,
     grouped,
-    less,
     relatives,
     visible,
 )
@@ -38,7 +37,7 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import Screening, screen
 from remaster_ros.discovery.selection import Proposal, Selection, Step
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.substitutes import named_instead, regrown
+from remaster_ros.discovery.substitutes import has_a_name, named_instead, regrown
 
 DRAWS = 300
 # Error of keeping a member of a family that has passed as a whole.
@@ -59,6 +58,8 @@ MOST_EXCHANGED = 6
 MOST_MERGED = 4
 # A member of a family has to raise the evidence by this: a free form of no size costs nothing.
 MEMBER = 1.0
+# The best noise for one cell less makes up for no greater loss of evidence.
+SETTLING = 0.5
 # Fits kept, each with the covariance of all its parameters.
 KEPT_FITS = 48
 # A cell whose removal would cost this much evidence is kept without a test by itself.
@@ -99,6 +100,7 @@ class Search:
         self._left_out = Comparisons(data, fold_of_pose)
         # The last fits, the latest at the end.
         self._fits: dict[frozenset[Cell], Solution | None] = {}
+        self._in_vain: set[frozenset[Cell]] = set()
 
     def run(self, given: Solution | None = None) -> Selection:
         """Search until nothing passes both tests."""
@@ -124,7 +126,9 @@ class Search:
                 if step.p_value <= SIGNIFICANCE and self.predicts(candidate, solution, least):
                     break
             else:
-                anew = regrown(solution, self.with_all, self.prune)
+                anew = self._named_instead(solution)
+                if anew is solution:
+                    anew = regrown(solution, self.with_all, self.prune)
                 gain = anew.log_evidence - solution.log_evidence
                 if gain <= HYSTERESIS or not self.predicts(anew, solution):
                     break
@@ -133,11 +137,26 @@ class Search:
             steps.append(step)
             solution = self.swap(self.prune(candidate))
             solution = refine_moments(solution, self.cells, self.data.part, self.fit)
-            solution = named_instead(solution, self.fit, self.grown, HYSTERESIS)
+            if not all(has_a_name(cell) for cell in step.cells):
+                solution = self._named_instead(solution)
             solution = self._judged(self.backward_elimination(self.drop_unpredictive(solution)))
+        solution = self._named_instead(solution)
         empty = self.fit(())
         assert empty is not None
         return Selection(empty, solution, tuple(steps))
+
+    def _named_instead(self, solution: Solution) -> Solution:
+        """Return the better one: a solution, or families of causes in place of what has no name.
+
+        What was tried in vain is not tried again.
+        """
+        cells = frozenset(solution.cells)
+        if cells in self._in_vain:
+            return solution
+        found = named_instead(solution, self.fit, self.grown, HYSTERESIS)
+        if found is solution:
+            self._in_vain.add(cells)
+        return found
 
     def _tested(
         self, solution: Solution, proposal: Proposal, screening: Screening
@@ -251,12 +270,12 @@ class Search:
         Where the evidence rises with the noise as it is, the best noise for the smaller set can
         wait; the cell is kept only by settled evidences.
         """
-        rows, catalogue = len(self.data), self.catalogue.cells
-        gains = evidence_without(solution, index, rows, catalogue) > solution.log_evidence
-        if unphysical or gains:
-            return less(solution, index, rows, catalogue), False
+        evidence = evidence_without(solution, index, len(self.data), self.catalogue.cells)
+        loss = solution.log_evidence - evidence
+        if unphysical or loss < 0.0:
+            return solution.less(index, evidence), False
         smaller = (*solution.cells[:index], *solution.cells[index + 1 :])
-        again = self.fit(smaller, solution) if settled else None
+        again = self.fit(smaller, solution) if settled and loss < SETTLING else None
         if again is None or again.log_evidence <= solution.log_evidence:
             return None
         return again, True
@@ -294,7 +313,8 @@ class Search:
                 continue
             held = solution
             for cell in group:
-                held = held.less(held.cells.index(cell), len(self.data))
+                index = held.cells.index(cell)
+                held = held.less(index, held.evidence_without(index, len(self.data)))
             # Other smoothness of the others cannot make up for so much.
             if self.held_out_share(held, solution) > NEEDED:
                 continue

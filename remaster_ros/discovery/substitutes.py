@@ -40,7 +40,7 @@ def named_instead(
     least
         By how much the log evidence has to rise.
     """
-    named = [cell for cell in solution.cells if _has_a_name(cell)]
+    named = [cell for cell in solution.cells if has_a_name(cell)]
     if not named or len(named) == len(solution.cells):
         return solution
     better = fit(named, solution)
@@ -94,6 +94,7 @@ def regrown(
     return best
 
 
-def _has_a_name(cell: Cell) -> bool:
+def has_a_name(cell: Cell) -> bool:
+    """Return whether a cell is one that a technician can act on, of a size that is known."""
     effect = EFFECTS[cell.name]
     return effect.is_cause and effect.plausible is not None

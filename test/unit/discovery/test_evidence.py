@@ -95,7 +95,10 @@ def test_a_fit_less_a_cell_is_the_fit_of_the_others_with_the_same_noise(
     whole = solve(data, cells)
     assert whole is not None
     rest = [cell for cell in cells if cell is not cells[dropped]]
-    held, settled = whole.less(dropped, len(data)), solve(data, rest, whole)
+    held, settled = (
+        whole.less(dropped, whole.evidence_without(dropped, len(data))),
+        solve(data, rest, whole),
+    )
     with monkeypatch.context() as patch:
         patch.setattr(evidence, 'STEPS', 0)
         same_noise = solve(data, rest, whole, prior=log_prior_one_by_one(cells))
