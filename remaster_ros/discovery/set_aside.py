@@ -126,9 +126,9 @@ def harm_and_gain(
         Of the errors that this leaves.
     """
     p = data.base.shape[2]
-    parts = zip(solution.cells, solution.slices(), strict=True)
-    kept = [np.arange(p), *(_indices(where) + p for cell, where in parts if not is_memory(cell))]
-    core = np.concatenate(kept)
+    # A set that was fitted before has its cells in the order they had then.
+    wheres = dict(zip(solution.cells, solution.slices(), strict=True))
+    core = np.concatenate((np.arange(p), *(_indices(wheres[one]) + p for one in without.cells)))
     columns = np.concatenate((data.base, data.columns(without.cells)), axis=2)
     # Coordinates whose squares add up to those of the predicted displacements.
     root = np.linalg.qr(columns.reshape(3 * len(data), -1), mode='r')

@@ -9,7 +9,7 @@ import pytest
 from calibration_scenes import CHAIN, extension, scene
 
 from remaster_ros.calibration.estimate import Problem, estimate
-from remaster_ros.calibration.extension import Extension, Term
+from remaster_ros.calibration.extension import Extension, Start, Term
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.errors import InputError
 
@@ -66,6 +66,49 @@ def test_effects_come_back_with_their_uncertainty(sagging) -> None:
     assert without.theta.shape == (0,)
     errors = [np.sqrt(np.mean(r.residuals_after**2)) for r in (without, result)]
     assert errors[1] < 0.9 * errors[0]
+
+
+def test_the_mode_is_the_same_from_where_the_effects_were_searched(sagging) -> None:
+    """From the truth, but for 0.3 degrees, 30 mm, and markers 5 mm away."""
+    session, arrays = sagging
+    given = extension(**arrays)
+    problem = Problem.of(session)
+    found = estimate(problem, given)
+    x = found.model.natural(found.mode.z)
+    offsets = found.model.offsets(x) + np.radians(0.3) * np.array([0.0, 1, -1, 1, -1, 1, 0.0])
+    T_R_N = found.model.T_R_N(x).copy()
+    T_R_N[:, :3, 3] += 0.03
+    start = Start(offsets, T_R_N, found.model.markers(x) + 5e-3)
+    again = estimate(problem, replace(given, start=start))
+    std = np.sqrt(np.diag(found.mode.covariance))
+    free = found.posterior.free
+    np.testing.assert_array_equal(again.posterior.free, free)
+    # The reference of the registrations is another one: what does not depend on it.
+    same = free[(free < found.model.joints) | (free >= found.model.core - 3)]
+    apart = again.model.natural(again.mode.z)[same] - x[same]
+    assert np.max(np.abs(apart) / std[np.isin(free, same)]) < 0.02
+    assert again.mode.log_evidence == pytest.approx(found.mode.log_evidence, abs=0.01)
+    assert again.left_out == found.left_out
+
+
+def test_offsets_at_zero_are_compared_where_that_is_asked_for(sagging) -> None:
+    session, arrays = sagging
+    result, other = (
+        fit_session(
+            session, rng=np.random.default_rng(3), draws=400, extension=extension(**arrays)
+        )
+        for _ in range(2)
+    )
+    accuracy = result.accuracy
+    assert result.accuracy is accuracy
+    assert replace(result, left_out=()).accuracy is accuracy
+    assert other.accuracy == accuracy
+    np.testing.assert_array_equal(result.draws, other.draws)
+    # With the effects alone the offsets are missing.
+    before, after = (
+        np.sqrt(np.mean(errors**2)) for errors in (result.residuals_before, result.residuals_after)
+    )
+    assert before > 2.0 * after
 
 
 def test_a_prior_on_effects_pulls_them_to_zero(sagging) -> None:

@@ -91,14 +91,12 @@ def test_a_fit_less_a_cell_is_the_fit_of_the_others_with_the_same_noise(
     scene, dropped, monkeypatch
 ):
     data: Residuals = residuals_of(scene[0])
-    cells = scene[1][1:7]
-    whole = solve(data, cells)
+    whole = solve(data, scene[1][1:7])
     assert whole is not None
+    cells = whole.cells
     rest = [cell for cell in cells if cell is not cells[dropped]]
-    held, settled = (
-        whole.less(dropped, whole.evidence_without(dropped, len(data))),
-        solve(data, rest, whole),
-    )
+    held = whole.less(dropped, whole.evidence_without(dropped, len(data)))
+    settled = solve(data, rest, whole)
     with monkeypatch.context() as patch:
         patch.setattr(evidence, 'STEPS', 0)
         same_noise = solve(data, rest, whole, prior=log_prior_one_by_one(cells))

@@ -137,6 +137,22 @@ def test_harm_and_gain_are_as_frequent_as_stated(scene):
     assert stated[1] > stated[0]
 
 
+def test_harm_and_gain_do_not_depend_on_the_order_of_the_causes(scene):
+    rng = np.random.default_rng(6)
+    memory = scene.memory(12.0, 3.0 * NOISE_M)
+    causes = list(EFFECTS['joint_compliance'].cells(scene.data.context))[1:3]
+    shift = scene.data.displaced(causes, np.array([2e-5, 4e-5]))
+    data = scene.with_errors(memory.draw(1, rng)[:, :, 0]).less(-shift)
+    memory = replace(memory, data=data)
+    solution = solved(data, *causes, scene.wander['middling'])
+    one, other = (
+        harm_and_gain(data, solution, solved(data, *order), memory)
+        for order in (causes, causes[::-1])
+    )
+    print('harm and gain', one)
+    assert one == pytest.approx(other, abs=0.02)
+
+
 def test_without_a_wander_nothing_changes(scene):
     data = scene.data
     solution = solved(data)

@@ -249,12 +249,71 @@ def test_what_waits_for_others_to_fail_is_proposed_after_them(monkeypatch):
     assert best.solution.cells == proposed[0]
     assert len(fitted) > first
     # All fitted before the first is proposed.
-    monkeypatch.setattr(proposals, 'FURTHER', np.inf)
+    for further in ('FURTHER', 'FURTHER_STRUCTURE', 'FURTHER_FAMILY'):
+        monkeypatch.setattr(proposals, further, np.inf)
     ordered = list(proposed_by(search, empty, screening))
     assert ordered[0].solution.cells == proposed[0]
     assert {one.solution.cells for one in ordered} == set(proposed)
     gains = [one.solution.log_evidence for one in ordered]
     assert gains == sorted(gains, reverse=True)
+
+
+def test_families_that_cannot_come_near_the_best_are_grown_once_that_has_failed():
+    search = searching(residuals_of(session_with(5, angles=waves_of_three_joints)))
+    empty = search.fit(())
+    rng = np.random.default_rng(8)
+    screening = screen(search.data, search.catalogue, empty, rng=rng, draws=DRAWS)
+    tried = []
+
+    def grown(solution, family):
+        tried.append(family)
+        return search.grown(solution, family)
+
+    found = proposals.propose(empty, screening, search.catalogue, search.fit, grown)
+    best = next(found).solution
+    assert {cell.name for cell in best.cells} == {'joint_error_curve'}
+    first = len(tried)
+    assert first < len(FAMILIES)
+    rest = list(found)
+    assert sorted(tried) == sorted(FAMILIES)
+    # What had to wait is nothing that would have been proposed first.
+    assert all(one.solution.log_evidence < best.log_evidence for one in rest)
+
+
+def test_chance_is_asked_once_whether_a_member_of_a_set_stays(monkeypatch):
+    search = searching(residuals_of(session_with(5, angles=waves_of_three_joints)))
+    found = search.fit([cell for cell in search.cells if cell.name == 'joint_error_curve'])
+    asked = []
+
+    def passes(cell, without, solution):
+        asked.append((cell, frozenset(solution.cells)))
+        return len(asked) % 2 == 0
+
+    monkeypatch.setattr(search, '_passes', passes)
+    left = search.backward_elimination(found)
+    assert 0 < len(asked) == len(set(asked))
+    count = len(asked)
+    assert search.backward_elimination(found).cells == left.cells
+    assert len(asked) == count
+    # On other rows it is another question.
+    search._look_at(search.data.only(search.data.rows.source[1:]))
+    search.backward_elimination(search.fit(found.cells))
+    assert len(asked) > count
+
+
+def test_named_causes_in_place_of_structure_are_tried_once_and_again_where_they_gained(
+    monkeypatch,
+):
+    search = searching(residuals_of(session_with(5, sensor=bent)))
+    begun = search.fit([cell for cell in search.cells if cell.name == 'sensor_field'][:1])
+    better = search.fit([cell for cell in search.cells if cell.name == 'joint_error_curve'][:1])
+    answers = [begun, better]
+    monkeypatch.setattr(stepwise_selection, 'named_instead', lambda solution, *_: answers.pop(0))
+    assert search._named_instead(begun) is begun
+    assert search._named_instead(begun) is begun
+    assert len(answers) == 1
+    search._look_at(search.data)
+    assert search._named_instead(begun) is better
 
 
 def test_what_was_fitted_is_not_fitted_again(monkeypatch):
