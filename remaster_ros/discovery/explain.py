@@ -13,12 +13,12 @@ from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.families import WHOLE, grouped
-from remaster_ros.discovery.gain import shares
 from remaster_ros.discovery.plain_forms import AS_WELL, SCREENING_ERROR, is_special_case
 from remaster_ros.discovery.proposals import Fit
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.screening import screen
 from remaster_ros.discovery.selection import Selection
+from remaster_ros.discovery.shares import shares
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.words import called, clock_time, joint_words
 
@@ -79,8 +79,8 @@ class FoundEffect:
     size_m
         RMS of what it does to the marker after absorption, over the fitted rows, m.
     share
-        Of the gain on held-out poses, the causes added in their order; None where the cause was
-        found by how far the fit moved a marker, not in the residuals.
+        Of the gain on held-out poses, see `shares`; None where the cause was found by how far the
+        fit moved a marker, not in the residuals.
     tied
         A look-alike that measurements could distinguish explains the data as well.
     sizes

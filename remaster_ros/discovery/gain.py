@@ -1,9 +1,8 @@
-"""What the causes gain: on held-out poses, against the noise, metric by metric, cause by cause."""
+"""What the causes gain: on held-out poses, against the noise, metric by metric."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +13,6 @@ from remaster_ros.calibration.accuracy import accuracy_of
 from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.result import FitResult
-from remaster_ros.discovery.effects.base import Cell
-from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray
@@ -81,28 +78,6 @@ def residuals_of(found: Estimate) -> FloatArray:
 def rms(errors: FloatArray, rows: BoolArray) -> float:
     """Return the RMS of the 3-D error of the given rows, m."""
     return float(np.sqrt(np.mean(np.sum(errors[rows] ** 2, axis=1))))
-
-
-def shares(data: Residuals, groups: Sequence[tuple[Cell, ...]], solution: Solution) -> list[float]:
-    """Return how much of the mean-square error each cause takes away, added in this order.
-
-    On held-out rows where there are any. All are refitted at each step; together they make 1.
-    """
-    rows = data.context.measurements.is_validation
-    if not rows.any():
-        rows = np.isin(np.arange(len(rows)), data.rows.source)
-    left: list[float] = []
-    chosen: tuple[Cell, ...] = ()
-    for group in ((), *groups):
-        chosen += group
-        fit = solution if len(chosen) == len(solution.cells) else solve(data, chosen, solution)
-        # A part that cannot be fitted alone changes nothing until it can.
-        left.append(left[-1] if fit is None else rms(data.unexplained(fit), rows) ** 2)
-    total = left[0] - left[-1]
-    return [
-        float((before - after) / total) if total > 0.0 else 0.0
-        for before, after in itertools.pairwise(left)
-    ]
 
 
 def pose_common_fraction(data: Residuals, solution: Solution) -> float:

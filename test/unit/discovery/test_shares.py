@@ -1,0 +1,97 @@
+"""Whose the gain is: the same in whatever order the causes are added."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from discovery_scenes import residuals_of, session_with
+
+from remaster_ros.discovery import evidence
+from remaster_ros.discovery import shares as shares_module
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.evidence import Solution, solve
+from remaster_ros.discovery.gain import rms
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.shares import shares
+from remaster_ros.types import FloatArray, Session
+
+ARC_MINUTE = np.radians(1.0 / 60.0)
+
+
+def waves(session: Session) -> FloatArray:
+    q = session.measurements.q
+    angles = np.zeros_like(q)
+    angles[:, 1] = 3.0 * ARC_MINUTE * np.sin(q[:, 1])
+    angles[:, 3] = 2.0 * ARC_MINUTE * np.sin(3.0 * q[:, 3])
+    return angles
+
+
+def scene(with_held_out: bool) -> tuple[Residuals, list[tuple[Cell, ...]], Solution]:
+    session = session_with(17, angles=waves)
+    if not with_held_out:
+        session = session.select(~session.measurements.is_validation)
+    data = residuals_of(session)
+
+    def cell(name: str, joint: int) -> Cell:
+        return next(c for c in EFFECTS[name].cells(data.context) if c.joints == (joint,))
+
+    # A wave of joint 2 and a free curve of it: each can do what the other does.
+    groups = [
+        (cell('joint_error_curve', 4),),
+        (cell('encoder_eccentricity', 2), cell('encoder_scale', 2)),
+        (cell('joint_error_curve', 2),),
+    ]
+    solution = solve(data, [one for group in groups for one in group])
+    assert solution is not None
+    return data, groups, solution
+
+
+@pytest.fixture(scope='module', params=[True, False], ids=['held out', 'fitted'])
+def found(request: pytest.FixtureRequest) -> tuple[Residuals, list[tuple[Cell, ...]], Solution]:
+    return scene(request.param)
+
+
+def test_shares_are_the_mean_over_all_orders_of_fits(found, monkeypatch):
+    data, groups, solution = found
+    # Noise and smoothness as they are.
+    monkeypatch.setattr(evidence, 'STEPS', 0)
+    held_out = data.context.measurements.is_validation
+    rows = held_out if held_out.any() else np.isin(np.arange(len(held_out)), data.rows.source)
+    taken = np.zeros(3)
+    for order in itertools.permutations(range(3)):
+        left = [
+            rms(
+                data.unexplained(solve(data, [c for i in order[:n] for c in groups[i]], solution)),
+                rows,
+            )
+            for n in range(4)
+        ]
+        taken[list(order)] -= np.diff(np.square(left))
+    expected = taken / taken.sum()
+    print(np.round(expected, 3))
+    assert shares(data, groups, solution) == pytest.approx(expected, abs=1e-4)
+    # What both explain is of both.
+    assert min(expected[1:]) > 0.1
+
+
+def test_shares_of_causes_do_not_depend_on_their_order(found, monkeypatch):
+    data, groups, solution = found
+    expected = shares(data, groups, solution)
+    for order in itertools.permutations(range(3)):
+        again = shares(data, [groups[index] for index in order], solution)
+        assert again == pytest.approx([expected[index] for index in order], abs=1e-9)
+    # Drawn orders, as for many causes: each order and its reverse.
+    monkeypatch.setattr(shares_module, 'ALL_ORDERS', 0)
+    assert shares(data, groups, solution) == pytest.approx(expected, abs=0.1)
+    assert sum(shares(data, groups, solution)) == pytest.approx(1.0)
+
+
+def test_where_nothing_is_gained_nobody_has_a_share():
+    data, groups, solution = scene(with_held_out=True)
+    held_out = data.context.measurements.is_validation[:, None]
+    opposite = replace(data, full_errors=np.where(held_out, -data.full_errors, data.full_errors))
+    assert shares(opposite, groups, solution) == [0.0, 0.0, 0.0]
