@@ -41,7 +41,7 @@ class Solution:
     Attributes
     ----------
     cells
-        The set, those with a penalty last.
+        The set; of a fit those with a penalty are last.
     parameters
         Of all the cells in order, SI, (m,).
     base
@@ -174,9 +174,9 @@ def _without(
 ) -> tuple[FloatArray, FloatArray]:
     """Return covariances were the parameters of a cell known: where it is in both of them."""
     full, unpenalised = before.both
-    return _conditioned(full, out), unpenalised if among is None else _conditioned(
-        unpenalised, among
-    )
+    if among is not None:
+        unpenalised = _conditioned(unpenalised, among)
+    return _conditioned(full, out), unpenalised
 
 
 def _regression(covariance: FloatArray, out: slice) -> FloatArray:

@@ -2,12 +2,11 @@
 
 A round screens all cells beside the set found so far and tries the best of them, and every
 physical group as a whole (all joints compliant, all links wrong), less the members that do not
-raise the evidence.
-The proposal of the highest evidence that passes two tests joins: its p-value over all cells
-tried, and its gain on poses left out in turn. After each round, cells that no longer raise the
-evidence are dropped, and each is swapped for what explains more in its place, because the first
-step acts on a mixture of causes. When nothing passes any more, families that imitate each other
-are chosen anew, and the rounds go on from there.
+raise the evidence. The proposal of the highest evidence that passes two tests joins: its p-value
+over all cells tried, and its gain on poses left out in turn. After each round, cells that no
+longer raise the evidence are dropped, and each is swapped for what explains more in its place: the
+first step acts on a mixture of causes. When nothing passes any more, families that imitate each
+other are chosen anew, and the rounds go on from there.
 """
 
 from __future__ import annotations
@@ -139,6 +138,7 @@ class Search:
             steps.append(step)
             solution = self.swap(self.prune(candidate))
             solution = refine_moments(solution, self.cells, self.data.part, self.fit)
+            # What joins beside structure gains about as much without: tried again at the end.
             if not all(has_a_name(cell) for cell in step.cells):
                 solution = self._named_instead(solution)
             solution = self._judged(self.backward_elimination(self.drop_unpredictive(solution)))
@@ -148,12 +148,8 @@ class Search:
         return Selection(empty, solution, tuple(steps))
 
     def _named_instead(self, solution: Solution) -> Solution:
-        """Return the better one: a solution, or families of causes in place of what has no name.
-
-        What was tried in vain is not tried again.
-        """
-        cells = frozenset(solution.cells)
-        if cells in self._in_vain:
+        """Return `named_instead`; what was tried in vain is not tried again."""
+        if (cells := frozenset(solution.cells)) in self._in_vain:
             return solution
         found = named_instead(solution, self.fit, self.grown, HYSTERESIS)
         if found is solution:
@@ -352,7 +348,7 @@ class Search:
             without = self.fit((*solution.cells[:index], *solution.cells[index + 1 :]), solution)
             if without is None:
                 continue
-            # The same set is looked at again: chance is asked once.
+            # Of one set chance is asked once.
             test = cell, frozenset(solution.cells), solution.log_evidence, without.log_evidence
             if test not in self._passed:
                 self._passed[test] = self._passes(cell, without, solution)
