@@ -140,12 +140,10 @@ def _projected(others: FloatArray, own: FloatArray) -> FloatArray:
     scale = np.linalg.norm(others, axis=0)
     unit = others / np.where(scale > 0.0, scale, 1.0)
     # By pivoted QR: the singular values would take three times as long.
-    explained: FloatArray = (
-        unit
-        @ scipy.linalg.lstsq(unit, own, cond=ROUNDING, check_finite=False, lapack_driver='gelsy')[
-            0
-        ]
+    fit, *_ = scipy.linalg.lstsq(
+        unit, own, cond=ROUNDING, check_finite=False, lapack_driver='gelsy'
     )
+    explained: FloatArray = unit @ fit
     return explained
 
 
