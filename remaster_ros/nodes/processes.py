@@ -53,9 +53,8 @@ class NodeProcesses:
         command = [sys.executable, '-m', 'remaster_ros.nodes', name, '--ros-args']
         command += ['--params-file', str(parameters_file)]
         for key, value in parameters.items():
-            # With the node's name: without it, the values of the file would take precedence.
             # JSON is YAML; text in double quotes stays text whatever it looks like.
-            command += ['-p', f'{name}:{key}:={json.dumps(value)}']
+            command += ['-p', f'{key}:={json.dumps(value)}']
         self._commands[name] = command
         self._spawn(name)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import socket
 import subprocess
 import sys
@@ -20,7 +21,9 @@ import pytest
 from optitrack_world import SENSOR, MarkerWorld, eventually, free_port, open_descriptors
 
 from remaster_ros.errors import DeviceError, InputError
+from remaster_ros.sensors.driver import SensorClock
 from remaster_ros.sensors.optitrack import natnetclient_backend
+from remaster_ros.sensors.optitrack.driver import OptiTrackDriver, Parameters
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
 from remaster_ros.sensors.optitrack.natnetclient_backend import NatNetClientBackend
 from remaster_ros.sensors.optitrack.protocol import natnet as our_natnet
@@ -323,8 +326,43 @@ def test_the_natnetclient_backend_refuses_what_it_cannot_do():
         with pytest.raises(DeviceError, match=r'streams 3\.1: set client to builtin'):
             client.start(wait_s=20.0)
         assert client.diagnosis().fault == 'version'
-    with pytest.raises(InputError, match='unicast'):
-        NatNetClientBackend(NatNetSettings(transport='multicast'), print)
     far = NatNetSettings(transport='unicast', server='192.0.2.77', data_port=data_port)
     with pytest.raises(DeviceError, match='on this computer'):
         NatNetClientBackend(far, print).start()
+
+
+@pytest.mark.parametrize(
+    ('given', 'named'),
+    [
+        ({'transport': 'multicast'}, 'transport is multicast'),
+        ({'bitstream': '4.1'}, r'bitstream is 4\.1'),
+        ({'further_markers': {'b': 2}}, 'further_markers'),
+    ],
+)
+def test_what_natnetclient_does_not_read_is_refused_by_name_with_the_remedy(given, named):
+    with pytest.raises(InputError) as refused:
+        NatNetClientBackend(NatNetSettings(**{'transport': 'unicast', **given}), print)
+    for text in (r'NatNet 2\.6 to 2\.10 in unicast only', named, 'set client to builtin'):
+        assert re.search(text, str(refused.value)), refused.value
+
+
+@pytest.mark.parametrize(
+    ('client', 'shown'),
+    [
+        ('builtin', 'builtin'),
+        (
+            'natnetclient',
+            'natnetclient (NatNet 2.6 to 2.10 in unicast only, one marker, from a server on this '
+            'computer)',
+        ),
+    ],
+)
+def test_the_state_shows_which_client_reads_and_what_it_is_limited_to(client, shown):
+    driver = OptiTrackDriver(
+        Parameters(server='127.0.0.1', transport='unicast', client=client, data_port=free_port()),
+        SensorClock(),
+    )
+    try:
+        assert driver.state().values['client'] == shown
+    finally:
+        driver.close()

@@ -15,7 +15,7 @@ from remaster_ros.sensors.driver import SensorClock, SensorParameters, SensorSta
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.diagnosis import warning
 from remaster_ros.sensors.optitrack.frame_gate import MarkerChoice, MarkerSample
-from remaster_ros.sensors.optitrack.natnetclient_backend import NatNetClientBackend
+from remaster_ros.sensors.optitrack.natnetclient_backend import READS, NatNetClientBackend
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.types import MarkerReading
 
@@ -29,7 +29,10 @@ class Parameters(NatNetSettings, SensorParameters):
     sensor: str = parameter('mocap', "the bar's name among the cell's sensors")
     server: str = parameter('192.168.0.10', 'the computer that runs Motive')
     client: str = parameter(
-        'builtin', 'which NatNet client to use', choices=('builtin', 'natnetclient')
+        'builtin',
+        'which NatNet client to use: `builtin` reads NatNet 2.6 to 4.3, multicast and unicast; '
+        f'`natnetclient`, the package of PyPI, {READS}',
+        choices=('builtin', 'natnetclient'),
     )
     rigid_body: str = parameter('', 'name of the rigid body in Motive; empty for the only one')
     member: int = parameter(
@@ -64,7 +67,9 @@ class OptiTrackDriver(StreamDriver):
         # The markers of a frame have one time of capture.
         self._frame: tuple[int, float, float] | None = None
         self._captured_s = 0.0
-        kind = NatNetClientBackend if p.client == 'natnetclient' else NatNetClient
+        by_package = p.client == 'natnetclient'
+        self._client_name = f'natnetclient ({READS})' if by_package else p.client
+        kind = NatNetClientBackend if by_package else NatNetClient
         self.client = kind(replace(p, marker=marker), self._samples.put, clock=clock.now)
         self.client.start()
 
@@ -93,6 +98,7 @@ class OptiTrackDriver(StreamDriver):
         status = self.client.status()
         diagnosis = self.client.diagnosis()
         values = {
+            'client': self._client_name,
             'fault': diagnosis.fault,
             'frames': status.frames,
             'lost': status.lost,

@@ -34,6 +34,8 @@ from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.sensors.optitrack.sockets import open_socket
 
 NEWEST_READ = (2, 10)
+READS = 'NatNet 2.6 to 2.10 in unicast only, one marker, from a server on this computer'
+"""What is left of NatNet with it, for people."""
 POLL_S = 0.2
 FAILURES_IN_A_ROW = 3
 """Then the server's model has probably changed, and natnetclient begins anew."""
@@ -61,15 +63,15 @@ class NatNetClientBackend(MarkerFollower):
         on_sample: Callable[[MarkerSample], object],
         clock: Callable[[], float] = time.time,
     ) -> None:
-        if settings.transport != 'unicast' or settings.bitstream:
+        wrong = {
+            f'transport is {settings.transport}': settings.transport != 'unicast',
+            f'bitstream is {settings.bitstream}': bool(settings.bitstream),
+            'the cell file has further_markers': bool(settings.further_markers),
+        }
+        if refused := ' and '.join(text for text, is_wrong in wrong.items() if is_wrong):
             raise InputError(
-                'client: natnetclient receives unicast only and cannot choose the bitstream: set '
-                'transport to unicast and bitstream to "", or client to builtin'
-            )
-        if settings.further_markers:
-            raise InputError(
-                'client: natnetclient is compared by one marker, but the cell file has '
-                'further_markers: set client to builtin'
+                f'client: natnetclient reads {READS}, but {refused}: set client to builtin, which '
+                'reads NatNet 2.6 to 4.3, multicast and unicast'
             )
         # It puts underscores for the blanks of a name.
         name = settings.marker.rigid_body.replace(' ', '_')
@@ -141,8 +143,7 @@ class NatNetClientBackend(MarkerFollower):
         if not OLDEST_VERSION <= answer.natnet_version <= NEWEST_READ:
             version = natnet.format_version(answer.natnet_version)
             self._refusal = (
-                f'natnetclient reads NatNet 2.6 to 2.10, the server streams {version}: set '
-                f'client to builtin'
+                f'natnetclient reads {READS}; the server streams {version}: set client to builtin'
             )
             self._ready.set()
         return not self._refusal

@@ -1,6 +1,10 @@
 """Node parameters: every config file fits; wrong values are refused with one line."""
 
 import importlib
+import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -16,7 +20,8 @@ from remaster_ros.sensors.registry import DRIVERS, load_driver
 pytestmark = pytest.mark.ros
 
 CONFIG = Path(__file__).parents[3] / 'config'
-NODES = sorted(path.name for path in (Path(__file__).parents[3] / 'scripts').iterdir())
+SCRIPTS = Path(__file__).parents[3] / 'scripts'
+NODES = sorted(path.name for path in SCRIPTS.iterdir())
 
 
 def fields_of(node):
@@ -50,9 +55,6 @@ def test_config_files_fit_the_dataclasses(name):
     for node, section in data.items():
         parameters = dict(section['ros__parameters'])
         parameters.pop('use_sim_time', None)
-        if node == '/**':
-            assert not parameters
-            continue
         # In any namespace: a bare name would match the node in the root namespace alone, and one
         # elsewhere would run on its defaults without a word.
         assert node.startswith('/**/')
@@ -61,6 +63,36 @@ def test_config_files_fit_the_dataclasses(name):
         for key, value in parameters.items():
             assert key in fields, f'{name}: {node} has no parameter {key}'
             check(node, fields[key], value)
+
+
+@pytest.mark.parametrize(
+    ('file', 'node', 'namespace', 'key', 'value'),
+    [
+        # Each stands in the file with a good value, so that the refused one is that of `-p`.
+        ('fake.yaml', 'optimizer', '', 'sampler', 'neither'),
+        ('fake.yaml', 'robot_bridge', '/left', 'speed_share', '7.5'),
+        ('fake.yaml', 'fake_robot', '', 'joint_state_rate', '-3.25'),
+        ('real.yaml', 'optimizer', '/left', 'sampler', 'neither'),
+    ],
+)
+def test_a_value_of_the_command_line_is_taken_before_that_of_a_shipped_file(
+    file, node, namespace, key, value
+):
+    """By the command that a user types; by the same executable where there is no `ros2`."""
+    ros2 = shutil.which('ros2')
+    run = [ros2, 'run', 'remaster_ros', node] if ros2 else [sys.executable, SCRIPTS / node]
+    remap = ['-r', f'__ns:={namespace}'] if namespace else []
+    ended = subprocess.run(
+        [*run, '--ros-args', *remap, '--params-file', CONFIG / file, '-p', f'{key}:={value}'],
+        env={**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_DOMAIN_ID': '91'},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert ended.returncode == 2, ended.stderr
+    assert key in ended.stderr
+    assert value in ended.stderr
 
 
 def test_a_wrong_type_a_wrong_range_and_a_wrong_word_are_one_line_each():
