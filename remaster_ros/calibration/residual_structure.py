@@ -165,7 +165,7 @@ def residual_structure(mode: Mode, measurements: Measurements) -> ResidualStruct
     white = whitened(mode, rows, families)
     size = rows.group_size[:, None, None]
     middle = {name: rows.group_sum(part) / size for name, part in white.items()}
-    apart = {name: part - middle[name][rows.group_of_row] for name, part in white.items()}
+    apart = {name: _apart(part, middle[name][rows.group_of_row]) for name, part in white.items()}
     between = {name: _flat(part * np.sqrt(size)) for name, part in middle.items()}
     within = {name: _flat(part) for name, part in apart.items()}
     basis = _basis(between['model'])
@@ -211,6 +211,18 @@ def _named(driver: str, sensor: str, degree: int) -> str:
     return f'{driver} {degree} {sensor}'
 
 
+def _apart(columns: FloatArray, middle: FloatArray) -> FloatArray:
+    """Return the deviations (n, 3, c) of columns from the means of their poses.
+
+    Where a pose is one configuration measured again, all that the joints determine is the same in
+    its rows: what is left of a column is rounding, and no function.
+    """
+    apart = columns - middle
+    rounding = 1e-9 * np.linalg.norm(columns, axis=(0, 1))
+    apart[:, :, np.linalg.norm(apart, axis=(0, 1)) <= rounding] = 0.0
+    return apart
+
+
 def _flat(columns: FloatArray) -> FloatArray:
     return columns.reshape(-1, columns.shape[2])
 
@@ -218,9 +230,9 @@ def _flat(columns: FloatArray) -> FloatArray:
 def _basis(columns: FloatArray) -> FloatArray:
     """Return an orthonormal basis of columns (n, c), (n, b), of whatever lengths."""
     length = np.linalg.norm(columns, axis=0)
-    kept = length > 1e-12 * np.max(length)
+    kept = length > 1e-12 * np.max(length, initial=0.0)
     left, singular, _ = np.linalg.svd(columns[:, kept] / length[kept], full_matrices=False)
-    basis: FloatArray = left[:, singular > 1e-9 * singular[0]]
+    basis: FloatArray = left[:, singular > 1e-9 * np.max(singular, initial=0.0)]
     return basis
 
 

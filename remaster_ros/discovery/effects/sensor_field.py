@@ -8,6 +8,7 @@ is sampled contains it.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from functools import partial
 
@@ -44,15 +45,17 @@ def cells(context: Context) -> Iterator[Cell]:
             continue
         rarity = RARITY * (len(LENGTHS) + 1) * len(context.sensor_names)
         # A fixed seed: the centers are a property of the places.
-        centers, _ = scipy.cluster.vq.kmeans2(
-            places, count, minit='++', rng=np.random.default_rng(0)
-        )
+        centers = _centers(places, count, np.random.default_rng(0))
         for variant, factor in LENGTHS.items():
             length = factor * spread
-            kernel = _kernel(centers, centers, length) + JITTER * np.eye(count)
+            kernel = _kernel(centers, centers, length) + JITTER * np.eye(len(centers))
             yield EFFECT.cell(
                 partial(_field, sensor=index, centers=centers, length=length),
-                [f'field_{axis}_{variant}_{name}_{i}' for i in range(count) for axis in 'xyz'],
+                [
+                    f'field_{axis}_{variant}_{name}_{i}'
+                    for i in range(len(centers))
+                    for axis in 'xyz'
+                ],
                 # The three axes of a center stand next to each other.
                 penalty=np.kron(kernel, np.eye(3)),
                 drawn_from=rarity,
@@ -69,6 +72,16 @@ def cells(context: Context) -> Iterator[Cell]:
             variant='range',
             subject=name,
         )
+
+
+def _centers(places: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
+    """Return at most so many places that stand for all; fewer where readings were repeated."""
+    with warnings.catch_warnings():
+        # Two centers that begin at readings of one place: one of them remains without any.
+        warnings.filterwarnings('ignore', 'One of the clusters is empty')
+        centers, nearest = scipy.cluster.vq.kmeans2(places, count, minit='++', rng=rng)
+    occupied: FloatArray = centers[np.unique(nearest)]
+    return occupied
 
 
 def _kernel(places: FloatArray, centers: FloatArray, length: float) -> FloatArray:

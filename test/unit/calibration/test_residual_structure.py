@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from calibration_scenes import scene
 from discovery_scenes import at_joint, session_with
+from session_shapes import repeats
 
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.fit import fit_session
@@ -220,3 +221,13 @@ def test_a_fit_has_wider_intervals_only_where_other_errors_are_left() -> None:
         low, high = result.joint_offsets_interval95[1:6].T
         assert np.all((low < result.joint_offsets[1:6]) & (result.joint_offsets[1:6] < high))
         np.testing.assert_allclose(high - low, 2 * 1.96 * times * model, rtol=0.2)
+
+
+def test_of_configurations_read_again_nothing_is_left_within_the_poses() -> None:
+    """What the joints determine is the same in all readings of a configuration."""
+    for times in (2, 3):
+        found = structure_of(repeats(61, times, 0))
+        assert not found.too_few
+        within = {test.driver for test in found.tests if not test.between_poses}
+        assert within.isdisjoint({'joint_angle', 'link', 'axis'})
+        assert {test.driver for test in found.tests if test.between_poses} >= {'joint_angle'}

@@ -11,31 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from session_shapes import observations
 
 from remaster_ros.errors import DiskError, InputError
 from remaster_ros.session.reader import read_session, write_session
 from remaster_ros.session.session_writer import SessionWriter
-from remaster_ros.types import Observation
-
-
-def observations(session):
-    m = session.measurements
-    for i in range(len(m)):
-        yield Observation(
-            observation=int(m.observation[i]),
-            pose=int(m.pose[i]),
-            configuration=int(m.configuration[i]),
-            split='validation' if m.is_validation[i] else 'optimization',
-            stamp_s=m.stamp_s[i],
-            sensor=session.sensor_names[m.sensor[i]],
-            marker=session.marker_names[m.marker[i]],
-            q=m.q[i],
-            position=m.position[i],
-            from_q=None if np.isnan(m.from_q[i]).any() else m.from_q[i],
-            std=None if np.isnan(m.std[i]).any() else m.std[i],
-            samples=None if m.samples[i] < 0 else int(m.samples[i]),
-            temperature_c=None if np.isnan(m.temperature_c[i]) else m.temperature_c[i],
-        )
 
 
 def test_the_folder_is_readable_after_every_observation(session, tmp_path):
@@ -144,8 +124,8 @@ KILLED = """
 import sys
 from remaster_ros.session.reader import read_session
 from remaster_ros.session.session_writer import SessionWriter
-sys.path.insert(0, {tests!r})
-from test_session_writer import observations
+sys.path[:0] = [{tests!r}]
+from session_shapes import observations
 session = read_session({source!r})
 writer = SessionWriter({folder!r}, session)
 for observation in observations(session):
@@ -158,7 +138,7 @@ sys.stdin.read()
 def test_a_killed_writer_loses_nothing_it_acknowledged(session, tmp_path):
     write_session(tmp_path / 'source', session)
     script = KILLED.format(
-        tests=str(Path(__file__).parent),
+        tests=str(Path(__file__).parents[2]),
         source=str(tmp_path / 'source'),
         folder=str(tmp_path / 's'),
     )

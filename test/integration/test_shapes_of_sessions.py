@@ -1,0 +1,92 @@
+"""Sessions of every shape go through every verb of the command line."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from session_shapes import CHEAP, LARGE, observations, one_pose_for_all
+
+from remaster_ros.cli.main import main
+from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.session.session_writer import SessionWriter
+
+# Every append waits for the disk.
+MOST_RECORDED = 300
+
+
+def own_table(session, folder):
+    """Write the joints and points of one sensor and marker as a table of anybody's."""
+    m = session.measurements
+    rows = np.flatnonzero((m.sensor == m.sensor[0]) & (m.marker == m.marker[0]))
+    path = folder / 'table.csv'
+    joints = [f'q{i + 1}_rad' for i in range(m.q.shape[1])]
+    with path.open('w', newline='') as file:
+        writer = csv.writer(file)
+        writer.writerow([*joints, 'x_m', 'y_m', 'z_m'])
+        writer.writerows(np.column_stack((m.q[rows], m.position[rows])).tolist())
+    (folder / 'arm.urdf').write_text(session.urdf)
+    return path
+
+
+def goes_through_every_verb(session, folder, capsys):
+    given, fit, found = folder / 'session', folder / 'fit', folder / 'found'
+    if len(session.measurements) <= MOST_RECORDED:
+        with SessionWriter(given, session) as writer:
+            for observation in observations(session):
+                writer.append(observation)
+    else:
+        write_session(given, session)
+    table = own_table(session, folder)
+    ends = ('--base-link', session.base_link, '--tip-link', session.tip_link)
+    for verb in (
+        ('recover', given),
+        ('fit', given, '--out', fit),
+        ('discover', given, '--out', found),
+        ('accuracy', given, '--offsets', fit / 'fit.json'),
+        ('report', given, fit, found, '--out', folder / 'page'),
+        ('import', table, '--urdf', folder / 'arm.urdf', '--out', folder / 'again', *ends),
+    ):
+        arguments = [str(word) for word in (*verb, '--quiet')]
+        if verb[0] not in ('recover', 'accuracy', 'import'):
+            arguments.append('--no-figures')
+        status = main(arguments)
+        said = capsys.readouterr()
+        # Without a recorder's journal there is nothing to recover from.
+        recorded = (given / 'journal.jsonl').exists() or verb[0] != 'recover'
+        assert status == (0 if recorded else 2), (verb[0], said.err)
+        if not recorded:
+            continue
+        assert 'error' not in said.err
+    offsets = json.loads((fit / 'fit.json').read_text())['joint_offsets']
+    assert sum(one['identifiable'] for one in offsets) >= len(offsets) - 3
+    again = read_session(folder / 'again').measurements
+    assert len(again) == len(table.read_text().splitlines()) - 1
+
+
+@pytest.mark.parametrize('shape', CHEAP)
+def test_a_small_session_goes_through_every_verb(shape, tmp_path, capsys):
+    session = CHEAP[shape]()
+    if session is None:
+        pytest.skip('the real data sets are not beside this repository (../shared/data)')
+    goes_through_every_verb(session, tmp_path, capsys)
+
+
+@pytest.mark.qualify
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize('shape', LARGE)
+def test_a_large_session_goes_through_every_verb(shape, tmp_path, capsys):
+    session = LARGE[shape]()
+    if session is None:
+        pytest.skip('the real data sets are not beside this repository (../shared/data)')
+    goes_through_every_verb(session, tmp_path, capsys)
+
+
+def test_forty_rows_of_one_pose_are_too_little_and_it_is_said(tmp_path, capsys):
+    write_session(tmp_path / 'session', one_pose_for_all(10))
+    for verb in ('fit', 'discover'):
+        out = str(tmp_path / verb)
+        assert main([verb, str(tmp_path / 'session'), '--out', out, '--no-figures']) == 1
+        assert 'saw 1 poses to fit; at least 3 are needed' in capsys.readouterr().err
