@@ -52,6 +52,7 @@ from remaster_ros.collection.events import (
     decode,
     encode,
 )
+from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 
 
@@ -99,6 +100,7 @@ class Bench(BridgeProcess):
         self.seen = Seen()
         self.planner, self.waiting_for, self.silent = 'waiting', '', set[str]()
         self._runs = 0
+        self.model = read_cell(parameters['cell']).model()
         self.emergency_shown: bool | None = None
         self.answers = True
         self.worst_gap_s = 0.0
@@ -299,7 +301,9 @@ class Bench(BridgeProcess):
         self._emergency.publish(Bool(data=stopped))
 
     def _say(self, body: State | Event) -> None:
-        record = EventRecord(node=f'/{body.sender}', body=body, stamp_ns=time.time_ns())
+        record = EventRecord(
+            node=f'/{body.sender}', body=body, stamp_ns=time.time_ns(), model=self.model
+        )
         self._records.publish(String(data=encode(record)))
 
     def _stamp(self, ahead_s: float) -> Time:

@@ -22,6 +22,9 @@ from remaster_ros.errors import InputError
 
 VERSION = 1
 
+SHORT = 8
+"""So many digits of a checksum are shown to people."""
+
 Index = Annotated[int, msgspec.Meta(ge=0)]
 Outcome = Literal['recorded', 'partial', 'rejected']
 
@@ -333,6 +336,46 @@ Event = (
 STATES = get_args(State)
 
 
+class ArmModel(msgspec.Struct, frozen=True, kw_only=True):
+    """Which arm and surroundings a node computes with.
+
+    Attributes
+    ----------
+    urdf, cell
+        Checksums of the URDF's content, and of what motions depend on in the cell file.
+    urdf_file, cell_file
+        Where the node has read them.
+    """
+
+    urdf: str
+    cell: str
+    urdf_file: str = ''
+    cell_file: str = ''
+
+    def difference(self, own: str, other: ArmModel, name: str) -> str:
+        """Return how the model of another node differs, '' where it does not.
+
+        Parameters
+        ----------
+        own, name
+            This node's name, and the other's.
+        other
+            The other's model.
+        """
+        found = [
+            f'{own} has the {what} {file} (checksum {mine[:SHORT]}) and {name} has '
+            f'{other_file} ({its[:SHORT]})'
+            for what, mine, its, file, other_file in (
+                ('URDF', self.urdf, other.urdf, self.urdf_file, other.urdf_file),
+                ('cell file', self.cell, other.cell, self.cell_file, other.cell_file),
+            )
+            if mine != its
+        ]
+        if not found:
+            return ''
+        return f'{"; ".join(found)}: start both with the same cell file'
+
+
 class EventRecord(msgspec.Struct, frozen=True, kw_only=True):
     """A state or an event, and which node published it when.
 
@@ -344,6 +387,8 @@ class EventRecord(msgspec.Struct, frozen=True, kw_only=True):
         Identifies this start of the node; how long it has been running, s.
     stamp_ns
         Time of the node's clock, ns.
+    model
+        Which arm the node computes with; None where it computes with none.
     """
 
     node: str
@@ -351,6 +396,7 @@ class EventRecord(msgspec.Struct, frozen=True, kw_only=True):
     started: str = ''
     uptime_s: float = 0.0
     stamp_ns: int = 0
+    model: ArmModel | None = None
     version: int = VERSION
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 NAMES = ('planner', 'recorder', 'robot')
 """The nodes that must be live; their reasons not to move count in this order."""
-OBSERVED = ('safety_link', 'controller', 'clock', 'rivals')
+OBSERVED = ('safety_link', 'model', 'controller', 'clock', 'rivals')
 """What else must be right."""
 KNOWN_S = 1.0
 """A planner's run that appears this soon after its first summary may be an old one, because the

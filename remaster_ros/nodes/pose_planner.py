@@ -32,6 +32,7 @@ from remaster_ros.collection import events
 from remaster_ros.collection.announcements import Announcements
 from remaster_ros.collection.collection_run import CollectionRun
 from remaster_ros.collection.optimizer_state import OptimizerState
+from remaster_ros.collection.peer_models import PeerModels
 from remaster_ros.collection.plan_confirmation import service_name
 from remaster_ros.collection.preflight_facts import PreflightFacts
 from remaster_ros.collection.tour_progress import TourProgress
@@ -96,8 +97,10 @@ class PosePlanner(RemasterNode):
         self.create_service(Trigger, 'remaster/collect', self._on_collect)
         self.create_service(Trigger, 'remaster/pause', self._on_pause, callback_group=at_once)
         self.create_service(Trigger, 'remaster/stop', self._on_stop, callback_group=at_once)
-        self.status = NodeStatus(self, self._summary, Path(self.cell.robot.urdf).stem)
+        model = self.cell.model()
+        self.status = NodeStatus(self, self._summary, Path(self.cell.robot.urdf).stem, model)
         self._facts = PreflightFacts(self.cell.sensors)
+        self._models = PeerModels(self.get_fully_qualified_name(), model)
         self._cleared = self._described = False
         self._measure = MeasureCalls(self, self.cell)
         listen(self, self._on_record)
@@ -235,6 +238,7 @@ class PosePlanner(RemasterNode):
     def _on_record(self, record: events.EventRecord) -> None:
         now = time.monotonic()
         self._facts.take(record.body, now)
+        self._models.take(record, now)
         self._announcements.take(record, now)
         match record.body:
             case events.ArmHalted(reason=why) | events.BridgeState(halted=why) if why:
@@ -320,6 +324,8 @@ class PosePlanner(RemasterNode):
             return self.clock_trouble
         if not self.status.alone(now):
             return 'listening whether there is another pose_planner'
+        if trouble := self._models.trouble(now):
+            return trouble
         if not self._announcements.matched(self._poses.subscribers, now):
             return 'waiting for robot_bridge and recorder'
         if not self._cleared:

@@ -106,7 +106,7 @@ class Recorder(RemasterNode):
             self._on_register,
             callback_group=ReentrantCallbackGroup(),
         )
-        self.status = NodeStatus(self, self._summary)
+        self.status = NodeStatus(self, self._summary, model=self.cell.model())
         for note in (*self.journal.notes, *self.keeper.bag.notes):
             self.get_logger().warning(note)
         self._register(self.journal.registration)

@@ -15,13 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.collection import events
+from remaster_ros.collection.peer_models import PeerModels
 from remaster_ros.errors import InputError
+from remaster_ros.kinematics.same_arm import difference
 from remaster_ros.motion.actions import (
     Action,
     CheckPath,
@@ -61,6 +64,13 @@ COMMANDS = 'joint_trajectory_controller/joint_trajectory'
 JOINTS = 'joint_states'
 SOLUTIONS = 'remaster/joint_solutions'
 WAYPOINTS = 'remaster/joint_waypoints'
+DESCRIPTION = 'robot_description'
+DESCRIPTION_QOS = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""As robot_state_publisher offers it."""
 NEWEST_STATES = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 """A bridge that is kept busy drops what is old: it needs where the arm is now."""
 MATCHED_WALL_S = 0.5
@@ -116,7 +126,13 @@ class RobotBridge(RemasterNode):
         # Since when a controller listens; a command before that would be lost.
         self._listened_wall: float | None = None
         self._settled = self.create_publisher(JointState, 'remaster/settled', RELIABLE)
-        self.status = NodeStatus(self, self._summary, Path(cell.robot.urdf).stem)
+        arm = cell.model()
+        self.status = NodeStatus(self, self._summary, Path(cell.robot.urdf).stem, arm)
+        self._models = PeerModels(self.get_fully_qualified_name(), arm)
+        # How the description that the robot publishes of itself contradicts ours; ''.
+        self._described = ''
+        self._urdf_file = arm.urdf_file
+        self.create_subscription(String, DESCRIPTION, self._on_description, DESCRIPTION_QOS)
         self.create_subscription(JointState, JOINTS, self._on_joint_state, NEWEST_STATES)
         self.create_subscription(JointTrajectory, WAYPOINTS, self._on_waypoints, RELIABLE)
         self.create_subscription(JointTrajectory, SOLUTIONS, self._on_solutions, RELIABLE)
@@ -159,8 +175,11 @@ class RobotBridge(RemasterNode):
 
     def _on_record(self, record: events.EventRecord) -> None:
         now = time.monotonic()
+        self._models.take(record, now)
         match record.body:
             case events.PlannerState(state=state, run=run):
+                # First: a planner of another arm must not count as running.
+                self._do(self.supervisor.observe('model', self._model_trouble(now), now))
                 if state == 'running':
                     # By it a planner that is started again sees that this bridge was there.
                     self._run = run
@@ -169,6 +188,16 @@ class RobotBridge(RemasterNode):
                 self._do(self.supervisor.recorder_waits(waiting_for, now))
             case events.ConfigurationEnded(stamp=self._pose_stamp, solution=solution):
                 self._do(self.supervisor.answered(solution, now))
+
+    def _on_description(self, message: String) -> None:
+        why = difference(self.chain, message.data)
+        self._described = why and (
+            f'{self.resolve_topic_name(DESCRIPTION)} is not the URDF of the cell, '
+            f'{self._urdf_file}: {why}; make the cell for the arm that is there (remaster init)'
+        )
+
+    def _model_trouble(self, now: float) -> str:
+        return self._models.trouble(now) or self._described
 
     def _on_waypoints(self, message: JointTrajectory) -> None:
         self._waypoints = message
@@ -216,6 +245,7 @@ class RobotBridge(RemasterNode):
         rivals = next(filter(None, (only.trouble() for only in self._only)), '')
         for name, trouble in (
             ('rivals', rivals),
+            ('model', self._model_trouble(now)),
             ('controller', self._controller_trouble(now)),
             ('clock', self.clock_trouble),
             ('safety_link', self._emergency.trouble()),

@@ -117,7 +117,7 @@ class SensorNode(RemasterNode):
             self._step = MeasureService(self, self.driver, cell, self._ending).step
         elif isinstance(self.driver, StreamDriver):
             self._step = partial(self._read, self.driver)
-        self.status = NodeStatus(self, self._summary, self.sensor)
+        self.status = NodeStatus(self, self._summary, self.sensor, cell.model())
         self._thread = threading.Thread(target=self._work, name=self.sensor, daemon=True)
         self._thread.start()
 

@@ -24,6 +24,7 @@ from std_msgs.msg import String
 from remaster_ros.collection.events import (
     STATES,
     Alive,
+    ArmModel,
     Event,
     EventRecord,
     State,
@@ -101,12 +102,19 @@ class NodeStatus:
         Returns what to report now.
     hardware_id
         In /diagnostics: the device that the node is for.
+    model
+        Which arm the node computes with; every record carries it.
     """
 
     def __init__(
-        self, node: Node, summary: Callable[[], Summary], hardware_id: str = 'none'
+        self,
+        node: Node,
+        summary: Callable[[], Summary],
+        hardware_id: str = 'none',
+        model: ArmModel | None = None,
     ) -> None:
         self._node, self._summary, self._hardware_id = node, summary, hardware_id
+        self._model = model
         # Distinguishes a node that was started again from the one before it.
         self._started, self._started_wall = str(time.time_ns()), time.monotonic()
         self._duplicates = DuplicateNodeCheck(self._started)
@@ -190,6 +198,7 @@ class NodeStatus:
             started=self._started,
             uptime_s=time.monotonic() - self._started_wall,
             stamp_ns=self._node.get_clock().now().nanoseconds,
+            model=self._model,
         )
         self._events.publish(String(data=encode(record)))
 

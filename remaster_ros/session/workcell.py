@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import xml.etree.ElementTree as ElementTree
 from math import radians
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +12,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
+from remaster_ros.collection.events import ArmModel
 from remaster_ros.errors import InputError, did_you_mean
 from remaster_ros.kinematics.bodies import Body, Shape, box, cylinder, obstacle, sphere
 from remaster_ros.kinematics.collision import HALF_STEP_M, CollisionModel, arm_bodies
@@ -37,6 +39,11 @@ from remaster_ros.types import FloatArray
 ON_TOOL = Bounds(-3.0, 3.0, 'm')
 # A marker is placed better than this; a session file may give more, where nothing is known.
 MARKER_STD = Bounds(0.0, 0.02, 'm', above=True)
+NO_MOTION = (
+    'urdf_text', 'file', 'mesh_path', 'confirm', 'poses', 'aim_at', 'held_joint',
+    'held_values_deg', 'marker_std_m', 'sensors',
+)  # fmt: skip
+"""What of a cell decides where an arm goes or where files lie, not whether it may go there."""
 CLEARANCE = Bounds(HALF_STEP_M, 1.0, 'm', remedy='; half the step of a path check is the least')
 
 
@@ -145,6 +152,25 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
                 if sensor[key] == usual:
                     del sensor[key]
         return hashlib.sha256(msgspec.json.encode(plain)).hexdigest()
+
+    def model(self) -> ArmModel:
+        """Return checksums of the arm and of all that a motion is checked against.
+
+        Copies on two hosts are the same if they differ in their folders, in comments, in the
+        order of keys or attributes or in white space alone. Meshes are not part of it.
+        """
+        urdf = ElementTree.canonicalize(self.urdf_text, strip_text=True)
+        plain = msgspec.to_builtins(self)
+        for key in NO_MOTION:
+            del plain[key]
+        del plain['robot']['urdf']
+        cell = msgspec.json.encode(plain, order='deterministic')
+        return ArmModel(
+            urdf=hashlib.sha256(urdf.encode()).hexdigest(),
+            cell=hashlib.sha256(cell).hexdigest(),
+            urdf_file=str(Path(self.file).parent / self.robot.urdf),
+            cell_file=self.file,
+        )
 
     def held(self, chain: SerialChain) -> dict[int, tuple[float, ...]] | None:
         """Return the held joint's index and values (rad), or None."""

@@ -169,6 +169,7 @@ def test_every_kind_has_its_own_name():
         'started': '',
         'uptime_s': 0.0,
         'stamp_ns': 0,
+        'model': None,
         'version': 1,
     }
 

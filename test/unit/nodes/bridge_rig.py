@@ -34,7 +34,8 @@ from remaster_ros.nodes import emergency_link, rivals, robot_bridge, status
 from remaster_ros.nodes.messages import seconds
 from remaster_ros.session.workcell import read_cell
 
-CHAIN = read_cell('demo').chain()
+CELL = read_cell('demo')
+CHAIN, MODEL = CELL.chain(), CELL.model()
 HOME = np.array([0.0, 0.3, 0.0, 1.0, 0.0, 0.5, 0.0])
 FAST = {
     'settle_s': 0.3,
@@ -123,6 +124,8 @@ class Rig:
         Who publishes: planner, recorder, robot.
     state, waiting_for
         What planner and recorder publish of themselves.
+    models
+        By node, the arms that others than the bridge's compute with.
     names, order
         The joints' names, and in which order joint_states has them.
     alter
@@ -144,6 +147,7 @@ class Rig:
         self.rng = np.random.default_rng(4)
         self.alive = {'planner', 'recorder', 'robot'}
         self.state, self.waiting_for, self.run_token = 'running', '', 'token'
+        self.models = {}
         self.alter = lambda message: message
         self.commands, self.events, self.summaries, self.settled = [], [], [], []
         self.pose = 0
@@ -333,7 +337,8 @@ class Rig:
 
     def say(self, body):
         """Publish a state or an event in the name of the node that publishes it."""
-        record = EventRecord(node=f'/{body.sender or "optimizer"}', body=body)
+        node = f'/{body.sender or "optimizer"}'
+        record = EventRecord(node=node, body=body, model=self.models.get(node, MODEL))
         self.taken(self.said, String(data=encode(record)), 'records')
 
     def say_planner(self, state=None):

@@ -97,8 +97,8 @@ def test_the_graph_and_silence_are_watched_by_themselves(rig):
     while time.monotonic() - began < 0.5:
         r.executor.spin_once(timeout_sec=0.05)
     names = [name for _, name, _, _ in watched]
-    assert names[:4] == ['rivals', 'controller', 'clock', 'safety_link']
-    assert 4 <= len(names) / 4 <= 11
+    assert names[:5] == ['rivals', 'model', 'controller', 'clock', 'safety_link']
+    assert 4 <= len(names) / 5 <= 11
     assert {(trouble, wall) for _, _, trouble, wall in watched} == {('', r.wall)}
 
 
@@ -359,12 +359,9 @@ def test_every_rule_is_asked_at_the_time_it_is(rig):
     }
     for name, args in wanted.items():
         assert seen[name][0] == args, name
-    assert [args[0] for args in seen['observe'][:4]] == [
-        'rivals',
-        'controller',
-        'clock',
-        'safety_link',
-    ]
+    names = [args[0] for args in seen['observe']]
+    begin = names.index('rivals')
+    assert names[begin:][:5] == ['rivals', 'model', 'controller', 'clock', 'safety_link']
     assert {args[2] for args in seen['observe']} == {r.wall}
     assert seen['plan'][0][1:] == (r.wall, {})
     assert seen['doubt'][0][1] == r.wall

@@ -204,3 +204,54 @@ def test_a_cell_with_meshes(tmp_path):
     assert kinds['link_3'] == 'hull'
     assert kinds['the link of joint_4'] == 'capsule'
     assert 'the link of joint_3' not in kinds
+
+
+# Which arm and surroundings these are
+
+
+def copied(folder, change=lambda text: text, **keys):
+    """Return the model of a copy of the demo cell in its own folder, the URDF beside it."""
+    folder.mkdir()
+    path = write_cell(folder, **keys)
+    urdf = config_path('robots/lwr4plus.urdf').read_text(encoding='utf-8')
+    (folder / 'arm.urdf').write_text(change(urdf), encoding='utf-8')
+    data = yaml.safe_load(path.read_text(encoding='utf-8'))
+    data['robot'] |= {'urdf': 'arm.urdf'}
+    path.write_text(yaml.safe_dump(data, sort_keys=bool(keys)), encoding='utf-8')
+    return read_cell(path).model()
+
+
+def test_a_copy_of_a_cell_elsewhere_is_the_same_arm(tmp_path):
+    first = copied(tmp_path / 'a')
+    other = copied(
+        tmp_path / 'b',
+        lambda text: f'{text}<!-- a comment -->'.replace('\n', '\r\n').replace('  <', '\t<'),
+        confirm=True,
+        floor_z_m=0,
+    )
+    assert (first.urdf, first.cell) == (other.urdf, other.cell)
+    assert first.urdf_file == str(tmp_path / 'a' / 'arm.urdf')
+    assert other.cell_file == str(tmp_path / 'b' / 'cell.yaml')
+
+
+@pytest.mark.parametrize(
+    'keys',
+    [
+        {'clearance_m': 0.02},
+        {'floor_z_m': -0.1},
+        {'obstacles': {'box': {'center_m': [1, 0, 0], 'size_m': [0.1, 0.1, 0.1]}}},
+        {'acceleration_limit_rad_s2': 9.0},
+        {'tool': {'knob': {'radius_m': 0.03}}},
+        {'unknown_offset_deg': 0.5},
+    ],
+)
+def test_whatever_a_motion_is_checked_against_counts(tmp_path, keys):
+    assert copied(tmp_path / 'a').cell != copied(tmp_path / 'b', **keys).cell
+
+
+def test_a_number_of_the_urdf_counts(tmp_path):
+    first = copied(tmp_path / 'a')
+    assert (
+        first.urdf
+        != copied(tmp_path / 'b', lambda text: text.replace('"0 0 1"', '"0 1 0"', 1)).urdf
+    )
