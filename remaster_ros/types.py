@@ -16,6 +16,7 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 Split = Literal['optimization', 'validation', 'reference']
+AngleUnit = Literal['deg', 'rad', 'gon']
 
 FARTHEST_M = 200.0
 """More than any tracker's range: such a number is in millimetres, or broken."""
@@ -216,6 +217,49 @@ class Measurements:
 
 
 @dataclass(frozen=True)
+class PadJoint:
+    """How a robot's own pad writes one joint.
+
+    The URDF's angle is ``sign`` times the pad's, with those coupled to it added, + ``zero_deg``.
+
+    Attributes
+    ----------
+    name
+        Of the joint on the pad, or in the table that came from it.
+    unit
+        In which the pad shows it.
+    sign
+        1 or -1.
+    zero_deg
+        The URDF's angle where the pad shows 0, degrees.
+    coupling
+        Joint of the URDF -> 1 or -1: what of the pad's angle of that joint is added to this one's.
+    """
+
+    name: str
+    unit: AngleUnit = 'deg'
+    sign: Literal[1, -1] = 1
+    zero_deg: float = 0.0
+    coupling: Mapping[str, Literal[1, -1]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Controller:
+    """How a robot's own pad writes the joints of the URDF.
+
+    Attributes
+    ----------
+    joints
+        Joint of the URDF -> how the pad writes it, base to tip.
+    maker
+        Of the controller; '' where it is not known.
+    """
+
+    joints: Mapping[str, PadJoint]
+    maker: str = ''
+
+
+@dataclass(frozen=True)
 class Session:
     """A session: the robot, the markers and sensors, and what was measured.
 
@@ -248,6 +292,9 @@ class Session:
         ``complete``, ``stopped``, ``aborted`` or '' where the file has none.
     operator, serial_number
         Who measured, and which arm; '' where the file has none.
+    controller
+        How the robot's own pad writes the joints; None where it writes them as the URDF, in
+        degrees, or nothing is known.
     extra
         Keys of session.yaml this version does not know, kept as they are.
     observations_sha256
@@ -274,6 +321,7 @@ class Session:
     further_markers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     oriented: frozenset[str] = frozenset()
     observations_sha256: str = ''
+    controller: Controller | None = None
 
     @property
     def urdf_sha256(self) -> str:

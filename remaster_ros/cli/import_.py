@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.importing.assemble import (
     SessionOptions,
     assemble,
-    corrected,
     refuse_outside_limits,
 )
 from remaster_ros.importing.bags import is_bag, read_bag
@@ -24,6 +23,7 @@ from remaster_ros.importing.robots import read_robot
 from remaster_ros.importing.rows import RawRows, TableOptions, read_rows
 from remaster_ros.importing.sense import Sense, check_sense
 from remaster_ros.importing.units import ANGLES, LENGTHS
+from remaster_ros.kinematics.pad_angles import pad_in_words
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.reader import write_session
 from remaster_ros.session.workcell import Workcell, read_cell
@@ -126,12 +126,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _couple(text: str) -> tuple[str, tuple[str, float]]:
+def _couple(text: str) -> tuple[str, tuple[str, Literal[1, -1]]]:
     """Argument type: a joint, and one that is added to it or subtracted."""
     name, sign, other = text.partition('=')
     if not (name and sign and other.lstrip('+-')):
         raise argparse.ArgumentTypeError(f'{text!r} is not JOINT=JOINT, such as J3=J2')
-    return name, (other.lstrip('+-'), -1.0 if other.startswith('-') else 1.0)
+    return name, (other.lstrip('+-'), -1 if other.startswith('-') else 1)
 
 
 def _offset(text: str) -> tuple[str, float]:
@@ -154,15 +154,14 @@ def run(args: argparse.Namespace) -> int:
         progress('reading', 0.0)
         rows = _read(args, chain).in_order()
         options = _session_options(args, cell)
-        q = corrected(rows, chain, options)
         notes = f'imported from {", ".join(path.name for path in args.files)}'
         rng = np.random.default_rng(args.seed)
-        session, how = assemble(rows, q, urdf, chain, options, rng, notes)
+        session, how = assemble(rows, urdf, chain, options, rng, notes)
         sense = check_sense(session, rows, progress)
     if not args.json:
         show(args.quiet, _as_text(rows, session, how))
     if sense.fits or args.unchecked:
-        refuse_outside_limits(rows, chain, q)
+        refuse_outside_limits(rows, chain, session.measurements.q)
         write_session(args.out, session)
     if args.json:
         print(
@@ -212,9 +211,9 @@ def _session_options(args: argparse.Namespace, cell: Workcell | None) -> Session
             place = [1e3 * value for value in cell.markers[marker]]
             std = 1e3 * cell.marker_std_m if std is None else std
     return SessionOptions(
-        couple=dict(args.couple),
+        couple=tuple(args.couple),
         reverse=args.reverse,
-        add_rad={name: np.radians(angle) for name, angle in args.offset},
+        add_deg=tuple(args.offset),
         sensor=sensor or 'sensor',
         marker=marker or 'marker',
         marker_m=None if place is None else tuple(1e-3 * value for value in place),
@@ -235,6 +234,9 @@ def _as_text(rows: RawRows, session: Session, how: list[str]) -> str:
         f'{session.tip_link}; '
         + ('times as given' if session.timed else 'no times: causes driven by time are untestable')
     )
+    if session.controller is not None:
+        words = pad_in_words(session.controller)
+        lines += [f'on the pad: {", ".join(words)}'] if words else []
     return '\n'.join([*lines, *how])
 
 

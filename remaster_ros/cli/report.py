@@ -104,6 +104,7 @@ def as_dict(answer: Answer, out: Path, plan: PlanFacts | None) -> dict[str, Any]
             for stage in answer.stages
         ],
         'brings': answer.brings,
+        'on_the_pad': [[vars(step) for step in group] for group in answer.on_the_pad],
         'noise_mm': {row.sensor: row.reading_mm for row in answer.noise},
         'remains': [row._asdict() for row in answer.remains],
         'plan': None if plan is None else plan_to_dict(plan),

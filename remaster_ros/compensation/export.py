@@ -19,6 +19,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from remaster_ros.compensation.mastering import MasteringStep, mastering
+from remaster_ros.kinematics.pad_angles import pad_in_words
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_rpy, rotation_vector_to_matrix
 from remaster_ros.session.safe_yaml import dump_yaml
@@ -85,8 +87,18 @@ def exports(result: FitResult, geometry: Geometry | None = None) -> dict[str, st
 
 def _notes(result: FitResult, remarks: Sequence[str] = ()) -> list[str]:
     """Return the warnings for the user of a file, a line each."""
+    controller = result.session.controller
+    words = [] if controller is None else pad_in_words(controller)
     return [
         *remarks,
+        *(
+            (
+                'in the joints and angles of the robot description (URDF), as the ROS driver has '
+                f'them, not in those of the pad: {", ".join(words)}',
+            )
+            if words
+            else ()
+        ),
         *(f'CHECK FIRST: {line}' for line in result.implausible),
         *(
             f'left out, not identifiable: {joint}: {" ".join(why.split())}'
@@ -102,40 +114,116 @@ def left_out(result: FitResult) -> dict[str, str]:
 
 
 def remaster_text(result: FitResult, remarks: Sequence[str] = ()) -> str:
-    """Return the instructions for re-mastering on the robot's own pad."""
-    rows = []
-    for i in np.flatnonzero(result.identifiable):
-        offset, std = np.degrees((result.joint_offsets[i], result.joint_offsets_std[i]))
-        name = result.joint_names[i]
-        rows.append(f'  {name:<20} {offset:>+12.4f} {std:>10.4f} {0.0 - offset:>+16.4f}')
-    head = f'  {"joint":<20} {"offset, deg":>12} {"std, deg":>10} {"drive to, deg":>16}'
+    """Return the instructions for re-mastering on the robot's own pad, in the pad's numbers."""
+    session = result.session
+    groups = mastering(
+        session.controller,
+        result.chain,
+        result.joint_offsets,
+        result.joint_offsets_std,
+        result.identifiable,
+    )
+    steps = [step for group in groups for step in group]
+    plain = len(groups) == len(steps) and all(step.is_plain for step in steps)
     notes = [f'  {joint}: {why}' for joint, why in left_out(result).items()]
+    words = [] if session.controller is None else pad_in_words(session.controller)
     return '\n'.join(
         [
             f'Joint zero-offsets of robot {result.chain.name!r}',
-            f'(URDF with SHA-256 {result.session.urdf_sha256})',
+            f'(URDF with SHA-256 {session.urdf_sha256})',
             '',
             *(f'CHECK FIRST: {line}' for line in result.implausible),
             *(('',) if result.implausible else ()),
             'The true joint angle is the reported one plus the offset. Use ONE of three ways,',
             'never two at once:',
             '',
-            '1. Re-master on the pad: drive each joint to the angle in the last column, as the',
-            "   robot reports it now, and set that place as the joint's new zero.",
+            *(_PLAIN if plain else _PAD),
             f'2. An offset layer between planner and controller: {LAYER_FILE}.',
             f'3. A corrected robot model for planner and controller: {URDF_FILE}.',
             '',
             *(line for remark in remarks for line in textwrap.wrap(remark, 88)),
             *(('',) if remarks else ()),
-            *((head, *rows) if rows else ('  No joint: these data determine no offset.',)),
+            *((_plain_rows(steps) if plain else _pad_rows(groups)) if steps else
+              ('  No joint: these data determine no offset.',)),
             *(('', 'Left out of all three, as the data do not determine their offsets. Leave',
-               'these joints as they are:', *notes) if notes else ()),
+               'these joints as they are'
+               f'{"" if all(step.determined for step in steps) else ", but for the table above"}:',
+               *notes) if notes else ()),
+            *(('', 'How the angles of the robot description (URDF) come from those on the pad, as',
+               'told when the session was made:', *(f'  {line}' for line in words),
+               'The offsets above, and ways 2 and 3, are in the numbers of the description.')
+              if words else ()),
             '',
             'Afterwards measure a few poses again and run "remaster accuracy": it shows whether',
             'the offsets are in use.',
             '',
         ]
     )  # fmt: skip
+
+
+_PLAIN = (
+    '1. Re-master on the pad: drive each joint to the angle in the last column, as the',
+    "   robot reports it now, and set that place as the joint's new zero.",
+)
+_PAD = (
+    '1. Re-master on the pad, in the numbers of the pad, line by line: drive the joint until',
+    '   the pad shows the angle under "drive to", and set it, in that place, so that the pad',
+    '   shows the angle under "set to". Any other place does as well: add the same angle to both.',
+)
+
+
+def _plain_rows(steps: Sequence[MasteringStep]) -> list[str]:
+    """Return the table of joints that the pad has as the URDF has them."""
+    rows = [f'  {"joint":<20} {"offset, deg":>12} {"std, deg":>10} {"drive to, deg":>16}']
+    for step in steps:
+        rows.append(
+            f'  {step.joint:<20} {step.offset_deg:>+12.4f} {step.std_deg:>10.4f} '
+            f'{step.drive_to:>+16.4f}'
+        )
+    return rows
+
+
+def _pad_rows(groups: Sequence[Sequence[MasteringStep]]) -> list[str]:
+    """Return the table of joints as the pad has them, with what belongs together."""
+    steps = [step for group in groups for step in group]
+    wide = max(len('on the pad'), *(len(step.pad_name) for step in steps))
+    long = max(len('in the URDF'), *(len(step.joint) for step in steps))
+    rows = [
+        f'  {"on the pad":<{wide}}  {"in the URDF":<{long}}  {"offset, deg":>11}  {"std, deg":>8}'
+        f'  {"drive to":>16}  {"set to":>16}'
+    ]
+    for group in groups:
+        if len(group) > 1:
+            names = [step.pad_name for step in group]
+            rows += [
+                f'  Coupled: drive {" and ".join(names)} to their angles first. Then, without a '
+                'move between,',
+                f'  set {", then ".join(names)}: also where setting one changes what the pad '
+                'shows of the next.',
+            ]
+        for step in group:
+            offset = f'{step.offset_deg:+.4f}' if step.determined else 'unknown'
+            std = f'{step.std_deg:.4f}' if step.determined else '-'
+            places = [f'{step.shown(v)} {step.unit}' for v in (step.drive_to, step.set_to)]
+            rows.append(
+                f'  {step.pad_name:<{wide}}  {step.joint:<{long}}  {offset:>11}  {std:>8}'
+                f'  {places[0]:>16}  {places[1]:>16}'
+            )
+            if step.unit != 'deg':
+                degrees = [f'{step.in_degrees(v):+.4f}' for v in (step.drive_to, step.set_to)]
+                rows.append(f'    ({step.pad_name} in degrees: {degrees[0]}, set to {degrees[1]})')
+            if not step.determined:
+                rows.append(
+                    f'    ({step.joint} keeps its zero in the URDF; what the pad shows goes with '
+                    'the joint that it is coupled to)'
+                )
+    others = [step for step in steps if step.set_to != 0.0]
+    if others:
+        rows += [
+            '  Where the controller sets nothing but 0, drive instead to',
+            *(f'    {step.pad_name}: {step.to_set_zero} {step.unit}' for step in others),
+        ]
+    return rows
 
 
 def layer_text(result: FitResult, remarks: Sequence[str] = ()) -> str:

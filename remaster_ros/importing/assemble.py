@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
+from typing import Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,9 +13,19 @@ from scipy.spatial import cKDTree
 from remaster_ros.errors import InputError
 from remaster_ros.importing.rows import RawRows
 from remaster_ros.importing.units import split_unit
+from remaster_ros.kinematics.pad_angles import PadAngles, coupled_in_circle
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.observations import LIMIT_TOLERANCE_RAD
-from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements, Session
+from remaster_ros.types import (
+    AngleUnit,
+    BoolArray,
+    Controller,
+    FloatArray,
+    IntArray,
+    Measurements,
+    PadJoint,
+    Session,
+)
 
 # Tool poses that are equal but for the rounding of the robot's report and for the difference
 # between its controller's kinematics and the nominal ones.
@@ -40,9 +51,9 @@ class SessionOptions:
 
     Attributes
     ----------
-    couple, reverse, add_rad
+    couple, reverse, add_deg
         Corrections of the joints by column, in this order: another joint that is added, with its
-        sign; signs that are reversed; angles added, rad.
+        sign; signs that are reversed; angles added, degrees.
     marker_m, marker_std_m
         Where the marker is in the tool frame, m; None where nothing is known.
     hold_out
@@ -51,9 +62,9 @@ class SessionOptions:
         Whether each row's configuration was reached from that of the row before.
     """
 
-    couple: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    couple: tuple[tuple[str, tuple[str, Literal[1, -1]]], ...] = ()
     reverse: tuple[str, ...] = ()
-    add_rad: Mapping[str, float] = field(default_factory=dict)
+    add_deg: tuple[tuple[str, float], ...] = ()
     sensor: str = 'sensor'
     marker: str = 'marker'
     marker_m: tuple[float, float, float] | None = None
@@ -62,17 +73,41 @@ class SessionOptions:
     visited_in_order: bool = False
 
 
-def corrected(rows: RawRows, chain: SerialChain, options: SessionOptions) -> FloatArray:
-    """Return the joint angles with the corrections that were told, rad, (n, k)."""
-    q = rows.q.copy()
-    for name, (other, sign) in options.couple.items():
-        added = rows.q[:, _joint(other, rows, chain, '--couple')]
-        q[:, _joint(name, rows, chain, '--couple')] += sign * added
+def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) -> Controller | None:
+    """Return how the controller writes the joints, by the table's columns and what was told.
+
+    None where that is known to be as the URDF has them, as in a bag without corrections.
+
+    Raises
+    ------
+    InputError
+        A joint that is not there, or one that is coupled to itself.
+    """
+    if rows.angle_unit is None and not (options.couple or options.reverse or options.add_deg):
+        return None
+    unit: AngleUnit = rows.angle_unit or 'rad'
+    names = [split_unit(name)[0] or name for name in rows.joint_columns]
+    if len(set(names)) < len(names):
+        names = list(chain.joint_names)
+    # Columns without names of their own are those of the URDF.
+    names = [own if name.isdigit() else name for name, own in zip(names, chain.joint_names)]
+    pads = [PadJoint(name, unit) for name in names]
+    for name, (other, sign) in options.couple:
+        added = chain.joint_names[_joint(other, rows, chain, '--couple')]
+        i = _joint(name, rows, chain, '--couple')
+        pads[i] = replace(pads[i], coupling={**pads[i].coupling, added: sign})
     for name in options.reverse:
-        q[:, _joint(name, rows, chain, '--reverse')] *= -1.0
-    for name, angle in options.add_rad.items():
-        q[:, _joint(name, rows, chain, '--offset')] += angle
-    return q
+        i = _joint(name, rows, chain, '--reverse')
+        pads[i] = replace(pads[i], sign=-1)
+    for name, angle in options.add_deg:
+        i = _joint(name, rows, chain, '--offset')
+        pads[i] = replace(pads[i], zero_deg=pads[i].zero_deg + angle)
+    joints = dict(zip(chain.joint_names, pads, strict=True))
+    if joint := coupled_in_circle({name: pad.coupling for name, pad in joints.items()}):
+        raise InputError(
+            f'--couple: {joints[joint].name} is coupled to itself, directly or by way of others'
+        )
+    return Controller(joints)
 
 
 def _joint(name: str, rows: RawRows, chain: SerialChain, option: str) -> int:
@@ -90,7 +125,6 @@ def _joint(name: str, rows: RawRows, chain: SerialChain, option: str) -> int:
 
 def assemble(
     rows: RawRows,
-    q: FloatArray,
     urdf: str,
     chain: SerialChain,
     options: SessionOptions,
@@ -99,23 +133,21 @@ def assemble(
 ) -> tuple[Session, list[str]]:
     """Return the session, and how poses were found and held out, a sentence each.
 
-    Parameters
-    ----------
-    q
-        Joint angles with the corrections, rad, (n, k).
-
     Raises
     ------
     InputError
         Labels that contradict each other, naming the row.
     """
+    controller = controller_of(rows, chain, options)
+    pad = PadAngles.of(controller, chain.joint_names)
+    q = pad.to_urdf(rows.q)
     n = len(q)
     pose, how_pose = _poses(rows, chain, q)
     configuration = _configurations(rows, pose, q)
     validation, how_split = _splits(rows, pose, options.hold_out, rng)
     sensor, sensors = _numbered(rows.labels.get('sensor', [options.sensor] * n))
     marker, markers = _numbered(rows.labels.get('marker', [options.marker] * n))
-    from_q = rows.from_q
+    from_q = pad.to_urdf(rows.from_q)
     if options.visited_in_order:
         from_q = _visited(configuration, q)
     measurements = Measurements(
@@ -152,6 +184,7 @@ def assemble(
         exit_status='complete',
         created=_date(rows),
         notes=notes,
+        controller=controller,
     )
     return session, [how_pose, how_split]
 

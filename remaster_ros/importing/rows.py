@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from remaster_ros.importing.values import (
     times,
 )
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.types import FloatArray
+from remaster_ros.types import AngleUnit, FloatArray
 
 _OTHERS = ('pose', 'configuration', 'split', 'sensor', 'marker')
 
@@ -62,6 +62,8 @@ class RawRows:
         (n,); NaN and -1 where unknown.
     columns
         Column -> what it was taken for, for people.
+    angle_unit
+        In which the table has the joints; None where they are those of the URDF, as in a bag.
     description
         How the files were read and joined, a line each.
     warnings
@@ -81,6 +83,7 @@ class RawRows:
     columns: dict[str, str]
     description: tuple[str, ...]
     warnings: tuple[str, ...]
+    angle_unit: AngleUnit | None = None
 
     def in_order(self) -> RawRows:
         """Return the rows in the order of their times."""
@@ -208,6 +211,7 @@ def _values(
         columns=meanings,
         description=description,
         warnings=warnings,
+        angle_unit=cast(AngleUnit, angle),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -11,6 +11,8 @@ import numpy as np
 from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.noise_check import MEAN_LENGTH
 from remaster_ros.compensation.export import GEOMETRY_FILE, LAYER_FILE, REMASTER_FILE, URDF_FILE
+from remaster_ros.compensation.mastering import MasteringStep, mastering
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, transform
 from remaster_ros.reports.answer_inputs import Inputs, all_taken_out
 from remaster_ros.reports.discovery_schema import Effect
@@ -18,7 +20,7 @@ from remaster_ros.reports.effect_words import STEP, is_held_by_model, is_of_meas
 from remaster_ros.reports.judgement import NOTICEABLE_GAIN
 from remaster_ros.reports.remaining import Remaining, what_remains
 from remaster_ros.reports.schemas import JointOffset, Judgement
-from remaster_ros.types import BoolArray, FloatArray
+from remaster_ros.types import BoolArray, FloatArray, Session
 
 ALL_FILES = (REMASTER_FILE, URDF_FILE, LAYER_FILE, GEOMETRY_FILE)
 Mood = Literal['good', 'caution', 'bad']
@@ -96,6 +98,12 @@ class Answer:
         Of every sensor for which it is known.
     remains
         What the deed leaves.
+    offsets
+        Of every joint.
+    on_the_pad
+        What to do on the robot's pad, in its own numbers, in groups of coupled joints.
+    pad_names
+        Joint of the URDF -> its name on the pad, where that is known.
     """
 
     mood: Mood
@@ -110,16 +118,24 @@ class Answer:
     noise: tuple[SensorNoise, ...]
     remains: tuple[Remaining, ...]
     offsets: tuple[JointOffset, ...]
+    on_the_pad: tuple[tuple[MasteringStep, ...], ...]
+    pad_names: Mapping[str, str]
 
     @property
-    def known(self) -> list[JointOffset]:
-        """The offsets to set."""
-        return [row for row in self.offsets if row.identifiable]
+    def plain_pad(self) -> bool:
+        """Whether the pad has the URDF's joints and degrees, each set where it is to show 0."""
+        return all(len(group) == 1 and group[0].is_plain for group in self.on_the_pad)
 
     @property
-    def unknown(self) -> list[JointOffset]:
-        """The offsets that the data do not determine."""
-        return [row for row in self.offsets if not row.identifiable]
+    def left_alone(self) -> list[str]:
+        """The joints to leave as they are, by their names on the pad: their zeros are unknown."""
+        told = {step.joint for group in self.on_the_pad for step in group}
+        return [
+            called if called == row.joint else f'{called} ({row.joint})'
+            for row in self.offsets
+            if not row.identifiable and row.joint not in told
+            for called in [self.pad_names.get(row.joint, row.joint)]
+        ]
 
     @property
     def files(self) -> list[str]:
@@ -144,6 +160,7 @@ def answer_of(inputs: Inputs) -> Answer:
     known = sum(row.identifiable for row in offsets)
     geometry = uses_causes and any(map(is_held_by_model, effects))
     taken_out = uses_causes and brings == len(rows) - 1
+    pad = inputs.session.controller
     measured = [title(e) for e in effects if taken_out and is_of_measurement(e)]
     return Answer(
         mood=_mood(inputs, uses_causes, held_out and action != 'wait'),
@@ -158,6 +175,20 @@ def answer_of(inputs: Inputs) -> Answer:
         noise=_noise(inputs),
         remains=tuple(what_remains(inputs, uses_causes, held_out, stages[brings].mean)),
         offsets=tuple(offsets),
+        on_the_pad=_on_the_pad(inputs.session, offsets),
+        pad_names={} if pad is None else {name: joint.name for name, joint in pad.joints.items()},
+    )
+
+
+def _on_the_pad(
+    session: Session, offsets: Sequence[JointOffset]
+) -> tuple[tuple[MasteringStep, ...], ...]:
+    return mastering(
+        session.controller,
+        SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link),
+        np.radians([row.mean_deg for row in offsets]),
+        np.radians([row.std_deg for row in offsets]),
+        np.array([row.identifiable for row in offsets]),
     )
 
 

@@ -22,7 +22,12 @@ from remaster_ros.session.files import (
 )
 from remaster_ros.session.manifest import check_data, read_manifest
 from remaster_ros.session.observations import RowFormat, format_measurements
-from remaster_ros.session.session_yaml import SessionHeader, parse_header, write_header
+from remaster_ros.session.session_yaml import (
+    SessionHeader,
+    parse_header,
+    require_known_joints,
+    write_header,
+)
 from remaster_ros.session.yaml_records import YAML_LIMIT
 from remaster_ros.types import Measurements, Session
 
@@ -76,6 +81,7 @@ def _read(folder: Path, sums: dict[str, str]) -> Session:
     check_data(sums, header_path, data)
     header = parse_header(data, header_path)
     urdf, chain = read_robot(folder, header, sums)
+    require_known_joints(header, chain.joint_names, header_path)
     rows_path = folder / ROWS
     data = read_limited(rows_path, OBSERVATIONS_LIMIT, 'a session folder holds observations.csv')
     check_data(sums, rows_path, data)
@@ -123,6 +129,8 @@ def write_session(folder: str | os.PathLike[str], session: Session) -> None:
     folder = Path(folder)
     chain = read_chain(session.urdf, folder / URDF, session.base_link, session.tip_link)
     header = write_header(session, URDF, session.exit_status)
+    parsed = parse_header(header.encode(), folder / HEADER)
+    require_known_joints(parsed, chain.joint_names, folder / HEADER)
     names = session.sensor_names, session.marker_names
     rows = format_measurements(all_rows(session), *names).encode()
     RowFormat(folder / ROWS, chain, *names).parse(rows)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
@@ -12,11 +12,12 @@ import msgspec
 import numpy as np
 
 from remaster_ros.errors import InputError
+from remaster_ros.kinematics.pad_angles import coupled_in_circle
 from remaster_ros.session.files import decode_text
 from remaster_ros.session.plain_data import to_plain
 from remaster_ros.session.safe_yaml import YamlError, dump_yaml, load_yaml
 from remaster_ros.session.yaml_records import BaseFrame, Bounds, Triple, out_of_bounds
-from remaster_ros.types import Measurements, Session
+from remaster_ros.types import AngleUnit, Controller, Measurements, PadJoint, Session
 
 FORMAT = 'remaster-session/1'
 ExitStatus = Literal['complete', 'stopped', 'aborted']
@@ -35,6 +36,27 @@ class _Sensor(msgspec.Struct):
     marker: str
     further_markers: tuple[str, ...] = ()
     orientation: bool = False
+
+
+class _PadJoint(msgspec.Struct):
+    name: str
+    unit: AngleUnit = 'deg'
+    sign: Literal[1, -1] = 1
+    zero_deg: Annotated[float, Bounds(-360.0, 360.0, 'degrees')] = 0.0
+    coupling: dict[str, Literal[1, -1]] = {}
+
+
+class _Controller(msgspec.Struct):
+    joints: dict[str, _PadJoint]
+    maker: str = ''
+
+    def record(self) -> Controller:
+        """Return it as the session has it."""
+        joints = {
+            name: PadJoint(pad.name, pad.unit, pad.sign, pad.zero_deg, pad.coupling)
+            for name, pad in self.joints.items()
+        }
+        return Controller(joints, self.maker)
 
 
 class SessionHeader(msgspec.Struct):
@@ -56,6 +78,7 @@ class SessionHeader(msgspec.Struct):
     operator: str = ''
     serial_number: str = ''
     notes: str = ''
+    controller: _Controller | None = None
     extra: dict[str, Any] = {}
 
     def session(
@@ -87,6 +110,7 @@ class SessionHeader(msgspec.Struct):
             operator=self.operator,
             serial_number=self.serial_number,
             extra=self.extra,
+            controller=None if self.controller is None else self.controller.record(),
             references=references,
         )
 
@@ -150,6 +174,7 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
         'operator': session.operator,
         'serial_number': session.serial_number,
         'notes': session.notes,
+        'controller': session.controller,
     }
     header = _checked(to_plain(content), 'session to be written: ')
     given = {key: value for key, value in to_plain(header).items() if value not in ('', {}, None)}
@@ -157,6 +182,14 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
         for key in ('further_markers', 'orientation'):
             if not sensor[key]:
                 del sensor[key]
+    if controller := given.get('controller'):
+        plain = msgspec.to_builtins(_PadJoint(''))
+        for name, joint in controller['joints'].items():
+            controller['joints'][name] = {
+                key: value for key, value in joint.items() if value != plain[key]
+            }
+        if not controller['maker']:
+            del controller['maker']
     return dump_yaml(_merge(given, session.extra))
 
 
@@ -206,12 +239,47 @@ def _problem(header: SessionHeader) -> str:
             return f'base_prior.{sensor}: no such sensor ({known}); correct the name'
         if problem := base.problem(f'base_prior.{sensor}'):
             return problem
+    if header.controller is not None and (problem := _controller_problem(header.controller)):
+        return problem
     if header.created:
         try:
             datetime.fromisoformat(header.created)
         except ValueError:
             return f'created: {header.created[:60]!r} is not an ISO 8601 time; correct it'
     return ''
+
+
+def _controller_problem(controller: _Controller) -> str:
+    """Return what is wrong with the pad's joints; '' where nothing is."""
+    if not controller.joints:
+        return 'controller.joints: none given; name the joints of the URDF, or leave it out'
+    names = [joint.name for joint in controller.joints.values()]
+    for joint, pad in controller.joints.items():
+        key = f'controller.joints.{joint}'
+        if not pad.name.strip() or any(letter in pad.name for letter in '\r\n\0'):
+            return f'{key}.name: {pad.name!r} is no usable name; give that on the pad'
+        if names.count(pad.name) > 1:
+            return f'{key}.name: {pad.name!r} is given to two joints; correct one'
+        for other in pad.coupling:
+            if other not in controller.joints:
+                known = ', '.join(controller.joints)
+                return f'{key}.coupling: {other!r} is not among the joints ({known}); correct it'
+    if in_circle := coupled_in_circle({n: j.coupling for n, j in controller.joints.items()}):
+        return (
+            f'controller.joints.{in_circle}.coupling: the joint is coupled to itself, directly or '
+            'by way of others; correct it'
+        )
+    return ''
+
+
+def require_known_joints(header: SessionHeader, joint_names: Sequence[str], path: Path) -> None:
+    """Refuse pad's joints that the URDF has not; `path` is that of session.yaml."""
+    for name in header.controller.joints if header.controller is not None else ():
+        if name not in joint_names:
+            raise InputError(
+                f"{path}: controller.joints: {name!r} is not among the URDF's joints "
+                f'({", ".join(joint_names)}); correct the name'
+            )
 
 
 def _unknown_keys(

@@ -1,0 +1,145 @@
+"""What a person does on the robot's own pad so that a joint's zero is right, in the pad's numbers.
+
+In a place in which the pad shows x it has to show y = x + d afterwards, with d the offset on the
+pad (`PadAngles`): whatever the place is, and whatever the controller keeps a zero of, the motor or
+the angle that it shows. Of coupled joints the first one's new zero may change what the pad shows
+of the next. So they are all driven to their places first, and are set there one after the other
+without a move between, each behind those that are added to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from remaster_ros.kinematics.pad_angles import PadAngles
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.types import AngleUnit, BoolArray, Controller, FloatArray, PadJoint
+
+# As in `importing.units`; of digits so many that rounding is less than 0.0001 degrees.
+_PER_RAD = {'deg': 180.0 / np.pi, 'rad': 1.0, 'gon': 200.0 / np.pi}
+_DIGITS = {'deg': 4, 'rad': 6, 'gon': 4}
+# Where the URDF's zero is out of reach the place is one of whole so many degrees.
+_STEP_DEG = 10.0
+
+
+@dataclass(frozen=True)
+class MasteringStep:
+    """One joint to be set on the pad.
+
+    Attributes
+    ----------
+    joint, pad_name
+        Its name in the URDF and on the pad.
+    unit
+        Of what the pad shows.
+    determined
+        False where the joint's own zero stays, and what the pad shows changes with another joint.
+    offset_deg, std_deg
+        Of the URDF's joint.
+    drive_to, set_to
+        What the pad shows in the place in which it is set, before and after, in `unit`.
+    """
+
+    joint: str
+    pad_name: str
+    unit: AngleUnit
+    determined: bool
+    offset_deg: float
+    std_deg: float
+    drive_to: float
+    set_to: float
+
+    @property
+    def digits(self) -> int:
+        """Digits behind the point."""
+        return _DIGITS[self.unit]
+
+    def shown(self, value: float) -> str:
+        """Return an angle as the pad shows it, with its sign."""
+        return f'{value:+.{self.digits}f}'
+
+    def in_degrees(self, value: float) -> float:
+        """Return an angle of the pad's unit in degrees."""
+        return float(np.degrees(value / _PER_RAD[self.unit]))
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the pad has the URDF's name and degrees, and it is set where it is to show 0."""
+        return self.pad_name == self.joint and self.unit == 'deg' and self.set_to == 0.0
+
+    @property
+    def to_set_zero(self) -> str:
+        """Where to drive instead where the controller sets nothing but 0."""
+        return self.shown(self.drive_to - self.set_to)
+
+
+def mastering(
+    controller: Controller | None,
+    chain: SerialChain,
+    offsets: FloatArray,
+    std: FloatArray,
+    known: BoolArray,
+) -> tuple[tuple[MasteringStep, ...], ...]:
+    """Return the joints to set: those of a group are all driven to first, and set in its order.
+
+    Parameters
+    ----------
+    controller
+        How the pad writes the joints; None where it writes them as the URDF does, in degrees.
+    chain
+        The k joints of the URDF.
+    offsets, std
+        Zero-offsets of the URDF's joints, rad, (k,).
+    known
+        Whether the data determine them, (k,); the others stay as they are.
+    """
+    pad = PadAngles.of(controller, chain.joint_names)
+    applied = np.where(known, offsets, 0.0)
+    change = pad.offsets_on_pad(applied)
+    after = pad.to_pad(_places(chain, applied))
+    before = after - change
+    joints = {} if controller is None else controller.joints
+
+    def step(i: int) -> MasteringStep:
+        name = chain.joint_names[i]
+        shown = joints.get(name, PadJoint(name))
+        per_rad, digits = _PER_RAD[shown.unit], _DIGITS[shown.unit]
+        # What is set is rounded first: the difference is what counts.
+        set_to = round(per_rad * float(after[i]), digits)
+        return MasteringStep(
+            name,
+            shown.name,
+            shown.unit,
+            bool(known[i]),
+            float(np.degrees(offsets[i])),
+            float(np.degrees(std[i])),
+            round(set_to + per_rad * float(before[i] - after[i]), digits) + 0.0,
+            set_to + 0.0,
+        )
+
+    # Also a joint with a zero of its own that stays, where a coupled one's does not.
+    moved = [i for i in range(len(chain)) if known[i] or change[i] != 0.0]
+    return tuple(tuple(step(i) for i in group) for group in _together(moved, pad))
+
+
+def _places(chain: SerialChain, offsets: FloatArray) -> FloatArray:
+    """Return true angles at which the joints are set, rad, (k,): 0 where they can be there."""
+    lower, upper = np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi)
+    step = np.radians(_STEP_DEG)
+    middle = step * np.round(0.5 * (lower + upper) / step)
+    # There the joint reports 0 less its offset.
+    reached = (lower <= -np.abs(offsets)) & (np.abs(offsets) <= upper)
+    return np.where(reached, 0.0, middle)
+
+
+def _together(joints: Sequence[int], pad: PadAngles) -> list[list[int]]:
+    """Return the joints in groups of coupled ones, each behind those that are added to it."""
+    groups: list[list[int]] = []
+    for i in joints:
+        mine = [g for g in groups if any(i in pad.coupled(j) or j in pad.coupled(i) for j in g)]
+        groups = [group for group in groups if group not in mine]
+        groups.append([i, *(j for group in mine for j in group)])
+    return sorted((sorted(group, key=pad.order.index) for group in groups), key=min)

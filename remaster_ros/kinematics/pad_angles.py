@@ -1,0 +1,110 @@
+"""The angles on a robot's own pad and those of its URDF: sign, zero and coupling of joints.
+
+Of k joints, with the pad's angles p and the URDF's q,
+
+    q = S (I + K) p + a
+
+where S has the signs, row i of K the joints whose pad angles are added to that of joint i, and a
+the URDF's angles at the pad's zero. A zero-offset δ of the URDF's joints (true angle = reported
+one + offset) is then one of d = (S (I + K))⁻¹ δ on the pad: in one place the pad has to show d
+more than it does, wherever the place is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from remaster_ros.types import Controller, FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class PadAngles:
+    """The map between k angles on the pad and those of the URDF, rad.
+
+    Attributes
+    ----------
+    matrix, from_urdf
+        S (I + K), (k, k), and its inverse, both of whole numbers.
+    zero
+        a, rad, (k,).
+    order
+        The joints in an order in which each stands behind those that are added to it.
+    """
+
+    matrix: FloatArray
+    from_urdf: FloatArray
+    zero: FloatArray
+    order: tuple[int, ...]
+
+    @classmethod
+    def of(cls, controller: Controller | None, joint_names: Sequence[str]) -> PadAngles:
+        """Return the map of a controller; joints that it does not name are those of the URDF."""
+        k = len(joint_names)
+        matrix, zero = np.eye(k), np.zeros(k)
+        joints = {} if controller is None else controller.joints
+        for i, name in enumerate(joint_names):
+            if name in joints:
+                for other, share in joints[name].coupling.items():
+                    matrix[i, joint_names.index(other)] += share
+                matrix[i] *= joints[name].sign
+                zero[i] = np.radians(joints[name].zero_deg)
+        order: list[int] = []
+        while len(order) < k:
+            free = [
+                i
+                for i in range(k)
+                if i not in order and all(j in order or j == i for j in np.flatnonzero(matrix[i]))
+            ]
+            order.append(free[0])
+        return cls(matrix, np.round(np.linalg.inv(matrix)), zero, tuple(order))
+
+    def to_urdf(self, pad: FloatArray) -> FloatArray:
+        """Return the URDF's angles, rad, (..., k), of the pad's."""
+        return pad @ self.matrix.T + self.zero
+
+    def to_pad(self, q: FloatArray) -> FloatArray:
+        """Return the pad's angles, rad, (..., k), of the URDF's."""
+        return self.offsets_on_pad(q - self.zero)
+
+    def offsets_on_pad(self, offsets: FloatArray) -> FloatArray:
+        """Return how much more the pad has to show for offsets of the URDF, rad, (..., k)."""
+        return offsets @ self.from_urdf.T
+
+    def coupled(self, joint: int) -> tuple[int, ...]:
+        """Return the joints whose pad angles are added to that of a joint."""
+        return tuple(j for j in np.flatnonzero(self.matrix[joint]).tolist() if j != joint)
+
+
+def pad_in_words(controller: Controller) -> list[str]:
+    """Return how the URDF's angles come from the pad's, a joint each where they are not equal."""
+    lines = []
+    for joint, pad in controller.joints.items():
+        if pad.sign == 1 and pad.zero_deg == 0.0 and not pad.coupling:
+            continue
+        names: list[tuple[int, str]] = [(pad.sign, pad.name)]
+        names += [(pad.sign * n, controller.joints[j].name) for j, n in pad.coupling.items()]
+        text = ''.join(f' {"+" if sign > 0 else "-"} {name}' for sign, name in names)
+        text = text.removeprefix(' + ') if pad.sign > 0 else f'-{text.removeprefix(" - ")}'
+        zero = (
+            f' {"+" if pad.zero_deg > 0.0 else "-"} {abs(pad.zero_deg):g}°' if pad.zero_deg else ''
+        )
+        lines.append(f'{joint} = {text}{zero}')
+    return lines
+
+
+def coupled_in_circle(coupling: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a joint that is added to itself, directly or by way of others; '' where none is."""
+    for joint in coupling:
+        reached, ahead = set(), list(coupling[joint])
+        while ahead:
+            other = ahead.pop()
+            if other not in reached:
+                reached.add(other)
+                ahead += coupling.get(other, {})
+        if joint in reached:
+            return joint
+    return ''
