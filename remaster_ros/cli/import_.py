@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from remaster_ros.cli.console import progress_bar, show
-from remaster_ros.cli.options import names, number
+from remaster_ros.cli.options import add_description, names, number
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.importing.assemble import (
     SessionOptions,
@@ -52,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--tip-link', metavar='LINK', help='frame T, in which the marker is (default: proposed)'
     )
+    add_description(parser)
     parser.add_argument('--json', action='store_true', help='print one JSON object')
     table = parser.add_argument_group('what the columns are, where it was not found')
     table.add_argument('--joints', metavar='COLUMN,…', type=names, default=(), help='base to tip')
@@ -146,7 +147,9 @@ def run(args: argparse.Namespace) -> int:
     """Read, show what was read, try it against the robot, write."""
     cell = None if args.cell is None else read_cell(args.cell)
     if cell is None:
-        urdf, chain = read_robot(args.urdf, args.base_link, args.tip_link)
+        urdf, chain = read_robot(
+            args.urdf, args.base_link, args.tip_link, args.package_path, trusted=args.trust
+        )
     else:
         urdf, base = cell.urdf_text, args.base_link or cell.robot.base_link
         chain = SerialChain.from_urdf(urdf, base, args.tip_link or cell.robot.tip_link)

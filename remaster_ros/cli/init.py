@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.cli.console import progress_bar, show
-from remaster_ros.cli.options import CANDIDATES, names, number
+from remaster_ros.cli.options import CANDIDATES, add_description, names, number
 from remaster_ros.errors import InputError, InsufficientDataError, did_you_mean
 from remaster_ros.kinematics.arm_ends import likely_base, likely_tips
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -37,7 +37,8 @@ from remaster_ros.session.cell_template import (
 )
 from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.session.meshes import find_mesh, mesh_reader
-from remaster_ros.session.robot_description import read_description
+from remaster_ros.session.packages import package_of
+from remaster_ros.session.robot_description import is_xacro, read_description
 from remaster_ros.session.workcell import Workcell, parse_cell
 
 # Tool poses by which the joints to hold are compared; poses that are planned to find the ranges.
@@ -61,14 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--base-link', metavar='LINK', help='frame R (default: the likely one)')
     parser.add_argument('--tip-link', metavar='LINK', help='frame T (default: the likely one)')
-    parser.add_argument(
-        '--package-path',
-        metavar='DIR',
-        type=Path,
-        action='append',
-        default=[],
-        help='a folder with ROS packages, or a package; may be repeated',
-    )
+    add_description(parser)
     parser.add_argument(
         '--sensors',
         metavar='NAME,…',
@@ -101,7 +95,9 @@ def run(args: argparse.Namespace) -> int:
     rng = np.random.default_rng(args.seed)
     with progress_bar(args.quiet or args.json) as progress:
         progress('reading', 0.0)
-        description = read_description(args.robot, _arguments(args.arguments), args.package_path)
+        description = read_description(
+            args.robot, _arguments(args.arguments), args.package_path, trusted=args.trust
+        )
         urdf = _urdf_file(args.robot, args.out, description)
         make_folder(args.out.parent)
         if urdf != args.robot:
@@ -138,7 +134,7 @@ def _arguments(given: list[str]) -> dict[str, str]:
 
 def _urdf_file(robot: Path, out: Path, text: str) -> Path:
     """Return the URDF that the cell names: the robot's own, or what xacro was made into."""
-    if robot.suffix != '.xacro' and '<xacro:' not in robot.read_text(errors='replace'):
+    if not is_xacro(robot):
         return robot
     name = robot.name.removesuffix('.xacro').removesuffix('.urdf')
     urdf = out.parent / f'{name}.urdf'
@@ -206,6 +202,9 @@ def _meshes(text: str, robot: Path, package_path: list[Path]) -> tuple[list[str]
             folders[str(folder.parent if folder.name == package else folder)] = None
         elif not Path(name.removeprefix('file://')).is_absolute():
             folders[str(path).removesuffix(name).rstrip('/')] = None
+        elif package_of(path) is None:
+            # What is named by its whole path is read beside the description, not beside the cell.
+            folders[str(path.parent)] = None
     return list(folders), missing
 
 

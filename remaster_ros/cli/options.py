@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 Number = TypeVar('Number', int, float)
@@ -65,6 +66,23 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
             metavar='N',
             help=f'candidate poses {what} (default {CANDIDATES}; those out of reach are dropped)',
         )
+
+
+def add_description(parser: argparse.ArgumentParser) -> None:
+    """Add what a robot description is read with."""
+    parser.add_argument(
+        '--package-path',
+        metavar='DIR',
+        type=Path,
+        action='append',
+        default=[],
+        help='a folder with ROS packages, or a package; may be repeated',
+    )
+    parser.add_argument(
+        '--trust',
+        action='store_true',
+        help='let a xacro file run any Python expression, and read any file and the environment',
+    )
 
 
 def names(text: str) -> tuple[str, ...]:

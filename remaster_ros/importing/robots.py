@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from remaster_ros.errors import InputError
@@ -12,7 +13,12 @@ from remaster_ros.session.robot_description import read_description
 
 
 def read_robot(
-    path: Path, base_link: str | None = None, tip_link: str | None = None
+    path: Path,
+    base_link: str | None = None,
+    tip_link: str | None = None,
+    package_path: Sequence[Path] = (),
+    *,
+    trusted: bool = False,
 ) -> tuple[str, SerialChain]:
     """Read a URDF, or expand a xacro, and find the arm in it.
 
@@ -20,13 +26,15 @@ def read_robot(
     ----------
     base_link, tip_link
         As told; None for the likely ones.
+    package_path, trusted
+        As of `read_description`.
 
     Raises
     ------
     InputError
         Naming the file and the remedy.
     """
-    urdf = read_description(path)
+    urdf = read_description(path, None, package_path, trusted=trusted)
     try:
         model = parse_urdf(urdf)
         base = likely_base(model) if base_link is None else base_link

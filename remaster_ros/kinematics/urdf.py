@@ -21,8 +21,8 @@ from remaster_ros.types import FloatArray
 _LARGEST = 1e6
 """No robot has a length (m), angle (rad) or mass (kg) above it; larger ones would overflow."""
 _XACRO = (
-    'URDF: this is xacro, from which a URDF is still to be made; expand it: remaster init FILE '
-    '(or ros2 run xacro xacro FILE > robot.urdf)'
+    'URDF: this is xacro, from which a URDF is still to be made; let its name end in .xacro, and '
+    'expand it: remaster init FILE (or ros2 run xacro xacro FILE > robot.urdf)'
 )
 _NO_LIMIT = 1e300
 """Some programs write a huge limit, such as 1e16, where they mean none."""

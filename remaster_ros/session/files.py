@@ -9,6 +9,9 @@ from pathlib import Path
 
 from remaster_ros.errors import DiskError, InputError
 
+URDF_LIMIT = 16 * 1024**2
+"""Largest robot description that is read, bytes."""
+
 
 def read_limited(path: Path, limit: int, missing: str) -> bytes:
     """Read a regular file of at most `limit` bytes.

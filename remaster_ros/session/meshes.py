@@ -5,7 +5,7 @@ Those of collision geometry as vertices alone, those of pictures with triangles 
 
 from __future__ import annotations
 
-import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -17,11 +17,13 @@ from urllib.parse import unquote
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.files import read_limited
-from remaster_ros.session.packages import find_package
+from remaster_ros.session.files import read_limited, refuse_utf16
+from remaster_ros.session.packages import Confinement, find_package, package_of, sourced
 from remaster_ros.types import FloatArray, IntArray
 
 MESH_LIMIT = 64 * 1024**2
+_ENCODING = re.compile(rb'<\?xml[^>]*?encoding\s*=\s*["\']([^"\']*)["\']')
+_ASCII_LIKE = (b'utf-8', b'us-ascii', b'ascii', b'iso-8859-1', b'iso-8859-15', b'windows-1252')
 KINDS = ('.stl', '.obj', '.dae', '.ply')
 
 Taken = TypeVar('Taken')
@@ -33,7 +35,8 @@ def mesh_reader(urdf: Path, mesh_path: Sequence[Path] = ()) -> Callable[[str], F
     ``package://NAME/rest`` is looked for as ``NAME/rest`` in the folders of `mesh_path`, in the
     share folders of AMENT_PREFIX_PATH, and beside and above the URDF (a package's own URDF lies
     inside it), also where a package's folder has another name than the package. ``file://`` and
-    plain names are taken relative to the URDF's folder, then to those of `mesh_path`.
+    plain names are taken relative to the URDF's folder, then to those of `mesh_path`. What lies
+    neither in one of these folders nor in a ROS package is not read.
 
     Parameters
     ----------
@@ -54,24 +57,32 @@ def mesh_reader(urdf: Path, mesh_path: Sequence[Path] = ()) -> Callable[[str], F
 def find_mesh(name: str, urdf: Path, mesh_path: Sequence[Path]) -> Path:
     """Return the file of a mesh; arguments as of `mesh_reader`, an `InputError` where none is."""
     folders: list[Path] = [*mesh_path]
+    files = Confinement(urdf, mesh_path)
+    candidates: list[Path] = []
     if name.startswith('package://'):
         inside = unquote(name.removeprefix('package://'))
         package, _, rest = inside.partition('/')
         folder = find_package(package, urdf, mesh_path)
-        if folder is not None and (folder / rest).is_file():
-            return folder / rest
-        prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
-        folders += [Path(prefix) / 'share' for prefix in prefixes if prefix]
-        folders += list(urdf.resolve().parents)
+        if folder is not None:
+            files.add(folder)
+            candidates.append(folder / rest)
+        folders += [*sourced(), *urdf.resolve().parents]
     elif '://' in name and not name.startswith('file://'):
         raise InputError(f'{urdf}: the mesh {name} cannot be fetched; name a package:// or a file')
     else:
         inside = unquote(name.removeprefix('file://'))
         folders.insert(0, urdf.parent)
-    candidates = [folder / inside for folder in folders]
-    for path in candidates:
-        if path.is_file():
+    candidates += [folder / inside for folder in folders]
+    there = [path for path in candidates if path.is_file()]
+    for path in there:
+        # A description that xacro has expanded names files of other packages by their whole paths.
+        if files.holds(path) or package_of(path.resolve()) is not None:
             return path
+    if there:
+        raise InputError(
+            f'{urdf}: the mesh {name} ({there[0]}) lies outside of the folder of the description '
+            'and of any ROS package; give its folder as mesh_path of the cell file'
+        )
     raise InputError(
         f'{urdf}: there is no mesh {name} (looked for {", ".join(map(str, candidates[:6]))}); '
         'give the folder that holds it, or its package, as mesh_path of the cell file, or source '
@@ -160,6 +171,8 @@ def _loaded(
     if kind not in KINDS:
         raise InputError(f'{path}: a mesh in a format that is not read; use {", ".join(KINDS)}')
     content = read_limited(path, MESH_LIMIT, 'the URDF names it as a mesh')
+    if kind == '.dae':
+        _refuse_entities(content, path)
     # Not at import: it takes a second, and most commands read no mesh.
     import trimesh
 
@@ -172,6 +185,20 @@ def _loaded(
     except Exception as error:
         # Whatever a parser of foreign bytes raises, one line comes out.
         raise InputError(f'{path}: no {kind[1:].upper()} mesh ({_line(error)})') from None
+
+
+def _refuse_entities(content: bytes, path: Path) -> None:
+    """Refuse a COLLADA file that is no plain XML, or declares entities: those name any file."""
+    refuse_utf16(content, path)
+    text = content.removeprefix(b'\xef\xbb\xbf').lstrip()
+    encoding = _ENCODING.match(text)
+    plain = encoding is None or encoding[1].lower() in _ASCII_LIKE
+    # An archive of them begins otherwise.
+    if not text.startswith(b'<') or not plain or b'<!DOCTYPE' in text or b'<!ENTITY' in text:
+        raise InputError(
+            f'{path}: no plain COLLADA file (an archive, another encoding, or one that declares a '
+            'DOCTYPE or entities); export it anew'
+        )
 
 
 def _collada_unit(content: bytes) -> float:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 # A package's name in its package.xml; attributes and comments there are rare.
 _NAME = re.compile(r'<name>\s*([^<\s]+)\s*</name>')
+# What a package may be called; a path is no name.
+_PACKAGE = re.compile(r'[A-Za-z][\w-]*')
 
 
 def find_package(name: str, beside: Path, package_path: Sequence[Path] = ()) -> Path | None:
@@ -25,6 +27,8 @@ def find_package(name: str, beside: Path, package_path: Sequence[Path] = ()) -> 
     package_path
         Further folders to look in.
     """
+    if not _PACKAGE.fullmatch(name):
+        return None
     for folder in _candidates(beside, package_path):
         if (folder / name).is_dir():
             return folder / name
@@ -37,11 +41,58 @@ def find_package(name: str, beside: Path, package_path: Sequence[Path] = ()) -> 
     return None
 
 
+def sourced() -> list[Path]:
+    """Return the share folders of the workspaces that are sourced."""
+    prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+    return [Path(prefix) / 'share' for prefix in prefixes if prefix]
+
+
+def package_of(path: Path) -> Path | None:
+    """Return the folder of the ROS package that a file is in; None where it is in none."""
+    return next((folder for folder in path.parents if (folder / 'package.xml').is_file()), None)
+
+
+class Confinement:
+    """Which files a robot description may name.
+
+    Those below its own folder, below the package that it is in, below the packages that it names,
+    and below the folders that the user gives. Links are followed before that is judged, but for
+    what a sourced workspace has: who builds a workspace runs its code, and links of its files lead
+    to their sources.
+
+    Parameters
+    ----------
+    path
+        The description.
+    package_path
+        Folders that the user gives.
+    """
+
+    def __init__(self, path: Path, package_path: Sequence[Path] = ()) -> None:
+        self._sourced = [Path(os.path.abspath(folder)) for folder in sourced()]
+        self._folders: list[Path] = []
+        for folder in package_path:
+            self.add(folder)
+        for one in (path.absolute(), path.resolve()):
+            self.add(one.parent)
+            if (package := package_of(one)) is not None:
+                self.add(package)
+
+    def add(self, folder: Path) -> None:
+        """Take the files below a folder as well."""
+        self._folders.append(folder.resolve())
+
+    def holds(self, path: Path) -> bool:
+        """Return whether a file may be read."""
+        real, written = path.resolve(), Path(os.path.abspath(path))
+        return any(map(real.is_relative_to, self._folders)) or any(
+            map(written.is_relative_to, self._sourced)
+        )
+
+
 def _candidates(beside: Path, package_path: Sequence[Path]) -> Iterator[Path]:
     yield from package_path
-    for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
-        if prefix:
-            yield Path(prefix) / 'share'
+    yield from sourced()
     for folder in beside.resolve().parents:
         # Above a package lies its workspace; further up there are none.
         yield folder

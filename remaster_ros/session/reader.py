@@ -15,6 +15,7 @@ import numpy as np
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.files import (
+    URDF_LIMIT,
     decode_text,
     make_new_folder,
     read_limited,
@@ -31,7 +32,6 @@ from remaster_ros.session.session_yaml import (
 from remaster_ros.session.yaml_records import YAML_LIMIT
 from remaster_ros.types import Measurements, Session
 
-URDF_LIMIT = 16 * 1024**2
 OBSERVATIONS_LIMIT = 1024**3
 
 HEADER = 'session.yaml'

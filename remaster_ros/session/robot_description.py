@@ -1,30 +1,52 @@
-"""Robot descriptions as their makers ship them: URDF text, or xacro that is expanded to it."""
+"""Robot descriptions as their makers ship them: URDF text, or xacro that is expanded to it.
+
+A xacro file is expanded in a process of its own, with little time and memory, without this
+process's environment, and, unless it is trusted, with no more than descriptions need
+(`xacro_expansion`). A file of any other name is never expanded.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import io
+import json
 import logging
+import os
 import re
+import signal
+import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.files import decode_text, read_limited
-from remaster_ros.session.packages import find_package
-from remaster_ros.session.reader import URDF_LIMIT
+from remaster_ros.session.files import URDF_LIMIT, decode_text, read_limited
 
-_UNDEFINED = re.compile(r'[Uu]ndefined substitution argument (\w+)')
+CPU_S = 30
+"""Processor time for an expansion, s: the largest descriptions take 2."""
+_KEPT = ('AMENT_PREFIX_PATH', 'LD_LIBRARY_PATH')
+"""Of the environment: where packages are, and what Python itself may need to start."""
 _COLOURS = re.compile(r'\x1b\[[0-9;]*m')
+# Not -m: that would put the working folder, which may be the description's, before the modules.
+_SERVE = (
+    'import json, sys; request = json.load(sys.stdin); sys.path[:] = request["modules"]; '
+    'from remaster_ros.session.xacro_expansion import serve; serve(request)'
+)
 
 log = logging.getLogger('remaster_ros')
 
 
+def is_xacro(path: Path) -> bool:
+    """Return whether a description is to be expanded: by its name, never by what is in it."""
+    return path.suffix == '.xacro'
+
+
 def read_description(
-    path: Path, arguments: Mapping[str, str] | None = None, package_path: Sequence[Path] = ()
+    path: Path,
+    arguments: Mapping[str, str] | None = None,
+    package_path: Sequence[Path] = (),
+    *,
+    trusted: bool = False,
 ) -> str:
-    """Return the URDF text of a .urdf file, or of a .xacro file with these arguments.
+    """Return the URDF text of a file, or of a .xacro file with these arguments.
 
     Parameters
     ----------
@@ -32,6 +54,9 @@ def read_description(
         What ``xacro`` takes as NAME:=VALUE.
     package_path
         Folders to look for ROS packages in, beside those around the file.
+    trusted
+        Whether a xacro file may do what a program may: any Python expression, any file, the
+        environment.
 
     Raises
     ------
@@ -39,58 +64,49 @@ def read_description(
         Naming the file and the remedy.
     """
     text = decode_text(read_limited(path, URDF_LIMIT, 'name a URDF or xacro file'), path)
-    if path.suffix != '.xacro' and '<xacro:' not in text:
+    if not is_xacro(path):
         return text
-    return _expanded(path, dict(arguments or {}), package_path)
-
-
-def _expanded(path: Path, arguments: dict[str, str], package_path: Sequence[Path]) -> str:
-    # Imported here: few commands need it.
-    import xacro
-    from xacro import substitution_args
-
-    def find(name: str) -> str:
-        folder = find_package(name, path, package_path)
-        if folder is None:
-            raise InputError(
-                f'{path}: it needs the ROS package {name}, which is not around it; give the '
-                'folder that holds the package with --package-path, or source its workspace'
-            )
-        # xacro takes a relative one from the file that it stands in.
-        return str(folder.absolute())
-
-    # Outside of ROS there is no ament_index_python, by which xacro finds packages.
-    before: Any = substitution_args._eval_find
-    substitution_args._eval_find = find
-    substitution_args._eval_dict['find'] = find
-    said = io.StringIO()
+    request = {
+        'file': str(path.absolute()),
+        'arguments': dict(arguments or {}),
+        'package_path': [str(folder.absolute()) for folder in package_path],
+        'trusted': trusted,
+        'cpu_s': CPU_S,
+        'modules': sys.path,
+    }
+    kept = {name: value for name, value in os.environ.items() if trusted or name in _KEPT}
     try:
-        with contextlib.redirect_stderr(said):
-            document = xacro.process_file(str(path), mappings=arguments)
-            text = document.documentElement.toprettyxml(indent='  ')
-    # A xacro file is a program: it raises whatever it leads to.
-    except Exception as error:
-        raise _failure(path, error) from None
-    finally:
-        substitution_args._eval_find = before
-        substitution_args._eval_dict['find'] = before
-    for line in _COLOURS.sub('', said.getvalue()).splitlines():
+        done = subprocess.run(
+            [sys.executable, '-I', '-c', _SERVE],
+            input=json.dumps(request).encode(),
+            capture_output=True,
+            env=kept,
+            check=False,
+            # It computes and waits for nothing; a busy machine may give it a tenth of a core.
+            timeout=10.0 * CPU_S,
+        )
+    except subprocess.TimeoutExpired:
+        raise _too_slow(path) from None
+    if done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+        raise _too_slow(path)
+    printed = _COLOURS.sub('', done.stderr.decode(errors='replace')).splitlines()
+    try:
+        answer = json.loads(done.stdout)
+    except ValueError:
+        raise InputError(
+            f'{path}: xacro ended with status {done.returncode}; correct the file '
+            f'({" ".join(printed)[-200:]})'
+        ) from None
+    if 'error' in answer:
+        raise InputError(answer['error'])
+    for line in printed:
         if line.strip():
             log.warning('%s: %s', path, line.strip())
-    return f'<?xml version="1.0"?>\n<!-- expanded from {path.name} by xacro -->\n{text}'
+    return f'<?xml version="1.0"?>\n<!-- expanded from {path.name} by xacro -->\n{answer["text"]}'
 
 
-def _failure(path: Path, error: BaseException) -> InputError:
-    """Return what went wrong in a xacro file, with the file that it is in and the remedy."""
-    import xacro
-
-    inner: BaseException | None = error
-    while inner is not None:
-        if isinstance(inner, InputError):
-            return inner
-        inner = getattr(inner, 'exc', None) or inner.__cause__ or inner.__context__
-    files = xacro.filestack or [str(path)]
-    what = ' '.join(str(error).split()) or type(error).__name__
-    missing = _UNDEFINED.search(what)
-    remedy = f'; give it behind the file: {missing[1]}:=VALUE' if missing else '; correct the file'
-    return InputError(f'{files[-1]}: xacro: {what[:300]}{remedy}')
+def _too_slow(path: Path) -> InputError:
+    return InputError(
+        f'{path}: xacro: it is not expanded after {CPU_S} s of processor time; does a macro call '
+        'itself, or double what it is given?'
+    )

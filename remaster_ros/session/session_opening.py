@@ -8,6 +8,7 @@ from pathlib import Path
 
 from remaster_ros.errors import InputError
 from remaster_ros.session.files import (
+    URDF_LIMIT,
     make_new_folder,
     read_limited,
     remove_leftovers,
@@ -21,7 +22,6 @@ from remaster_ros.session.reader import (
     OBSERVATIONS_LIMIT,
     ROWS,
     URDF,
-    URDF_LIMIT,
     read_header,
 )
 from remaster_ros.session.session_yaml import parse_header, with_exit_status

@@ -29,9 +29,8 @@ from remaster_ros.planning.expected_sensors import POSE_SIGMA_M, SIGMA_M, Expect
 from remaster_ros.planning.planned_design import DesignSettings
 from remaster_ros.session.cell_poses import RANGES, CellPoses
 from remaster_ros.session.cell_sensor import CellSensor
-from remaster_ros.session.files import decode_text, read_limited
+from remaster_ros.session.files import URDF_LIMIT, decode_text, read_limited
 from remaster_ros.session.meshes import mesh_reader
-from remaster_ros.session.reader import URDF_LIMIT
 from remaster_ros.session.yaml_places import with_line
 from remaster_ros.session.yaml_records import YAML_LIMIT, Bounds, Triple, read_yaml
 from remaster_ros.types import FloatArray

@@ -119,6 +119,32 @@ def test_xacro_is_expanded_beside_the_cell_with_packages_found_by_their_name(do,
     assert 'xacro:' not in cell.urdf_text.split('-->', 1)[1]
 
 
+@pytest.mark.parametrize('name', ['arm.urdf.xacro', 'arm.urdf'])
+@pytest.mark.parametrize('verb', ['init', 'import'])
+def test_a_description_runs_no_command(tmp_path, capsys, verb, name):
+    canary = tmp_path / 'canary'
+    urdf = ROBOTS['irb120']().urdf.replace('<robot ', f'<robot {XACRO} ')
+    popen = "[c for c in ().__class__.__base__.__subclasses__() if c.__name__ == 'Popen'][0]"
+    shell = f"${{(lambda: {popen}('touch {canary}', shell=True).wait())()}}"
+    path = tmp_path / name
+    path.write_text(
+        urdf.replace(
+            '</robot>', f'<xacro:property name="a" value="{shell}"/><link name="${{a}}"/></robot>'
+        )
+    )
+    table = tmp_path / 'table.csv'
+    table.write_text('A1;A2;A3;A4;A5;A6;X;Y;Z\n1;2;3;4;5;6;7;8;9\n')
+    out = tmp_path / 'out'
+    args = [path, '--out', out] if verb == 'init' else [table, '--urdf', path, '--out', out]
+    assert main([verb, *map(str, args)]) == 2
+    error = capsys.readouterr().err
+    assert len(error.splitlines()) == 1
+    assert name in error
+    assert ('a lambda' if name.endswith('xacro') else 'let its name end in .xacro') in error
+    assert not canary.exists()
+    assert not out.exists()
+
+
 def test_a_package_that_is_elsewhere_is_asked_for_and_found(do, tmp_path, monkeypatch):
     path = macro(tmp_path, ROBOTS['irb120']())
     elsewhere = tmp_path / 'elsewhere'

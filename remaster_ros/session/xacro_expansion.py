@@ -1,0 +1,285 @@
+"""Expand one xacro file, in a process of its own, which `robot_description` starts and bounds.
+
+xacro's places where a file does something are replaced: expressions (`xacro_expressions`),
+substitutions ``$(…)``, which files are read, and XML that declares entities. With trust only the
+way to find packages is, as outside of ROS there is no ament_index_python.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import json
+import os
+import re
+import resource
+import sys
+from pathlib import Path
+from typing import Any
+from xml.dom import minidom
+
+import xacro
+import yaml
+from xacro import substitution_args
+
+from remaster_ros.errors import InputError
+from remaster_ros.session.files import URDF_LIMIT, decode_text, read_limited
+from remaster_ros.session.packages import Confinement, find_package
+from remaster_ros.session.xacro_expressions import (
+    ExpressionError,
+    Function,
+    evaluate,
+    global_names,
+)
+
+MEMORY = 1024**3
+"""What an expansion may take, bytes: descriptions of makers take a tenth of it."""
+_TRUST = 'add --trust if you trust this file and its packages like a program that you run'
+_UNDEFINED = re.compile(r'Undefined substitution argument (\w+)')
+# xacro's own tokens. Its lexer copies what is left of a text with each of them.
+_TOKENS = re.compile(
+    r'(?P<escaped>\$\$+[{(])|\$\{(?P<expression>[^}]*)\}|\$\((?P<substitution>[^)]*)\)'
+    r'|(?P<text>[^$]+|\$[^{($]+|\$$)'
+)
+
+
+class Expansion:
+    """The expansion of one file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    package_path
+        Folders to look for ROS packages in, beside those around the file.
+    trusted
+        Whether the file may do what a program may.
+    """
+
+    def __init__(self, path: Path, package_path: list[Path], *, trusted: bool) -> None:
+        self._path, self._package_path = path, package_path
+        self._files = Confinement(path, package_path)
+        if trusted:
+            substitution_args._eval_find = self._find
+            substitution_args._eval_dict['find'] = self._find
+            return
+        self._written = 0
+        xacro._global_symbols = global_names(
+            load_yaml=self._load_yaml,
+            abs_filename=self._file,
+            dotify=xacro.YamlDictWrapper,
+            arg=self._argument,
+            tokenize=_tokens,
+            fatal=_fatal,
+            **dict.fromkeys(('message', 'warning', 'error', 'print_location'), _show),
+        )
+        xacro.eval_text = self._text
+        # Units in YAML (!degrees 90) are expressions, too.
+        xacro.safe_eval = self._evaluated
+        xacro.abs_filename_spec = self._file
+        xacro.get_include_files = self._included
+        xacro.parse = self._parsed
+
+    def text(self, arguments: dict[str, str]) -> str:
+        """Return the file as URDF text."""
+        document = xacro.process_file(str(self._path), mappings=arguments)
+        text: str = document.documentElement.toprettyxml(indent='  ')
+        return text
+
+    # What stands in texts and attributes
+
+    def _text(self, text: str, symbols: Any) -> Any:
+        """Return a text with its expressions and substitutions worked out, as xacro.eval_text."""
+        parts, at = [], 0
+        for token in _TOKENS.finditer(text):
+            if token.start() != at:
+                break
+            at = token.end()
+            kind = token.lastgroup
+            if kind == 'expression':
+                expression = str(self._text(token['expression'], symbols))
+                parts.append(self._evaluated(expression, symbols))
+            elif kind == 'substitution':
+                parts.append(self._substituted(str(self._text(token['substitution'], symbols))))
+            else:
+                parts.append(token[0][1:] if kind == 'escaped' else token[0])
+        if at < len(text):
+            raise InputError(f'{_here()}: {text[at:][:80]!r} is no expression; correct the file')
+        if len(parts) == 1:
+            self._count(parts[0])
+            return parts[0]
+        joined = []
+        for part in parts:
+            joined.append(str(part))
+            self._count(joined[-1])
+        return ''.join(joined)
+
+    def _count(self, part: Any) -> None:
+        self._written += len(part) if isinstance(part, str) else 1
+        if self._written > URDF_LIMIT:
+            raise InputError(f'{_here()}: it expands to more than {URDF_LIMIT} characters')
+
+    def _evaluated(self, expression: str, symbols: Any, _: Any = None) -> Any:
+        try:
+            return evaluate(expression, symbols)
+        except ExpressionError as error:
+            raise _refused(f'${{{expression}}}', str(error)) from None
+
+    def _substituted(self, command: str) -> str:
+        name, *given = command.split() or ['']
+        if name == 'find' and len(given) == 1:
+            return self._find(given[0])
+        if name == 'arg' and len(given) == 1:
+            return str(self._argument(given[0]))
+        if name == 'eval' and given:
+            return str(self._eval(command.strip().removeprefix('eval')))
+        if name in ('env', 'optenv'):
+            raise _refused(f'$({command})', 'the environment is not read')
+        raise _refused(f'$({command})', 'no substitution of a robot description')
+
+    def _eval(self, expression: str) -> Any:
+        given = xacro.substitution_args_context['arg']
+        values = {name: _converted(value) for name, value in given.items()}
+        functions = {
+            'arg': Function(lambda name: _converted(self._argument(name))),
+            'find': Function(self._find),
+        }
+        try:
+            return evaluate(expression, xacro._global_symbols | functions | values)
+        except ExpressionError as error:
+            raise _refused(f'$(eval{expression})', str(error)) from None
+
+    def _argument(self, name: str) -> str:
+        try:
+            value: str = xacro.substitution_args_context['arg'][name]
+        except KeyError:
+            raise xacro.XacroException(f'Undefined substitution argument {name}') from None
+        return value
+
+    # Which files are read
+
+    def _find(self, name: str) -> str:
+        folder = find_package(name, self._path, self._package_path)
+        if folder is None:
+            raise InputError(
+                f'{self._path}: it needs the ROS package {name}, which is not around it; give the '
+                'folder that holds the package with --package-path, or source its workspace'
+            )
+        # A folder that has the name alone may be anybody's.
+        if (folder / 'package.xml').is_file():
+            self._files.add(folder)
+        # xacro takes a relative one from the file that it stands in.
+        return str(folder.absolute())
+
+    def _file(self, name: str) -> str:
+        """Return the file that is named in the one being read, if it may be read."""
+        if not isinstance(name, str):
+            raise _refused(str(name), 'no file name')
+        path = Path(_here()).parent / name
+        if not self._files.holds(path):
+            raise InputError(
+                f'{_here()}: it names {name}, which lies outside of the folder of the description '
+                'and of the packages that it names; give the folder that it is in with '
+                f'--package-path, or {_TRUST}'
+            )
+        return str(path)
+
+    def _included(self, name: str, symbols: Any) -> Any:
+        name = str(self._text(name, symbols))
+        if not re.search(r'[*?[]', name):
+            yield self._file(name)
+            return
+        # Nothing outside is listed either.
+        fixed = re.split(r'[*?[]', name, maxsplit=1)[0]
+        self._file(f'{os.path.dirname(fixed)}/.' if '/' in fixed else '.')
+        for found in sorted(glob.glob(str(Path(_here()).parent / name))):
+            yield self._file(found)
+
+    def _parsed(self, given: Any, filename: str = '') -> Any:
+        path = Path(filename)
+        if not path.exists():
+            # What xacro raises, which knows of files that may be missing.
+            xacro.filestack.pop()
+            raise xacro.XacroException(f'no such file: {path}', exc=FileNotFoundError())
+        text = decode_text(read_limited(path, URDF_LIMIT, 'the description includes it'), path)
+        # The keyword is case-sensitive in XML, so text without it cannot declare an entity.
+        if '<!DOCTYPE' in text or '<!ENTITY' in text:
+            raise InputError(f'{path}: it declares a DOCTYPE or entities; remove the declaration')
+        return minidom.parseString(text)
+
+    def _load_yaml(self, filename: str) -> Any:
+        path = Path(self._file(filename))
+        text = decode_text(read_limited(path, URDF_LIMIT, 'the description loads it'), path)
+        for unit in xacro.ConstructUnits:
+            yaml.SafeLoader.add_constructor(unit.value.tag, unit.constructor)
+        xacro.filestack.append(str(path))
+        try:
+            return xacro.YamlListWrapper.wrap(yaml.safe_load(text))
+        except yaml.YAMLError as error:
+            raise InputError(f'{path}: no YAML ({error}); correct the file') from None
+        finally:
+            xacro.filestack.pop()
+
+
+def _here() -> str:
+    """Return the file that is being read."""
+    return str(xacro.filestack[-1])
+
+
+def _refused(what: str, why: str) -> InputError:
+    return InputError(f'{_here()}: {what:.200}: {why}; correct it, or {_TRUST}')
+
+
+def _converted(value: Any) -> Any:
+    return substitution_args.convert_value(value, 'auto') if isinstance(value, str) else value
+
+
+def _show(*given: Any, **_: Any) -> str:
+    print(*given, file=sys.stderr)
+    return ''
+
+
+def _fatal(*given: Any) -> None:
+    raise InputError(f'{_here()}: {" ".join(map(str, given))}')
+
+
+def _tokens(text: str, sep: str = ',; ', skip_empty: bool = True) -> list[str]:
+    items = re.split(f'[{re.escape(sep)}]', text)
+    return [item for item in items if item or not skip_empty]
+
+
+def _line(path: Path, error: BaseException) -> str:
+    """Return what went wrong, with the file that it is in and the remedy."""
+    inner: BaseException | None = error
+    while inner is not None:
+        if isinstance(inner, InputError):
+            return str(inner)
+        inner = getattr(inner, 'exc', None) or inner.__cause__ or inner.__context__
+    file = (xacro.filestack or [path])[-1]
+    if isinstance(error, RecursionError):
+        return f'{file}: xacro: nested too deeply; does a macro call itself, or a file itself?'
+    if isinstance(error, MemoryError):
+        return f'{file}: xacro: it needs too much memory; correct the file'
+    what = ' '.join(str(error).split()) or type(error).__name__
+    missing = _UNDEFINED.search(what)
+    remedy = f'; give it behind the file: {missing[1]}:=VALUE' if missing else '; correct the file'
+    return f'{file}: xacro: {what[:300]}{remedy}'
+
+
+def serve(request: dict[str, Any]) -> None:
+    """Answer a request of `robot_description` on stdout: ``text``, or ``error`` with one line."""
+    path, trusted = Path(request['file']), request['trusted']
+    resource.setrlimit(resource.RLIMIT_CPU, (request['cpu_s'], request['cpu_s']))
+    if not trusted:
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    try:
+        folders = [Path(folder) for folder in request['package_path']]
+        # What xacro prints is for people.
+        with contextlib.redirect_stdout(sys.stderr):
+            text = Expansion(path, folders, trusted=trusted).text(request['arguments'])
+        answer = {'text': text}
+    # A xacro file is a program: it raises whatever it leads to.
+    except Exception as error:
+        answer = {'error': _line(path, error)}
+    sys.stdout.write(json.dumps(answer))
