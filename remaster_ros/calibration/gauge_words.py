@@ -88,6 +88,13 @@ def hardly_seen(names: Sequence[str], loadings: FloatArray) -> str:
     return f'{listed(parts)}, which change together'
 
 
+def the(kind: str, name: str) -> str:
+    """Return 'the sensor mocap'; 'the sensor' and 'sensor_2' of names that tell the kind."""
+    if name.lower() == kind:
+        return f'the {kind}'
+    return name if name.lower().startswith(kind) else f'the {kind} {name}'
+
+
 def listed(parts: Sequence[str]) -> str:
     """Join parts by commas and an `and`."""
     if len(parts) < 2:

@@ -19,7 +19,7 @@ from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.decision import Named, decisions
 from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.side_by_side import rms_sigmas
-from remaster_ros.discovery.words import part_words, percent, shown
+from remaster_ros.discovery.words import part_words, percent, sentence_case, shown
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.discovery_json import (
@@ -115,15 +115,13 @@ def summary(
     """Return verdict, causes, gain and coverage of the held-out rows in a few lines."""
     lines = [f'verdict: {found.verdict}']
     for effect in found.effects:
-        joints = f' {list(effect.joints)}' if effect.joints else ''
         share = '' if effect.share is None else f', {percent(effect.share)} of the gain'
-        lines.append(f'{effect.name}{joints}: {1e3 * effect.size_m:.3f} mm{share}; {effect.cause}')
+        lines.append(f'{effect.title}: {1e3 * effect.size_m:.3f} mm{share}; {effect.cause}')
         if effect.remedy:
             lines.append(f'    to do: {effect.remedy}')
         for alike in effect.confusable_with:
-            where = f' {list(alike.joints)}' if alike.joints else ''
             fewer = part_words(effect.name, effect.joints, alike.name, alike.joints)
-            name = fewer or f'{alike.name}{where}'
+            name = fewer or sentence_case(alike.title)
             lines.append(f'    could be {name}; to distinguish: {alike.separate_by}')
     lines += [f'unexplained: {left.next}' for left in found.unexplained]
     if found.verdict == 'none':
@@ -160,7 +158,7 @@ def side_by_side(found: Discovery, confirmation: Confirmation) -> list[str]:
     """Return a table of the zero-offsets and the causes' parameters in both sessions."""
     tables = [('zero-offsets', confirmation.joint_offsets)]
     tables += [
-        (effect.name, cause.parameters)
+        (effect.title, cause.parameters)
         for effect, cause in zip(found.effects, confirmation.effects, strict=False)
     ]
     width = max((len(row.name) for _, rows in tables for row in rows), default=0)

@@ -7,7 +7,7 @@ import numpy as np
 from remaster_ros.discovery.confirmation import LEAST_GAIN, Confirmation, ConfirmedCause
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.explain import FoundEffect
-from remaster_ros.discovery.words import called, percent
+from remaster_ros.discovery.words import percent
 
 
 def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
@@ -63,7 +63,7 @@ def _summary(found: Confirmation) -> str:
 
 def _share_in_words(effect: FoundEffect, cause: ConfirmedCause) -> str:
     share = cause.carried_over
-    name = called(effect.name, effect.joints)
+    name = effect.title
     change = f'{1e3 * cause.rms_without_m:.3f} to {1e3 * cause.rms_frozen_m:.3f} mm RMS'
     if not np.isfinite(cause.rms_frozen_m):
         return f'{name}: the other session does not determine it.'

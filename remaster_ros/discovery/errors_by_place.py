@@ -12,6 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.residual_structure import LEAST_NOISE_M, explained_of_poses
 from remaster_ros.calibration.smooth_functions import of_position
 from remaster_ros.discovery.effects.sensor_field import EFFECT as SENSOR_FIELD
@@ -56,7 +57,7 @@ def errors_by_place(
             size_m=size_m,
             p_value=found.p_value,
             next=(
-                f'From pose to pose the errors follow the place in front of the sensor {name} '
+                f'From pose to pose the errors follow the place in front of {the("sensor", name)} '
                 f'more than chance would ({1e3 * size_m:.3f} mm RMS), but no cause stands out '
                 'from all that were tried. Measure the same poses with the sensor moved and '
                 'turned: what follows its volume is its own; or measure more poses.'

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.catalogue import Catalogue
 from remaster_ros.discovery.effects.base import Cell
@@ -20,7 +21,13 @@ from remaster_ros.discovery.screening import screen
 from remaster_ros.discovery.selection import Selection
 from remaster_ros.discovery.shares import shares
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.words import called, clock_time, joint_words
+from remaster_ros.discovery.words import (
+    KIND_OF_SUBJECT,
+    clock_time,
+    joint_words,
+    sentence_case,
+    titled,
+)
 
 # Look-alikes within this of the evidence are named; within the other, the leaders tie.
 CONFUSABLE = 5.0
@@ -60,6 +67,8 @@ class LookAlike:
         No measurement of these markers could: the two displace every pose alike.
     general
         It is a free form, and the effect one of the shapes that it can have.
+    title
+        A heading for people.
     """
 
     name: str
@@ -68,6 +77,7 @@ class LookAlike:
     separate_by: str
     same: bool = False
     general: bool = False
+    title: str = ''
 
 
 @dataclass(frozen=True)
@@ -81,6 +91,14 @@ class FoundEffect:
     share
         Of the gain on held-out poses, see `shares`; None where the cause was found by how far the
         fit moved a marker, not in the residuals.
+    title
+        A heading for people, such as 'Link length of joint 2'.
+    in_robot_model
+        A corrected robot model holds it.
+    of_measurement
+        It lies in how the arm was measured and not in the arm.
+    moment_s
+        When it happened, s since the first reading, where it came at one moment and stayed.
     tied
         A look-alike that measurements could distinguish explains the data as well.
     sizes
@@ -104,6 +122,10 @@ class FoundEffect:
     tied: bool = False
     sizes: tuple[str, ...] = ()
     remedy: str = ''
+    title: str = ''
+    in_robot_model: bool = False
+    of_measurement: bool = False
+    moment_s: float | None = None
 
     def sampled(
         self, result: FitResult, group: Sequence[Cell] = (), context: Context | None = None
@@ -210,7 +232,7 @@ def _described(
             strict=True,
         )
     )
-    if not np.isnan(first.moment):
+    if first.happened:
         # Nothing tells where between two readings it was.
         elapsed = data.part.elapsed_s
         gap = elapsed[elapsed > first.moment].min() - elapsed[elapsed <= first.moment].max()
@@ -241,7 +263,11 @@ def _described(
         cause=in_words(group, data.part) + _also_called(alike),
         size_m=_size(data, solution, group),
         share=share,
-        remedy=EFFECTS[first.name].remedy,
+        remedy=EFFECTS[first.name].remedy.format(driver=first.driver.replace('_', ' ')),
+        title=titled(first, _joints(group)),
+        in_robot_model=all(cell.model_change is not None for cell in group),
+        of_measurement=first.of_measurement,
+        moment_s=first.moment if first.happened else None,
         tied=any(
             not (other.same or other.general) and other.log_evidence_gain > gain - TIED
             for other in alike
@@ -252,7 +278,7 @@ def _described(
 
 def _also_called(alike: Sequence[LookAlike]) -> str:
     """Return a sentence with the other names of the same displacement; '' where it has none."""
-    names = [called(other.name, other.joints) for other in alike if other.same]
+    names = [sentence_case(other.title) for other in alike if other.same]
     if not names:
         return ''
     return (
@@ -307,6 +333,7 @@ def _look_alikes(
             separate_by(cell, other, same),
             same,
             len(group) == 1 and is_special_case(cell, other),
+            titled(other, other.joints),
         )
     return tuple(sorted(best.values(), key=lambda alike: -alike.log_evidence_gain))
 
@@ -359,13 +386,14 @@ def in_words(group: Sequence[Cell], context: Context) -> str:
     first = group[0]
     joints = _joints(group)
     effect = EFFECTS[first.name]
-    subject = first.subject or joint_words(joints[:1] if effect.driven_by_joint else joints)
+    whose = the(KIND_OF_SUBJECT.get(first.place, ''), first.subject) if first.subject else ''
+    subject = whose or joint_words(joints[:1] if effect.driven_by_joint else joints)
     other = f'joint {joints[1]}' if len(joints) > 1 else ''
     place = first.place.replace('_', ' ')
     if first.joints:
         place += f' of joint {first.joints[0]}'
-    if first.subject:
-        place += f' of {first.subject}'
+    if whose:
+        place += f' of {whose}'
     sentence = effect.sentence.format(
         subject=subject,
         other=other,

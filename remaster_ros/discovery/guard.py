@@ -10,9 +10,11 @@ import scipy
 
 from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Estimate
+from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.gain import Gain
+from remaster_ros.discovery.words import sentence_case
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.types import FloatArray, Priors
 
@@ -41,6 +43,17 @@ class Unexplained:
     size_m: float
     p_value: float
     next: str
+
+
+def suggested(effects: Sequence[FoundEffect]) -> str:
+    """Return causes in a few words, each with its joint, its place and its minute."""
+    words = []
+    for effect in effects:
+        word = sentence_case(effect.title)
+        if effect.moment_s is not None:
+            word += f' {effect.moment_s / 60.0:.1f} min after the first reading'
+        words.append(word)
+    return listed(list(dict.fromkeys(words)))
 
 
 def is_harmful(gain: Gain) -> bool:
@@ -77,7 +90,7 @@ def harm_of(
     p_value = np.nan
     if len(change) > 1 and np.ptp(change) > 0.0:
         p_value = scipy.stats.ttest_1samp(change, 0.0, alternative='greater').pvalue
-    names = ', '.join(dict.fromkeys(effect.name.replace('_', ' ') for effect in effects))
+    names = suggested(effects)
     assert gain.held_out_rms_before_m is not None
     assert gain.held_out_rms_after_m is not None
     return Unexplained(
@@ -109,7 +122,7 @@ def unfitted(
     reason
         Why they cannot be fitted together with offsets, registrations and markers.
     """
-    names = ', '.join(dict.fromkeys(effect.name.replace('_', ' ') for effect in effects))
+    names = suggested(effects)
     return Unexplained(
         where='residuals',
         driver='unknown',

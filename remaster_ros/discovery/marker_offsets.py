@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 
 from remaster_ros.calibration.estimate import Estimate
+from remaster_ros.calibration.gauge_words import the
 from remaster_ros.discovery.effects.marker_offset import EFFECT as MARKER_OFFSET
 from remaster_ros.discovery.effects.sizes import number
 from remaster_ros.discovery.explain import FoundEffect, Parameter
@@ -157,7 +158,8 @@ def _effect(
     rank: int,
 ) -> FoundEffect:
     effect = MARKER_OFFSET
-    cause = effect.sentence.format(subject=name)
+    cause = effect.sentence.format(subject=the('marker', name))
+    cause = cause[:1].upper() + cause[1:]
     if blind.any():
         unseen = ' and '.join(axis for axis, hidden in zip('xyz', blind, strict=True) if hidden)
         cause += (
@@ -184,4 +186,6 @@ def _effect(
         size_m=way,
         sizes=(f'{name} is {off} away from it',),
         remedy=effect.remedy,
+        title='Marker offset' if name == 'marker' else f'Marker offset of {name}',
+        of_measurement=True,
     )

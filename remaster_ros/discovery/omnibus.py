@@ -17,6 +17,7 @@ from functools import cached_property
 import numpy as np
 import scipy
 
+from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.errors_by_place import errors_by_place
 from remaster_ros.discovery.explain import FoundEffect
@@ -213,14 +214,15 @@ class _Checks:
         for check in self.fit.noise_checks:
             if check.stated_m is None or check.explained:
                 continue
+            stating = the('sensor', check.sensor)
             yield Unexplained(
                 where='noise',
                 driver='stated_std',
                 size_m=check.error_m,
                 p_value=np.nan,
                 next=(
-                    f'The sensor {check.sensor} states {1e3 * check.stated_m:.3f} mm per axis '
-                    f'with its readings, but the mean error is {1e3 * check.error_m:.3f} mm: '
+                    f'{stating[:1].upper()}{stating[1:]} states {1e3 * check.stated_m:.3f} mm per '
+                    f'axis with its readings, but the mean error is {1e3 * check.error_m:.3f} mm: '
                     'the arm does not repeat itself so well, the sensor is worse than it states, '
                     'or a cause is missing. Measure one pose twenty times, coming from elsewhere '
                     'each time.'

@@ -7,7 +7,8 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from remaster_ros.calibration.gauge_words import listed
+from remaster_ros.calibration.gauge_words import listed, the
+from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.sizes import rounded
 
 # Unit of a parameter -> the unit for people, and how many of those one is.
@@ -22,6 +23,9 @@ SHOWN_UNITS = {
     '1/s': ('µm/(m h)', 3.6e9),
 }
 
+UNNAMED = 'unnamed'
+# Place of an error -> what the name of its subject names.
+KIND_OF_SUBJECT = {'sensor_frame': 'sensor', 'marker': 'marker'}
 
 # Stamps between 2001 and 2100 are counted from 1970 on, smaller ones from the start of something.
 EARLIEST_S, LATEST_S = 1e9, 4.1e9
@@ -50,6 +54,41 @@ def clock_time(stamp_s: float) -> str:
     if not EARLIEST_S < stamp_s < LATEST_S:
         return ''
     return f'{datetime.fromtimestamp(stamp_s, UTC):%H:%M:%S UTC on %Y-%m-%d}'
+
+
+def titled(cell: Cell, joints: Sequence[int]) -> str:
+    """Return a heading: 'Link length of joint 2', 'Joint 3 slipped', 'The sensor mocap moved'.
+
+    Parameters
+    ----------
+    cell
+        The first of a cause.
+    joints
+        Of the whole cause.
+    """
+    kind = KIND_OF_SUBJECT.get(cell.place, '')
+    joint = joint_words(joints[:1]) if joints else ''
+    if cell.happened:
+        words = {
+            'joint_angle': f'{joint} slipped',
+            'marker': f'{the(kind, cell.subject)} moved',
+            'sensor_frame': f'{the(kind, cell.subject)} moved',
+        }.get(cell.place, 'the base moved, or all sensors together')
+    elif cell.name == UNNAMED:
+        whose = joint or (the(kind, cell.subject) if cell.subject else '')
+        driver = cell.driver.replace('_', ' ')
+        words = cell.place.replace('_', ' ') + (f' of {whose}' if whose else '')
+        words += f': an error that follows {driver}'
+    else:
+        words = called(cell.name, joints)
+        if cell.subject.lower() not in ('', kind):
+            words += f' of {cell.subject}'
+    return words[:1].upper() + words[1:]
+
+
+def sentence_case(title: str) -> str:
+    """Return a heading as it stands within a sentence."""
+    return title[:1].lower() + title[1:]
 
 
 def called(name: str, joints: Sequence[int]) -> str:

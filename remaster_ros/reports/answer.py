@@ -16,7 +16,6 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, transform
 from remaster_ros.reports.answer_inputs import Inputs, all_taken_out
 from remaster_ros.reports.discovery_schema import Effect
-from remaster_ros.reports.effect_words import STEP, is_held_by_model, is_of_measurement, title
 from remaster_ros.reports.judgement import NOTICEABLE_GAIN
 from remaster_ros.reports.remaining import Remaining, what_remains
 from remaster_ros.reports.schemas import JointOffset, Judgement
@@ -158,10 +157,10 @@ def answer_of(inputs: Inputs) -> Answer:
         inputs.judgement, effects, stages[0].mean, stages[brings].mean, offsets
     )
     known = sum(row.identifiable for row in offsets)
-    geometry = uses_causes and any(map(is_held_by_model, effects))
+    geometry = uses_causes and any(effect.in_robot_model for effect in effects)
     taken_out = uses_causes and brings == len(rows) - 1
     pad = inputs.session.controller
-    measured = [title(e) for e in effects if taken_out and is_of_measurement(e)]
+    measured = [e.title for e in effects if taken_out and e.of_measurement]
     return Answer(
         mood=_mood(inputs, uses_causes, held_out and action != 'wait'),
         headline=reason or _headline(known, stages, brings, held_out, measured, geometry),
@@ -208,9 +207,13 @@ def _stages(inputs: Inputs) -> tuple[list[tuple[str, FloatArray]], int]:
     if all_taken_out(inputs.found):
         effects = inputs.found.effects
         text = 'with zero-offsets' + (
-            ' and lengths' if any(map(is_held_by_model, effects)) else ''
+            ' and lengths' if any(effect.in_robot_model for effect in effects) else ''
         )
-        text += ', measuring errors taken out' if any(map(is_of_measurement, effects)) else ''
+        text += (
+            ', measuring errors taken out'
+            if any(effect.of_measurement for effect in effects)
+            else ''
+        )
         return [*rows, (text, inputs.causes_mm)], 2
     brings = 1
     if inputs.model_mm is not None:
@@ -233,9 +236,9 @@ def _action(
     """Return what to do, and where it is not to set the offsets, why."""
     if judgement.mood == 'bad':
         return 'wait', f'Set nothing yet. {judgement.headline}'
-    slipped = [e for e in effects if e.form == STEP and e.place == 'joint_angle']
+    slipped = [e for e in effects if e.moment_s is not None and not e.of_measurement]
     if slipped:
-        names = listed([title(effect) for effect in slipped])
+        names = listed([effect.title for effect in slipped])
         return 'wait', (
             f'Set nothing yet. {names} while it was measured, so no one zero-offset holds for all '
             'of the session.'
@@ -277,7 +280,7 @@ def _mood(inputs: Inputs, uses_causes: bool, may_be_good: bool) -> Mood:
     moods: list[Mood] = []
     if found is None or not found.effects:
         moods.append(fit.mood)
-    elif not uses_causes or not all(map(is_held_by_model, found.effects)):
+    elif not uses_causes or not all(effect.in_robot_model for effect in found.effects):
         # Something is left, in the arm or in how it was measured.
         moods.append('caution')
     if found is not None and isinstance(found.judgement, Judgement):

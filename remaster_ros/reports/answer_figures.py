@@ -15,7 +15,6 @@ from remaster_ros.kinematics.transforms import apply
 from remaster_ros.planning.tour_order import FITTED, REFERENCE
 from remaster_ros.reports.answer import Answer, registrations
 from remaster_ros.reports.answer_inputs import Inputs
-from remaster_ros.reports.effect_words import moment, title
 from remaster_ros.reports.figures import (
     AFTER,
     BEFORE,
@@ -149,15 +148,14 @@ def over_session(subject: Subject) -> Figure:
 def _mark_moments(ax: Axes, subject: Subject) -> None:
     found = subject.inputs.found
     for effect in found.effects if found is not None else ():
-        when = moment(effect)
-        if when is None:
+        if effect.moment_s is None:
             continue
-        at = when[0] / 60.0
+        at = effect.moment_s / 60.0
         ax.axvline(at, color=INK, linewidth=1.0, ls=(0, (4, 2)))
         low, high = ax.get_xlim()
         left = at > 0.5 * (low + high)
         ax.annotate(
-            title(effect),
+            effect.title,
             (at, 1.0),
             xycoords=('data', 'axes fraction'),
             xytext=(-4 if left else 4, 3),

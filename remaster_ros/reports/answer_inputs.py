@@ -16,7 +16,6 @@ from remaster_ros.compensation.export import URDF_FILE
 from remaster_ros.errors import InputError
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.discovery_schema import Discovered
-from remaster_ros.reports.effect_words import is_held_by_model, is_of_measurement
 from remaster_ros.reports.fit_json import (
     APPLY_FOLDER,
     DISCOVERY_FILE,
@@ -125,7 +124,7 @@ def read_inputs(
         path = found_path.parent / PREDICTIONS_FILE
         predicted = read_columns(path, session, PREDICTED, 'discover')
         causes_mm = _lengths_mm(session.measurements.position - predicted)
-    if any(map(is_held_by_model, found.effects)) and not all_taken_out(found):
+    if any(effect.in_robot_model for effect in found.effects) and not all_taken_out(found):
         path = found_path.parent / APPLY_FOLDER / URDF_FILE
         data = read_limited(path, FIT_LIMIT, 'discover again, which writes it')
         model_mm = errors_with_model_mm(session, decode_text(data, path))
@@ -135,7 +134,7 @@ def read_inputs(
 def all_taken_out(found: Discovered) -> bool:
     """Whether all causes are in the corrected robot model, or in how the arm was measured."""
     return found.verdict != 'undetermined' and all(
-        is_held_by_model(effect) or is_of_measurement(effect) for effect in found.effects
+        effect.in_robot_model or effect.of_measurement for effect in found.effects
     )
 
 
@@ -156,8 +155,10 @@ def _lengths_mm(errors: FloatArray) -> FloatArray:
 
 def _require_same(session: Session, result: Fit | Discovered, path: Path, verb: str) -> None:
     """Refuse the result of other data, or of a version whose files lack what the page has."""
-    if not isinstance(result.session, msgspec.Struct) or not isinstance(
-        result.judgement, msgspec.Struct
+    if (
+        not isinstance(result.session, msgspec.Struct)
+        or not isinstance(result.judgement, msgspec.Struct)
+        or (isinstance(result, Discovered) and not all(e.title for e in result.effects))
     ):
         raise InputError(f'{path}: of an earlier version; {verb} this session again')
     if result.session.observations_sha256 != session.observations_sha256:

@@ -9,7 +9,7 @@ import numpy as np
 from remaster_ros.compensation.export import GEOMETRY_FILE, Geometry, exports
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.explain import FoundEffect
-from remaster_ros.discovery.words import called
+from remaster_ros.discovery.words import sentence_case
 
 
 def applied(discovery: Discovery) -> dict[str, str]:
@@ -50,7 +50,4 @@ def geometry_of(discovery: Discovery) -> Geometry | None:
 
 
 def _named(effects: Sequence[FoundEffect]) -> str:
-    joints: dict[str, set[int]] = {}
-    for effect in effects:
-        joints.setdefault(effect.name, set()).update(effect.joints)
-    return ', '.join(called(name, sorted(numbers)) for name, numbers in joints.items())
+    return ', '.join(sentence_case(effect.title) for effect in effects)

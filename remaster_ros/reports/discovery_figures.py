@@ -16,7 +16,6 @@ from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import driver_named
 from remaster_ros.discovery.explain import FoundEffect
-from remaster_ros.reports.effect_words import STEP, title
 from remaster_ros.reports.figures import (
     AFTER,
     BEFORE,
@@ -172,7 +171,7 @@ def causes(discovery: Discovery) -> Figure:
         cell
         for group in discovery.groups
         for cell in group
-        if cell.place == 'joint_angle' or not np.isnan(cell.moment)
+        if cell.place == 'joint_angle' or cell.happened
     ]
     constant = [
         effect
@@ -200,7 +199,7 @@ def _sizes(ax: Axes, discovery: Discovery, effects: Sequence[FoundEffect]) -> No
     y = np.arange(len(sizes) + 1)
     ax.barh(y[:-1], sizes, color=AFTER, height=0.4)
     ax.barh(y[-1:], [noise], color=GRID, edgecolor=INK, linewidth=0.5, height=0.4)
-    names = [textwrap.fill(title(effect), 26) for effect in effects]
+    names = [textwrap.fill(effect.title, 26) for effect in effects]
     ax.set_yticks(y.tolist(), [*names, 'noise alone'])
     # Few bars are no thicker than many.
     ax.set_ylim(max(len(y), 4) - 0.5, -0.7)
@@ -315,13 +314,13 @@ def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
         low, high = middle - spread, middle + spread
         ax.fill_between(around / per_shown, low, high, color=AFTER, alpha=0.25, linewidth=0)
         # What jumps has no slope between two readings.
-        drawn = 'default' if np.isnan(cell.moment) else 'steps-mid'
+        drawn = 'default' if not cell.happened else 'steps-mid'
         ax.plot(at / per_shown, line, color=AFTER, linewidth=1.3, drawstyle=drawn)
     limit = np.quantile(np.abs(points), 0.99)
     ax.set_ylim(-1.2 * limit, 1.2 * limit)
     ax.set_xlabel(label)
     ax.set_ylabel('arc minutes')
-    name = 'slip' if cell.name == STEP else cell.name.replace('_', ' ')
+    name = 'slip' if cell.happened else cell.name.replace('_', ' ')
     ax.set_title(f'joint {cell.joints[0]}: {name}')
 
 

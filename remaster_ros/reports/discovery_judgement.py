@@ -11,9 +11,8 @@ from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.explain import UNCERTAIN
 from remaster_ros.discovery.undetected import DETECTED
-from remaster_ros.discovery.words import called
+from remaster_ros.discovery.words import sentence_case
 from remaster_ros.reports.discovery_schema import Discovered
-from remaster_ros.reports.effect_words import STEP
 from remaster_ros.reports.schemas import Judgement
 
 # Regions meant for 95 % of the held-out rows that hold clearly less than this are too small.
@@ -77,7 +76,7 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
         return False
     if any(effect.sigmas < UNCERTAIN for effect in discovery.effects):
         return False
-    if any(effect.form == STEP for effect in discovery.effects):
+    if any(effect.moment_s is not None for effect in discovery.effects):
         # What was measured before and after it does not agree.
         return False
     if confirmation is not None and not confirmation.same_offsets:
@@ -119,9 +118,7 @@ def _other_choices(discovery: Discovery) -> str:
 def _uncertain(discovery: Discovery) -> str:
     """Return which causes may be chance by their own standard deviations; ''."""
     names = [
-        called(effect.name, effect.joints)
-        for effect in discovery.effects
-        if effect.sigmas < UNCERTAIN
+        sentence_case(effect.title) for effect in discovery.effects if effect.sigmas < UNCERTAIN
     ]
     return f' Not certain by its own standard deviation: {", ".join(names)}.' if names else ''
 

@@ -41,6 +41,7 @@ class LookAlike(Struct):
     separate_by: str
     same: bool = False
     general: bool = False
+    title: str = ''
 
 
 class NamedCause(Struct):
@@ -65,6 +66,9 @@ class Effect(Struct):
     """A cause; ``size_m`` is the RMS at the marker after absorption, ``share`` of the gain.
 
     ``sizes`` are its parts in arc minutes and millimetres, ``remedy`` is what to do about it.
+    ``title`` is a heading; '' in files of earlier versions, which lack what follows it, too:
+    whether a corrected robot model holds it, whether it lies in how the arm was measured, and when
+    it happened if it came at one moment and stayed.
     """
 
     name: str
@@ -81,6 +85,10 @@ class Effect(Struct):
     share: float | UnsetType | None = UNSET
     sizes: list[str] | UnsetType = UNSET
     remedy: str | UnsetType = UNSET
+    title: str = ''
+    in_robot_model: bool = False
+    of_measurement: bool = False
+    moment_s: float | None = None
 
 
 class Gain(Struct):

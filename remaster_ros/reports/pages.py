@@ -11,9 +11,16 @@ import msgspec
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
-from remaster_ros.discovery.words import called, p_value_text, part_words, percent, shown
+from remaster_ros.discovery.words import (
+    called,
+    p_value_text,
+    part_words,
+    percent,
+    sentence_case,
+    shown,
+)
 from remaster_ros.reports.discovery_schema import Effect
-from remaster_ros.reports.effect_words import law, title
+from remaster_ros.reports.effect_words import law
 from remaster_ros.reports.figures import GRID, INK, PAPER
 from remaster_ros.reports.fit_json import REPORT_FILE
 from remaster_ros.session.files import make_folder, write_atomically
@@ -36,10 +43,9 @@ def page(template: str, **content: Any) -> str:
         'shown': shown,
         'look_alike': lambda other, of: (
             part_words(of['name'], of['joints'], other['name'], other['joints'])
-            or called(other['name'], other['joints'])
+            or sentence_case(other.get('title') or called(other['name'], other['joints']))
         ),
         'called': lambda one: called(one['name'], one['joints']),
-        'heading': lambda effect: title(msgspec.convert(effect, Effect)),
         'law': lambda effect: law(msgspec.convert(effect, Effect)),
     }
     return environment.get_template(template).render(**content)

@@ -11,7 +11,6 @@ from remaster_ros.discovery.words import clock_time
 from remaster_ros.reports.answer_inputs import Inputs
 from remaster_ros.reports.discovery_judgement import more_than_noise
 from remaster_ros.reports.discovery_schema import Discovered
-from remaster_ros.reports.effect_words import is_held_by_model, title
 
 # Fewer gross errors are in the table of left-out rows alone.
 FEWEST_GROSS, LEAST_SHARE = 3, 0.01
@@ -82,14 +81,14 @@ def what_remains(
 def _of_discovery(found: Discovered, uses_causes: bool) -> list[Remaining]:
     """Return the causes that stay, and what has none."""
     rows: list[Remaining] = []
-    stay = [e for e in found.effects if not (uses_causes and is_held_by_model(e))]
+    stay = [e for e in found.effects if not (uses_causes and e.in_robot_model)]
     for effect in stay[:MOST_NAMED]:
         sizes = effect.sizes if isinstance(effect.sizes, list) else []
         size = '; '.join(sizes)
         if len(sizes) > MOST_SIZES and isinstance(effect.size_m, float):
             size = f'{1e3 * effect.size_m:.3f} mm RMS at the marker'
         remedy = effect.remedy if isinstance(effect.remedy, str) else ''
-        rows.append(Remaining(title(effect), size, remedy))
+        rows.append(Remaining(effect.title, size, remedy))
     if more := stay[MOST_NAMED:]:
         largest = max(e.size_m for e in more if isinstance(e.size_m, float))
         size = f'up to {1e3 * largest:.3f} mm RMS at the marker'

@@ -136,6 +136,20 @@ class Cell:
         """Number of parameters m."""
         return len(self.parameters)
 
+    @property
+    def happened(self) -> bool:
+        """Whether it came at one moment and stayed: before it and after it the arm is another."""
+        return not np.isnan(self.moment)
+
+    @property
+    def of_measurement(self) -> bool:
+        """Whether it lies in how the arm was measured and not in the arm."""
+        if self.happened:
+            return self.place != 'joint_angle'
+        return self.place == 'sensor_frame' or (
+            self.place == 'marker' and self.driver == 'constant'
+        )
+
     @cached_property
     def roughness(self) -> FloatArray:
         """Eigenvalues of the penalty, ascending, (m,); none where there is none."""

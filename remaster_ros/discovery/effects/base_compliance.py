@@ -31,7 +31,7 @@ def _tips(context: Context, cell: Cell, draws: FloatArray) -> str:
     moment = largest(np.linalg.norm(context.base_moment, axis=1))
     about = cell.parameters if cell.size > 1 else ('',)
     return ' and '.join(
-        f'the base tips by {angle(draws[:, i] * moment)} under {moment:.0f} N m'
+        f'base and first links tip by {angle(draws[:, i] * moment)} under {moment:.0f} N m'
         + (f' about {name[-1]}' if name else '')
         for i, name in enumerate(about)
     )
@@ -47,9 +47,13 @@ EFFECT = Effect(
     unit='rad/(N m)',
     plausible=(1e-7, 1e-4),
     sign=1,
-    sentence='The base gives way under the weight of the arm (loose bolts or a soft stand).',
+    sentence='Base or first links give way under the weight of the arm (loose bolts, a soft '
+    'stand, or the arm itself).',
     separate_by='the same poses at several angles of joint 1, with and without a payload',
-    remedy='Tighten the bolts of the base and stiffen the stand.',
+    remedy='Hold a dial gauge between the ground and the foot of the arm while it stretches. A '
+    'foot that tips shows loose bolts or a soft stand: tighten or stiffen them. Where it does not '
+    'tip, or another arm of the type on another stand gives way as much, it is the arm: its '
+    'bearings and first links give way, no bolt changes that, and it can only be corrected.',
     size=_tips,
     cells=cells,
     needs=needs_gravity,

@@ -36,7 +36,7 @@ EFFECT = Effect(
     unit='rad/(N m)',
     plausible=(1e-6, 1e-3),
     sign=1,
-    sentence='The weight it carries winds up {subject} (soft gearbox or bearing).',
+    sentence='The weight carried winds up {subject} (soft gearbox or bearing).',
     separate_by='the same poses with and without a payload on the tool',
     remedy='Have the gearbox and the bearing of the joint checked for play and wear; correct '
     'what is left by the torque, and state the payload.',

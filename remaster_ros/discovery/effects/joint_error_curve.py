@@ -63,7 +63,7 @@ EFFECT = Effect(
     source='Eilers & Marx 1996, Statistical Science 11 (P-splines)',
     unit='rad',
     plausible=(1e-6, 5e-3),
-    sentence='The error of {subject} follows its own angle (gearbox or encoder).',
+    sentence='The error of {subject} follows the angle of the same joint (gearbox or encoder).',
     separate_by='poses that step the joint through its range, all else held; '
     'with and without a payload',
     remedy='Correct the angle by the curve that was found, within the angles that were '

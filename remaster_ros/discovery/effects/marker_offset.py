@@ -39,11 +39,11 @@ EFFECT = Effect(
     source='eq. 8 of Van Wyk et al. with the marker as a parameter',
     unit='m',
     plausible=(1e-5, 2e-2),
-    sentence='The marker {subject} is not at its stated place on the tool.',
+    sentence='{subject} is not at its stated place on the tool.',
     separate_by='the marker measured against the tool plate, or the last joint turned by itself',
     remedy='Correct the place of the marker in session.yaml, or measure it against the tool '
     'plate.',
-    size=up_to('marker {subject} is off'),
+    size=up_to('{subject} is off'),
     cells=cells,
     moves_the_fit=True,
 )

@@ -54,7 +54,7 @@ EFFECT = Effect(
     source='tripod and mount creep; ISO 10360-10 drift checks',
     unit='m/s',
     plausible=(1e-10, 2e-6),
-    sentence='The sensor {subject} creeps against the robot base while measuring.',
+    sentence='{subject} creeps against the robot base while measuring.',
     separate_by='fixed reference markers measured again and again, and poses repeated in time',
     remedy='Fix the mount of the sensor, let the sensor warm up, and watch references while '
     'measuring.',

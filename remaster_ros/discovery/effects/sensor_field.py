@@ -113,7 +113,7 @@ EFFECT = Effect(
     'J. Mach. Learn. Res. 6',
     unit='m',
     plausible=(1e-6, 5e-3),
-    sentence='The errors follow the place in the view of the sensor {subject}.',
+    sentence='The errors follow the place in the view of {subject}.',
     separate_by='the same poses measured with the sensor moved and turned',
     remedy='Measure with the sensor somewhere else, and calibrate its lenses; the errors '
     'follow its volume.',

@@ -73,7 +73,7 @@ EFFECT = Effect(
     source='Uhlenbeck & Ornstein 1930, Phys. Rev. 36',
     unit='m',
     plausible=(1e-6, 5e-3),
-    sentence='The errors of the sensor {subject} follow each other: a reading errs as the ones '
+    sentence='The errors of {subject} follow each other: a reading errs as the ones '
     'before it (serial correlation).',
     separate_by='fixed reference markers measured again and again, and poses repeated in time',
     remedy='Fix the mount of the sensor, let it warm up, and watch references while measuring.',

@@ -38,7 +38,8 @@ EFFECT = Effect(
     unit='rad/rad',
     plausible=(1e-5, 1e-2),
     sign=1,
-    sentence='When measured, {subject} still lags by a share of the last move (wait longer).',
+    sentence='When measured, {subject} had not arrived: a share of the last move was missing '
+    '(wait longer).',
     separate_by='longer waiting before each measurement, and large moves from both sides',
     remedy='Wait longer before each measurement, and in use before each action that must be '
     'exact; check the integral gain of the servo.',

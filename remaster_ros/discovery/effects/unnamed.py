@@ -305,8 +305,8 @@ EFFECT = Effect(
     plausible=None,
     sentence='No named cause: {place} follows {driver}.',
     separate_by='poses in which {driver} changes and all else is held',
-    remedy='Find the cause with the measurements named; until then the model that is '
-    'returned corrects it where it was measured.',
+    remedy='Find the cause: measure poses in which {driver} changes and all else is held, and see '
+    'what it comes with. Until then nothing that can be loaded into a controller corrects it.',
     size=_size,
     cells=cells,
     cause_per='variant',

@@ -23,13 +23,14 @@ EFFECT = FoundEffect(
     p_value=0.002,
     log_evidence_gain=50.0,
     confusable_with=(
-        LookAlike('encoder_scale', (2,), 48.0, 'a payload'),
+        LookAlike('encoder_scale', (2,), 48.0, 'a payload', title='Encoder scale of joint 2'),
         LookAlike('joint_compliance', (4,), 47.0, 'another payload'),
     ),
     cause='The weight it carries winds up joints 2 and 4.',
     size_m=0.5e-3,
     share=1.0,
     remedy='Stiffen it.',
+    title='Joint compliance of joints 2 and 4',
 )
 
 
@@ -49,11 +50,11 @@ def found(effects, gain, untestable, thinning=None):
 def test_causes_look_alikes_and_gain_are_said():
     text = summary(found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {}))
     assert 'verdict: effects' in text
-    assert 'joint_compliance [2, 4]: 0.500 mm, 100 % of the gain' in text
+    assert 'Joint compliance of joints 2 and 4: 0.500 mm, 100 % of the gain' in text
     assert 'to do: Stiffen it.' in text
     nothing = summary(found((replace(EFFECT, share=-0.004),), Gain(None, None, 1e-4, {}), {}))
     assert ', 0 % of the gain' in nothing
-    assert 'could be encoder_scale [2]; to distinguish: a payload' in text
+    assert 'could be encoder scale of joint 2; to distinguish: a payload' in text
     assert 'could be joint 4 alone; to distinguish: another payload' in text
     assert '1.000 mm RMS before, 0.300 mm after; the noise alone is 0.280 mm' in text
 
@@ -107,7 +108,10 @@ def test_the_other_session_is_shown_side_by_side():
     assert 'joint_2' in text
     many = [compared(f'curve_2_at_{i}', 1e-4, 2e-4, 2.0) for i in range(30)]
     text = summary(session, confirmation(0.93, 0.35e-3, many))
-    assert 'joint_compliance: 30 values, which differ by 2.0 standard deviations' in text
+    assert (
+        'Joint compliance of joints 2 and 4: 30 values, which differ by 2.0 standard deviations'
+        in text
+    )
 
 
 def test_a_cause_that_was_cured_is_not_confirmed():

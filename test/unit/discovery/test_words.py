@@ -1,0 +1,117 @@
+"""What people are told of a cause: its heading, its sentence, and what to do, for every effect."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration_scenes import scene
+from discovery_scenes import residuals_of
+
+from remaster_ros.calibration.gauge_words import the
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.explain import FoundEffect, in_words
+from remaster_ros.discovery.guard import suggested
+from remaster_ros.discovery.words import titled
+
+
+@pytest.fixture(scope='module')
+def context():
+    """Return the rows of a session whose sensor and marker have the names that imports give."""
+    session, _ = scene(3, poses=14)
+    names = {'sir': 'marker', 'smr': 'marker_2'}
+    markers = {names[name]: place for name, place in session.markers.items()}
+    sensors = {'sensor': 'marker'}
+    session = replace(session, sensors=sensors, markers=markers)
+    return residuals_of(session).part
+
+
+def one_each(context):
+    """Return a cell of each place, driver and form of every effect."""
+    found = {}
+    for effect in EFFECTS.values():
+        if not effect.needs(context):
+            for cell in effect.cells(context):
+                found.setdefault((cell.name, cell.place, cell.driver, cell.form), cell)
+    return list(found.values())
+
+
+def groups(context):
+    """Return every cause that may be found: one cell, or those of two joints together."""
+    for cell in one_each(context):
+        yield (cell,)
+        if len(cell.joints) == 1 and EFFECTS[cell.name].cause_per == 'effect':
+            other = 1 + cell.joints[0] % context.joints
+            yield (cell, replace(cell, joints=(other,)))
+
+
+def test_no_sentence_names_a_thing_twice_or_has_a_plural_with_a_singular_verb(context):
+    cells = one_each(context)
+    assert {cell.place for cell in cells} >= {'sensor_frame', 'marker', 'joint_angle'}
+    for group in groups(context):
+        joints = tuple(sorted({joint for cell in group for joint in cell.joints}))
+        draws = np.full((2, group[0].size), 1e-4)
+        told = [
+            in_words(group, context),
+            titled(group[0], joints),
+            EFFECTS[group[0].name].size(context, group[0], draws),
+        ]
+        for text in told:
+            assert not re.search(r'\b(sensor|marker) \1\b', text, re.IGNORECASE), text
+            assert not re.search(r'(?<!of )joints \d and \d (still )?(\w+s|is|has)\b', text), text
+            assert '{' not in text
+            assert 'unnamed' not in text
+
+
+def test_names_that_tell_the_kind_are_not_preceded_by_it():
+    assert the('sensor', 'sensor') == 'the sensor'
+    assert the('sensor', 'sensor_2') == 'sensor_2'
+    assert the('sensor', 'mocap') == 'the sensor mocap'
+
+
+def test_headings_say_what_happened_and_where(context):
+    titles = {titled(cell, cell.joints) for cell in one_each(context)}
+    for title in (
+        'Joint 1 slipped',
+        'The sensor moved',
+        'The marker moved',
+        'Link length of joint 1',
+        'Sensor scale',
+        'Base rotation: an error that follows time',
+    ):
+        assert title in titles, titles
+
+
+def test_what_a_remedy_calls_for_is_named_in_it(context):
+    """No remedy refers to measurements, or to a file, that nothing names."""
+    for cell in one_each(context):
+        remedy = EFFECTS[cell.name].remedy.format(driver=cell.driver.replace('_', ' '))
+        assert 'measurements named' not in remedy
+        assert '{' not in remedy
+        if cell.name == 'unnamed':
+            assert f'poses in which {cell.driver.replace("_", " ")} changes' in remedy
+        if cell.name == 'base_compliance':
+            # Two arms of one type are equally soft: then bolts are not the remedy.
+            assert 'another arm of the type' in remedy
+            assert 'dial gauge' in remedy
+
+
+def test_a_guard_names_joint_place_and_minute():
+    slip = FoundEffect(
+        name='unnamed',
+        joints=(3,),
+        place='joint_angle',
+        driver='time',
+        form='step',
+        parameters=(),
+        p_value=0.003,
+        log_evidence_gain=40.0,
+        confusable_with=(),
+        cause='The joint angle of joint 3 jumped.',
+        size_m=1e-3,
+        title='Joint 3 slipped',
+        moment_s=455.0,
+    )
+    assert suggested([slip]) == 'joint 3 slipped 7.6 min after the first reading'
