@@ -1,9 +1,9 @@
 """Whether noise explains the error that a fit leaves, judged without the fitted noise.
 
 The fitted noise is what the model leaves: it contains the errors of a tracker that was moved, of a
-compliant joint, of a sensor with a wrong scale. Two figures depend less on the model's errors: the
-standard deviation that the sensor states with its readings, and how far the errors of the joint
-solutions of one pose differ, which the sensor measures at one place.
+compliant joint, of a sensor with a wrong scale. Two figures depend less on the model's errors:
+what the scatter of its frames leaves in their mean, which is the reading, and how far the errors
+of the joint solutions of one pose differ, which the sensor measures at one place.
 """
 
 from __future__ import annotations
@@ -13,7 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from remaster_ros.calibration.outliers import CERTAIN, gross_probability, robust_scale
+from remaster_ros.calibration.outliers import (
+    CERTAIN,
+    LARGEST_SHARE,
+    gross_probability,
+    robust_scale,
+)
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements
 
 # Errors that all solutions of a pose share belong to a sensor's noise as well: 0.5 mm beside
@@ -44,10 +49,10 @@ class NoiseCheck:
     sensor
         Its name.
     error_m
-        Mean 3-D error on the rows judged, without the worst twentieth, m.
+        Mean 3-D error on the rows judged, without the worst twentieth and without gross errors, m.
     stated_m
-        Standard deviation per axis that the sensor states of its samples (RMS), m; None where
-        no reading has one.
+        Standard deviation per axis of a reading (RMS) by the scatter of the samples that it is the
+        mean of, m; None where no reading has one.
     within_m
         Standard deviation per axis of the errors within poses, m; None where no pose has two.
     poses
@@ -56,7 +61,9 @@ class NoiseCheck:
         How many times larger noise makes the error on held-out rows, as few poses determine the
         parameters poorly; 1 on fitted rows.
     gross
-        ``observation`` of every held-out row that is a gross error: no fit leaves those out.
+        ``observation`` of every held-out row that is a single gross error: no fit leaves those
+        out. None where so many are that a fit would refuse them: something changed there, or the
+        model does not hold.
     mean_m
         Mean 3-D error on all rows judged, gross ones too, m.
     """
@@ -79,9 +86,10 @@ class NoiseCheck:
         return (
             f'{len(self.gross)} held-out readings of {self.sensor} are gross errors (observation '
             f'{listed}{" …" if len(self.gross) > LISTED else ""}) and make up most of its mean '
-            f'error of {1e3 * self.mean_m:.3f} mm; without its worst twentieth it is '
-            f'{1e3 * self.error_m:.3f} mm. Run "remaster discover", which tests whether they '
-            'belong to another configuration.'
+            f'error of {1e3 * self.mean_m:.3f} mm; without them it is '
+            f'{1e3 * self.error_m:.3f} mm. Compare the clocks of sensor and robot, and what was '
+            'hidden or moved then; "remaster discover" tests whether they belong to another '
+            'configuration.'
         )
 
     @property
@@ -97,10 +105,10 @@ class NoiseCheck:
         return None if self.noise_m is None else MEAN_LENGTH * self.spread * self.noise_m
 
     @property
-    def explained(self) -> bool:
-        """Whether noise explains the error; False where the noise is unknown."""
+    def explained(self) -> bool | None:
+        """Whether noise explains the error; None where the noise is unknown."""
         if self.noise_error_m is None:
-            return False
+            return None
         few = 1.0 + 1.0 / np.sqrt(self.poses)
         return bool(self.error_m <= MOST * few * self.noise_error_m)
 
@@ -138,16 +146,17 @@ def check_noise(
         judged = held_out if held_out.any() else mine
         errors = np.linalg.norm(residuals, axis=1)
         lengths = np.sort(errors[judged])
-        most = len(lengths) - int(WORST_SHARE * len(lengths))
+        gross = _gross(measurements, errors, held_out)
+        most = len(lengths) - max(int(WORST_SHARE * len(lengths)), len(gross))
         checks.append(
             NoiseCheck(
                 name,
                 float(lengths[:most].mean()),
-                _stated(measurements.std[mine]),
+                _stated(measurements.select(mine)),
                 _within(measurements, residuals, mine),
                 len(np.unique(measurements.pose[judged])),
                 spread if held_out.any() else 1.0,
-                _gross(measurements, errors, held_out),
+                gross,
                 float(lengths.mean()),
             )
         )
@@ -159,6 +168,8 @@ def _gross(measurements: Measurements, errors: FloatArray, rows: BoolArray) -> t
     if not rows.any():
         return ()
     gross = gross_probability(errors[rows] / robust_scale(errors[rows])) > CERTAIN
+    if gross.sum() > max(1.0, LARGEST_SHARE * len(gross)):
+        return ()
     return tuple(measurements.observation[rows][gross].tolist())
 
 
@@ -173,8 +184,9 @@ def _spread(fitted: Measurements, parameters: int) -> float:
     return float(np.sqrt(1.0 + min(parameters / free, LARGEST_SPREAD**2 - 1.0)))
 
 
-def _stated(std: FloatArray) -> float | None:
-    """Return the RMS of the standard deviations (n, 3), NaN where unknown."""
+def _stated(measurements: Measurements) -> float | None:
+    """Return the RMS of the standard deviations of the readings, each a mean of its samples."""
+    std = measurements.std / np.sqrt(np.maximum(measurements.samples, 1))[:, None]
     known = std[np.isfinite(std)]
     rms = float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
     # A column of zeros stands for an unknown figure, not for a sensor without noise.

@@ -139,7 +139,7 @@ class ResidualStructure:
 
 def errors_are_left(checks: Sequence[NoiseCheck], structure: ResidualStructure | None) -> bool:
     """Return whether the residuals have structure, or are more than the noise that is known."""
-    unexplained = any(c.noise_error_m is not None and not c.explained for c in checks)
+    unexplained = any(check.explained is False for check in checks)
     return unexplained or (structure is not None and bool(structure.found))
 
 

@@ -6,6 +6,7 @@ import argparse
 import time
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from remaster_ros.calibration.predictions import Coverage
@@ -15,7 +16,6 @@ from remaster_ros.discovery.confirmation import (
     confirm,
     require_other_session,
 )
-from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.decision import Named, decisions
 from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.side_by_side import rms_sigmas
@@ -25,10 +25,13 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.discovery_json import (
     held_out_coverage,
     predictions_of,
+    read_discovery,
     save_discovery,
 )
+from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.fit_json import DISCOVERY_FILE, prepare_folder
 from remaster_ros.reports.found_causes import earlier_pairs
+from remaster_ros.reports.schemas import Judgement
 from remaster_ros.session.reader import read_session
 
 # Of a curve's hundred values the table has one line; discovery.json has them all.
@@ -98,7 +101,11 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         show_file(args.out / DISCOVERY_FILE)
     else:
-        show(args.quiet, summary(found, confirmation, held_out_coverage(found, predictions)))
+        content = msgspec.convert(read_discovery(args.out / DISCOVERY_FILE), Discovered)
+        assert isinstance(content.judgement, Judgement)
+        judged = content.judgement
+        coverage = held_out_coverage(found, predictions)
+        show(args.quiet, summary(found, judged, confirmation, coverage))
         for one in decided:
             show(args.quiet, one.describe())
         show(args.quiet, f'written: {report}')
@@ -109,11 +116,12 @@ def run(args: argparse.Namespace) -> int:
 
 def summary(
     found: Discovery,
+    judged: Judgement,
     confirmation: Confirmation | None = None,
     held_out: Coverage | None = None,
 ) -> str:
     """Return verdict, causes, gain and coverage of the held-out rows in a few lines."""
-    lines = [f'verdict: {found.verdict}']
+    lines = [f'verdict: {found.verdict}', judged.headline]
     for effect in found.effects:
         share = '' if effect.share is None else f', {percent(effect.share)} of the gain'
         lines.append(f'{effect.title}: {1e3 * effect.size_m:.3f} mm{share}; {effect.cause}')
@@ -124,15 +132,6 @@ def summary(
             name = fewer or sentence_case(alike.title)
             lines.append(f'    could be {name}; to distinguish: {alike.separate_by}')
     lines += [f'unexplained: {left.next}' for left in found.unexplained]
-    if found.verdict == 'none':
-        lines.append('nothing beyond the zero-offsets and the noise was found')
-    gain = found.gain
-    if gain.held_out_rms_before_m is not None and gain.held_out_rms_after_m is not None:
-        lines.append(
-            f'held out: {1e3 * gain.held_out_rms_before_m:.3f} mm RMS before, '
-            f'{1e3 * gain.held_out_rms_after_m:.3f} mm after; '
-            f'the noise alone is {1e3 * gain.noise_floor_m:.3f} mm'
-        )
     if held_out is not None and held_out.share is not None:
         lines.append(
             f'{held_out.inside} of {held_out.rows} held-out rows ({percent(held_out.share)}) lie '
@@ -146,10 +145,9 @@ def summary(
             'with the causes as found, frozen'
         )
     lines += [f'not testable: {name}: {why}' for name, why in found.untestable.items()]
-    if not found.fit.sampler.converged:
-        lines.append(f'uncertainties are approximate: {found.fit.sampler.message}')
+    lines += judged.doubts
+    lines += [f'other session: {line}' for line in judged.points]
     if confirmation is not None:
-        lines += [f'other session: {line}' for line in in_words(found, confirmation)]
         lines += side_by_side(found, confirmation)
     return '\n'.join(lines)
 

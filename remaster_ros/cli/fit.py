@@ -18,8 +18,8 @@ from remaster_ros.calibration.fit import (
 )
 from remaster_ros.cli.console import progress_bar, show, show_file
 from remaster_ros.cli.options import integer, number
-from remaster_ros.collection.reference_session import changes
 from remaster_ros.reports.fit_json import FIT_FILE, prepare_folder, save_fit
+from remaster_ros.reports.judgement import verdict
 from remaster_ros.session.priors import read_priors
 from remaster_ros.session.reader import read_session
 
@@ -117,30 +117,10 @@ def summary(result: FitResult) -> str:
             if turned.get('after'):
                 before, after = turned['before']['mean_deg'], turned['after']['mean_deg']
                 lines.append(f'… orientation: {before:.4f} deg before, {after:.4f} deg after')
-    for check in result.noise_checks:
-        left = f'{1e3 * check.error_m:.3f} mm that are left'
-        if check.noise_error_m is None:
-            lines.append(f'{check.sensor}: how much of the {left} is noise cannot be told apart')
-        elif not check.explained:
-            lines.append(
-                f'{check.sensor}: noise ({1e3 * check.noise_error_m:.3f} mm) does not explain the '
-                f'{left}: other errors dominate; run "remaster discover"'
-            )
-    lines += [check.spoilt for check in result.noise_checks if check.spoilt]
-    if result.structure is not None:
-        lines += [f'{test.words} ({test.chance})' for test in result.structure.found]
-        if result.structure.found and all(check.explained for check in result.noise_checks):
-            lines.append('other errors dominate; run "remaster discover"')
-    if np.any(result.widening > 1.0):
-        lines.append(
-            'the standard deviations of the offsets include these other errors: up to '
-            f'{np.max(result.widening):.1f} times those of the model alone'
-        )
-    _, found = changes(result.session, result.chain, result.T_R_N)
-    lines += [f'changed while it was measured: {change.describe()}' for change in found]
+    judged = verdict(result)
+    lines += [judged.headline, *judged.points]
     if not result.session.timed:
         lines.append('the session has no times: nothing that changes with time can be seen')
-    lines.append(result.sampler.message)
     if result.left_out:
         rows = ', '.join(str(observation) for observation, _ in result.left_out)
         lines.append(f'left out as gross errors: observation {rows}')

@@ -94,6 +94,7 @@ def as_dict(answer: Answer, out: Path, plan: PlanFacts | None) -> dict[str, Any]
         'headline': answer.headline,
         'action': answer.action,
         'held_out': answer.held_out,
+        'not_counted': answer.not_counted,
         'stages': [
             {
                 'title': stage.title,

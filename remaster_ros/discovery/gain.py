@@ -12,10 +12,14 @@ import scipy
 from remaster_ros.calibration.accuracy import accuracy_of
 from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Estimate
+from remaster_ros.calibration.outliers import LARGEST_SHARE
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray
+
+# A row with an error of so many standard deviations of all its noise is gross.
+GROSS = 7.0
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,11 @@ class Gain:
         With offsets only, and with the effects.
     noise_floor_m
         What the estimated noise alone leaves.
+    held_out_gross
+        How many held-out rows are single gross errors: so far off with and without the effects
+        that neither is judged by them.
+    held_out_kept_before_m, held_out_kept_after_m
+        The same RMS without these.
     metrics
         'relative' and 'post_registration', each 'before' and 'after', as in fit.json; empty
         without validation rows.
@@ -37,6 +46,24 @@ class Gain:
     held_out_rms_after_m: float | None
     noise_floor_m: float
     metrics: Mapping[str, Any]
+    held_out_gross: int = 0
+    held_out_kept_before_m: float | None = None
+    held_out_kept_after_m: float | None = None
+
+
+def held_out_words(gain: Gain) -> str:
+    """Return the errors on held-out poses in words; '' without such poses."""
+    before, after = gain.held_out_kept_before_m, gain.held_out_kept_after_m
+    if before is None or after is None or gain.held_out_rms_after_m is None:
+        return ''
+    words = f'{1e3 * before:.3f} mm RMS before, {1e3 * after:.3f} mm after; the noise alone is '
+    words += f'{1e3 * gain.noise_floor_m:.3f} mm'
+    if gain.held_out_gross:
+        words += (
+            f'; {gain.held_out_gross} gross error{"s" if gain.held_out_gross > 1 else ""} not '
+            f'counted (with them {1e3 * gain.held_out_rms_after_m:.3f} mm after)'
+        )
+    return words
 
 
 def gain_of(
@@ -61,11 +88,21 @@ def gain_of(
     none = np.arange(0)
     metrics = accuracy_of(measurements, none, before, after, None, rng)['validation']
     assert metrics is not None
+    limit = GROSS * noise.total[measurements.sensor]
+    lengths = [np.linalg.norm(errors, axis=1) for errors in (errors_before, fit.residuals_after)]
+    gross = held_out & np.all(np.array(lengths) > limit, axis=0)
+    if gross.sum() > max(1.0, LARGEST_SHARE * held_out.sum()):
+        # So many are no single errors: something changed there, or the model does not hold.
+        gross[:] = False
+    kept = held_out & ~gross
     return Gain(
         rms(errors_before, held_out),
         rms(fit.residuals_after, held_out),
         floor,
         {name: metrics[name] for name in ('relative', 'post_registration')},
+        int(gross.sum()),
+        rms(errors_before, kept),
+        rms(fit.residuals_after, kept),
     )
 
 

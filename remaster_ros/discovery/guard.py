@@ -58,7 +58,8 @@ def suggested(effects: Sequence[FoundEffect]) -> str:
 
 def is_harmful(gain: Gain) -> bool:
     """Return whether the causes make the error on held-out poses larger by more than 5 %."""
-    before, after = gain.held_out_rms_before_m, gain.held_out_rms_after_m
+    # Gross errors, which are there with and without causes, would hide what these do.
+    before, after = gain.held_out_kept_before_m, gain.held_out_kept_after_m
     return before is not None and after is not None and after > MOST_HARM * before
 
 
@@ -91,19 +92,19 @@ def harm_of(
     if len(change) > 1 and np.ptp(change) > 0.0:
         p_value = scipy.stats.ttest_1samp(change, 0.0, alternative='greater').pvalue
     names = suggested(effects)
-    assert gain.held_out_rms_before_m is not None
-    assert gain.held_out_rms_after_m is not None
+    before_m, after_m = gain.held_out_kept_before_m, gain.held_out_kept_after_m
+    assert before_m is not None
+    assert after_m is not None
     return Unexplained(
         where='held_out_poses',
         driver='unknown',
-        size_m=gain.held_out_rms_before_m,
+        size_m=before_m,
         p_value=float(p_value),
         next=(
             f'The residuals suggest {names}, but with that the error on the held-out poses goes '
-            f'from {1e3 * gain.held_out_rms_before_m:.3f} to '
-            f'{1e3 * gain.held_out_rms_after_m:.3f} mm RMS: it is not taken as a cause. Measure '
-            'poses that are spread as the arm is used, over the whole region and with the tool '
-            'turned, and search again.'
+            f'from {1e3 * before_m:.3f} to {1e3 * after_m:.3f} mm RMS: it is not taken as a '
+            'cause. Measure poses that are spread as the arm is used, over the whole region and '
+            'with the tool turned, and search again.'
         ),
     )
 

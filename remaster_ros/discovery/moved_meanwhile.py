@@ -12,13 +12,12 @@ import numpy as np
 import scipy
 
 from remaster_ros.calibration.moved_since import moved_since
+from remaster_ros.calibration.outliers import LARGEST_SHARE
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.gain import rms
 from remaster_ros.discovery.guard import Unexplained
 from remaster_ros.types import BoolArray, FloatArray
 
-# A larger share of a sensor's rows is no matter of single gross errors; a fit refuses as many.
-MOST_GROSS = 0.1
 # Of careful measurements; for the p-value.
 USUAL_GROSS = 0.01
 
@@ -39,7 +38,7 @@ def far_off(context: Context, errors: FloatArray, gross: BoolArray) -> Iterator[
     for index, sensor in enumerate(context.sensor_names):
         rows = np.flatnonzero(held_out & (context.sensor == index))
         count = int(gross[rows].sum())
-        if count <= MOST_GROSS * len(rows):
+        if count <= LARGEST_SHARE * len(rows):
             continue
         size = rms(errors, np.isin(np.arange(len(gross)), rows[gross[rows]]))
         moved = moved_text(context, errors, index)

@@ -21,7 +21,7 @@ from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.errors_by_place import errors_by_place
 from remaster_ros.discovery.explain import FoundEffect
-from remaster_ros.discovery.gain import rms
+from remaster_ros.discovery.gain import GROSS, rms
 from remaster_ros.discovery.guard import Unexplained
 from remaster_ros.discovery.held_out_poses import compare_held_out
 from remaster_ros.discovery.moved_meanwhile import far_off, moved_text
@@ -31,8 +31,6 @@ from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 # Of one check where nothing is wrong.
 SIGNIFICANCE = 0.001
-# A row with an error of so many standard deviations of all its noise is gross.
-GROSS = 7.0
 # Fewer readings of another configuration may be chance or carelessness.
 FEWEST_MISPAIRED = 2
 # Gross errors that are compared with the places of all rows.
@@ -212,7 +210,7 @@ class _Checks:
     def beyond_stated(self) -> Iterator[Unexplained]:
         """Errors larger than what the sensor itself states allows."""
         for check in self.fit.noise_checks:
-            if check.stated_m is None or check.explained:
+            if check.stated_m is None or check.explained is not False:
                 continue
             stating = the('sensor', check.sensor)
             yield Unexplained(
@@ -222,7 +220,7 @@ class _Checks:
                 p_value=np.nan,
                 next=(
                     f'{stating[:1].upper()}{stating[1:]} states {1e3 * check.stated_m:.3f} mm per '
-                    f'axis with its readings, but the mean error is {1e3 * check.error_m:.3f} mm: '
+                    f'axis for a reading, but the mean error is {1e3 * check.error_m:.3f} mm: '
                     'the arm does not repeat itself so well, the sensor is worse than it states, '
                     'or a cause is missing. Measure one pose twenty times, coming from elsewhere '
                     'each time.'

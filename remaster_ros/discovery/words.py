@@ -10,6 +10,7 @@ import numpy as np
 from remaster_ros.calibration.gauge_words import listed, the
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.sizes import rounded
+from remaster_ros.discovery.effects.unnamed import EFFECT as NO_NAME
 
 # Unit of a parameter -> the unit for people, and how many of those one is.
 SHOWN_UNITS = {
@@ -23,7 +24,6 @@ SHOWN_UNITS = {
     '1/s': ('µm/(m h)', 3.6e9),
 }
 
-UNNAMED = 'unnamed'
 # Place of an error -> what the name of its subject names.
 KIND_OF_SUBJECT = {'sensor_frame': 'sensor', 'marker': 'marker'}
 
@@ -74,7 +74,7 @@ def titled(cell: Cell, joints: Sequence[int]) -> str:
             'marker': f'{the(kind, cell.subject)} moved',
             'sensor_frame': f'{the(kind, cell.subject)} moved',
         }.get(cell.place, 'the base moved, or all sensors together')
-    elif cell.name == UNNAMED:
+    elif cell.name == NO_NAME.name:
         whose = joint or (the(kind, cell.subject) if cell.subject else '')
         driver = cell.driver.replace('_', ' ')
         words = cell.place.replace('_', ' ') + (f' of {whose}' if whose else '')

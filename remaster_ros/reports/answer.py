@@ -10,6 +10,7 @@ import numpy as np
 
 from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.noise_check import MEAN_LENGTH
+from remaster_ros.calibration.outliers import LARGEST_SHARE
 from remaster_ros.compensation.export import GEOMETRY_FILE, LAYER_FILE, REMASTER_FILE, URDF_FILE
 from remaster_ros.compensation.mastering import MasteringStep, mastering
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -93,6 +94,8 @@ class Answer:
         The error of every row there, (n,).
     held_out
         The stages are judged by poses that were never fitted.
+    not_counted
+        Of their readings so many are gross errors, by which no stage is judged.
     noise
         Of every sensor for which it is known.
     remains
@@ -114,6 +117,7 @@ class Answer:
     brings: int
     final_mm: FloatArray
     held_out: bool
+    not_counted: int
     noise: tuple[SensorNoise, ...]
     remains: tuple[Remaining, ...]
     offsets: tuple[JointOffset, ...]
@@ -149,6 +153,7 @@ def answer_of(inputs: Inputs) -> Answer:
     fit, found = inputs.fit, inputs.found
     effects = found.effects if found is not None else []
     judged, held_out = judged_rows(inputs)
+    not_counted = int(inputs.session.measurements.is_validation.sum()) - int(judged.sum())
     rows, brings = _stages(inputs)
     stages = tuple(Stage(text, errors[judged]) for text, errors in rows)
     uses_causes = brings > 1
@@ -163,7 +168,10 @@ def answer_of(inputs: Inputs) -> Answer:
     measured = [e.title for e in effects if taken_out and e.of_measurement]
     return Answer(
         mood=_mood(inputs, uses_causes, held_out and action != 'wait'),
-        headline=reason or _headline(known, stages, brings, held_out, measured, geometry),
+        headline=reason
+        or _headline(
+            known, stages, brings, held_out, measured, geometry, not_counted if held_out else 0
+        ),
         action=action,
         uses_causes=uses_causes,
         has_geometry=geometry,
@@ -171,8 +179,9 @@ def answer_of(inputs: Inputs) -> Answer:
         brings=brings,
         final_mm=rows[brings][1],
         held_out=held_out,
+        not_counted=not_counted if held_out else 0,
         noise=_noise(inputs),
-        remains=tuple(what_remains(inputs, uses_causes, held_out, stages[brings].mean)),
+        remains=tuple(what_remains(inputs, uses_causes, held_out)),
         offsets=tuple(offsets),
         on_the_pad=_on_the_pad(inputs.session, offsets),
         pad_names={} if pad is None else {name: joint.name for name, joint in pad.joints.items()},
@@ -195,7 +204,11 @@ def judged_rows(inputs: Inputs) -> tuple[BoolArray, bool]:
     """Return the rows that the stages are judged by, (n,), and whether they were held out."""
     m = inputs.session.measurements
     if m.is_validation.any():
-        return m.is_validation, True
+        gross = m.is_validation & np.isin(m.observation, inputs.gross)
+        # So many are no single errors: something changed there, or the model does not hold.
+        if gross.sum() > max(1.0, LARGEST_SHARE * m.is_validation.sum()):
+            return m.is_validation, True
+        return m.is_validation & ~gross, True
     return ~np.isin(m.observation, list(inputs.fit_left_out)), False
 
 
@@ -295,12 +308,15 @@ def _headline(
     held_out: bool,
     measured: Sequence[str],
     corrects_model: bool,
+    not_counted: int,
 ) -> str:
     """Return the deed and its gain; ``measured`` is what was found of the measurement."""
     before, after = stages[0], stages[brings]
     deed = f'Set the zero-offsets of {joints} joint{"s" if joints > 1 else ""}'
     deed += ' and correct the robot model' if corrects_model else ''
     where = 'poses that were never fitted' if held_out else 'the fitted poses'
+    if not_counted:
+        where += f' ({not_counted} gross error{"s" if not_counted > 1 else ""} not counted)'
     if measured:
         # That part of the errors was never the arm's.
         return (

@@ -67,6 +67,15 @@ class Inputs:
         assert isinstance(self.fit.judgement, Judgement)
         return self.fit.judgement
 
+    @property
+    def gross(self) -> list[int]:
+        """``observation`` of the gross errors: with the causes some are none that the fit has."""
+        if self.found is not None:
+            return self.found.noise.outliers
+        checks = self.fit.explained_by_noise
+        held_out = checks.values() if isinstance(checks, dict) else ()
+        return [*self.fit_left_out, *(row for check in held_out for row in check.gross)]
+
     @cached_property
     def fit_left_out(self) -> dict[int, str]:
         """``observation`` of every row that was not fitted, and why."""

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 from markupsafe import Markup
 
+from remaster_ros.compensation.export import GEOMETRY_FILE
 from remaster_ros.discovery.words import clock_time
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -26,6 +27,7 @@ from remaster_ros.reports.fit_json import APPLY_FOLDER, REPORT_FILE
 from remaster_ros.reports.fit_tables import accuracy_rows, marker_rows
 from remaster_ros.reports.pages import inlined, page
 from remaster_ros.reports.plan_page import check_plan_page
+from remaster_ros.reports.remaining import NO_FILE
 from remaster_ros.session.files import decode_text, make_folder, read_limited, write_atomically
 from remaster_ros.types import FloatArray
 
@@ -124,6 +126,10 @@ def answer_html(subject: Subject, drawings: dict[str, Markup], printing: bool = 
     inputs, answer = subject.inputs, subject.answer
     fit = msgspec.to_builtins(inputs.fit)
     found = msgspec.to_builtins(inputs.found) if inputs.found is not None else None
+    if found is not None and GEOMETRY_FILE not in answer.files:
+        for effect in found['effects']:
+            if effect['in_robot_model']:
+                effect['remedy'] = NO_FILE
     source = fit
     if found is not None and answer.uses_causes:
         source = fit | {key: found[key] for key in ('registration', 'markers', 'sampler')}
@@ -158,11 +164,11 @@ def _chain(inputs: Inputs) -> SerialChain:
 def _how_sure(inputs: Inputs, answer: Answer) -> list[str]:
     """Return what else matters: of the fit, of the model with causes, of the other session."""
     judgement, found = inputs.judgement, inputs.found
-    answered = judgement.doubts if found is not None else []
+    answered = judgement.findings if found is not None else []
     lines = [] if answer.uses_causes else judgement.points
     lines = [line for line in lines if line not in (*answered, *judgement.disagreements)]
     if found is not None and isinstance(found.judgement, msgspec.Struct):
-        lines += found.judgement.points
+        lines += [found.judgement.headline, *found.judgement.points, *found.judgement.doubts]
     return lines
 
 

@@ -6,10 +6,12 @@ import msgspec
 import numpy as np
 
 from remaster_ros.calibration.measured_again import MeasuredAgain
+from remaster_ros.calibration.noise_check import SPOILT
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.explain import UNCERTAIN
+from remaster_ros.discovery.gain import held_out_words
 from remaster_ros.discovery.undetected import DETECTED
 from remaster_ros.discovery.words import sentence_case
 from remaster_ros.reports.discovery_schema import Discovered
@@ -43,7 +45,8 @@ def judgement(
     return Judgement(
         mood='good' if proven else 'caution',
         headline=headline(discovery, confirmation, more),
-        points=[*points, again.words] if again.again else points,
+        points=points,
+        doubts=[again.words] if again.again else [],
     )
 
 
@@ -57,7 +60,10 @@ def more_than_noise(content: Discovered) -> str:
             'Fewer held-out rows than should lie where they were predicted: something is left '
             'that the model does not have.'
         )
-    after, most = gain.held_out_rms_after_m, MOST_OVER_NOISE + regions.held_out.rows**-0.5
+    after = gain.held_out_kept_after_m
+    if isinstance(after, msgspec.UnsetType):
+        after = gain.held_out_rms_after_m
+    most = MOST_OVER_NOISE + regions.held_out.rows**-0.5
     if after is not None and after > most * gain.noise_floor_m:
         return (
             f'The error on held-out poses is {after / gain.noise_floor_m:.1f} times that of the '
@@ -81,8 +87,10 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
         return False
     if confirmation is not None and not confirmation.same_offsets:
         return False
-    before, after = discovery.gain.held_out_rms_before_m, discovery.gain.held_out_rms_after_m
+    before, after = discovery.gain.held_out_kept_before_m, discovery.gain.held_out_kept_after_m
     if before is None or after is None:
+        return False
+    if _spoilt(discovery):
         return False
     if discovery.verdict == 'none':
         return _would_show(discovery)
@@ -97,6 +105,23 @@ def least_seen_m(discovery: Discovery) -> float:
     """
     numbers = discovery.residuals.errors.size
     return float(DETECTED * discovery.gain.noise_floor_m / np.sqrt(numbers))
+
+
+def _spoilt(discovery: Discovery) -> bool:
+    """Whether gross errors make up much of the error on held-out poses."""
+    every, kept = discovery.gain.held_out_rms_after_m, discovery.gain.held_out_kept_after_m
+    return every is not None and kept is not None and every > SPOILT * kept
+
+
+def _gross(discovery: Discovery) -> str:
+    """Return how many readings are gross errors, a sentence; '' of none."""
+    count, of = len(discovery.outliers), len(discovery.residuals.context.measurements)
+    if not count:
+        return ''
+    return (
+        f' {count} of {of} readings {"are gross errors" if count > 1 else "is a gross error"}, '
+        'which no cause explains: find out what was moved, hidden or paired wrongly then.'
+    )
 
 
 def _would_show(discovery: Discovery) -> bool:
@@ -127,19 +152,15 @@ def headline(
     discovery: Discovery, confirmation: Confirmation | None = None, more: str = ''
 ) -> str:
     """Return the result in one or a few sentences; `more` is what held-out rows show beside it."""
-    result = _result(discovery, confirmation, left=bool(more))
-    return f'{result} {more}' if more else result
+    result = _result(discovery, confirmation, left=bool(more) or bool(discovery.outliers))
+    return result + (f' {more}' if more else '') + _gross(discovery)
 
 
 def _result(discovery: Discovery, confirmation: Confirmation | None, *, left: bool) -> str:
     gain = discovery.gain
     change = ''
-    if gain.held_out_rms_before_m is not None and gain.held_out_rms_after_m is not None:
-        change = (
-            f' On poses it never fitted the error goes from '
-            f'{1e3 * gain.held_out_rms_before_m:.3f} to {1e3 * gain.held_out_rms_after_m:.3f} mm '
-            f'RMS; the noise alone is {1e3 * gain.noise_floor_m:.3f} mm.'
-        )
+    if words := held_out_words(gain):
+        change = f' The error on poses it never fitted: {words}.'
     doubt = ''
     if not discovery.fit.sampler.converged:
         doubt = f' How uncertain the figures are is not known: {discovery.fit.sampler.message}.'
@@ -160,7 +181,7 @@ def _result(discovery: Discovery, confirmation: Confirmation | None, *, left: bo
         nothing = 'Nothing was found' if left else 'Nothing is there'
         return (
             f'{nothing} beyond the zero-offsets and the noise; a cause {seen} would not '
-            f'show.{doubt}'
+            f'show.{change}'
         )
     if discovery.verdict == 'unexplained':
         return f'Something is there that no cause explains.{change}'

@@ -92,11 +92,17 @@ class Effect(Struct):
 
 
 class Gain(Struct):
-    """RMS of the 3-D error over every validation row, and what the noise alone makes."""
+    """RMS of the 3-D error over every validation row, and what the noise alone makes.
+
+    ``held_out_kept_…`` is the same without the ``held_out_gross`` rows that are gross errors.
+    """
 
     held_out_rms_before_m: float | None
     held_out_rms_after_m: float | None
     noise_floor_m: float
+    held_out_gross: int = 0
+    held_out_kept_before_m: float | UnsetType | None = UNSET
+    held_out_kept_after_m: float | UnsetType | None = UNSET
 
 
 class NoiseOfDiscovery(Struct):

@@ -117,6 +117,7 @@ def fit_content(result: FitResult) -> schemas.Fit:
                 'noise_m': check.noise_error_m,
                 'stated_std_m': check.stated_m,
                 'within_pose_std_m': check.within_m,
+                'gross': check.gross,
             }
             for check in result.noise_checks
         },

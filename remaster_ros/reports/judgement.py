@@ -29,22 +29,25 @@ def references(result: FitResult) -> tuple[int, list[str]]:
 def verdict(result: FitResult) -> Judgement:
     """Judge a fit: what was gained, whether the chains agree, what is not identifiable."""
     validated = result.accuracy['validation'] is not None
-    split = 'validation' if validated else 'optimization'
-    metrics = result.accuracy[split]['post_registration']
-    before, after = metrics['before']['mean_mm'], metrics['after']['mean_mm']
+    before, after = _mean_errors_mm(result, validated)
     gain = before / max(after, 1e-9)
     again = MeasuredAgain.of(result.session.measurements)
     where = 'on poses it never fitted' if validated else 'on the fitted poses'
     if again.most:
         where = 'on held-out poses, most of which were fitted as well'
+    gross = sum(len(check.gross) for check in result.noise_checks) if validated else 0
+    if gross:
+        where += f' ({gross} gross error{"s" if gross > 1 else ""} not counted)'
     change = f'{before:.3f} mm to {after:.3f} mm {where}'
-    unexplained = [check for check in result.noise_checks if not check.explained]
+    unexplained = [check for check in result.noise_checks if check.explained is False]
+    untold = [check for check in result.noise_checks if check.explained is None]
     changes = references(result)[1]
     spoilt = [check.spoilt for check in result.noise_checks if check.spoilt]
-    doubts = [_compared(check) for check in unexplained] + _structure(result)
+    findings = [_compared(check) for check in unexplained] + _structure(result)
+    doubts = [_compared(check) for check in untold]
     disagreements = changes + spoilt
-    points = doubts + disagreements
-    doubtful = bool(unexplained) or result.other_errors
+    points = findings + doubts + _widening(result) + disagreements
+    doubtful = bool(unexplained or untold) or result.other_errors
     few = result.structure is not None and result.structure.too_few
     unproven = changes or spoilt or few or again.most or not validated
     mood: Literal['good', 'caution', 'bad'] = 'caution'
@@ -127,13 +130,34 @@ def verdict(result: FitResult) -> Judgement:
             f'{len(result.left_out)} observation{plural} left out as gross errors; '
             'they are listed below.'
         )
-    return Judgement(mood, headline, points, doubts, disagreements)
+    return Judgement(mood, headline, points, findings, doubts, disagreements)
+
+
+def _mean_errors_mm(result: FitResult, validated: bool) -> tuple[float, float]:
+    """Return the mean 3-D error before and after, mm, of the rows judged less gross errors."""
+    gross = [row for check in result.noise_checks for row in check.gross]
+    if not (validated and gross):
+        split = 'validation' if validated else 'optimization'
+        metrics = result.accuracy[split]['post_registration']
+        return metrics['before']['mean_mm'], metrics['after']['mean_mm']
+    m = result.session.measurements
+    rows = m.is_validation & ~np.isin(m.observation, gross)
+    before, after = (
+        1e3 * float(np.linalg.norm(residuals[rows], axis=1).mean())
+        for residuals in (result.residuals_before, result.residuals_after)
+    )
+    return before, after
 
 
 def _structure(result: FitResult) -> list[str]:
-    """Return what the residuals follow, and what that does to the intervals."""
+    """Return what the residuals follow."""
     found = result.structure.found if result.structure is not None else ()
-    lines = [f'{test.words[0].upper()}{test.words[1:]} ({test.chance}).' for test in found]
+    return [f'{test.words[0].upper()}{test.words[1:]} ({test.chance}).' for test in found]
+
+
+def _widening(result: FitResult) -> list[str]:
+    """Return what errors that the model leaves out do to the intervals."""
+    lines = []
     if np.any(result.widening > 1.0):
         lines.append(
             'The standard deviations and intervals of the offsets include what the model leaves '
@@ -172,7 +196,7 @@ def _compared(check: NoiseCheck) -> str:
     sources = [
         f'{1e3 * std:.3f} mm per axis {what}'
         for std, what in (
-            (check.stated_m, 'stated by the sensor'),
+            (check.stated_m, 'by the scatter of the samples of a reading'),
             (check.within_m, 'within a pose'),
         )
         if std is not None

@@ -14,6 +14,11 @@ from remaster_ros.reports.discovery_schema import Discovered
 
 # Fewer gross errors are in the table of left-out rows alone.
 FEWEST_GROSS, LEAST_SHARE = 3, 0.01
+# In place of a remedy that is a file: it is beside the page only where it belongs to the deed.
+NO_FILE = (
+    'No robot model beside this page holds it: correcting it brings no noticeable gain beside the '
+    'zero-offsets, or the page says to set nothing.'
+)
 # The first screen names so many causes, with so many sizes each; all of them stand below.
 MOST_NAMED, MOST_SIZES = 4, 2
 
@@ -32,35 +37,32 @@ class Remaining(NamedTuple):
         return f'{self.what}{": " if size else ""}{size}. {self.remedy}'.rstrip()
 
 
-def what_remains(
-    inputs: Inputs, uses_causes: bool, held_out: bool, left_mm: float
-) -> list[Remaining]:
-    """Return what the deed leaves, the causes first; ``left_mm`` is the mean error after it."""
+def what_remains(inputs: Inputs, uses_causes: bool, held_out: bool) -> list[Remaining]:
+    """Return what the deed leaves, the causes first."""
     found, judgement = inputs.found, inputs.judgement
     rows = [] if found is None else _of_discovery(found, uses_causes)
-    if judgement.doubts and found is None:
+    if found is None and (lines := judgement.findings or judgement.doubts):
         rows.append(
             Remaining(
-                'Not shown to be noise',
-                judgement.doubts[0],
+                'More than noise' if judgement.findings else 'Not shown to be noise',
+                lines[0],
                 'Search for its cause: remaster discover SESSION --out DIR, then give DIR to '
                 'remaster report.',
             )
         )
-    elif (
-        found is not None
-        and not rows
-        # Causes have answered the doubts of the fit without them.
-        and ((judgement.doubts and not found.effects) or more_than_noise(found))
-    ):
-        rows.append(
-            Remaining(
-                'More than noise',
-                f'noise does not explain the mean error of {left_mm:.3f} mm, and no cause that '
-                'was tried does either',
-                'Look at the largest errors below; measure again, with references in between.',
+    elif found is not None and not rows:
+        # Causes have answered the findings of the fit without them.
+        left = more_than_noise(found)
+        if not left and not found.effects:
+            left = next(iter(judgement.findings), '')
+        if left:
+            rows.append(
+                Remaining(
+                    'More than noise',
+                    f'{left.rstrip(".")}. No cause that was tried explains it',
+                    'Look at the largest errors below; measure again, with references in between.',
+                )
             )
-        )
     if (gross := _gross(inputs)) is not None:
         rows.append(gross)
     rows += [Remaining('The data disagree', line, '') for line in judgement.disagreements]
@@ -74,6 +76,8 @@ def what_remains(
             if found is not None
             else 'what is left is what noise explains'
         )
+        if judgement.doubts:
+            words += '; how large the noise is nothing shows but these errors themselves'
         rows.append(Remaining('Noise', words, ''))
     return rows
 
@@ -88,6 +92,7 @@ def _of_discovery(found: Discovered, uses_causes: bool) -> list[Remaining]:
         if len(sizes) > MOST_SIZES and isinstance(effect.size_m, float):
             size = f'{1e3 * effect.size_m:.3f} mm RMS at the marker'
         remedy = effect.remedy if isinstance(effect.remedy, str) else ''
+        remedy = NO_FILE if effect.in_robot_model else remedy
         rows.append(Remaining(effect.title, size, remedy))
     if more := stay[MOST_NAMED:]:
         largest = max(e.size_m for e in more if isinstance(e.size_m, float))
@@ -108,9 +113,7 @@ def _of_discovery(found: Discovered, uses_causes: bool) -> list[Remaining]:
 def _gross(inputs: Inputs) -> Remaining | None:
     """Return how many readings are gross errors, of which sensors and when; None of few."""
     session, m = inputs.session, inputs.session.measurements
-    # With the causes some of those that the fit left out are none.
-    gross = inputs.fit_left_out if inputs.found is None else inputs.found.noise.outliers
-    rows = np.isin(m.observation, list(gross))
+    rows = np.isin(m.observation, inputs.gross)
     if rows.sum() < max(FEWEST_GROSS, LEAST_SHARE * len(m)):
         return None
     sensors = listed([session.sensor_names[i] for i in np.unique(m.sensor[rows])])

@@ -179,8 +179,9 @@ class NoiseCheck(Struct):
     """Does noise explain what is left of a sensor's errors?
 
     ``after_m`` is the mean error after (held out where there are such rows, without the worst
-    twentieth), ``noise_m`` what the noise makes that the sensor states and that shows within poses
-    (None where neither does).
+    twentieth), ``noise_m`` what the noise makes that the sensor states for a reading, the mean of
+    its samples, and that shows within poses (None where neither does, as ``explained``). ``gross``
+    has the observations of the held-out rows that are gross errors.
     """
 
     explained: bool | None
@@ -188,18 +189,21 @@ class NoiseCheck(Struct):
     noise_m: float | None
     stated_std_m: float | None
     within_pose_std_m: float | None
+    gross: list[int] = []
 
 
 class Judgement(Struct):
     """A result for a reader who did not measure it: green, amber or red, and why.
 
-    ``points`` is what else matters before it is used. Of these, ``doubts`` are what noise does not
-    explain, but causes may; ``disagreements`` are data that contradict each other.
+    ``points`` is what else matters before it is used. Of these, ``findings`` are what noise does
+    not explain, but causes may; ``doubts`` are what these data cannot show; ``disagreements`` are
+    data that contradict each other.
     """
 
     mood: Literal['good', 'caution', 'bad']
     headline: str
     points: list[str] = []
+    findings: list[str] = []
     doubts: list[str] = []
     disagreements: list[str] = []
 

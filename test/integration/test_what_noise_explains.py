@@ -66,5 +66,8 @@ def test_a_tracker_that_was_moved_4_mm_is_not(made: Session, tmp_path: Path, sha
     assert check['after_m'] > 8 * check['noise_m']
     # The fitted noise takes up the misfit where it was fitted.
     assert (fit['noise']['tracker']['pose_sigma_m'] > 1e-3) == (share < 0.5)
-    line = next(line for line in out.splitlines() if line.startswith('tracker: noise ('))
-    assert 'run "remaster discover"' in line
+    # What is printed is the verdict of the file and of the page.
+    for line in (fit['judgement']['headline'], *fit['judgement']['points']):
+        assert line in out.splitlines()
+    assert 'run "remaster discover"' in fit['judgement']['headline']
+    assert any(line.startswith('tracker: the error') for line in fit['judgement']['findings'])

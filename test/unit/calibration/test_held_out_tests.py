@@ -101,7 +101,7 @@ def test_a_sensor_that_was_moved_is_named_and_the_page_is_not_green():
     judged = verdict(result)
     assert judged.mood == 'caution'
     said = 'On held-out poses the error of mocap from pose to pose is'
-    assert any(doubt.startswith(said) for doubt in judged.doubts)
+    assert any(finding.startswith(said) for finding in judged.findings)
 
 
 def test_errors_that_differ_between_the_joint_solutions_are_seen_within_the_poses():

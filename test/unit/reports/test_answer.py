@@ -12,12 +12,14 @@ import pytest
 from remaster_ros.compensation.export import exports
 from remaster_ros.errors import InputError
 from remaster_ros.reports.answer import answer_of
+from remaster_ros.reports.answer_figures import Subject
 from remaster_ros.reports.answer_inputs import Inputs, errors_with_model_mm, parts, read_inputs
-from remaster_ros.reports.answer_report import checked_svg, require_ready, worst_rows
+from remaster_ros.reports.answer_report import answer_html, checked_svg, require_ready, worst_rows
 from remaster_ros.reports.discovery_judgement import more_than_noise
-from remaster_ros.reports.discovery_schema import Discovered
+from remaster_ros.reports.discovery_schema import Discovered, PredictedRegions
 from remaster_ros.reports.effect_words import law
 from remaster_ros.reports.fit_json import fit_content, save_fit
+from remaster_ros.reports.remaining import NO_FILE
 from remaster_ros.reports.schemas import Fit, Judgement
 
 STEP = {'driver': 'time', 'form': 'step', 'name': 'unnamed', 'moment_s': 455.0}
@@ -68,6 +70,7 @@ def effect(name, place, driver, form='constant', joints=(2,), **more):
         'cause': 'The cause.',
         'sizes': ['by 1.00 mm ± 0.01 mm'],
         'size_m': 1e-3,
+        'share': 0.5,
         'remedy': 'The remedy.',
         **more,
     }
@@ -158,9 +161,39 @@ def test_causes_that_stay_are_listed_with_their_remedy_and_the_others_are_not(in
         'Link length of joint 2',
         'Joint compliance of joint 2',
     ]
-    assert all(row.remedy == 'The remedy.' for row in remains)
+    assert [row.remedy for row in remains] == [NO_FILE, 'The remedy.']
     (left,) = answer_of(inputs([LENGTH])).remains
     assert left.what == 'Noise'
+
+
+@pytest.mark.parametrize(
+    ('model', 'errors', 'there'),
+    [
+        (0.4, (3.0, 0.5, 0.3), True),
+        (0.49, (3.0, 0.5, 0.3), False),
+        (0.29, (0.3, 0.299, 0.2), False),
+    ],
+)
+def test_no_page_names_a_file_that_is_not_beside_it(inputs, fit_result, model, errors, there):
+    file = 'apply/robot_geometry.urdf'
+    length = {**LENGTH, 'remedy': f'Put it into the robot model: {file} has it.'}
+    made = inputs([length, SOFT], errors=errors, model=model)
+    made.found.untestable, made.found.unexplained, made.found.least_p_value = {}, [], 0.003
+    none = {'rows': 0, 'inside': 0, 'share': None, 'interval95': None}
+    made.found.predicted_regions95 = msgspec.convert(
+        {
+            'widening': 1.0,
+            'held_out': none,
+            'fitted': none,
+        },
+        PredictedRegions,
+    )
+    for key in ('registration', 'markers', 'sampler'):
+        setattr(made.found, key, getattr(made.fit, key))
+    answer = answer_of(made)
+    assert ('robot_geometry.urdf' in answer.files) == there
+    html = answer_html(Subject(made, answer, fit_result.chain), {})
+    assert (file in html) == there
 
 
 @pytest.mark.parametrize(('model', 'uses_causes'), [(0.4, True), (0.49, False)])
@@ -197,16 +230,26 @@ def test_a_robot_model_is_judged_as_it_is(fit_result):
 
 def test_what_no_cause_explains_is_never_called_noise(inputs, fit):
     assert [row.what for row in answer_of(inputs([])).remains] == ['Noise']
-    fit.judgement.doubts = ['tracker: the error after is 0.500 mm; noise makes 0.100 mm.']
-    (alone,) = answer_of(inputs()).remains
-    assert alone.size == fit.judgement.doubts[0]
+    fit.judgement.findings = ['tracker: the error after is 0.500 mm; noise makes 0.100 mm.']
+    alone = answer_of(inputs()).remains[0]
+    assert (alone.what, alone.size) == ('More than noise', fit.judgement.findings[0])
     assert 'remaster discover' in alone.sentence
     assert '..' not in alone.sentence
     (searched,) = answer_of(inputs([])).remains
     assert searched.what == 'More than noise'
-    assert '0.500 mm, and no cause' in searched.size
-    # A cause that the robot model then holds has answered the doubts of the fit without it.
+    assert searched.size.startswith(fit.judgement.findings[0].rstrip('.'))
+    # A cause that the robot model then holds has answered the finding of the fit without it.
     assert [row.what for row in answer_of(inputs([LENGTH])).remains] == ['Noise']
+
+
+def test_a_doubt_is_no_finding(inputs, fit):
+    """Where nothing shows how large the noise is, nobody is told that it is exceeded."""
+    fit.judgement.doubts = ['tracker: nothing shows how much of the 0.500 mm is noise.']
+    alone = answer_of(inputs()).remains[0]
+    assert (alone.what, alone.size) == ('Not shown to be noise', fit.judgement.doubts[0])
+    (searched,) = answer_of(inputs([])).remains
+    assert searched.what == 'Noise'
+    assert 'nothing shows' in searched.size
 
 
 def test_many_gross_errors_say_when_and_of_which_sensor(inputs):
@@ -220,6 +263,25 @@ def test_many_gross_errors_say_when_and_of_which_sensor(inputs):
     name = made.session.sensor_names[m.sensor[-1]]
     assert gross.size.startswith(f'4 of {len(m)} readings, of {name}: ')
     assert f'configurations {first} to {last}, {minutes:.1f} to ' in gross.size
+
+
+def test_single_gross_errors_decide_nothing(inputs):
+    """Three of the held-out readings, 80 mm off with and without offsets, are counted apart."""
+    clean, made = inputs([]), inputs([])
+    held_out = np.flatnonzero(made.session.measurements.is_validation)
+    rows = held_out[: len(held_out) // 15]
+    assert len(rows) > 1
+    made.before_mm[rows] = made.after_mm[rows] = 80.0
+    made.found.noise.outliers = made.session.measurements.observation[rows].tolist()
+    answer = answer_of(made)
+    assert answer.action == 'set'
+    assert [stage.mean for stage in answer.stages] == [s.mean for s in answer_of(clean).stages]
+    assert answer.not_counted == len(rows)
+    assert f'({len(rows)} gross errors not counted)' in answer.headline
+    # A third of them is no matter of single gross errors.
+    many = held_out[: len(held_out) // 3]
+    made.found.noise.outliers = made.session.measurements.observation[many].tolist()
+    assert answer_of(made).not_counted == 0
 
 
 def test_an_error_of_the_measurement_is_no_gain_of_the_arm(inputs):
