@@ -114,7 +114,7 @@ def test_a_bump_is_told_in_words_by_the_clock(made: Path, page: Text) -> None:
     truth = json.loads((made / 'session/truth.json').read_text())['effects'][0]['detail']
     text = ' '.join(page.words)
     sensor = truth['sensor']
-    assert f'Sensor {sensor} moved' in text
+    assert f'The sensor {sensor} moved' in text
     told = re.search(
         r'jumped at 08:(\d\d):(\d\d) UTC on 2026-11-22, .* between configurations \d+ and \d+',
         text,
@@ -184,7 +184,7 @@ def test_a_session_alone_is_fitted_first(made: Path, tmp_path: Path) -> None:
     assert 'remaster discover' in done.stdout
     html = (tmp_path / 'out/report.html').read_text(encoding='utf-8')
     assert '<svg' not in html
-    assert 'Not shown to be noise' in html
+    assert 'More than noise' in html
 
 
 def test_a_session_in_which_something_moved_is_green_on_no_page(made: Path) -> None:
