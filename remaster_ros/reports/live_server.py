@@ -14,6 +14,8 @@ who is not meant to:
   tells, and is shown as a stranger's: it reaches neither this server nor the token (sandbox).
 - Nothing is written, no path comes from a request, bodies are small, no page may frame this one,
   and no script runs here but the ones of this package.
+- Connections are few, and those that have not shown the token live for one request
+  (`live_connections`). Trouble is one line a minute, which is left out where nobody reads.
 """
 
 from __future__ import annotations
@@ -33,9 +35,10 @@ from functools import cache
 from typing import Any
 
 import msgspec
-from tornado.httpserver import HTTPServer
+from tornado.httputil import HTTPServerRequest
 from tornado.web import Application, HTTPError, RequestHandler
 
+from remaster_ros.reports.live_connections import IDLE_S, REQUEST_S, BoundedServer, log_rarely
 from remaster_ros.reports.live_place import Place, hosts, listen, tls
 from remaster_ros.reports.scene_view import view_script
 
@@ -180,6 +183,14 @@ class LiveServer:
             return name
         return f'{CONFIRM}/{self._plan}' if self._plan else ''
 
+    def believe(self, request: HTTPServerRequest) -> None:
+        """Keep the connection of a request that has shown the token, whatever others do."""
+        self._connections.believe(request)
+
+    def answered(self, request: HTTPServerRequest) -> None:
+        """Give the connection of a request time for the next one."""
+        self._connections.answered(request)
+
     def close(self) -> None:
         """End the server and its thread."""
         self._loop.call_soon_threadsafe(self._loop.stop)
@@ -187,6 +198,7 @@ class LiveServer:
 
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
+        log_rarely(self._loop)
         application = Application(
             [
                 (r'/view', _View, {'server': self}),
@@ -199,14 +211,14 @@ class LiveServer:
             default_handler_args={'server': self},
             log_function=lambda handler: None,
         )
-        server = HTTPServer(
+        server = self._connections = BoundedServer(
             application,
             ssl_options=self._tls,
             max_body_size=LARGEST_BODY,
             max_buffer_size=16 * LARGEST_BODY,
             max_header_size=8 * LARGEST_BODY,
-            idle_connection_timeout=30.0,
-            body_timeout=5.0,
+            idle_connection_timeout=IDLE_S,
+            body_timeout=REQUEST_S,
         )
         server.add_socket(self._socket)
         try:
@@ -224,6 +236,9 @@ class _Handler(RequestHandler):
 
     def initialize(self, server: LiveServer) -> None:
         self._server = server
+
+    def on_finish(self) -> None:
+        self._server.answered(self.request)
 
     def set_default_headers(self) -> None:
         self.clear_header('Server')
@@ -283,6 +298,7 @@ class _WithToken(_Handler):
         wanted = f'Bearer {self._server.token}'
         if len(given) != 1 or not hmac.compare_digest(given[0].encode(), wanted.encode()):
             raise HTTPError(401, reason='open the page by the address that remaster watch gives')
+        self._server.believe(self.request)
 
 
 class _View(_WithToken):
