@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from remaster_ros.collection.frame_mean import are_too_many, of_the_marker
 from remaster_ros.kinematics.transforms import mean_quaternion_xyzw
 from remaster_ros.types import FloatArray, MarkerReading
 
@@ -66,6 +67,8 @@ class PairedReading:
         Samples in the mean.
     orientation
         Of the measured body, mean as x, y, z, w, (4,); None where no sample has one.
+    dropped
+        Frames of the dwell that are not in the mean: too far from the others (`frame_mean`).
     """
 
     sensor: str
@@ -76,6 +79,7 @@ class PairedReading:
     std: FloatArray | None = None
     samples: int = 1
     orientation: FloatArray | None = None
+    dropped: int = 0
 
 
 @dataclass(frozen=True)
@@ -86,8 +90,8 @@ class Rejection:
     ----------
     reason
         A name to count by: ``moving``, ``unseen``, ``clock``, ``stale``, ``too_few``,
-        ``unsteady``, ``frozen``, ``swapped``, ``device``, ``absent`` or ``not_waited``; of a
-        single marker also ``hidden``.
+        ``unsteady``, ``scattered``, ``frozen``, ``swapped``, ``device``, ``absent`` or
+        ``not_waited``; of a single marker also ``hidden``.
     detail
         One line with the numbers.
     """
@@ -379,8 +383,18 @@ class Pairing:
         inside = q[stamps <= end]
         q_mean = inside.mean(axis=0) if len(inside) else q[0]
         positions = np.array([reading.position for reading in used]).reshape(-1, 3)
-        std = None
+        std, dropped = None, 0
         if not rules.single_shot:
+            kept = of_the_marker(positions)
+            dropped = int(np.sum(~kept))
+            if are_too_many(dropped, len(used)) or len(used) - dropped < rules.min_samples:
+                detail = (
+                    f'{dropped} of {len(used)} frames are far from the others: damaged on their '
+                    'way, or another marker in between?'
+                )
+                return Rejection(rules.sensor, 'scattered', detail)
+            used = [reading for reading, keep in zip(used, kept, strict=True) if keep]
+            positions = positions[kept]
             std = positions.std(axis=0, ddof=1) if len(used) > 1 else np.zeros(3)
             if not np.all(std <= rules.max_std_m):
                 detail = f'std {1e3 * std.max():.3f} mm (allowed {1e3 * rules.max_std_m:.3f} mm)'
@@ -391,7 +405,7 @@ class Pairing:
         turns = [reading.orientation for reading in used if reading.orientation is not None]
         turn = mean_quaternion_xyzw(turns) if turns else None
         mean, count = positions.mean(axis=0), len(used)
-        return PairedReading(rules.sensor, marker, end, q_mean, mean, std, count, turn)
+        return PairedReading(rules.sensor, marker, end, q_mean, mean, std, count, turn, dropped)
 
 
 def _seen(readings: list[MarkerReading]) -> list[MarkerReading]:

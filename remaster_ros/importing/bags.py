@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from remaster_ros.collection.frame_mean import are_too_many, of_the_marker
 from remaster_ros.collection.pairing import SensorRules
 from remaster_ros.errors import InputError
 from remaster_ros.importing.rows import RawRows
@@ -184,7 +185,7 @@ class _Rows:
     def __init__(self, unit: float) -> None:
         self._unit = unit
         self._rows: list[tuple[str, float, FloatArray, FloatArray, FloatArray, int]] = []
-        self._unsteady = 0
+        self._unsteady = self._dropped = 0
         self._arrays: dict[str, tuple[FloatArray, FloatArray]] = {}
 
     def add(self, topic: str, stream: _Stream, start: float, end: float, q: FloatArray) -> None:
@@ -199,6 +200,13 @@ class _Rows:
             return
         std = np.full(3, np.nan)
         if len(points) >= FEWEST_SAMPLES:
+            kept = of_the_marker(points)
+            dropped = len(points) - int(kept.sum())
+            if are_too_many(dropped, len(points)):
+                self._unsteady += 1
+                return
+            points = points[kept]
+            self._dropped += dropped
             std = points.std(axis=0, ddof=1)
             if std.max() > SensorRules('', '').max_std_m:
                 self._unsteady += 1
@@ -239,6 +247,7 @@ class _Rows:
         }
         columns |= {topic: 'not used' for topic in seen if topic not in columns}
         unsteady = f'{self._unsteady} standstills with a marker that was not still were left out'
+        dropped = f'{self._dropped} points far from all others of their standstill were left out'
         return RawRows(
             where=tuple(f'{path}, {end:.3f} s' for end in ends),
             joint_columns=chain.joint_names,
@@ -255,5 +264,8 @@ class _Rows:
                 f'{path}: {len(set(ends))} standstills with points; means of the points from '
                 f'{SWING_S:g} s after the joints stood still',
             ),
-            warnings=(unsteady,) if self._unsteady else (),
+            warnings=(
+                *((unsteady,) if self._unsteady else ()),
+                *((dropped,) if self._dropped else ()),
+            ),
         )

@@ -250,6 +250,9 @@ class Recorder(RemasterNode):
             self._waited_s[name] += waited_s
         refused = (*ended.rejected, *ended.left_out)
         self.counts.update(f'{item.sensor}_{item.reason}' for item in refused)
+        for item in ended.accepted:
+            if item.dropped:
+                self.counts[f'{item.sensor}_frames_dropped'] += item.dropped
         self.counts.update(f'{name}_accepted' for name in {item.sensor for item in ended.accepted})
         self.keeper.write(partial(self._write_down, ended))
 

@@ -190,6 +190,8 @@ class MarkerGate:
         self._last_number: int | None = None
         self._last_timestamp = -math.inf
         self._last_reading: MarkerSample | None = None
+        # Whether the stream has begun again since that reading.
+        self._restarted = False
         self._repeats = 0
         self.forget_assets()
 
@@ -268,7 +270,7 @@ class MarkerGate:
             self.counts.dropped[found] += 1
             self.counts.last_reason = found
             return None
-        self._last_reading = reading
+        self._last_reading, self._restarted = reading, False
         self.counts.accepted += 1
         self.counts.last_reason = None
         return reading
@@ -290,7 +292,7 @@ class MarkerGate:
             if not -REORDER_WINDOW <= step <= MOST_LOST or back_s > RESTART_S:
                 self.counts.restarts += 1
                 self._last_timestamp = -math.inf
-                self._last_reading = None
+                self._restarted = True
             elif step == 0:
                 return Dropped.DUPLICATE
             elif step < 0:
@@ -328,7 +330,14 @@ class MarkerGate:
         if last is None:
             return None
         moved = float(np.linalg.norm(reading.position - last.position))
+        # A damaged frame number looks like a restart, which takes the marker nowhere: across one,
+        # where two times have nothing in common, that of arrival counts.
         elapsed = reading.timestamp_s - last.timestamp_s
+        if self._restarted:
+            elapsed = reading.received_s - last.received_s
+            if elapsed < 0.0:
+                # This clock was set back, too.
+                return None
         if moved > JUMP_MARGIN_M + self._choice.max_speed_m_s * elapsed:
             return Dropped.JUMP
         return None

@@ -25,7 +25,7 @@ def frame(number, *markers, **fields):
 
 def gate_for(**choice):
     gate = MarkerGate(MarkerChoice(**({'marker_id': MARKER_ID} | choice)), GateCounts())
-    return gate, lambda f: gate.admit(f, 50.0, 10_000_000)
+    return gate, lambda f, received_s=50.0: gate.admit(f, received_s, 10_000_000)
 
 
 def test_a_measured_marker_is_a_reading():
@@ -102,10 +102,24 @@ def test_lost_frames_are_counted_and_a_restarted_stream_is_followed():
     for number in (100, 101, 105):
         assert admit(frame(number, marker())) is not None
     assert gate.counts.lost == 3
-    assert admit(frame(1, marker(x=0.9))) is not None, 'frame numbers began again'
-    assert admit(frame(2, marker(x=0.9), timestamp=5.0)) is not None
-    assert admit(frame(3, marker(x=0.1), timestamp=0.0)) is not None, 'the time began again'
+    assert admit(frame(1, marker(x=0.9)), 51.0) is not None, 'frame numbers began again'
+    assert admit(frame(2, marker(x=0.9), timestamp=5.0), 51.01) is not None
+    assert admit(frame(3, marker(x=0.1), timestamp=0.0), 52.0) is not None, 'the time began again'
     assert (gate.counts.restarts, gate.counts.lost) == (2, 3)
+
+
+def test_a_damaged_number_does_not_carry_the_marker_away():
+    """It looks like a restart, across which the marker was taken to be anywhere."""
+    gate, admit = gate_for()
+    for number in range(500, 510):
+        assert admit(frame(number, marker(x=0.5 + 1e-6 * number)), 0.01 * number) is not None
+    # The frame that is damaged, and the next one, which goes on where the stream was.
+    assert admit(frame(7, marker(x=48.0)), 5.0905) is None
+    assert gate.counts.last_reason == Dropped.JUMP
+    assert admit(frame(510, marker(x=0.5002)), 5.10) is not None
+    assert admit(frame(511, marker(x=0.5)), 5.11) is not None
+    # A clock of this host that was set back tells nothing of how long ago the last reading was.
+    assert admit(frame(1, marker(x=0.9)), -1000.0) is not None
 
 
 def test_a_first_reading_that_cannot_be_keeps_no_later_one_out():
