@@ -37,6 +37,38 @@ class InsufficientDataError(RemasterError):
     """The data do not allow an answer; the message has the reason, and what to measure."""
 
 
+class MisfitError(InsufficientDataError):
+    """The data are not those of this robot, as the session describes it.
+
+    Parameters
+    ----------
+    what
+        What does not fit.
+    remedy
+        What to check, where no mistake was found that explains it.
+    """
+
+    def __init__(self, what: str, remedy: str) -> None:
+        super().__init__(f'{what}; {remedy}')
+        self.what, self.remedy = what, remedy
+
+
+class MistakeFoundError(InsufficientDataError):
+    """A misfit that a mistake in the session's tables explains.
+
+    Parameters
+    ----------
+    sentence
+        What does not fit, and what mends it.
+    options
+        Of ``remaster import SESSION``, which mends it; '' where the data cannot tell which.
+    """
+
+    def __init__(self, sentence: str, options: str) -> None:
+        super().__init__(sentence)
+        self.options = options
+
+
 class DeviceError(RemasterError):
     """A device does not answer, or answers what it must not; names the device and the remedy."""
 

@@ -1,40 +1,54 @@
-"""Are a table's joints those of the robot? Signs, order, zero positions and units, tried on data.
+"""Are a session's tables as the robot has it? Signs, order, zeros, units and rows, tried on data.
 
 Tables of others have a joint that counts the other way round, columns in another order, a zero
-position 90 degrees off, other units. Every such arrangement is tried in closed form: with any 3×3
-matrix G in the place of the sensor's rotation and scale (as in `initial_guess`),
+position 90 degrees off, other units, points beside the joints of another row. Every such
+arrangement is tried in closed form: with any 3×3 matrix G in the place of the sensor's rotation
+and scale (as in `initial_guess`),
 
     T_R_T(q) · marker = G p + t
 
-is linear in marker, G and t. What comes nearest is fitted as any session is.
+is linear in marker, G and t. What comes nearest is fitted as any session is. What is otherwise
+from a row on, or of the tool, is tried in `mistakes`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain as chain_of
 from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.initial_guess import MEDIAN_CHI3, closest_start, robust_spread
+from remaster_ros.calibration.outliers import LARGEST_SHARE
 from remaster_ros.errors import InsufficientDataError
-from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.types import FloatArray, Session
+from remaster_ros.kinematics.serial_chain import LIMIT_TOLERANCE_RAD, SerialChain
+from remaster_ros.kinematics.transforms import rotation_vector_to_matrix
+from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements, Session
 
 # Fewer rows fit to one of so many arrangements by chance: each point has 3 coordinates, the linear
 # problem 15 unknowns.
 FEWEST_ROWS = 12
-# Rows that are tried at most, evenly spread.
+# Rows that are tried at most, evenly spread; in the linear problem, of 15 unknowns, fewer do.
 MOST_ROWS = 200
+_MOST_LINEAR = 40
+# The fit leaves out so many gross rows; of the others, a tenth of three-dimensional Gaussian
+# errors is longer than so many standard deviations.
+_MOST = 1.0 - LARGEST_SHARE
+_MOST_CHI3 = 2.5003
 # A fit is gross from this distance on: an uncalibrated robot's own offsets leave less.
 GROSS_M = 5e-3
 # And from such a zero-offset on: a robot that is mastered at all has less.
 GROSS_OFFSET_RAD = np.deg2rad(5.0)
 # An arrangement is proposed if it fits so many times as well.
 CONVINCING = 5.0
+# Those whose errors are less than so many times those of the closest fit as well: the offsets that
+# an arm has leave some of any two the larger error.
+ALIKE = 2.0
 # So many of the best linear ones are fitted, those whose error is no larger share of the points'
 # extent: zero-offsets of some degrees leave less.
 _FITTED = 6
@@ -42,6 +56,11 @@ _LARGEST_LINEAR = 0.15
 # Frames of so many rows at a time, to bound the memory.
 _BATCH_FRAMES = 20_000
 _QUARTER = np.pi / 2.0
+# What belongs to the joints of a row and not to its point.
+_OF_JOINTS = (
+    *('pose', 'configuration', 'is_validation', 'is_reference'),
+    *('q', 'from_q', 'effort'),
+)
 # Of angles that are degrees taken for radians, and the other way round.
 _SCALES = (1.0, np.pi / 180.0, 180.0 / np.pi)
 
@@ -68,7 +87,17 @@ class Arrangement:
     length_scale
         What the points are multiplied by.
     shift
-        A row's point belongs to the joints so many rows before.
+        A row's point belongs to the joints so many rows before, of those with its sensor and
+        marker.
+    exchanged
+        Indices of two markers whose labels are exchanged; () where none are.
+    since, until
+        Observations between which rows are shifted or labels exchanged, the latter excluded; None
+        where from the first, or to the last.
+    turned
+        Axis and quarters of a turn by which the markers' places are turned in the tool frame.
+    tip_link
+        Tool frame; '' where as given.
     """
 
     order: tuple[int, ...]
@@ -79,6 +108,11 @@ class Arrangement:
     mirrored: bool = False
     length_scale: float = 1.0
     shift: int = 0
+    exchanged: tuple[int, ...] = ()
+    since: int | None = None
+    until: int | None = None
+    turned: tuple[int, int] = (0, 0)
+    tip_link: str = ''
 
     @classmethod
     def given(cls, joints: int) -> Arrangement:
@@ -88,7 +122,8 @@ class Arrangement:
     @property
     def changes(self) -> int:
         """How many things are other than given."""
-        moved = sum(column != joint for joint, column in enumerate(self.order))
+        # Two that are exchanged are one thing, and so are all of them tip to base.
+        moved = sum(column != joint for joint, column in enumerate(self.order)) // 2
         return (
             moved
             + sum(sign < 0 for sign in self.signs)
@@ -99,6 +134,12 @@ class Arrangement:
             + 2 * self.mirrored
             + (self.length_scale != 1.0)
             + abs(self.shift)
+            + bool(self.exchanged)
+            + (self.since is not None)
+            + (self.until is not None)
+            # Rarer than another link.
+            + 2 * (self.turned[1] != 0)
+            + bool(self.tip_link)
         )
 
     def joints(self, columns: FloatArray) -> FloatArray:
@@ -123,6 +164,9 @@ class Fitted:
         The arrangement.
     error_m
         Median distance of the points from the fit, m.
+    most_error_m
+        The distance that nine of ten points keep within, as a median of Gaussian errors, m: larger
+        than the median where a part of the points is off.
     joint_offsets
         rad, (k,); the outer two are 0.
     marker_shift_m
@@ -133,26 +177,99 @@ class Fitted:
     error_m: float
     joint_offsets: FloatArray
     marker_shift_m: float
+    most_error_m: float
 
     @property
     def gross(self) -> bool:
         """Whether the table is hardly that of this robot."""
         turned = np.abs(self.joint_offsets) > GROSS_OFFSET_RAD
-        return bool(self.error_m > GROSS_M or turned.any())
+        return bool(self.left_m > GROSS_M or turned.any())
+
+    @property
+    def left_m(self) -> float:
+        """What the fit leaves, also where it leaves it in a part of the points alone, m."""
+        return max(self.error_m, self.most_error_m)
 
 
 def arranged(session: Session, arrangement: Arrangement) -> Session:
-    """Return a session with its joints and points rearranged."""
+    """Return a session with its joints, points, labels and tool rearranged."""
     m = session.measurements
-    q = arrangement.joints(m.q)
-    points = arrangement.points(m.position)
-    keep = slice(max(0, arrangement.shift), len(m) + min(0, arrangement.shift))
-    came = slice(max(0, -arrangement.shift), len(m) + min(0, -arrangement.shift))
-    rows = np.arange(len(m))[keep]
+    moved = replace(
+        m,
+        q=arrangement.joints(m.q),
+        from_q=arrangement.joints(m.from_q),
+        effort=None
+        if m.effort is None
+        else m.effort[:, list(arrangement.order)] * np.array(arrangement.signs),
+        position=arrangement.points(m.position),
+    )
+    concerned = between(m, arrangement.since, arrangement.until)
+    if arrangement.exchanged:
+        a, b = arrangement.exchanged
+        moved = exchanged(moved, a, b, concerned)
+    if arrangement.shift:
+        moved = shifted(moved, arrangement.shift, concerned)
+    R = rotation_vector_to_matrix(
+        _QUARTER * arrangement.turned[1] * np.eye(3)[arrangement.turned[0]]
+    )
     return replace(
         session,
-        measurements=replace(m.select(rows), q=q[came], position=points[keep]),
+        measurements=moved,
+        markers={name: R @ place for name, place in session.markers.items()},
+        tip_link=arrangement.tip_link or session.tip_link,
+        observations_sha256='',
     )
+
+
+def between(m: Measurements, since: int | None, until: int | None) -> BoolArray:
+    """Return which rows stand from one observation on and before another, (n,)."""
+    row = np.arange(len(m))
+    first = 0 if since is None else _row_of(m, since)
+    last = len(m) if until is None else _row_of(m, until)
+    return (row >= first) & (row < last)
+
+
+def _row_of(m: Measurements, observation: int) -> int:
+    found = np.flatnonzero(m.observation == observation)
+    return int(found[0]) if len(found) else len(m)
+
+
+def exchanged(m: Measurements, a: int, b: int, concerned: BoolArray) -> Measurements:
+    """Return the measurements with the labels of two markers exchanged in the rows concerned."""
+    marker = m.marker.copy()
+    marker[concerned & (m.marker == a)] = b
+    marker[concerned & (m.marker == b)] = a
+    return replace(m, marker=marker)
+
+
+def shifted(m: Measurements, shift: int, concerned: BoolArray) -> Measurements:
+    """Return the measurements with each point beside the joints so many rows before its own.
+
+    The rows of each sensor and marker are moved among themselves; those without joints are left
+    out.
+    """
+    of, kept = came_from(m, shift, concerned)
+    joints: dict[str, Any] = {
+        name: None if (column := getattr(m, name)) is None else column[of] for name in _OF_JOINTS
+    }
+    return replace(m, **joints).select(kept)
+
+
+def came_from(m: Measurements, shift: int, concerned: BoolArray) -> tuple[IntArray, BoolArray]:
+    """Return the row whose joints belong to each point, (n,), and which points have one, (n,)."""
+    of, kept = np.arange(len(m)), np.ones(len(m), bool)
+    for rows in streams(m):
+        mine = rows[concerned[rows]]
+        of[mine] = np.roll(mine, shift)
+        kept[mine[:shift] if shift > 0 else mine[shift:]] = False
+    return of, kept
+
+
+def streams(m: Measurements) -> Iterator[IntArray]:
+    """Give the rows of each sensor and marker, in their order."""
+    _, which = np.unique(np.stack((m.sensor, m.marker)), axis=1, return_inverse=True)
+    for index in np.unique(which):
+        yield np.flatnonzero(which.ravel() == index)
 
 
 def some_rows(session: Session) -> Session:
@@ -171,7 +288,7 @@ def fit_arrangement(session: Session, arrangement: Arrangement) -> Fitted:
     InsufficientDataError
         Too few rows or poses to register a sensor.
     """
-    problem = Problem.of(arranged(session, arrangement))
+    problem = Problem.of(some_rows(arranged(session, arrangement)))
     model = problem.empty_model()
     start, z = closest_start(
         model,
@@ -182,13 +299,18 @@ def fit_arrangement(session: Session, arrangement: Arrangement) -> Fitted:
         problem.marker_priors(model),
     )
     rows = Rows.of(problem.measurements, problem.fitted, start.reference)
-    spread = robust_spread(rows.target - start.predict(z, rows), rows)
+    errors = rows.target - start.predict(z, rows)
+    spread = robust_spread(errors, rows)
+    most = max(
+        float(np.quantile(np.linalg.norm(errors[span], axis=1), _MOST)) for _, span in rows.spans
+    )
     shift = np.linalg.norm(start.markers(z) - problem.markers, axis=1)
     return Fitted(
         arrangement,
         MEDIAN_CHI3 * float(spread.max()),
         start.offsets(z),
         float(shift.max()),
+        most * MEDIAN_CHI3 / _MOST_CHI3,
     )
 
 
@@ -207,10 +329,8 @@ def linear_errors(
         Signed: metres of the robot for one of the points, negative where G mirrors them.
     """
     m = session.measurements
-    _, which, count = np.unique(
-        np.stack((m.sensor, m.marker)), axis=1, return_inverse=True, return_counts=True
-    )
-    rows = np.flatnonzero(which.ravel() == np.argmax(count))
+    rows = max(streams(m), key=len)
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _MOST_LINEAR)).astype(np.int64)]
     q, points = m.q[rows], m.position[rows]
     n = len(rows)
     centred = points - points.mean(axis=0)
@@ -221,7 +341,7 @@ def linear_errors(
     step = max(1, _BATCH_FRAMES // n)
     for first in range(0, len(arrangements), step):
         part = arrangements[first : first + step]
-        tools = chain.forward(np.array([np.roll(a.joints(q), a.shift, axis=0) for a in part]))
+        tools = chain.forward(np.array([a.joints(q) for a in part]))
         flat = tools[..., :3, :].reshape(len(part), n, 12)
         left = (flat - base @ (base.T @ flat)).reshape(len(part), n, 3, 4)
         design = left[..., :3].reshape(len(part), 3 * n, 3)
@@ -250,13 +370,13 @@ def search(session: Session, given: Fitted, lengths: Sequence[float] = ()) -> li
     Several of them can fit equally well: an arm with a plane of symmetry, mirrored, is the same
     arm with some joints reversed.
 
-    Simpler changes come first: units and signs, then the order, then zero positions by quarters of
-    a turn, then joint 3 coupled to joint 2, then rows shifted by one; all of them with any signs.
+    Tried are units, the order, zero positions by quarters of a turn, joint 3 coupled to joint 2,
+    and rows shifted by one, all of them with any signs.
 
     Parameters
     ----------
     session
-        From `some_rows`.
+        With its markers open: one that is firm at a wrong place would bend the fit.
     given
         The fit of the table as it is.
     lengths
@@ -264,47 +384,96 @@ def search(session: Session, given: Fitted, lengths: Sequence[float] = ()) -> li
     """
     if len(session.measurements) < FEWEST_ROWS:
         return []
-    if given.error_m <= GROSS_M:
-        # The fit itself found the zero positions.
-        turns = np.round(given.joint_offsets / _QUARTER).astype(int).tolist()
-        fit = fit_arrangement(session, replace(given.arrangement, quarters=tuple(turns)))
-        return [] if fit.gross else [fit]
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
-    for candidates in _stages(len(chain)):
-        errors, scales = linear_errors(chain, session, candidates)
-        found = []
-        for i in np.argsort(errors, kind='stable')[:_FITTED]:
+    if given.left_m <= GROSS_M:
+        turns = np.round(given.joint_offsets / _QUARTER).astype(int)
+        if not np.any(turns % 4):
+            return []
+        # The fit itself found the zero positions. Where they are outside the limits it is another
+        # mistake: a shoulder that counts the other way is one with its neighbours turned round.
+        found_zeros = replace(given.arrangement, quarters=tuple(turns.tolist()))
+        candidates: Iterable[Arrangement] = chain_of(
+            [found_zeros], _nearest(chain, session, lengths)
+        )
+    else:
+        candidates = _nearest(chain, session, lengths)
+    found, seen = [], {given.arrangement}
+    for candidate in candidates:
+        arrangement = within_limits(candidate, chain, session.measurements.q)
+        if arrangement is None or arrangement in seen:
+            continue
+        seen.add(arrangement)
+        try:
+            fit = fit_arrangement(session, arrangement)
+        except (InsufficientDataError, np.linalg.LinAlgError):
+            continue
+        if not fit.gross and (given.left_m <= GROSS_M or fit.left_m * CONVINCING < given.left_m):
+            found.append(fit)
+    return closest(found)
+
+
+def closest(found: Sequence[Fitted]) -> list[Fitted]:
+    """Return the fits that are about as close as the closest, the simplest first."""
+    best = min((fit.left_m for fit in found), default=0.0)
+    alike = [fit for fit in found if fit.left_m < ALIKE * best]
+    return sorted(alike, key=lambda fit: (fit.arrangement.changes, fit.left_m))
+
+
+def within_limits(
+    arrangement: Arrangement, chain: SerialChain, columns: FloatArray
+) -> Arrangement | None:
+    """Return the arrangement, whole turns added, with which all angles keep the joints' limits.
+
+    None where there is none: what was measured on this arm, and a reader takes, keeps them.
+    """
+    q = arrangement.joints(columns)
+    low, high = q.min(axis=0) + LIMIT_TOLERANCE_RAD, q.max(axis=0) - LIMIT_TOLERANCE_RAD
+    quarters = list(arrangement.quarters)
+    for joint, turn in enumerate(quarters):
+        whole = [
+            turns
+            for turns in ((0, -4, 4) if turn else (0,))
+            if low[joint] + turns * _QUARTER >= chain.lower[joint]
+            and high[joint] + turns * _QUARTER <= chain.upper[joint]
+        ]
+        if not whole:
+            return None
+        quarters[joint] += whole[0]
+    return replace(arrangement, quarters=tuple(quarters))
+
+
+def _nearest(
+    chain: SerialChain, session: Session, lengths: Sequence[float]
+) -> Iterator[Arrangement]:
+    """Give the arrangements of each kind that come nearest in the linear problem."""
+    everywhere = np.ones(len(session.measurements), bool)
+    for shift, candidates in _stages(len(chain)):
+        m = session.measurements
+        moved = replace(session, measurements=shifted(m, shift, everywhere) if shift else m)
+        errors, scales = linear_errors(chain, some_rows(moved), candidates)
+        # Of an arm with symmetries several are the same to the last digits: the simplest first.
+        changes = [candidate.changes for candidate in candidates]
+        for i in np.lexsort((changes, [float(f'{error:.3g}') for error in errors]))[:_FITTED]:
             if errors[i] > _LARGEST_LINEAR:
                 break
             scale = min((1.0, *lengths), key=lambda length: abs(np.log(length / abs(scales[i]))))
-            arrangement = replace(
-                candidates[i], mirrored=bool(scales[i] < 0.0), length_scale=scale
-            )
-            for tried in {arrangement, replace(arrangement, mirrored=False)}:
-                try:
-                    fit = fit_arrangement(session, tried)
-                except (InsufficientDataError, np.linalg.LinAlgError):
-                    continue
-                if not fit.gross and fit.error_m * CONVINCING < given.error_m:
-                    found.append(fit)
-        if found:
-            closest = min(fit.error_m for fit in found)
-            alike = [fit for fit in found if fit.error_m < 2.0 * closest]
-            return sorted(alike, key=lambda fit: (fit.arrangement.changes, fit.error_m))
-    return []
+            plain = replace(candidates[i], length_scale=scale, shift=shift)
+            yield plain
+            if scales[i] < 0.0:
+                yield replace(plain, mirrored=True)
 
 
-def _stages(joints: int) -> Iterator[list[Arrangement]]:
+def _stages(joints: int) -> Iterator[tuple[int, list[Arrangement]]]:
+    """Give the kinds of arrangements, each with any signs, and by how much rows are shifted."""
     plain = Arrangement.given(joints)
     signs = list(product((1, -1), repeat=joints))
-    yield [replace(plain, signs=some, angle_scale=scale) for scale in _SCALES for some in signs]
-    yield [replace(plain, order=order, signs=some) for order in _orders(joints) for some in signs]
-    yield [
-        replace(plain, signs=some, quarters=turns) for turns in _turns(joints) for some in signs
-    ]
+    yield 0, [replace(plain, signs=some, angle_scale=by) for by in _SCALES for some in signs]
+    yield 0, [replace(plain, order=way, signs=some) for way in _orders(joints) for some in signs]
+    yield 0, [replace(plain, signs=some, quarters=by) for by in _turns(joints) for some in signs]
     if joints > 2:
-        yield [replace(plain, signs=some, coupled=share) for share in (1, -1) for some in signs]
-    yield [replace(plain, signs=some, shift=shift) for shift in (-1, 1) for some in signs]
+        yield 0, [replace(plain, signs=some, coupled=share) for share in (1, -1) for some in signs]
+    for shift in (-1, 1):
+        yield shift, [replace(plain, signs=some) for some in signs]
 
 
 def _orders(joints: int) -> Iterable[tuple[int, ...]]:

@@ -25,7 +25,7 @@ from remaster_ros.calibration.priors import (
     offset_prior,
     plausible_offsets,
 )
-from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.errors import InputError, InsufficientDataError, MisfitError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.linear_algebra import one_thread
 from remaster_ros.types import (
@@ -233,7 +233,9 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
     Raises
     ------
     InsufficientDataError
-        Where the data do not determine the parameters, or disagree with the model altogether.
+        Where the data do not determine the parameters.
+    MisfitError
+        Where they disagree with the model altogether.
     """
     measurements = problem.measurements
     empty = problem.empty_model(extension)
@@ -273,8 +275,9 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
     errors = rows.target - model.predict(z, rows)
     try:
         judgement = find_outliers(rows, refit, errors, model.sensor_names)
-    except InsufficientDataError as error:
-        raise InsufficientDataError(f'{error}{_moved(problem, rows, errors)}') from None
+    except MisfitError as error:
+        remedy = f'{error.remedy}{_moved(problem, rows, errors)}'
+        raise MisfitError(error.what, remedy) from None
     _require_information(int(np.sum(~judgement.gross)), free, model)
     mode = with_directions(fitted(~judgement.gross))
     gauge = _judged_at(mode, gauge, known)

@@ -9,9 +9,10 @@ import numpy as np
 
 from remaster_ros.calibration.accuracy import accuracy_of
 from remaster_ros.calibration.comparison import predicted_rows
-from remaster_ros.calibration.estimate import Estimate, Problem, estimate, hold_offsets
+from remaster_ros.calibration.estimate import Estimate, Problem, hold_offsets
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.linearisation import linearise
+from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.calibration.orientation_accuracy import tool_orientations
 from remaster_ros.calibration.predictive_accuracy import Predictive
 from remaster_ros.errors import InputError
@@ -83,7 +84,7 @@ def accuracy_with_offsets(
             raise InputError(
                 f'{np.size(values)} zero-offsets for a robot of {len(problem.chain)} joints'
             )
-    found = estimate(problem)
+    found = sound_estimate(session)
     model = found.model
     given = hold_offsets(found.mode, np.asarray(joint_offsets, dtype=float))
     predicted_before = predicted_rows(problem, model, found.before.z)

@@ -11,6 +11,7 @@ import numpy as np
 from remaster_ros.calibration.convergence import MINIMUM_DRAWS
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.extension import Extension
+from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.calibration.paper import BURN_IN_SHARE, STEPS, fit_paper
 from remaster_ros.calibration.result import FitResult, Sampled, build_result, sampled_columns
 from remaster_ros.calibration.sampling import PRECISION, Progress, sample_posterior, silent
@@ -77,7 +78,8 @@ def fit_session(
     InputError
         A session that does not fit its robot, or arguments out of range.
     InsufficientDataError
-        Data that do not allow an answer.
+        Data that do not allow an answer; where they do without a mistake in the session's tables,
+        a `MistakeFoundError` names it.
     """
     for what, given in (('further effects', extension), ('priors on its parameters', priors)):
         if sampler == 'paper' and given is not None:
@@ -104,7 +106,9 @@ def fit_session(
             progress=lambda share: report('sampling', share),
         )
     else:
-        sampled = _fast(estimate(problem, extension), chains, draws, precision, rng, report)
+        # With further effects the same model has been fitted to the same rows before.
+        found = estimate(problem, extension) if extension else sound_estimate(session, priors)
+        sampled = _fast(found, chains, draws, precision, rng, report)
         if unmodelled is not None:
             sampled = replace(sampled, unmodelled=unmodelled)
     seconds = clock() - started if clock is not None else np.nan

@@ -17,7 +17,7 @@ from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.noise import RESOLUTION_M
 from remaster_ros.calibration.priors import TIGHTEST_PRIOR, Prior, prior_rows
 from remaster_ros.calibration.registration import register_points
-from remaster_ros.errors import InsufficientDataError
+from remaster_ros.errors import InsufficientDataError, MisfitError
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
@@ -67,7 +67,9 @@ def robust_start(
     Raises
     ------
     InsufficientDataError
-        When the points of a sensor do not fix a registration, or are not those of this robot.
+        When the points of a sensor do not fix a registration.
+    MisfitError
+        When they are not those of this robot.
     """
     everything, rows = rows, _some_rows(measurements, rows)
     start, z = closest_start(model, measurements, rows, nominal_markers, marker_std_m, priors)
@@ -163,10 +165,11 @@ def _require_right_hand(model: Model, rows: Rows, predicted: FloatArray) -> None
         proper, mirrored = np.sqrt(np.maximum(squares, 0.0) / len(here))
         extent = np.sqrt(np.mean(np.sum(there**2, axis=1)))
         if proper > LEAST_MIRRORED * extent and mirrored < MIRRORED * proper:
-            raise InsufficientDataError(
+            raise MisfitError(
                 f"sensor '{model.sensor_names[sensor]}': its points are mirrored: they agree with "
                 f'the robot within {mirrored * 1e3:.1f} mm with one axis turned round, and within '
-                f'{proper * 1e3:.1f} mm as they are; give x, y, z of a right-handed frame'
+                f'{proper * 1e3:.1f} mm as they are',
+                'give x, y, z of a right-handed frame',
             )
 
 
@@ -182,9 +185,10 @@ def _require_likeness(model: Model, rows: Rows, errors: FloatArray) -> None:
                 if model.extension is None
                 else 'the sizes found for its further effects do not hold; fit without them'
             )
-            raise InsufficientDataError(
+            raise MisfitError(
                 f"sensor '{model.sensor_names[sensor]}': the robot model leaves errors of "
-                f'{error * 1e3:.0f} mm in points {extent * 1e3:.0f} mm apart; {remedy}'
+                f'{error * 1e3:.0f} mm in points {extent * 1e3:.0f} mm apart',
+                remedy,
             )
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.noise import RESOLUTION_M
-from remaster_ros.errors import InsufficientDataError
+from remaster_ros.errors import MisfitError
 from remaster_ros.types import BoolArray, FloatArray
 
 # A row is left out from this probability on.
@@ -80,7 +80,7 @@ def find_outliers(
 
     Raises
     ------
-    InsufficientDataError
+    MisfitError
         When more than a tenth of a sensor's rows would be left out, or too many are gross to
         identify them.
     """
@@ -222,10 +222,11 @@ def _require_majority(rows: Rows, errors: FloatArray, sensor_names: Sequence[str
             continue
         half, most = np.quantile(np.linalg.norm(errors[span], axis=1), _QUANTILES)
         if most / _EXPECTED[1] > TAIL_LIMIT * (half / _EXPECTED[0] + RESOLUTION_M):
-            raise InsufficientDataError(
+            raise MisfitError(
                 f"sensor '{sensor_names[sensor]}': half of the observations agree within "
                 f'{_mm(half)} mm, but a fifth is off by more than {_mm(most)} mm: too many gross '
-                'errors to name them; look for mixed-up markers or a sensor that was moved'
+                'errors to name them',
+                'look for mixed-up markers or a sensor that was moved',
             )
 
 
@@ -233,9 +234,10 @@ def _guard(rows: Rows, gross: BoolArray, sensor_names: Sequence[str]) -> None:
     for sensor, span in rows.spans:
         out, of = int(gross[span].sum()), span.stop - span.start
         if out > max(1.0, LARGEST_SHARE * of):
-            raise InsufficientDataError(
+            raise MisfitError(
                 f"sensor '{sensor_names[sensor]}': {out} of {of} observations are gross errors, "
-                'too many to leave out; look for mixed-up markers or a sensor that was moved'
+                'too many to leave out',
+                'look for mixed-up markers or a sensor that was moved',
             )
 
 

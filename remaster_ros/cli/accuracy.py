@@ -13,10 +13,10 @@ import numpy as np
 from remaster_ros.calibration.evaluate_offsets import OffsetsJudgement, accuracy_with_offsets
 from remaster_ros.calibration.orientation_accuracy import METRICS as ORIENTATION
 from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.cli.sessions import read_to_fit
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit, require_own
 from remaster_ros.session.files import make_folder, write_atomically
-from remaster_ros.session.reader import read_session
 from remaster_ros.types import Session
 from remaster_ros.version import __version__
 
@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Judge the offsets, print a table, write JSON with --out."""
-    session = read_session(args.session)
+    session = read_to_fit(args.session)
     fit = read_fit(args.offsets)
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     offsets, std = joint_offsets_rad(fit, chain.joint_names)

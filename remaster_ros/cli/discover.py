@@ -11,6 +11,7 @@ import numpy as np
 
 from remaster_ros.calibration.predictions import Coverage
 from remaster_ros.cli.console import progress_bar, show, show_file
+from remaster_ros.cli.sessions import read_to_fit
 from remaster_ros.discovery.confirmation import (
     Confirmation,
     confirm,
@@ -62,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Search, extend, measure the gain, write, and print a summary of a few lines."""
-    session = read_session(args.session)
+    session = read_to_fit(args.session)
     other = None if args.confirm is None else read_session(args.confirm)
     if other is not None:
         # Not after the long search.

@@ -18,10 +18,10 @@ from remaster_ros.calibration.fit import (
 )
 from remaster_ros.cli.console import progress_bar, show, show_file
 from remaster_ros.cli.options import integer, number
+from remaster_ros.cli.sessions import read_to_fit
 from remaster_ros.reports.fit_json import FIT_FILE, prepare_folder, save_fit
 from remaster_ros.reports.judgement import verdict
 from remaster_ros.session.priors import read_priors
-from remaster_ros.session.reader import read_session
 
 log = logging.getLogger('remaster_ros')
 
@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fit, write, and print a summary of a few lines."""
-    session = read_session(args.session)
+    session = read_to_fit(args.session)
     priors = read_priors(args.prior) if args.prior is not None else None
     # Before the fit: an hour of sampling must not end at a folder that cannot be written.
     prepare_folder(args.out, FIT_FILE)

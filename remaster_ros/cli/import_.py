@@ -9,9 +9,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.options import add_description, names, number
-from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
 from remaster_ros.importing.assemble import (
     SessionOptions,
     assemble,
@@ -22,10 +23,11 @@ from remaster_ros.importing.columns import Told
 from remaster_ros.importing.robots import read_robot
 from remaster_ros.importing.rows import RawRows, TableOptions, read_rows
 from remaster_ros.importing.sense import Sense, check_sense
+from remaster_ros.importing.sessions import Mending, Stretch, arrangement_of, mended
 from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.kinematics.pad_angles import pad_in_words
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.reader import write_session
+from remaster_ros.session.reader import HEADER, read_session, write_session
 from remaster_ros.session.workcell import Workcell, read_cell
 from remaster_ros.types import Session
 
@@ -40,10 +42,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='FILE',
         type=Path,
         nargs='+',
-        help='a table with joints and points, or two to be joined; or a ROS bag',
+        help='a table with joints and points, or two to be joined; or a ROS bag; or a session '
+        'folder, to write it without a mistake that is in it',
     )
     parser.add_argument('--out', metavar='SESSION', type=Path, required=True, help='new folder')
-    robot = parser.add_mutually_exclusive_group(required=True)
+    robot = parser.add_mutually_exclusive_group()
     robot.add_argument('--urdf', metavar='FILE', type=Path, help='the nominal arm')
     robot.add_argument(
         '--cell', metavar='CELL', help='a cell file: its arm, sensor (aim_at) and marker'
@@ -94,6 +97,40 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help='add an angle to a joint; may be repeated',
     )
+    arm.add_argument(
+        '--multiply-angles',
+        metavar='F',
+        type=number(1e-6, 1e6),
+        default=1.0,
+        help='of a session: its angles, which were converted twice',
+    )
+    arm.add_argument(
+        '--multiply-points',
+        metavar='F',
+        type=number(1e-9, 1e9),
+        default=1.0,
+        help='of a session: its points, which were converted twice',
+    )
+    arm.add_argument(
+        '--shift-points',
+        metavar='ROWS[@FROM-TO]',
+        type=_stretch,
+        help='move each point to the joints of the row behind it (1) or before it (-1); in the '
+        'observations (rows, counted from 0) from FROM on, before TO, or all',
+    )
+    arm.add_argument(
+        '--exchange-markers',
+        metavar='A,B[@FROM-TO]',
+        type=_stretch,
+        help='exchange the labels of two markers, in all rows or in some',
+    )
+    arm.add_argument(
+        '--turn-tool',
+        metavar='AXIS=DEG',
+        type=_turn,
+        default=('', 0.0),
+        help="turn the markers' places about x, y or z of the tool frame, by a multiple of 90",
+    )
     session = parser.add_argument_group('the session')
     session.add_argument('--sensor', metavar='NAME', help='default: sensor')
     session.add_argument('--marker', metavar='NAME', help='default: marker')
@@ -135,6 +172,25 @@ def _couple(text: str) -> tuple[str, tuple[str, Literal[1, -1]]]:
     return name, (other.lstrip('+-'), -1 if other.startswith('-') else 1)
 
 
+def _stretch(text: str) -> Stretch:
+    """Argument type: what is moved, and between which observations."""
+    what, at, between = text.partition('@')
+    since, dash, until = between.partition('-')
+    if at and not (dash and all(end.isdigit() or not end for end in (since, until))):
+        raise argparse.ArgumentTypeError(
+            f'{text!r} does not end in @FROM-TO, such as @40- or @-40'
+        )
+    return Stretch(what, int(since) if since else None, int(until) if until else None)
+
+
+def _turn(text: str) -> tuple[str, float]:
+    """Argument type: an axis and an angle in degrees."""
+    axis, sign, angle = text.partition('=')
+    if axis not in ('x', 'y', 'z') or not sign:
+        raise argparse.ArgumentTypeError(f'{text!r} is not AXIS=DEGREES, such as z=90')
+    return axis, number(-360.0, 360.0, 'degrees')(angle)
+
+
 def _offset(text: str) -> tuple[str, float]:
     """Argument type: a joint and an angle in degrees."""
     name, sign, angle = text.rpartition('=')
@@ -145,6 +201,10 @@ def _offset(text: str) -> tuple[str, float]:
 
 def run(args: argparse.Namespace) -> int:
     """Read, show what was read, try it against the robot, write."""
+    if len(args.files) == 1 and (args.files[0] / HEADER).exists():
+        return _mend(args)
+    if args.urdf is None and args.cell is None:
+        raise InputError('the table is of which arm? give --urdf FILE or --cell CELL')
     cell = None if args.cell is None else read_cell(args.cell)
     if cell is None:
         urdf, chain = read_robot(
@@ -160,6 +220,11 @@ def run(args: argparse.Namespace) -> int:
         notes = f'imported from {", ".join(path.name for path in args.files)}'
         rng = np.random.default_rng(args.seed)
         session, how = assemble(rows, urdf, chain, options, rng, notes)
+        # What is not of the columns is undone in the session that they make.
+        told = Mending(
+            shift=args.shift_points, exchange=args.exchange_markers, turn=args.turn_tool
+        )
+        session = mended(session, arrangement_of(told, session, chain.joint_names))
         sense = check_sense(session, rows, progress)
     if not args.json:
         show(args.quiet, _as_text(rows, session, how))
@@ -178,6 +243,46 @@ def run(args: argparse.Namespace) -> int:
     if not args.json:
         show(args.quiet, sense.sentence)
         show(args.quiet, f'written: {args.out}; go on with: remaster fit {args.out} --out …')
+    return 0
+
+
+def _mend(args: argparse.Namespace) -> int:
+    """Write a session as told, its mistake undone; refuse where it does not fit its robot then."""
+    folder: Path = args.files[0]
+    points = [name.lower() for name in args.points]
+    if args.points and points not in ([*'xyz'], [*'yxz'], ['y_m', 'x_m', 'z_m']):
+        raise InputError('--points: of a session X and Y can be exchanged; give y_m,x_m,z_m')
+    session = read_session(folder, within_limits=False)
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    told = Mending(
+        order=args.joints,
+        couple=args.couple,
+        reverse=args.reverse,
+        add_deg=args.offset,
+        angle_scale=args.multiply_angles * ANGLES[args.angles or 'rad'],
+        length_scale=args.multiply_points * LENGTHS[args.length or 'm'],
+        mirrored=bool(points) and points[0].startswith('y'),
+        shift=args.shift_points,
+        exchange=args.exchange_markers,
+        turn=args.turn_tool,
+        tip_link=args.tip_link or '',
+    )
+    with progress_bar(args.quiet or args.json) as progress:
+        progress('trying', 0.0)
+        session = mended(session, arrangement_of(told, session, chain.joint_names))
+        if not args.unchecked:
+            try:
+                sound_estimate(session)
+            except MistakeFoundError as error:
+                raise InsufficientDataError(
+                    f'{error}: {error.options}; nothing was written; to write it as it is, add '
+                    '--unchecked'
+                ) from None
+    write_session(args.out, session)
+    if args.json:
+        print(json.dumps({'session': str(args.out), 'columns': {}, 'warnings': [], 'hint': ''}))
+        return 0
+    show(args.quiet, f'written: {args.out}; go on with: remaster fit {args.out} --out …')
     return 0
 
 

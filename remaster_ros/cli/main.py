@@ -11,9 +11,10 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from shlex import quote
 
 from remaster_ros.cli.options import Parser, integer
-from remaster_ros.errors import InsufficientDataError, RemasterError
+from remaster_ros.errors import InsufficientDataError, MistakeFoundError, RemasterError
 from remaster_ros.version import __version__
 
 # Each verb is the module of that name beside this one, imported only when it is used: SciPy and
@@ -67,6 +68,12 @@ def build_parser(chosen: str | None) -> argparse.ArgumentParser:
     return parser
 
 
+def _mending(args: argparse.Namespace, options: str) -> str:
+    """Return the command that writes the session at hand without the mistake found in it."""
+    session = str(args.session).rstrip(os.sep)
+    return f'remaster import {quote(session)} {options} --out {quote(f"{session}-mended")}'
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     argv = sys.argv[1:] if argv is None else list(argv)
@@ -97,6 +104,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Here and not at exit, where it could not be caught: the reader may have gone.
         sys.stdout.flush()
         return status
+    except MistakeFoundError as error:
+        _complain(f'{error}; to mend it: {_mending(args, error.options)}')
+        return 1
     except RemasterError as error:
         _complain(str(error))
         return 1 if isinstance(error, InsufficientDataError) else 2

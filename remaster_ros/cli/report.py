@@ -12,12 +12,12 @@ import numpy as np
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.cli.console import progress_bar, show
+from remaster_ros.cli.sessions import read_to_fit
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.answer import Answer
 from remaster_ros.reports.answer_inputs import parts, read_inputs
 from remaster_ros.reports.answer_plan import PlanFacts, plan_facts, plan_to_dict
 from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE, prepare_folder, save_fit
-from remaster_ros.session.reader import read_session
 from remaster_ros.session.recorded_plan import read_plan
 
 FIT_FOLDER = 'fit'
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read or fit, write the page, print the answer in a few lines."""
     fit_path, found_path = parts(args.results)
-    session = read_session(args.session)
+    session = read_to_fit(args.session)
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     plan = read_plan(args.session, chain)
     out = args.out or Path(f'{args.session.resolve().name}-report')

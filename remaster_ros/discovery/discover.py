@@ -16,6 +16,7 @@ import numpy as np
 
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.fit import fit_session
+from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
@@ -296,7 +297,7 @@ def _sampled(
 def find_causes(session: Session, *, rng: np.random.Generator, progress: Progress) -> Findings:
     """Search a session for causes; see `discover_session`."""
     progress('offsets', 0.0)
-    before = found = estimate(Problem.of(session))
+    before = found = sound_estimate(session)
     residuals = Residuals.of(found)
     bare = solve(residuals, ())
     moved = moved_markers(found, residuals, bare) if bare is not None else ()

@@ -10,12 +10,12 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
+from remaster_ros.calibration.mistakes import UNKNOWN_MARKER_STD_M
 from remaster_ros.errors import InputError
 from remaster_ros.importing.rows import RawRows
 from remaster_ros.importing.units import split_unit
 from remaster_ros.kinematics.pad_angles import PadAngles, coupled_in_circle
-from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.observations import LIMIT_TOLERANCE_RAD
+from remaster_ros.kinematics.serial_chain import LIMIT_TOLERANCE_RAD, SerialChain
 from remaster_ros.types import (
     AngleUnit,
     BoolArray,
@@ -35,8 +35,6 @@ SAME_POSE_RAD = 5e-3
 HOLD_OUT_ONE_OF = 4
 # Fewer poses are all needed for the fit.
 FEWEST_POSES = 12
-# Where nothing is known of a marker's place (the session format's own advice).
-UNKNOWN_MARKER_STD_M = 0.3
 # 3 January 2000: times of day without a date do not reach it, nor do seconds since some start.
 FIRST_DATE_S = 946_684_800.0 + 2 * 86_400.0
 _SPLITS = {

@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import re
 
-ANGLES = {
-    'rad': 1.0,
-    'deg': math.radians(1.0),
-    'gon': math.radians(0.9),
-}
-LENGTHS = {
-    'm': 1.0,
-    'cm': 1e-2,
-    'mm': 1e-3,
-    'um': 1e-6,
-    'in': 0.0254,
-}
+from remaster_ros.calibration.mistakes import ANGLES, LENGTHS
+
+__all__ = ['ANGLES', 'LENGTHS', 'SI', 'TEMPERATURES', 'TIMES', 'split_unit']
+
 TIMES = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0}
 TEMPERATURES = {'degc': 1.0, 'k': 1.0}
 SI = {**ANGLES, **LENGTHS, **TIMES, **TEMPERATURES}

@@ -24,6 +24,9 @@ from remaster_ros.kinematics.transforms import (
 from remaster_ros.kinematics.urdf import UrdfJoint, UrdfModel, parse_urdf
 from remaster_ros.types import BoolArray, FloatArray
 
+# Reported angles may be beyond a joint's limits by so much: both are rounded.
+LIMIT_TOLERANCE_RAD = np.deg2rad(1.0)
+
 
 @dataclass(frozen=True, eq=False)
 class SerialChain:

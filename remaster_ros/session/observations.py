@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.serial_chain import LIMIT_TOLERANCE_RAD, SerialChain
 from remaster_ros.session.csv_table import Table, split_line
 from remaster_ros.session.files import decode_text, refuse_utf16
 from remaster_ros.session.sequence_rules import (
@@ -25,7 +24,6 @@ from remaster_ros.types import FARTHEST_M, FloatArray, Measurements, Observation
 
 log = logging.getLogger('remaster_ros')
 
-LIMIT_TOLERANCE_RAD = math.radians(1.0)
 FRAME = 'frame'
 """The column that names the rows of one sensor which come from one frame."""
 ORIENTATION = ('orientation_x', 'orientation_y', 'orientation_z', 'orientation_w')
@@ -86,6 +84,8 @@ class RowFormat:
         The names in session.yaml, in their order.
     with_frame, with_orientation
         Whether the rows that are to be written have the columns `FRAME` and `ORIENTATION`.
+    within_limits
+        Whether joint angles outside the robot's limits are refused.
     """
 
     def __init__(
@@ -96,10 +96,12 @@ class RowFormat:
         markers: Sequence[str],
         with_frame: bool = False,
         with_orientation: bool = False,
+        within_limits: bool = True,
     ) -> None:
         self._path, self._chain = path, chain
         self._sensors, self._markers = sensors, markers
         self._with_frame, self._with_orientation = with_frame, with_orientation
+        self._within_limits = within_limits
         self._columns = ColumnNames(len(chain))
 
     def parse(self, data: bytes) -> Measurements:
@@ -215,7 +217,8 @@ class RowFormat:
         for names, q in ((columns.q, measurements.q), (columns.from_q, measurements.from_q)):
             below = q < chain.lower - LIMIT_TOLERANCE_RAD
             above = q > chain.upper + LIMIT_TOLERANCE_RAD
-            table.refuse(below | above, dict(zip(names, problems)))
+            if self._within_limits:
+                table.refuse(below | above, dict(zip(names, problems)))
         far = f'm is further than {FARTHEST_M:g} m away, beyond any sensor; are the units metres?'
         outside = np.abs(measurements.position) > FARTHEST_M
         table.refuse(outside, dict.fromkeys(columns.position, far))

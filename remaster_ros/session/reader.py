@@ -41,7 +41,7 @@ URDF = 'robot.urdf'
 _ATTEMPTS = 10
 
 
-def read_session(folder: str | os.PathLike[str]) -> Session:
+def read_session(folder: str | os.PathLike[str], *, within_limits: bool = True) -> Session:
     """Read a session folder (format ``remaster-session/1``), and refuse what does not fit it.
 
     The folder may be read at any moment, also while it is being written and after a power cut.
@@ -50,6 +50,8 @@ def read_session(folder: str | os.PathLike[str]) -> Session:
     ----------
     folder
         Holds session.yaml, observations.csv and the URDF that session.yaml names.
+    within_limits
+        Whether joint angles outside the robot's limits are refused.
 
     Returns
     -------
@@ -67,7 +69,7 @@ def read_session(folder: str | os.PathLike[str]) -> Session:
     for _ in range(_ATTEMPTS):
         sums = read_manifest(folder)
         try:
-            return _read(folder, sums)
+            return _read(folder, sums, within_limits)
         except InputError:
             # A recorder may have closed the session, or gone on with it, while it was read.
             if read_manifest(folder) == sums:
@@ -75,7 +77,7 @@ def read_session(folder: str | os.PathLike[str]) -> Session:
     raise InputError(f'{folder}: changes faster than it can be read; try again')
 
 
-def _read(folder: Path, sums: dict[str, str]) -> Session:
+def _read(folder: Path, sums: dict[str, str], within_limits: bool) -> Session:
     header_path = folder / HEADER
     data = read_limited(header_path, YAML_LIMIT, 'a session folder holds session.yaml')
     check_data(sums, header_path, data)
@@ -86,7 +88,7 @@ def _read(folder: Path, sums: dict[str, str]) -> Session:
     data = read_limited(rows_path, OBSERVATIONS_LIMIT, 'a session folder holds observations.csv')
     check_data(sums, rows_path, data)
     names = tuple(header.sensors), tuple(header.markers)
-    measurements = RowFormat(rows_path, chain, *names).parse(data)
+    measurements = RowFormat(rows_path, chain, *names, within_limits=within_limits).parse(data)
     references = None
     if measurements.is_reference is not None:
         of_references = measurements.is_reference

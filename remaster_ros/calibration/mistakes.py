@@ -1,0 +1,409 @@
+"""Which mistake of a person makes a session fit its robot? Tried on data, where it does not fit.
+
+Joints that count the other way round, columns in another order, zero positions 90 degrees off,
+units, mirrored points and points beside the joints of another row come from `arrangement`. Here
+come those that begin at a row, found by two fits that do not contain the row, and those of the
+tool: another link, a turned frame, a wrong place of the marker. What is named was tried: the
+session without it is estimated as any session is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations, product
+from shlex import quote
+
+import numpy as np
+
+from remaster_ros.calibration.arrangement import (
+    ALIKE,
+    CONVINCING,
+    FEWEST_ROWS,
+    GROSS_M,
+    GROSS_OFFSET_RAD,
+    Arrangement,
+    Fitted,
+    arranged,
+    came_from,
+    closest,
+    exchanged,
+    fit_arrangement,
+    search,
+    some_rows,
+)
+from remaster_ros.calibration.estimate import Estimate, Problem, estimate
+from remaster_ros.calibration.grouped_rows import Rows
+from remaster_ros.calibration.initial_guess import CAUCHY_WIDTH, closest_start, robust_spread
+from remaster_ros.errors import (
+    InputError,
+    InsufficientDataError,
+    MisfitError,
+    MistakeFoundError,
+    RemasterError,
+)
+from remaster_ros.kinematics.arm_ends import likely_tips
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.urdf import parse_urdf
+from remaster_ros.linear_algebra import one_thread
+from remaster_ros.types import FloatArray, Measurements, Priors, Session
+
+# Where nothing is known of a marker's place (the session format's own advice).
+UNKNOWN_MARKER_STD_M = 0.3
+# A marker found so far from where it was said to be is on another link, or its place is wrong.
+MARKER_STDS = 5.0
+MARKER_SHIFT_M = 5e-3
+# Units that tables are in, m and rad.
+LENGTHS: Mapping[str, float] = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254}
+ANGLES: Mapping[str, float] = {'rad': 1.0, 'deg': np.pi / 180.0, 'gon': np.pi / 200.0}
+TRIED = (
+    'joints reversed or in another order, zero positions by 90 degrees, units, joint 3 coupled to '
+    'joint 2, mirrored points, points beside the joints of a row before or behind it, labels of '
+    'markers exchanged (also from a row on), a turned tool, another tip link'
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Mistakes:
+    """What trying has shown.
+
+    Attributes
+    ----------
+    given
+        The fit of the session as it is, its markers' places left open.
+    fitting
+        The mistakes without which it fits, the simplest first; several where the data cannot tell.
+    """
+
+    given: Fitted
+    fitting: tuple[Fitted, ...]
+
+
+def find_mistakes(session: Session) -> Mistakes:
+    """Look for the mistakes without which a session fits its robot.
+
+    Parameters
+    ----------
+    session
+        That does not fit, or is gross.
+
+    Raises
+    ------
+    InsufficientDataError
+        Too few rows to fit anything.
+    """
+    joints = session.measurements.q.shape[1]
+    # A marker that is firm at a wrong place would bend the fit.
+    part = replace(session, marker_std_m=max(session.marker_std_m, UNKNOWN_MARKER_STD_M))
+    given = fit_arrangement(part, Arrangement.given(joints))
+    if len(session.measurements) < FEWEST_ROWS:
+        return Mistakes(given, ())
+    found = [] if given.gross else _of_the_tool(session, given)
+    if not found:
+        lengths = {a / b for a, b in product(LENGTHS.values(), repeat=2) if a != b}
+        found = search(part, given, sorted(lengths))
+        for arrangement in () if found else _from_a_row_on(part):
+            try:
+                fit = fit_arrangement(part, arrangement)
+            except RemasterError:
+                continue
+            if not fit.gross and fit.left_m * CONVINCING < given.left_m:
+                found.append(fit)
+    return Mistakes(given, tuple(fit for fit in closest(found) if _holds(session, fit)))
+
+
+def _holds(session: Session, fit: Fitted) -> bool:
+    """Return whether the session as rearranged is estimated like any other, and is not gross."""
+    try:
+        found = estimate(Problem.of(some_rows(arranged(session, fit.arrangement))))
+    except (RemasterError, np.linalg.LinAlgError):
+        return False
+    return not is_gross(found)
+
+
+def is_gross(found: Estimate) -> bool:
+    """Return whether an estimate has larger offsets or errors than a mastered robot leaves."""
+    offsets = found.mode.z[: found.model.joints]
+    sigma = found.posterior.noise(found.mode.eta).sigma
+    return bool(np.any(np.abs(offsets) > GROSS_OFFSET_RAD) or np.any(sigma > GROSS_M))
+
+
+@one_thread
+def sound_estimate(session: Session, priors: Priors | None = None) -> Estimate:
+    """Estimate a session; where it does not fit its robot, name the mistake without which it does.
+
+    Raises
+    ------
+    MistakeFoundError
+        It does not fit, or is gross, and does without a mistake that is named.
+    MisfitError
+        It does not fit, and none of the mistakes that were tried mends it.
+    """
+    try:
+        found = estimate(Problem.of(session, priors))
+    except MisfitError as error:
+        refused = error
+    else:
+        if not is_gross(found):
+            return found
+        mistakes = find_mistakes(session)
+        if mistakes.fitting:
+            raise _named(session, mistakes, 'the session does not fit the robot')
+        return found
+    try:
+        mistakes = find_mistakes(session)
+    except InsufficientDataError:
+        raise refused from None
+    if not mistakes.fitting:
+        few = len(session.measurements) < FEWEST_ROWS
+        why = (
+            f'{len(session.measurements)} rows are too few to look for the reason'
+            if few
+            else f'tried, and it is none of these: {TRIED}'
+        )
+        raise MisfitError(refused.what, f'{refused.remedy}; {why}')
+    raise _named(session, mistakes, refused.what)
+
+
+def _named(session: Session, mistakes: Mistakes, what: str) -> MistakeFoundError:
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    columns = Columns(chain.joint_names, chain.joint_names)
+    sentence, options = in_a_sentence(mistakes, session, columns)
+    return MistakeFoundError(f'{what}; {sentence}', options)
+
+
+def _of_the_tool(session: Session, given: Fitted) -> list[Fitted]:
+    """Return the links and turns with which the markers are where they were said to be.
+
+    Where there are none, that the markers' places are wrong.
+    """
+    allowed = max(MARKER_STDS * session.marker_std_m, MARKER_SHIFT_M)
+    if given.marker_shift_m < allowed:
+        return []
+    plain = given.arrangement
+    candidates = [
+        replace(plain, tip_link=tip)
+        for tip in likely_tips(parse_urdf(session.urdf), session.base_link)
+        if tip != session.tip_link
+    ]
+    candidates += [
+        replace(plain, turned=(axis, quarters)) for axis in range(3) for quarters in (1, -1, 2)
+    ]
+    candidates += [replace(plain, exchanged=pair) for pair in _pairs(session.measurements)]
+    part = replace(session, marker_std_m=max(session.marker_std_m, UNKNOWN_MARKER_STD_M))
+    found = []
+    for arrangement in candidates:
+        try:
+            fit = fit_arrangement(part, arrangement)
+        except (InputError, InsufficientDataError):
+            continue
+        if fit.marker_shift_m < allowed:
+            found.append(fit)
+    return found
+
+
+def _pairs(m: Measurements) -> list[tuple[int, int]]:
+    """Return the pairs of markers that one sensor has measured."""
+    pairs: set[tuple[int, int]] = set()
+    for sensor in np.unique(m.sensor):
+        pairs |= set(combinations(np.unique(m.marker[m.sensor == sensor]).tolist(), 2))
+    return sorted(pairs)
+
+
+def _from_a_row_on(session: Session) -> Iterator[Arrangement]:
+    """Give what may be otherwise from a row on, with the row that divides the session best.
+
+    One half of the rows contains no such row. The first half, as given, and the last half, as it
+    would be, are fitted; every row is compared with either.
+    """
+    m = session.measurements
+    plain, everywhere = Arrangement.given(m.q.shape[1]), np.ones(len(m), bool)
+    numbers = m.observation.tolist()
+    for pair in _pairs(m):
+        other = exchanged(m, *pair, everywhere)
+        for row in _divisions(session, m, other):
+            yield replace(plain, exchanged=pair, since=numbers[row])
+        for row in _divisions(session, other, m):
+            yield replace(plain, exchanged=pair, until=numbers[row])
+    for shift in (-1, 1):
+        of, _ = came_from(m, shift, everywhere)
+        for row in _divisions(session, m, replace(m, q=m.q[of])):
+            yield replace(plain, shift=shift, since=numbers[row])
+
+
+def _divisions(session: Session, before: Measurements, after: Measurements) -> Iterator[int]:
+    """Give the rows from which on the second is the better table, the first before them."""
+    half = len(before) // 2
+    if half < FEWEST_ROWS:
+        return
+    for table, rows in ((before, slice(0, half)), (after, slice(half, len(before)))):
+        costs = _costs(session, table.select(np.arange(len(before))[rows]), before, after)
+        if costs is not None:
+            least = int(np.argmin(np.concatenate(([0.0], np.cumsum(costs[0] - costs[1])))))
+            if 0 < least < len(before):
+                yield least
+
+
+def _costs(
+    session: Session, part: Measurements, before: Measurements, after: Measurements
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return the robust cost of every row of two tables, by a fit of a part; None without one."""
+
+    def problem(m: Measurements) -> Problem:
+        fitted = replace(m, is_validation=np.zeros(len(m), bool))
+        return Problem.of(replace(session, measurements=fitted))
+
+    try:
+        fitted = problem(some_rows(replace(session, measurements=part)).measurements)
+        model = fitted.empty_model()
+        start, z = closest_start(
+            model,
+            fitted.measurements,
+            fitted.fitted,
+            fitted.markers,
+            float(np.max(fitted.marker_std_m)),
+            fitted.marker_priors(model),
+        )
+    except (InsufficientDataError, np.linalg.LinAlgError):
+        return None
+    rows = Rows.of(fitted.measurements, fitted.fitted, start.reference)
+    spread = robust_spread(rows.target - start.predict(z, rows), rows)
+    costs = []
+    for table in (before, after):
+        whole = problem(table)
+        if (whole.sensor_names, whole.marker_names) != (fitted.sensor_names, fitted.marker_names):
+            return None
+        rows = Rows.of(whole.measurements, whole.fitted, start.reference)
+        squares = np.sum((rows.target - start.predict(z, rows)) ** 2, axis=1)
+        width = CAUCHY_WIDTH * spread[whole.measurements.sensor[rows.source]]
+        cost = np.empty(len(rows))
+        cost[rows.source] = np.log1p(squares / width**2)
+        costs.append(cost)
+    return costs[0], costs[1]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """How a table names what it holds.
+
+    Attributes
+    ----------
+    joints, shown
+        Its columns of joints, and how they are called in a sentence.
+    points
+        Its columns of x, y and z.
+    length_unit, angle_unit
+        In which its numbers were taken to be.
+    """
+
+    joints: tuple[str, ...]
+    shown: tuple[str, ...]
+    points: tuple[str, ...] = ('x_m', 'y_m', 'z_m')
+    length_unit: str = 'm'
+    angle_unit: str = 'rad'
+
+
+def in_a_sentence(mistakes: Mistakes, session: Session, columns: Columns) -> tuple[str, str]:
+    """Return which mistakes make the session fit, and the options that undo the first of them."""
+    found, given = mistakes.fitting[0], mistakes.given
+    words, options = in_words(found.arrangement, session, columns)
+    sentence = f'with {words} the data fit to {shown_mm(found.error_m)}; without, to '
+    # Where only a part of the rows is off, the median does not show it.
+    sentence += shown_mm(given.error_m if given.error_m > GROSS_M else given.left_m)
+    if given.left_m < ALIKE * found.left_m:
+        largest, least = (
+            np.degrees(np.abs(np.angle(np.exp(1j * fit.joint_offsets))).max())
+            for fit in (given, found)
+        )
+        sentence = (
+            f'with {words} the zero-offsets are below {max(1.0, least):.1f} degrees; without, one '
+            f'is {largest:.0f} degrees'
+        )
+        if found.marker_shift_m + MARKER_SHIFT_M < given.marker_shift_m:
+            sentence = (
+                f'with {words} the marker is {shown_mm(found.marker_shift_m)} from where it was '
+                f'said to be; without, {shown_mm(given.marker_shift_m)}'
+            )
+    told = {words: options}
+    for fit in mistakes.fitting[1:]:
+        if fit.arrangement.changes <= found.arrangement.changes + 1:
+            other, instead = in_words(fit.arrangement, session, columns)
+            told.setdefault(other, instead)
+    others = [f'with {other} ({instead})' for other, instead in list(told.items())[1:]]
+    if others:
+        sentence += f'; {" or ".join(others)} they fit as well, and the data cannot tell which'
+    return sentence, options
+
+
+def in_words(found: Arrangement, session: Session, columns: Columns) -> tuple[str, str]:
+    """Return what is other than given, and the options of ``remaster import`` that make it so."""
+    names = [columns.shown[column] for column in found.order]
+    words, options = [], []
+    given = Arrangement.given(len(names))
+    if found.order != given.order:
+        words.append(f'the joints in the order {", ".join(names)}')
+        options.append(f'--joints {quote(",".join(columns.joints[c] for c in found.order))}')
+    for what, scale, unit, units in (
+        ('angles', found.angle_scale, columns.angle_unit, ANGLES),
+        ('length', found.length_scale, columns.length_unit, LENGTHS),
+    ):
+        if scale != 1.0:
+            size = scale * units[unit]
+            other = min(units, key=lambda name: abs(np.log(units[name] / size)))
+            of = 'angles' if what == 'angles' else 'points'
+            if np.isclose(units[other], size):
+                words.append(f'the {of} in {other}')
+                options.append(f'--{what} {other}')
+            else:
+                words.append(f'the {of} times {scale:.6g} (they were converted twice)')
+                options.append(f'--multiply-{of} {scale!r}')
+    if found.coupled:
+        sign = '' if found.coupled > 0 else '-'
+        words.append(
+            f'{sign or "+"}{names[1]} added to {names[2]} (it counts from the horizontal)'
+        )
+        options.append(f'--couple {quote(f"{names[2]}={sign}{names[1]}")}')
+    reversed_ = [names[i] for i, sign in enumerate(found.signs) if sign < 0]
+    if reversed_:
+        words.append(f'{" and ".join(reversed_)} reversed')
+        options.append(f'--reverse {quote(",".join(reversed_))}')
+    for i, quarter in enumerate(found.quarters):
+        if quarter:
+            words.append(f'{90 * quarter:+d} degrees on {names[i]}')
+            options.append(f'--offset {quote(f"{names[i]}={90 * quarter}")}')
+    if found.mirrored:
+        x, y, z = columns.points
+        words.append('X and Y exchanged (the points are mirrored)')
+        options.append(f'--points {quote(f"{y},{x},{z}")}')
+    stretch, at = _stretch(found)
+    if found.shift:
+        where = 'before' if found.shift > 0 else 'behind'
+        words.append(f'each point{stretch} moved to the joints of the row {where} it')
+        options.append(f'--shift-points={-found.shift}{at}')
+    if found.exchanged:
+        a, b = (session.marker_names[marker] for marker in found.exchanged)
+        words.append(f'the labels {a} and {b} exchanged{stretch}')
+        options.append(f'--exchange-markers {quote(f"{a},{b}{at}")}')
+    if found.turned[1]:
+        axis, angle = 'xyz'[found.turned[0]], 90 * found.turned[1]
+        words.append(f"the markers' places turned by {angle} degrees about {axis} of the tool")
+        options.append(f'--turn-tool {axis}={angle}')
+    if found.tip_link:
+        words.append(f'the tip link {found.tip_link}')
+        options.append(f'--tip-link {quote(found.tip_link)}')
+    return ', '.join(words), ' '.join(options)
+
+
+def _stretch(found: Arrangement) -> tuple[str, str]:
+    """Return the rows of a mistake in words, and as options have them."""
+    if found.since is not None:
+        return f' from observation {found.since} on', f'@{found.since}-'
+    if found.until is not None:
+        return f' before observation {found.until}', f'@-{found.until}'
+    return '', ''
+
+
+def shown_mm(length: float) -> str:
+    """Return a length for a sentence."""
+    size = 1e3 * length
+    return f'{size:.0f} mm' if size >= 10.0 else f'{size:.2g} mm'

@@ -1,0 +1,36 @@
+"""A session that is to be fitted, read for the verbs of the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from remaster_ros.calibration.mistakes import sound_estimate
+from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
+from remaster_ros.session.reader import read_session
+from remaster_ros.types import Session
+
+
+def read_to_fit(folder: Path) -> Session:
+    """Read a session; where its joints are outside their limits, look for the mistake behind it.
+
+    Raises
+    ------
+    InputError
+        As `read_session`.
+    MistakeFoundError
+        Joints outside their limits, and the mistake without which the session fits its robot.
+    """
+    try:
+        return read_session(folder)
+    except InputError as refused:
+        try:
+            session = read_session(folder, within_limits=False)
+        except InputError:
+            raise refused from None
+        try:
+            sound_estimate(session)
+        except MistakeFoundError as error:
+            raise MistakeFoundError(f'{refused} {error}', error.options) from None
+        except (InputError, InsufficientDataError):
+            pass
+        raise

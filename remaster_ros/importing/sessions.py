@@ -1,0 +1,197 @@
+"""A session that was written with a mistake in it, without the mistake: as import is told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, cast
+
+import numpy as np
+
+from remaster_ros.calibration.arrangement import Arrangement, arranged
+from remaster_ros.errors import InputError, did_you_mean
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.session.reader import all_rows
+from remaster_ros.types import Controller, PadJoint, Session
+
+QUARTER_DEG = 90.0
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """What is moved, and between which observations, the latter excluded; None where to an end."""
+
+    what: str
+    since: int | None = None
+    until: int | None = None
+
+
+@dataclass(frozen=True)
+class Mending:
+    """What was told of a session's tables.
+
+    Attributes
+    ----------
+    order
+        Joint whose column each joint, base to tip, is to take; () for as they are.
+    couple, reverse, add_deg
+        As of `assemble.SessionOptions`.
+    angle_scale, length_scale
+        What angles and points are multiplied by.
+    mirrored
+        True where X and Y of the points are exchanged.
+    shift, exchange
+        Rows that each point is moved on by, and two markers whose labels are exchanged.
+    turn
+        Axis, and degrees by which the markers' places are turned about it; '' for not at all.
+    tip_link
+        Tool frame; '' for as it is.
+    """
+
+    order: Sequence[str] = ()
+    couple: Sequence[tuple[str, tuple[str, float]]] = ()
+    reverse: Sequence[str] = ()
+    add_deg: Sequence[tuple[str, float]] = ()
+    angle_scale: float = 1.0
+    length_scale: float = 1.0
+    mirrored: bool = False
+    shift: Stretch | None = None
+    exchange: Stretch | None = None
+    turn: tuple[str, float] = ('', 0.0)
+    tip_link: str = ''
+
+
+def arrangement_of(told: Mending, session: Session, joint_names: Sequence[str]) -> Arrangement:
+    """Return the arrangement of a session that was told.
+
+    Raises
+    ------
+    InputError
+        Names that the session has not, or angles that are no quarters of a turn.
+    """
+    k = len(joint_names)
+    if told.order and len(told.order) != k:
+        raise InputError(f'--joints names {len(told.order)} joints; the session has {k}')
+    for stretch in (told.shift, told.exchange):
+        for number in () if stretch is None else (stretch.since, stretch.until):
+            if number is not None and number not in all_rows(session).observation:
+                raise InputError(f'there is no observation {number} in the session; correct it')
+    if told.shift is not None and told.exchange is not None:
+        raise InputError('--shift-points and --exchange-markers: give one at a time')
+    signs, quarters, coupled = [1] * k, [0] * k, 0
+    for name in told.reverse:
+        signs[_index(name, joint_names, '--reverse')] = -1
+    for name, angle in told.add_deg:
+        quarters[_index(name, joint_names, '--offset')] += _quarters(angle, '--offset')
+    for name, (other, sign) in told.couple:
+        if (
+            _index(name, joint_names, '--couple') != 2
+            or _index(other, joint_names, '--couple') != 1
+        ):
+            raise InputError('--couple: in a session only joint 3 is coupled, to joint 2')
+        coupled = int(sign)
+    stretch = told.shift or told.exchange or Stretch('')
+    axis, angle = told.turn
+    return Arrangement(
+        order=tuple(_index(name, joint_names, '--joints') for name in told.order)
+        or tuple(range(k)),
+        signs=tuple(signs),
+        quarters=tuple(quarters),
+        angle_scale=told.angle_scale,
+        coupled=coupled,
+        mirrored=told.mirrored,
+        length_scale=told.length_scale,
+        shift=0 if told.shift is None else -_rows(told.shift.what),
+        exchanged=() if told.exchange is None else _markers(told.exchange.what, session),
+        since=stretch.since,
+        until=stretch.until,
+        turned=('xyz'.index(axis) if axis else 0, _quarters(angle, '--turn-tool')),
+        tip_link=told.tip_link,
+    )
+
+
+def mended(session: Session, arrangement: Arrangement) -> Session:
+    """Return a whole session, its references among it, without a mistake."""
+    if arrangement == Arrangement.given(len(arrangement.order)):
+        return session
+    whole = arranged(replace(session, measurements=all_rows(session)), arrangement)
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    whole = replace(whole, controller=_controller(session, arrangement, chain.joint_names))
+    m = whole.measurements
+    if m.is_reference is None:
+        return whole
+    rows = replace(m, is_reference=None)
+    return replace(
+        whole, measurements=rows.select(~m.is_reference), references=rows.select(m.is_reference)
+    )
+
+
+def _controller(
+    session: Session, arrangement: Arrangement, joint_names: Sequence[str]
+) -> Controller | None:
+    """Return how the pad writes the joints, now that their columns are understood otherwise."""
+    plain = Arrangement.given(len(joint_names))
+    of_joints = (arrangement.order, arrangement.signs, arrangement.quarters, arrangement.coupled)
+    if of_joints == (plain.order, plain.signs, plain.quarters, plain.coupled):
+        return session.controller
+    known = {} if session.controller is None else session.controller.joints
+    now = {joint_names[column]: joint for joint, column in zip(joint_names, arrangement.order)}
+    pads = {}
+    for i, (joint, column) in enumerate(zip(joint_names, arrangement.order, strict=True)):
+        pad = known.get(joint_names[column], PadJoint(joint_names[column]))
+        coupling = {now[other]: share for other, share in pad.coupling.items()}
+        sign: Literal[1, -1] = 1
+        if arrangement.signs[i] < 0:
+            sign = -1
+        pads[joint] = replace(
+            pad,
+            sign=cast(Literal[1, -1], sign * pad.sign),
+            zero_deg=sign * pad.zero_deg + QUARTER_DEG * arrangement.quarters[i],
+            coupling=coupling,
+        )
+    if arrangement.coupled:
+        second, third = (joint_names[arrangement.order[i]] for i in (1, 2))
+        other = known.get(second, PadJoint(second))
+        own = known.get(third, PadJoint(third))
+        if own.coupling or other.coupling or other.zero_deg:
+            raise InputError('--couple: the joints of this session are coupled or moved already')
+        share = cast(Literal[1, -1], arrangement.coupled * own.sign * other.sign)
+        pads[joint_names[2]] = replace(pads[joint_names[2]], coupling={joint_names[1]: share})
+    return Controller(pads, '' if session.controller is None else session.controller.maker)
+
+
+def _rows(text: str) -> int:
+    try:
+        rows = int(text)
+    except ValueError:
+        rows = 0
+    if abs(rows) != 1:
+        raise InputError(
+            f'--shift-points: {text!r} is neither 1 nor -1; points are moved by a row'
+        )
+    return rows
+
+
+def _markers(text: str, session: Session) -> tuple[int, ...]:
+    names = text.split(',')
+    if len(names) != 2:
+        raise InputError(f'--exchange-markers: {text!r} is not two markers, such as sir,smr')
+    return tuple(_index(name, session.marker_names, '--exchange-markers') for name in names)
+
+
+def _index(name: str, names: Sequence[str], option: str) -> int:
+    if name not in names:
+        raise InputError(
+            f'{option}: there is no {name!r}; there are {", ".join(names)}'
+            f'{did_you_mean(name, names)}'
+        )
+    return names.index(name)
+
+
+def _quarters(angle: float, option: str) -> int:
+    quarters = angle / QUARTER_DEG
+    if not np.isclose(quarters, round(quarters)):
+        raise InputError(
+            f'{option}: {angle:g} degrees are no multiple of 90; what is less is found by the fit'
+        )
+    return round(quarters)
