@@ -321,7 +321,7 @@ def choice(
     if goal is None:
         return np.arange(min(PAPER, len(information)))
     if designed:
-        design = choose(information, travel, Goal(goal, 1.0), rng)
+        design = choose(information, travel, Goal(goal, 1.0), rng, whole_poses=False)
         assert design.reached
         return np.array(design.chosen, dtype=np.int64)
     count = np.arange(1, len(information) + 1)
@@ -351,7 +351,7 @@ def tour(
         )
     )
     plans = {'optimization': plan}
-    order = tuple(visit_order(plans, model, travel)) if in_order else ()
+    order = tuple(visit_order(plans, model, travel, whole_poses=False)) if in_order else ()
     walk = tuple(row.chosen.tolist()), order
     if walk not in walks:
         legs, lost = walks[walk] = [], []

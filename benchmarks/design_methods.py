@@ -205,7 +205,9 @@ def at_count(
     found: Sequence[int] = ()
     for _ in range(9):
         goal = float(np.sqrt(low * high))
-        design = choose(information, travel, Goal(goal, 1.0), rng, floors, exchanges=40)
+        design = choose(
+            information, travel, Goal(goal, 1.0), rng, floors, exchanges=40, whole_poses=False
+        )
         if design.reached and len(design.chosen) <= count:
             found, high = design.chosen, goal
         else:

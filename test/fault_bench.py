@@ -50,9 +50,9 @@ def cell_of_several_markers(folder: Path) -> Path:
     text = text.replace('../robots', str(config_path('robots')))
     text = text.replace('marker: smr\n', 'marker: smr\n    further_markers: {smr_2: 2}\n')
     text = text.replace('  smr: [-0.1', '  smr_2: [0.0, -0.09, 0.03]\n  smr: [-0.1')
-    designed = ('  design', '  joint_std', '  order')
+    text = text.replace('design: optimal', 'design: latin_hypercube')
     path = folder / 'cell.yaml'
-    lines = [line for line in text.splitlines() if not line.startswith(designed)]
+    lines = [line for line in text.splitlines() if not line.startswith('  joint_std')]
     path.write_text('\n'.join(lines), encoding='utf-8')
     return path
 

@@ -15,7 +15,8 @@ from remaster_ros.kinematics.body_pairs import RESERVE_M
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.planning.candidates import PlanningScene
 from remaster_ros.planning.collection_plan import CollectionPlan, plan_collection
-from remaster_ros.planning.tour_planner import TourPlanner
+from remaster_ros.planning.tour_order import REGISTRATION
+from remaster_ros.planning.tour_planner import REGISTRATION_CANDIDATES, TourPlanner
 from remaster_ros.planning.travel_time import DWELL_S, SETTLE_S, SPEED_SHARE, TravelTime
 from remaster_ros.reports.found_causes import read_causes
 from remaster_ros.reports.plan_json import plan_text, plan_to_dict
@@ -121,7 +122,11 @@ def planned(
         args.dwell,
     )
     causes = read_causes(args.separate, scene.model.chain.joint_names) if args.separate else ()
-    counts = {'optimization': args.poses, 'validation': args.validation}
+    counts = {
+        'optimization': args.poses,
+        'validation': args.validation,
+        REGISTRATION: REGISTRATION_CANDIDATES,
+    }
     planner = TourPlanner(
         scene, counts, args.seed, args.reference_every, cell.design_settings(), travel, causes
     )

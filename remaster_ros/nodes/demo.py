@@ -75,6 +75,9 @@ class Parameters:
     candidates: int = parameter(
         14, 'candidate poses for optimization and for validation, each', low=1, high=1000
     )
+    held_out_candidates: int = parameter(
+        0, 'candidate poses for validation, where not as many; 0 for as many', low=0, high=1000
+    )
     reference_every: int = parameter(
         25, 'configurations between two visits to the references; 0 for none', low=0, high=10_000
     )
@@ -201,7 +204,7 @@ class Demo:
                 'session': session,
                 'discovery': str(self.discovery),
                 'optimization_candidates': size,
-                'validation_candidates': size,
+                'validation_candidates': self.p.held_out_candidates or size,
                 'reference_every': self.p.reference_every,
             },
             'recorder': {'session': session},

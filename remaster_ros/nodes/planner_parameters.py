@@ -12,7 +12,7 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.parameters import parameter
 from remaster_ros.planning.rival_causes import FoundCause
 from remaster_ros.planning.tour_order import REGISTRATION
-from remaster_ros.planning.tour_planner import TourPlanner
+from remaster_ros.planning.tour_planner import REGISTRATION_CANDIDATES, TourPlanner
 from remaster_ros.planning.travel_time import SPEED_SHARE, TravelTime
 from remaster_ros.session.workcell import Workcell
 
@@ -29,7 +29,10 @@ class Parameters:
         60, 'candidate poses that the gain is proved on', low=0, high=10000
     )
     registration_candidates: int = parameter(
-        12, 'candidate poses for the three-point registration', low=3, high=1000
+        REGISTRATION_CANDIDATES,
+        'candidate poses for the three-point registration',
+        low=3,
+        high=1000,
     )
     seed: int = parameter(0, 'seed of the Latin hypercube', low=0)
     reference_every: int = parameter(
@@ -117,7 +120,7 @@ class Parameters:
             'seed': self.seed,
             'reference_every': self.reference_every,
             'limit_margin_deg': self.limit_margin_deg,
-            # Other plans do not depend on them, and are those of older versions.
+            # Other plans do not depend on them.
             **(speeds if design.optimal or design.fastest else {}),
             **({'separate': repr(causes)} if causes else {}),
         }

@@ -50,6 +50,7 @@ from remaster_ros.nodes.progress_lines import ProgressLines
 from remaster_ros.nodes.run_token import LivingRun, new_token, silence_s
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import JOINT_STATES, LATCHED, RELIABLE, NodeStatus, Summary, listen
+from remaster_ros.planning.collection_plan import session_time_s
 from remaster_ros.planning.tour_order import REGISTRATION, PoseVisit
 from remaster_ros.session.plan_journal import PlanJournal
 from remaster_ros.session.plan_records import NO_FREE_PATH
@@ -102,6 +103,7 @@ class PosePlanner(RemasterNode):
         self._facts = PreflightFacts(self.cell.sensors)
         self._models = PeerModels(self.get_fully_qualified_name(), model)
         self._cleared = self._described = False
+        self._session_s = 0.0
         self._measure = MeasureCalls(self, self.cell)
         listen(self, self._on_record)
         ProgressLines(self, self.status.steady, self.progress.counts, lambda: self.run.state)
@@ -347,7 +349,12 @@ class PosePlanner(RemasterNode):
             return
         if tour is not None and self.progress.phase != REGISTRATION and not self._described:
             self._described = True
-            self.status.event(events.TourPlanned(self._further.planned(tour)))
+            planned = self._further.planned(tour)
+            if self._q is not None and not tour.begin_at:
+                self._session_s = session_time_s(self._tours, tour, self._q)
+                minutes = f'{self._session_s / 60.0:.1f} min'
+                planned += f'; about {minutes} of robot time for the whole session'
+            self.status.event(events.TourPlanned(planned))
         with self._lock:
             # Paused or stopped while the pose was chosen and written: collect announces it.
             if self.run.state == 'running':
@@ -382,6 +389,8 @@ class PosePlanner(RemasterNode):
             'resuming': 'yes' if run.left else 'no',
             **self._preview.values(),
             **self.progress.counts(),
+            # Of the whole session; '' before its collection is planned.
+            'robot_time_s': f'{self._session_s:.0f}' if self._session_s else '',
             'dropped_solutions_no free path': self.journal.outcomes[NO_FREE_PATH],
         }
         why = full or run.why

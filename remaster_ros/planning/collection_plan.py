@@ -12,15 +12,16 @@ import numpy as np
 from remaster_ros.errors import InsufficientDataError, RemasterError
 from remaster_ros.motion.trajectory import Trajectory
 from remaster_ros.planning.candidates import PlannedPose
-from remaster_ros.planning.planned_design import Designed
+from remaster_ros.planning.planned_design import NO_FREE_PATH, Designed
 from remaster_ros.planning.separating_design import SeparatingDesign
 from remaster_ros.planning.tour_order import PoseVisit, Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.types import FloatArray
 
-NO_FREE_PATH = 'no free path'
 FITTED = 'optimization'
+REGISTERING = 3
+"""Poses that register the sensors; the others of their plan are visited where one is not seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +76,15 @@ class CollectionPlan:
     tour
         As planned.
     visits
-        All configurations in the order of their visits, references each time.
+        All configurations in the order of their visits: registration, fit, held out, and
+        references each time.
     unreached
         Configurations that no free path leads to.
     measuring_s
         Settling and dwell at each of them, s.
     robot_time_s
-        Motion, settling and dwell, s.
+        Motion, settling and dwell of all visits, s: of the whole session where all of it is
+        ahead.
     max_tool_speed_m_s
         Of the fastest point of arm and tool, m/s.
     joint_std
@@ -121,7 +124,7 @@ class CollectionPlan:
     def dropped(self) -> dict[str, int]:
         """Reason -> number of joint solutions that are not visited."""
         lost = {NO_FREE_PATH: self.unreached} if self.unreached else {}
-        return {**self.tour.dropped_solutions, **lost}
+        return dict(self.tour.dropped_solutions + Counter(lost))
 
 
 def plan_collection(
@@ -130,7 +133,7 @@ def plan_collection(
     start: FloatArray,
     progress: Callable[[float], None] = lambda share: None,
 ) -> CollectionPlan:
-    """Go through a collection from beginning to end, as the planner's node does it.
+    """Go through a session from its registration to its end, as the planner's node does it.
 
     Parameters
     ----------
@@ -150,7 +153,10 @@ def plan_collection(
         determine the offsets.
     """
     tour = planner.collection(T_R_N)
-    plan = look_ahead(planner, T_R_N, [tour], start, progress=progress)
+    tours = [tour]
+    if planner.registers:
+        tours.insert(0, planner.registration().only_first(REGISTERING))
+    plan = look_ahead(planner, T_R_N, tours, start, progress=progress)
     if plan.undetermined:
         raise InsufficientDataError(
             f'{len(tour.plans[FITTED].poses)} poses to fit can be visited, too few or too alike: '
@@ -226,6 +232,36 @@ def look_ahead(
         undetermined,
         planner.separated,
     )
+
+
+def session_time_s(planner: TourPlanner, tour: Tour, start: FloatArray) -> float:
+    """Return about how long the robot takes for a whole session, s, without looking for ways.
+
+    For the registration, what is fitted, what is held out and the references, with settling and
+    dwell. Every way counts as straight: looking for those around something takes nearly all of the
+    time that `plan_collection` takes.
+
+    Parameters
+    ----------
+    planner
+        Plans the tour.
+    tour
+        Of the collection, however far it is.
+    start
+        Where the arm stands, rad, (k,).
+    """
+    tours = [tour]
+    if planner.registers:
+        tours.insert(0, planner.registration().only_first(REGISTERING))
+    here, total = start, 0.0
+    for part in tours:
+        straight = part.afresh()
+        while (stop := straight.next(here)) is not None:
+            for q in stop.solutions:
+                total += float(planner.travel.straight(here, q[None])[0])
+                total += planner.travel.measuring_s
+                here = q
+    return total
 
 
 def outlook(planner: TourPlanner) -> tuple[Tour, Expected]:

@@ -229,6 +229,25 @@ class DesignInformation:
             weighted=self.weighted[kept],
         )
 
+    def whole_poses(self) -> tuple[DesignInformation, list[IntArray]]:
+        """Return it for poses in all their configurations, and which these are.
+
+        Poses share nothing, so that their information adds up.
+        """
+        members = [np.flatnonzero(self.pose == index) for index in np.unique(self.pose)]
+        sums = np.array([self.weighted[mine].sum(axis=0) for mine in members])
+        shared = self._shared(sums, np.array([len(mine) for mine in members]))
+        own = np.array([self.own[mine].sum(axis=0) for mine in members]) - shared
+        first = [mine[0] for mine in members]
+        poses = replace(
+            self,
+            q=self.q[first],
+            pose=np.arange(len(members)),
+            own=own,
+            weighted=np.zeros((len(members), *self.weighted.shape[1:])),
+        )
+        return poses, members
+
     def total(self, chosen: Sequence[int]) -> FloatArray:
         """Return the information of chosen configurations and the priors, (f, f)."""
         which = np.array(chosen, dtype=np.int64)

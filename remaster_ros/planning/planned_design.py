@@ -27,6 +27,7 @@ from remaster_ros.planning.visit_order import fastest_order
 from remaster_ros.types import FloatArray, IntArray, Priors
 
 NOT_NEEDED = 'not needed by the design'
+NO_FREE_PATH = 'no free path'
 POOL_CANDIDATES = 400
 """Candidate poses that a design chooses from, besides those of the plan that it replaces."""
 MOST_CANDIDATES = 1500
@@ -45,8 +46,11 @@ class DesignSettings:
     ----------
     optimal
         False for all poses of the Latin hypercube.
+    whole_poses
+        Visit each pose in all its solutions, nearest first, before the next one; otherwise the
+        design chooses single configurations, and the fastest order comes back to a pose.
     fastest
-        Visit configurations in the order of least travel, not all solutions of a pose at a time.
+        Visit poses, or configurations, in the order of least travel, not the nearest next.
     sensors
         What will measure, with its expected noise.
     marker_std_m
@@ -62,6 +66,7 @@ class DesignSettings:
     """
 
     optimal: bool = False
+    whole_poses: bool = True
     fastest: bool = False
     sensors: tuple[ExpectedSensor, ...] = ()
     marker_std_m: float = 0.5e-3
@@ -159,8 +164,11 @@ def designed_plans(
     )
     number = np.concatenate([np.arange(len(pose.solutions)) for pose in poses])
     left: IntArray = np.arange(min(len(information), max(MOST_CANDIDATES, count)))
+    if settings.whole_poses and len(left) < len(information):
+        left = left[information.pose[left] < information.pose[len(left)]]
     for _ in range(MOST_TRIES):
-        design = choose(information.only(left), travel, goal, rng, _floors(information, left))
+        among, floors = information.only(left), _floors(information, left, settings.whole_poses)
+        design = choose(among, travel, goal, rng, floors, whole_poses=settings.whole_poses)
         chosen = left[np.array(design.chosen, dtype=np.int64)]
         lost = _without_way(scene.model, information.q[chosen], travel)
         if not lost:
@@ -172,14 +180,21 @@ def designed_plans(
         for mine in [np.sort(chosen[information.pose[chosen] == index])]
     ]
     dropped = _sum(plan.dropped, pool.dropped, {NOT_NEEDED: len(poses) - len(kept)})
+    lost_solutions = 0
+    if settings.whole_poses:
+        # What is missing of a pose is what no way leads to.
+        visited = np.isin(information.pose, information.pose[chosen])
+        lost_solutions = int(np.sum(visited)) - len(chosen)
     solutions = _sum(
         plan.dropped_solutions,
         pool.dropped_solutions,
-        {NOT_NEEDED: len(information) - len(chosen)},
+        {NO_FREE_PATH: lost_solutions},
+        {NOT_NEEDED: len(information) - len(chosen) - lost_solutions},
     )
     designed = {**plans, 'optimization': Plan(tuple(kept), dropped, solutions)}
     if 'validation' in plans:
-        designed['validation'] = _held_out(plans['validation'], rng)
+        solutions_of_each = None if settings.whole_poses else HELD_OUT_SOLUTIONS
+        designed['validation'] = _held_out(plans['validation'], solutions_of_each, rng)
     return Designed(
         designed,
         goal,
@@ -189,19 +204,23 @@ def designed_plans(
     )
 
 
-def _floors(information: DesignInformation, left: IntArray) -> Floors:
-    """Return the floors, lower where these configurations have not so many poses."""
+def _floors(information: DesignInformation, left: IntArray, whole_poses: bool) -> Floors:
+    """Return the floors, lower where these configurations have not so many poses.
+
+    Of whole poses all are to have two solutions: that is what they are visited for.
+    """
     count = np.unique(information.pose[left], return_counts=True)[1]
-    whole = Floors()
-    return Floors(min(whole.poses, len(count)), min(whole.repeated, int(np.sum(count > 1))))
+    floors = Floors()
+    repeated = floors.poses if whole_poses else floors.repeated
+    return Floors(min(floors.poses, len(count)), min(repeated, int(np.sum(count > 1))))
 
 
-def _held_out(plan: Plan, rng: np.random.Generator) -> Plan:
-    """Return as many of the held-out poses as are needed, and solutions of each."""
+def _held_out(plan: Plan, solutions: int | None, rng: np.random.Generator) -> Plan:
+    """Return as many of the held-out poses as are needed, and of each all solutions or so many."""
     kept = tuple(
         PlannedPose(
             pose.T_R_T,
-            pose.solutions[np.sort(rng.permutation(len(pose.solutions))[:HELD_OUT_SOLUTIONS])],
+            pose.solutions[np.sort(rng.permutation(len(pose.solutions))[:solutions])],
         )
         # In the order of a Latin hypercube neighbours have nothing in common.
         for pose in plan.poses[:HELD_OUT_POSES]
@@ -219,6 +238,8 @@ def visit_order(
     plans: Mapping[str, Plan],
     model: CollisionModel,
     travel: TravelTime,
+    *,
+    whole_poses: bool = True,
 ) -> list[tuple[str, int, int]]:
     """Order all configurations of some plans by travel time.
 
@@ -230,6 +251,9 @@ def visit_order(
         What the arm must not hit: a way that is not straight counts as longer.
     travel
         How long the ways take.
+    whole_poses
+        Visit a pose in all its solutions before the next one: poses count as far apart as the
+        nearest of their solutions.
 
     Returns
     -------
@@ -245,21 +269,36 @@ def visit_order(
     if not visits:
         return []
     q = np.array([plans[split].poses[index].solutions[number] for split, index, number in visits])
+    keys = [visit[:2] if whole_poses else visit for visit in visits]
+    begin = [i for i, key in enumerate(keys) if i == 0 or key != keys[i - 1]]
+    places = [range(a, b) for a, b in pairwise([*begin, len(visits)])]
+    each = travel.between(q)
     # The arm may come from anywhere: as near to all.
-    times = np.zeros((len(q) + 1, len(q) + 1))
-    times[1:, 1:] = travel.between(q)
+    times = np.zeros((len(places) + 1, len(places) + 1))
+    times[1:, 1:] = np.minimum.reduceat(np.minimum.reduceat(each, begin, axis=0), begin, axis=1)
     order = fastest_order(times)
     judged: set[tuple[int, int]] = set()
     for _ in range(MOST_TRIES):
         legs = {(min(leg), max(leg)) for leg in pairwise(order)} - judged
         judged |= legs
-        blocked = [leg for leg in legs if not is_straight_free(model, *q[np.array(leg) - 1])]
+        blocked = [
+            leg for leg in legs if not _is_free(model, q, each, *(places[i - 1] for i in leg))
+        ]
         if not blocked:
             break
         for a, b in blocked:
             times[a, b] = times[b, a] = DETOUR * times[a, b]
         order = fastest_order(times)
-    return [visits[place - 1] for place in order]
+    return [visits[member] for place in order for member in places[place - 1]]
+
+
+def _is_free(
+    model: CollisionModel, q: FloatArray, times: FloatArray, one: range, other: range
+) -> bool:
+    """Return whether the shortest way between two places, of configurations each, is free."""
+    apart = times[one.start : one.stop, other.start : other.stop]
+    a, b = np.unravel_index(int(np.argmin(apart)), apart.shape)
+    return is_straight_free(model, q[one[int(a)]], q[other[int(b)]])
 
 
 def _without_way(model: CollisionModel, q: FloatArray, travel: TravelTime) -> list[int]:

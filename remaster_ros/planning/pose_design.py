@@ -1,11 +1,12 @@
-"""Choose configurations that tell the most in the least time: greedy, then exchange of poses.
+"""Choose poses that tell the most in the least time: greedy, then exchange.
 
 A-optimal for the joint offsets (least sum of their variances), I-optimal for the tool (least mean
-variance of the predicted markers in a box), or a mixture of both. Configurations are added one by
-one, each the one that lowers the criterion the most for its time, until the wanted standard
-deviations are reached; those that are not needed any more are left out. Then poses are exchanged
-while that saves robot time: one is brought in with all its solutions, or some are left out and
-what is missing is filled up, and again what is not needed is left out.
+variance of the predicted markers in a box), or a mixture of both. What is chosen is a pose in all
+its joint solutions, with their information and their time, or single configurations. They are
+added one by one, each the one that lowers the criterion the most for its time, until the wanted
+standard deviations are reached; those that are not needed any more are left out. Then poses are
+exchanged while that saves robot time: one is brought in with all its solutions, or some are left
+out and what is missing is filled up, and again what is not needed is left out.
 
 Single configurations are not exchanged, as V. V. Fedorov's and T. J. Mitchell's (DETMAX)
 algorithms do: the error that the configurations of a pose share makes the first of a pose tell
@@ -17,7 +18,7 @@ relaxation) has to weigh subsets of the solutions of a pose. benchmarks/RESULTS.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,7 +36,7 @@ HELD_OUT_POSES = 12
 (`discovery.screening`), on held-out rows as on the others, and 12 poses of 3 coordinates give the
 RMS error on them to 12 %."""
 HELD_OUT_SOLUTIONS = 2
-"""Solutions of each: two solutions of a pose are what the relative metric compares."""
+"""Solutions of each, where not all are visited: two are what the relative metric compares."""
 MOST_CONFIGURATIONS = 400
 """A design that needs more is not reached."""
 MOST_EXCHANGES, EFFORT = 200, 6000
@@ -147,6 +148,8 @@ def choose(
     floors: Floors = Floors(),
     most: int = MOST_CONFIGURATIONS,
     exchanges: int = MOST_EXCHANGES,
+    *,
+    whole_poses: bool = True,
 ) -> Design:
     """Choose configurations.
 
@@ -164,11 +167,14 @@ def choose(
         Configurations chosen at most.
     exchanges
         Tried at most.
+    whole_poses
+        Choose poses with all their configurations; single ones otherwise.
     """
-    search = _Search(information, travel, goal, floors)
-    chosen = search.filled([], min(most, len(information)))
+    units = _Units(information, travel, whole_poses)
+    search = _Search(units, goal, floors)
+    chosen = search.filled([], most)
     if not search.is_done(chosen):
-        return Design(tuple(chosen), reached=False)
+        return Design(units.configurations(chosen), reached=False)
     best = search.thinned(chosen)
     for _ in range(min(exchanges, EFFORT // len(best))):
         tried = search.with_other_poses(best, rng)
@@ -176,18 +182,78 @@ def choose(
             tried = search.thinned(tried)
             if search.spent(tried) < search.spent(best) - WORTHWHILE_S:
                 best = tried
-    return Design(tuple(best), reached=True)
+    return Design(units.configurations(best), reached=True)
+
+
+class _Units:
+    """What is chosen one by one: configurations, or poses with all of theirs.
+
+    Attributes
+    ----------
+    whole
+        Whether they are poses.
+    information
+        Of each of the n units.
+    members
+        Which configurations each is.
+    solutions
+        How many, (n,).
+    stay_s
+        Time of measuring them and of the ways between them, s, (n,).
+    """
+
+    def __init__(self, information: DesignInformation, travel: TravelTime, whole: bool) -> None:
+        self.information, self.whole = information, whole
+        self.members = list(np.arange(len(information))[:, None])
+        if whole:
+            self.information, self.members = information.whole_poses()
+        self.solutions: IntArray = np.array([len(mine) for mine in self.members])
+        self._travel, self._q = travel, [information.q[mine] for mine in self.members]
+        self._by_joints = replace(travel, limits=replace(travel.limits, tool_speed=np.inf))
+        self._first = np.cumsum(self.solutions) - self.solutions
+        between = np.array([self._between(q) for q in self._q])
+        self.stay_s: FloatArray = self.solutions * travel.measuring_s + between
+        self._near: dict[int, FloatArray] = {}
+
+    def _between(self, q: FloatArray) -> float:
+        """Return the mean time through solutions (m, k) of a pose, nearest first, s."""
+        times = self._travel.between(q)
+        order = np.argsort(times, axis=1)
+        along = np.take_along_axis(times[order[:, :-1]], order[:, 1:, None], axis=2)
+        return float(np.mean(np.sum(along, axis=(1, 2))))
+
+    def near(self, index: int) -> FloatArray:
+        """Return the time from one unit to each, s, (n,)."""
+        if index not in self._near:
+            # Which two are the nearest, by the joints alone; looking at the tool takes long.
+            q, own = np.concatenate(self._q), self._q[index]
+            joints = np.array([self._by_joints.straight(one, q) for one in own])
+            mine = np.argmin(joints, axis=0)
+            least = np.min(joints, axis=0)
+            ends = [
+                first + int(np.argmin(least[first : first + count]))
+                for first, count in zip(self._first, self.solutions, strict=True)
+            ]
+            near = np.empty(len(ends))
+            for start in np.unique(mine[ends]):
+                these = np.flatnonzero(mine[ends] == start)
+                near[these] = self._travel.straight(own[start], q[np.array(ends)[these]])
+            self._near[index] = near
+            # Its own place is no neighbour of it.
+            self._near[index][index] = np.inf
+        return self._near[index]
+
+    def configurations(self, chosen: Sequence[int]) -> tuple[int, ...]:
+        """Return the configurations of chosen units."""
+        return tuple(int(each) for index in chosen for each in self.members[index])
 
 
 class _Search:
     """The criterion of candidates, and what they cost."""
 
-    def __init__(
-        self, information: DesignInformation, travel: TravelTime, goal: Goal, floors: Floors
-    ) -> None:
-        self._information, self._travel, self._goal = information, travel, goal
-        self._floors, self._root = floors, goal.weights(information)
-        self._near: dict[int, FloatArray] = {}
+    def __init__(self, units: _Units, goal: Goal, floors: Floors) -> None:
+        self._units, self._information, self._goal = units, units.information, goal
+        self._floors, self._root = floors, goal.weights(units.information)
 
     def _criteria(self, matrices: FloatArray) -> FloatArray:
         """Return trace(L' M^-1 L) of information (..., f, f), (...)."""
@@ -196,7 +262,7 @@ class _Search:
         return np.einsum('ij,...ij->...', self._root, np.linalg.solve(finite, root))
 
     def _with_each(self, chosen: Sequence[int], allowed: BoolArray) -> tuple[IntArray, FloatArray]:
-        """Return the configurations that promise the most, and the criterion with each, (m,)."""
+        """Return the units that promise the most, and the criterion with each, (m,)."""
         information = self._information
         allowed = allowed.copy()
         allowed[np.array(chosen, dtype=np.int64)] = False
@@ -209,20 +275,11 @@ class _Search:
         return among, self._criteria(information.with_each(chosen, among))
 
     def _times(self, chosen: Sequence[int]) -> FloatArray:
-        """Return what each configuration adds to the robot's time beside the chosen, s, (n,)."""
+        """Return what each unit adds to the robot's time beside the chosen, s, (n,)."""
         if not chosen:
-            return np.full(len(self._information), self._travel.measuring_s)
-        near = np.min([self._near_to(index) for index in chosen], axis=0)
-        return near + self._travel.measuring_s
-
-    def _near_to(self, index: int) -> FloatArray:
-        """Return the time from one configuration to each, s, (n,)."""
-        if index not in self._near:
-            q = self._information.q
-            self._near[index] = self._travel.straight(q[index], q)
-            # Its own place is no neighbour of it.
-            self._near[index][index] = np.inf
-        return self._near[index]
+            return self._units.stay_s
+        near = np.min([self._units.near(index) for index in chosen], axis=0)
+        return near + self._units.stay_s
 
     def is_done(self, chosen: Sequence[int]) -> bool:
         return self._floors.hold(self._poses(chosen)) and self._goal.is_reached(
@@ -230,41 +287,50 @@ class _Search:
         )
 
     def _poses(self, chosen: Sequence[int]) -> IntArray:
-        """Return the pose of each of the chosen, (m,)."""
-        return self._information.pose[np.array(chosen, dtype=np.int64)]
+        """Return the pose of each configuration of the chosen, (m,)."""
+        which = np.array(chosen, dtype=np.int64)
+        return np.repeat(self._information.pose[which], self._units.solutions[which])
 
     def _best_addition(self, chosen: Sequence[int]) -> int:
-        """Return which configuration gains the most per second."""
+        """Return which unit gains the most for its time."""
         allowed = np.ones(len(self._information), bool)
         if chosen and self._goal.is_reached(self._information, chosen):
-            # Only the floors are missing.
-            poses, repeated, count = self._floor_counts(chosen)
-            new = (count == 0) & (poses < self._floors.poses)
-            second = (count == 1) & (repeated < self._floors.repeated)
-            allowed = new | second if np.any(new | second) else allowed
+            missing = self._missing(chosen)
+            allowed = missing if missing.any() else allowed
+            if self._units.whole and missing.any():
+                # Beyond the goal what its further solutions tell is not worth their time.
+                return int(np.argmin(np.where(missing, self._times(chosen), np.inf)))
         among, criteria = self._with_each(chosen, allowed)
         now = self._criteria(self._information.total(chosen))
         return int(
             among[np.argmax(np.log(now / criteria) / self._times(chosen)[among] ** URGENCY)]
         )
 
-    def _floor_counts(self, chosen: Sequence[int]) -> tuple[int, int, IntArray]:
-        """Return the poses, those with two, and how many are at each configuration's, (n,)."""
-        pose = self._information.pose
+    def _missing(self, chosen: Sequence[int]) -> BoolArray:
+        """Return which units come nearer to the floors, (n,)."""
+        pose, several = self._information.pose, self._units.solutions > 1
         count = np.bincount(self._poses(chosen), minlength=int(pose.max()) + 1)
-        return int(np.sum(count > 0)), int(np.sum(count > 1)), count[pose]
+        poses, repeated = np.sum(count > 0), np.sum(count > 1)
+        new = (count[pose] == 0) & (poses < self._floors.poses)
+        if repeated < self._floors.repeated:
+            if self._units.whole:
+                return (count[pose] == 0) & several
+            new |= count[pose] == 1
+        return new
 
     def filled(self, chosen: Sequence[int], most: int) -> list[int]:
         """Add what gains the most for its time until goal and floors are reached."""
         chosen = list(chosen)
-        while len(chosen) < most and not self.is_done(chosen):
+        while len(chosen) < len(self._information) and not self.is_done(chosen):
+            if len(self._poses(chosen)) >= most:
+                break
             chosen.append(self._best_addition(chosen))
         return chosen
 
     def with_other_poses(self, chosen: Sequence[int], rng: np.random.Generator) -> list[int]:
         """Bring a pose in with all its solutions, or leave a few out and fill up again."""
         pose = self._information.pose
-        own = np.unique(self._poses(chosen))
+        own = np.unique(pose[np.array(chosen, dtype=np.int64)])
         if rng.random() < 0.5:
             others = np.setdiff1d(pose, own)
             if not len(others):
@@ -272,34 +338,36 @@ class _Search:
             return [*chosen, *np.flatnonzero(pose == rng.choice(others)).tolist()]
         out = rng.choice(own, rng.integers(1, max(2, min(5, len(own) // 3 + 1))), replace=False)
         left = [index for index in chosen if pose[index] not in out]
-        return self.filled(left, len(chosen) + MOST_MORE)
+        return self.filled(left, len(self._poses(chosen)) + MOST_MORE)
 
     def thinned(self, chosen: Sequence[int]) -> list[int]:
         """Leave out one after the other while goal and floors are reached."""
         chosen = list(chosen)
-        while True:
-            fewer = self._without_least(chosen)
-            if not self.is_done(fewer):
-                return chosen
+        while len(chosen) > 1 and self.is_done(fewer := self._without_least(chosen)):
             chosen = fewer
+        return chosen
 
     def _without_least(self, chosen: Sequence[int]) -> list[int]:
         """Leave out the one that tells the least for its time, the floors kept if possible."""
         which = np.array(chosen, dtype=np.int64)
         without = [[other for other in chosen if other != index] for index in chosen]
         matrices = np.array([self._information.total(rest) for rest in without])
-        near = np.array([self._near_to(index)[which] for index in chosen])
+        near = np.array([self._units.near(index)[which] for index in chosen])
+        stay_s = self._units.stay_s[which]
+        # One that is left alone has no neighbour, and no way.
+        near[~np.isfinite(near)] = np.inf if len(chosen) > 2 else 0.0
         spent = [
             np.sum(np.min(np.delete(np.delete(near, i, 0), i, 1), axis=0))
             for i in range(len(chosen))
         ]
-        measuring = (len(chosen) - 1) * self._travel.measuring_s
-        cost = np.log(self._criteria(matrices)) + URGENCY * np.log(np.array(spent) + measuring)
+        times = np.array(spent) + np.sum(stay_s) - stay_s
+        cost = np.log(self._criteria(matrices)) + URGENCY * np.log(times)
         kept = np.array([self._floors.hold(self._poses(rest)) for rest in without])
         return without[int(np.argmin(np.where(kept | ~kept.any(), cost, np.inf)))]
 
     def spent(self, chosen: Sequence[int]) -> float:
         """Return about how long the robot takes, s: each is reached from the nearest other one."""
         which = np.array(chosen, dtype=np.int64)
-        near = np.min([self._near_to(index)[which] for index in chosen], axis=0)
-        return float(np.sum(near)) + len(chosen) * self._travel.measuring_s
+        near = np.min([self._units.near(index)[which] for index in chosen], axis=0)
+        ways = float(np.sum(near)) if len(chosen) > 1 else 0.0
+        return ways + float(np.sum(self._units.stay_s[which]))

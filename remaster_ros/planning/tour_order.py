@@ -177,6 +177,29 @@ class Tour:
         other._left, other._numbers = deepcopy(self._left), dict(self._numbers)
         return other
 
+    def only_first(self, count: int) -> Tour:
+        """Return a tour of the first poses of each split alone."""
+        plans = {
+            split: replace(plan, poses=plan.poses[:count]) for split, plan in self.plans.items()
+        }
+        return self._again(plans, self._model)
+
+    def afresh(self) -> Tour:
+        """Return the tour from its beginning, with every way straight."""
+        return self._again(self.plans, None)
+
+    def _again(self, plans: Mapping[str, Plan], model: CollisionModel | None) -> Tour:
+        return Tour(
+            self._chain,
+            plans,
+            in_order=self.in_order,
+            one_solution=self.one_solution,
+            model=model,
+            reference_every=self.reference_every,
+            order=self.order,
+            begin_at=self.begin_at,
+        )
+
     def next(self, q: FloatArray) -> PoseVisit | None:
         """Return the next stop for an arm at joint positions `q` (rad, (k,)); None at the end."""
         proposed = self.propose(q)

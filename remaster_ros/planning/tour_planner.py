@@ -36,6 +36,8 @@ from remaster_ros.planning.tour_order import (
 from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.types import FloatArray, Measurements
 
+REGISTRATION_CANDIDATES = 12
+"""Candidate poses for the three-point registration, where nothing else is stated."""
 MOST_TRIES = 5
 """So often references are chosen anew where one has no free way to it."""
 
@@ -96,6 +98,11 @@ class TourPlanner:
         """T_R_N of each sensor at its rough place, (4, 4)."""
         return {name: transform(np.eye(3), at) for name, at in self.scene.rough_R.items()}
 
+    @property
+    def registers(self) -> bool:
+        """Whether the sensors are registered by poses of this planner's."""
+        return REGISTRATION in self._counts
+
     def registration(self) -> Tour:
         """Plan poses for the three-point registration, before sensors at their rough places."""
         plan = self._plan(REGISTRATION, self.scene.rough_R)
@@ -129,7 +136,8 @@ class TourPlanner:
             plans['optimization'] = self._separating(plans['optimization'], sensors_R)
         order = []
         if self.design.fastest:
-            order = visit_order(plans, self.model, self.travel)
+            whole = self.design.whole_poses
+            order = visit_order(plans, self.model, self.travel, whole_poses=whole)
         if self._every:
             plans[REFERENCE] = self._references(plans)
         return Tour(self._chain, plans, model=self.model, reference_every=self._every, order=order)

@@ -11,7 +11,7 @@ import numpy as np
 from remaster_ros.planning.collection_plan import FITTED, CollectionPlan, Expected
 from remaster_ros.planning.planned_design import DesignSettings
 from remaster_ros.planning.separating_design import DECIDED, SeparatingDesign
-from remaster_ros.planning.tour_order import REFERENCE, Tour
+from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, Tour
 
 HELD_OUT = 'validation'
 
@@ -19,8 +19,10 @@ HELD_OUT = 'validation'
 def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
     """Return what ``remaster plan --json`` prints.
 
-    ``dropped`` counts poses that lost all their solutions, ``dropped_configurations`` solutions.
-    ``expected_tool_std_mm`` is the root mean square of the 3-D error of the predicted markers.
+    ``robot_time_s`` is that of the whole session: registration, what is fitted, what is held out
+    and references. ``dropped`` counts poses that lost all their solutions,
+    ``dropped_configurations`` solutions. ``expected_tool_std_mm`` is the root mean square of the
+    3-D error of the predicted markers.
     """
     visits = Counter(visit.split for visit in plan.visits)
     design = plan.designed
@@ -77,14 +79,16 @@ def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
         + (', chosen for what they tell' if settings.optimal else ' of a Latin hypercube'),
         f'held out: {visits[HELD_OUT]} configurations at {poses.get(HELD_OUT, 0)} poses',
     ]
+    if visits[REGISTRATION]:
+        lines.append(f'registration: {visits[REGISTRATION]} configurations')
     if plan.tour.references:
         lines.append(
-            f'references: {plan.tour.references} configurations, {visits["reference"]} visits'
+            f'references: {plan.tour.references} configurations, {visits[REFERENCE]} visits'
         )
     lines += [
         f'dropped poses: {_counts(plan.tour.dropped)}',
         f'dropped configurations: {_counts(plan.dropped)}',
-        f'robot time: {minutes_text(plan.robot_time_s)}, '
+        f'robot time of the whole session: {minutes_text(plan.robot_time_s)}, '
         f'fastest point at {plan.max_tool_speed_m_s:.2f} m/s',
     ]
     lines += _expected_lines(plan.joint_std, plan.joint_rms, plan.tool_rms)

@@ -76,7 +76,8 @@ def plan_page(
         confirm_service=service_name(confirm),
         mood='caution' if missed_goal(plan) or plan.undetermined else 'good',
         headline=(
-            f'{len(plan.visits)} configurations at {poses} poses in {minutes} of robot time; no '
+            f'{len(plan.visits)} configurations at {poses} poses in {minutes} of robot time for '
+            f'the whole session; no '
             f'point of arm and tool faster than {plan.max_tool_speed_m_s:.2f} m/s.'
         ),
         moving=minutes_text(moving_s),

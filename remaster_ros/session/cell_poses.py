@@ -20,6 +20,7 @@ Range = tuple[float, float]
 REACH = Bounds(-10.0, 10.0, 'm')
 LATIN_HYPERCUBE, OPTIMAL = 'latin_hypercube', 'optimal'
 NEAREST, FASTEST = 'nearest', 'fastest'
+ALL, CHOSEN = 'all', 'chosen'
 RANGES = ('azimuth_deg', 'radius_m', 'height_m', 'roll_deg')
 
 
@@ -36,10 +37,12 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
     Attributes
     ----------
     design
-        ``latin_hypercube`` for all of its poses, ``optimal`` for those that tell the most.
+        ``optimal`` for the poses that tell the most, ``latin_hypercube`` for all of its poses.
+    solutions
+        ``all`` for each pose in all its free joint solutions, nearest first; ``chosen`` for the
+        configurations that take the fewest minutes, a pose again where that is shorter.
     order
-        ``nearest`` for the nearest pose next, in all its solutions; ``fastest`` for the least
-        travel.
+        ``nearest`` for the nearest pose next, ``fastest`` for the least travel.
     tool_share
         0 for the joint offsets alone, 1 for the tool's error alone, between them for a mixture.
     joint_std_deg, tool_std_m
@@ -53,7 +56,8 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
     radius_m: Annotated[Range, Bounds(0.0, 10.0, 'm')] = (0.2, 0.5)
     height_m: Annotated[Range, REACH] = (0.4, 0.8)
     roll_deg: Range = (0.0, 360.0)
-    design: str = LATIN_HYPERCUBE
+    design: str = OPTIMAL
+    solutions: str = ALL
     order: str = NEAREST
     tool_share: Annotated[float, Bounds(0.0, 1.0)] = 0.0
     joint_std_deg: Annotated[float | None, Bounds(0.0, 5.0, 'degrees', above=True)] = None
@@ -74,6 +78,7 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
         box = self.tool_box
         return DesignSettings(
             optimal=self.design == OPTIMAL,
+            whole_poses=self.solutions == ALL,
             fastest=self.order == FASTEST,
             sensors=sensors,
             marker_std_m=marker_std_m,
@@ -115,7 +120,12 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
                     f'poses.{key} is {low:g} to {high:g}, a range of {high - low:.3g} degrees; if '
                     f'radians were meant, write {degrees(low):.4g}, {degrees(high):.4g}'
                 )
-        for key, words in (('design', (LATIN_HYPERCUBE, OPTIMAL)), ('order', (NEAREST, FASTEST))):
+        choices = {
+            'design': (OPTIMAL, LATIN_HYPERCUBE),
+            'solutions': (ALL, CHOSEN),
+            'order': (NEAREST, FASTEST),
+        }
+        for key, words in choices.items():
             if getattr(self, key) not in words:
                 return f'poses.{key} is {getattr(self, key)!r}; write {" or ".join(words)}'
         return self._without_effect()
@@ -123,6 +133,11 @@ class CellPoses(msgspec.Struct, forbid_unknown_fields=True):
     def _without_effect(self) -> str:
         """Return which key changes nothing beside the others; '' where each does."""
         given = self.given()
+        if self.solutions == CHOSEN and (self.design, self.order) == (LATIN_HYPERCUBE, NEAREST):
+            return (
+                f'poses.solutions: {CHOSEN} has no effect with design: {LATIN_HYPERCUBE} and '
+                f'order: {NEAREST}; leave it out'
+            )
         if 'tool_share' in given and self.design != OPTIMAL:
             return (
                 f'poses.tool_share has no effect with design: {self.design}; write design: '

@@ -19,6 +19,8 @@ def cell_with(folder, poses):
     text = config_path('cells/demo.yaml').read_text(encoding='utf-8')
     text = text.replace('../robots', str(config_path('robots')))
     path = folder / 'cell.yaml'
+    if 'design:' in poses:
+        text = text.replace('  design: latin_hypercube\n', '')
     path.write_text(text.replace('poses:\n', f'poses:\n{poses}', 1), encoding='utf-8')
     return path
 
@@ -42,7 +44,11 @@ def test_the_object_says_what_is_planned(capsys):
     found = as_json(capsys, 'demo', *FEW, '--reference-every', 0)
     assert found['poses'] == sum(part['poses'] for part in found['splits'].values())
     assert found['configurations'] == sum(part['visits'] for part in found['splits'].values())
-    assert found['poses'] + sum(found['dropped'].values()) == 32
+    assert (
+        found['poses'] + sum(found['dropped'].values())
+        == 32 + found['splits']['registration']['poses']
+    )
+    assert found['splits']['registration']['visits'] == 3
     assert found['goal'] is None
     std = found['expected_std_deg']
     assert list(std) == [f'joint_{i}' for i in range(1, 8)]
@@ -55,7 +61,7 @@ def test_the_object_says_what_is_planned(capsys):
 
 def test_an_optimal_design_is_as_precise_in_less_time(tmp_path, capsys):
     whole = as_json(capsys, 'demo', *FEW)
-    path = cell_with(tmp_path, '  design: optimal\n  order: fastest\n')
+    path = cell_with(tmp_path, '  design: optimal\n  solutions: chosen\n  order: fastest\n')
     optimal = as_json(capsys, path, *FEW)
     assert optimal['goal']['reached']
     assert optimal['expected_rms_std_deg'] <= whole['expected_rms_std_deg'] * 1.0001
@@ -67,7 +73,14 @@ def test_an_optimal_design_is_as_precise_in_less_time(tmp_path, capsys):
 def test_people_read_a_subject_a_line(capsys):
     status, out, err = run(capsys, 'demo', *FEW)
     assert (status, err) == (0, '')
-    for words in ('to fit: ', 'held out: ', 'references: ', 'dropped poses: ', 'robot time: '):
+    for words in (
+        'to fit: ',
+        'held out: ',
+        'references: ',
+        'dropped poses: ',
+        'registration: ',
+        'robot time of the whole session: ',
+    ):
         assert words in out
     assert 'joint_1              not identifiable' in out
     assert run(capsys, 'demo', *FEW, '--quiet')[1] == ''

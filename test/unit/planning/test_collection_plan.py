@@ -1,15 +1,19 @@
 """A whole collection before it begins: designs and orders of a cell, every way of them free."""
 
+from collections import Counter
+from itertools import groupby
+
 import numpy as np
 import pytest
 
 from remaster_ros.kinematics.free_paths import is_straight_free
-from remaster_ros.kinematics.transforms import transform
 from remaster_ros.planning import planned_design, pose_design
-from remaster_ros.planning.collection_plan import look_ahead, plan_collection
-from remaster_ros.planning.planned_design import NOT_NEEDED
+from remaster_ros.planning.candidates import order_solutions, plan_poses
+from remaster_ros.planning.collection_plan import look_ahead, plan_collection, session_time_s
+from remaster_ros.planning.planned_design import NOT_NEEDED, DesignSettings
 from remaster_ros.planning.pose_design import HELD_OUT_POSES, HELD_OUT_SOLUTIONS, Floors
 from remaster_ros.planning.tour_planner import TourPlanner
+from remaster_ros.reports.plan_json import plan_text, plan_to_dict
 from remaster_ros.session.cell_poses import CellPoses
 from remaster_ros.session.workcell import read_cell
 
@@ -20,25 +24,70 @@ def small(monkeypatch):
     monkeypatch.setattr(pose_design, 'EFFORT', 300)
 
 
-def planned(poses, counts=(24, 24), every=0):
+def planner_of(poses, counts=(24, 24), every=0, registration=0):
     cell = read_cell('demo')
     cell.poses = poses
-    chain = cell.chain()
-    scene = cell.planning_scene(chain)
+    scene = cell.planning_scene(cell.chain())
     counts = {'optimization': counts[0], 'validation': counts[1]}
+    if registration:
+        counts['registration'] = registration
     planner = TourPlanner(scene, counts, 0, every, cell.design_settings())
-    places = {name: transform(np.eye(3), origin) for name, origin in scene.rough_R.items()}
-    start = np.deg2rad([5.0, 7.0, 0.0, 112.0, 10.0, 35.0, -20.0])
-    return scene, plan_collection(planner, places, start)
+    return planner, np.deg2rad([5.0, 7.0, 0.0, 112.0, 10.0, 35.0, -20.0])
+
+
+def planned(poses, counts=(24, 24), every=0, registration=0):
+    planner, start = planner_of(poses, counts, every, registration)
+    return planner.scene, plan_collection(planner, planner.rough_places, start)
 
 
 def of(plan, split):
     return [visit for visit in plan.visits if visit.split == split]
 
 
-def test_an_optimal_design_reaches_what_all_poses_reach_in_less_time_on_free_ways():
-    _, whole = planned(CellPoses())
-    scene, plan = planned(CellPoses(design='optimal', order='fastest'))
+LATIN = 'latin_hypercube'
+
+
+def test_a_cell_has_by_default_designed_poses_each_in_all_its_free_solutions_nearest_first():
+    _, whole = planned(CellPoses(design=LATIN))
+    scene, plan = planned(CellPoses())
+    assert plan.designed.reached
+    assert plan.joint_rms <= whole.joint_rms
+    assert plan.robot_time_s < whole.robot_time_s
+    fitted, held_out = of(plan, 'optimization'), of(plan, 'validation')
+    assert len({visit.pose for visit in fitted}) >= Floors().poses
+    assert len({visit.pose for visit in held_out}) == min(
+        HELD_OUT_POSES, whole.tour.poses['validation']
+    )
+    ways = scene.inverse_kinematics
+    limits = scene.model.chain.velocity_limits
+    for stop in stops(plan):
+        # All that the arm can take and every sensor sees, in one go.
+        T = plan.tour.plans[stop[0].split].poses[stop[0].pose].T_R_T
+        free = plan_poses(ways, scene.model, T[None], scene.sights, scene.limit_margin_rad)
+        (pose,) = free.poses
+        visited = np.array([visit.q for visit in stop])
+        assert len(visited) == len(pose.solutions)
+        # Nearest to where the arm stands when the pose is published; a nearer one comes later only
+        # where no free straight way led to it.
+        nearest = order_solutions(visited, stop[0].points[0], limits).tolist()
+        for number, visit in enumerate(stop):
+            nearer = [i for i in nearest[: nearest.index(number)] if i > number]
+            assert not any(
+                is_straight_free(scene.model, visit.points[0], visited[i]) for i in nearer
+            )
+    assert len(stops(plan)) == len({(v.split, v.pose) for v in (*fitted, *held_out)})
+    assert min(len(stop) for stop in stops(plan) if stop[0].split == 'optimization') >= 2
+
+
+def stops(plan):
+    """Return the visits of each pose that is no reference, next to each other."""
+    measured = [visit for visit in plan.visits if visit.split in ('optimization', 'validation')]
+    return [list(stop) for _, stop in groupby(measured, lambda visit: (visit.split, visit.pose))]
+
+
+def test_chosen_solutions_reach_what_all_poses_reach_in_the_fewest_minutes_on_free_ways():
+    _, whole = planned(CellPoses(design=LATIN))
+    scene, plan = planned(CellPoses(solutions='chosen', order='fastest'))
     assert plan.joint_rms <= whole.joint_rms
     assert plan.robot_time_s < 0.7 * whole.robot_time_s
     fitted, held_out = of(plan, 'optimization'), of(plan, 'validation')
@@ -56,6 +105,28 @@ def test_an_optimal_design_reaches_what_all_poses_reach_in_less_time_on_free_way
         np.testing.assert_array_equal(before.q, after.points[0])
 
 
+def test_the_robot_time_is_that_of_the_whole_session():
+    _, plan = planned(CellPoses(), every=25, registration=12)
+    by_split = Counter()
+    for visit in plan.visits:
+        by_split[visit.split] += visit.trajectory.duration_s + plan.measuring_s
+    assert by_split.keys() == {'registration', 'optimization', 'validation', 'reference'}
+    assert len(of(plan, 'registration')) == 3
+    assert sum(by_split.values()) == pytest.approx(plan.robot_time_s)
+    assert plan_to_dict(plan)['robot_time_s'] == pytest.approx(plan.robot_time_s, abs=0.1)
+    assert 'robot time of the whole session' in plan_text(plan, DesignSettings(optimal=True))
+
+
+def test_the_time_without_looking_for_ways_is_that_of_the_plan():
+    planner, start = planner_of(CellPoses(), every=25, registration=12)
+    plan = plan_collection(planner, planner.rough_places, start)
+    tour = plan.tour.fork()
+    # However far it is: what a planner that goes on states is the whole session too.
+    for _ in range(3):
+        start = tour.next(start).solutions[-1]
+    assert session_time_s(planner, tour, start) == pytest.approx(plan.robot_time_s, rel=0.1)
+
+
 def test_every_candidate_is_accounted_for():
     _, plan = planned(CellPoses(design='optimal'))
     candidates = 24 + 60 + 24
@@ -63,13 +134,19 @@ def test_every_candidate_is_accounted_for():
     assert plan.tour.dropped[NOT_NEEDED] > 0
 
 
-def test_the_fastest_order_of_the_same_poses_takes_less_time():
-    _, nearest = planned(CellPoses())
-    _, fastest = planned(CellPoses(order='fastest'))
+def test_the_fastest_order_of_the_same_configurations_takes_less_time():
+    _, nearest = planned(CellPoses(design=LATIN))
+    _, fastest = planned(CellPoses(design=LATIN, solutions='chosen', order='fastest'))
     assert fastest.tour.configurations == nearest.tour.configurations
     assert len(fastest.visits) + fastest.unreached == len(nearest.visits) + nearest.unreached
     assert fastest.robot_time_s < 0.9 * nearest.robot_time_s
     assert fastest.joint_rms == pytest.approx(nearest.joint_rms)
+
+
+def test_the_fastest_order_of_whole_poses_visits_each_once():
+    _, plan = planned(CellPoses(design=LATIN, order='fastest'))
+    found = [(stop[0].split, stop[0].pose) for stop in stops(plan)]
+    assert len(found) == len(set(found)) == sum(plan.poses.values())
 
 
 def test_a_stated_goal_is_reached_or_said_not_to_be():

