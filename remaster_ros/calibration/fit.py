@@ -162,4 +162,5 @@ def _fast(
         z_before=lambda: found.before.z,
         left_out=found.left_out,
         mode=found.mode,
+        found=found,
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from remaster_ros.calibration.comparison import Comparison, compared, predicted_rows
 from remaster_ros.calibration.convergence import SamplerInfo
-from remaster_ros.calibration.estimate import Problem
+from remaster_ros.calibration.estimate import Estimate, Problem
 from remaster_ros.calibration.held_out_tests import held_out_tests
 from remaster_ros.calibration.identifiability import Gauge, GaugeDirection, known_offsets
 from remaster_ros.calibration.laplace import Mode
@@ -98,6 +98,8 @@ class FitResult:
         (chains, draws, m).
     predictive
         The posterior as predictions take it.
+    found
+        The estimate whose posterior was sampled; None where the sampler is the paper's.
     """
 
     session: Session
@@ -131,6 +133,7 @@ class FitResult:
     theta_std: FloatArray
     theta_draws: FloatArray
     predictive: Predictive
+    found: Estimate | None = None
 
     @property
     def comparison(self) -> Comparison:
@@ -204,6 +207,8 @@ class Sampled:
     unmodelled
         How c causes outside the model move the natural parameters, one standard deviation of
         each, (size, c); None where none are expected.
+    found
+        Whose posterior it is; None where it was not sought.
     """
 
     posterior: Posterior
@@ -220,6 +225,7 @@ class Sampled:
     left_out: tuple[tuple[int, str], ...]
     mode: Mode | None = None
     unmodelled: FloatArray | None = None
+    found: Estimate | None = None
 
     def widened(self, rng: np.random.Generator) -> Sampled:
         """Return the same with the draws moved by causes outside the model."""
@@ -365,6 +371,7 @@ def build_result(
         theta_std=model.theta(flat).std(axis=0, ddof=1),
         theta_draws=model.theta(sampled.z),
         predictive=predictive,
+        found=sampled.found,
     )
 
 

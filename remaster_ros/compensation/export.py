@@ -33,6 +33,7 @@ REMASTER_FILE = 'remaster.txt'
 LAYER_FILE = 'offset_layer.yaml'
 URDF_FILE = 'robot_calibrated.urdf'
 GEOMETRY_FILE = 'robot_geometry.urdf'
+MODEL_FILE = 'robot_model.urdf'
 
 _PROLOG = re.compile(r'(?:\s*(?:<\?.*?\?>|<!--.*?-->))*\s*', re.DOTALL)
 _LIMITS = {

@@ -356,6 +356,10 @@ class _System:
         bound = np.full(len(self.entering), np.log(RESOLUTION_M))
         low = np.concatenate((bound, smooth - _LARGE))
         high = np.concatenate((np.full(len(bound), np.log(0.1)), smooth + _LARGE))
+        least = np.array([self.cells[i].least for i in self.penalised])
+        with np.errstate(divide='ignore'):
+            high[len(bound) :] = np.minimum(high[len(bound) :], -2.0 * np.log(least))
+        low = np.minimum(low, high)
         return np.clip(eta, low, high), low, high
 
     def _typical(self, which: int, noise: Noise) -> float:

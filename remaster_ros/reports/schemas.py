@@ -55,6 +55,8 @@ class JointOffset(Struct):
     """One joint's zero-offset; where ``identifiable`` is false, ``why`` is the reason.
 
     ``model_std_deg`` stands where ``std_deg`` is wider than the model has it (``intervals``).
+    ``std_deg`` is for an arm that is its drawing; ``std_with_geometry_deg`` holds what lengths and
+    tilts off their drawing would do to the offset (``geometry``).
     """
 
     joint: str
@@ -64,6 +66,7 @@ class JointOffset(Struct):
     identifiable: bool
     why: str
     model_std_deg: float | UnsetType = UNSET
+    std_with_geometry_deg: float | UnsetType = UNSET
 
 
 class GaugeCombination(Struct):
@@ -223,6 +226,37 @@ class StructureTest(Struct):
     ratio: float | UnsetType = UNSET
 
 
+class Imitation(Struct):
+    """Which length or tilt moves a joint's offset most: by ``deg`` if it is the tolerance off.
+
+    ``joint`` is the joint's name; ``link_length`` ``of`` 2 is that of the link after joint 2.
+    """
+
+    joint: str
+    cause: Literal['link_length', 'joint_axis_tilt']
+    of: int
+    axis: str
+    deg: float
+
+
+class FittedGeometry(Struct):
+    """All link lengths and axis tilts fitted beside the offsets, one variance for either kind.
+
+    Standard deviations are RMS displacements of the marker by each length and each tilt, at least
+    ``tolerance_mm``. Errors are means over the validation rows, with the offsets on the drawing
+    and with the robot model that has these lengths and tilts; ``file`` is that model where it
+    predicts them better, '' where it does not.
+    """
+
+    tolerance_mm: float
+    length_std_mm: float | None
+    tilt_std_mm: float | None
+    drawing_held_out_mean_mm: float | None
+    held_out_mean_mm: float | None
+    file: str
+    imitations: list[Imitation]
+
+
 class Fit(Struct):
     """fit.json.
 
@@ -246,6 +280,7 @@ class Fit(Struct):
     explained_by_noise: dict[str, NoiseCheck] | UnsetType = UNSET
     residual_structure: list[StructureTest] | UnsetType = UNSET
     intervals: Literal['model', 'robust'] | UnsetType = UNSET
+    geometry: FittedGeometry | UnsetType = UNSET
     judgement: Judgement | UnsetType = UNSET
 
 

@@ -110,6 +110,9 @@ class Cell:
         axes, those of a spline next to each other; None else.
     model_change
         The same as a change of the robot model, where it is one; None else.
+    least
+        Of a penalised cell: standard deviation of the weights at a penalty of 1 that its
+        smoothness does not go below, in ``unit``; 0 for none.
     """
 
     name: str
@@ -130,6 +133,7 @@ class Cell:
     moment_std: float = 0.0
     curve: Curve | None = None
     model_change: ModelChange | None = None
+    least: float = 0.0
 
     @property
     def size(self) -> int:

@@ -1,0 +1,226 @@
+"""Link lengths and axis tilts beside the zero-offsets, all at once, and none of them selected.
+
+No arm is its drawing. Every length is a random effect about the drawing, and so is every tilt; one
+variance for all lengths and one for all tilts follow from the restricted likelihood (`evidence`),
+and neither is taken to be less than the tolerance of the drawing: what offsets imitate exactly
+leaves nothing in the residuals that could show it. Two things follow::
+
+    an offset's error if the drawing is off:   Var δ = Var(δ | drawing) + B S B'
+    a robot model to load:                     origins moved by E[g | data], offsets fitted with it
+
+with B = (A'WA + P)⁻¹ A'WZ the response of the offsets model A to a unit of each length and tilt
+Z, and S their variances. Columns are in units of the marker's RMS displacement, so that one
+tolerance in metres serves lengths and tilts alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from remaster_ros.calibration.comparison import predicted_rows
+from remaster_ros.calibration.estimate import Estimate, Problem, estimate
+from remaster_ros.calibration.identifiability import OPEN_ANGLE
+from remaster_ros.calibration.model import Model
+from remaster_ros.calibration.priors import TIGHTEST_PRIOR, prior_rows
+from remaster_ros.discovery.effects import joint_axis_tilt, link_length
+from remaster_ros.discovery.effects.base import Cell
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.evidence import solve
+from remaster_ros.discovery.random_effects import Family, by_members
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.stretches import root_of_inverse
+from remaster_ros.discovery.to_extension import extension_of, offsets_of
+from remaster_ros.errors import InsufficientDataError
+from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.kinematics.transforms import rotation_vector_to_matrix
+from remaster_ros.linear_algebra import one_thread
+from remaster_ros.types import FloatArray
+
+# Links of arms are machined and assembled to a tenth of a millimetre or so.
+TOLERANCE_M = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class GeometryModel:
+    """The arm with the lengths and tilts that its session shows; k joints, m lengths and tilts.
+
+    Attributes
+    ----------
+    tolerance_m
+        Of the drawing: RMS displacement of the marker by each length and each tilt, m.
+    members
+        Their cells; ``variant`` is the axis.
+    std_m
+        Standard deviation of each before it is measured, as RMS displacement of the marker, m,
+        (m,).
+    offset_moves
+        What one such standard deviation of each does to each zero-offset of the fit that takes the
+        arm to be its drawing, rad, (k, m).
+    shifts, turns
+        Of each joint's origin, in the frame of the link before, m, and of its frame, a rotation
+        vector, rad, (k, 3) each.
+    joint_offsets
+        Zero-offsets fitted together with it, those that the gauge holds at 0, rad, (k,).
+    held_out_m, drawing_held_out_m
+        Mean distance of measured and predicted position over the validation rows, m, with this
+        geometry and on the drawing; NaN without such rows.
+    """
+
+    tolerance_m: float
+    members: tuple[Cell, ...]
+    std_m: FloatArray
+    offset_moves: FloatArray
+    shifts: FloatArray
+    turns: FloatArray
+    joint_offsets: FloatArray
+    held_out_m: float
+    drawing_held_out_m: float
+
+    @property
+    def is_better(self) -> bool:
+        """Whether held-out poses are predicted better with it than on the drawing."""
+        return self.held_out_m < self.drawing_held_out_m
+
+    def offsets_std(self, std: FloatArray) -> FloatArray:
+        """Return stds of offsets, given the drawing (k,), as they are if it is not exact, rad."""
+        moved: FloatArray = np.hypot(std, np.linalg.norm(self.offset_moves, axis=1))
+        return moved
+
+    def largest_imitation(self, joint: int) -> tuple[Cell, float]:
+        """Return which length or tilt of the tolerance moves a joint's offset most, and by what.
+
+        Parameters
+        ----------
+        joint
+            From 0.
+
+        Returns
+        -------
+        Cell, float
+            The length or tilt, and the change of the offset, rad.
+        """
+        moves = np.abs(self.offset_moves[joint]) * (self.tolerance_m / self.std_m)
+        most = int(np.argmax(moves))
+        return self.members[most], float(moves[most])
+
+
+@one_thread
+def geometry_model(found: Estimate, tolerance_m: float = TOLERANCE_M) -> GeometryModel | None:
+    """Fit all lengths and tilts beside the zero-offsets; None where they cannot be fitted.
+
+    Parameters
+    ----------
+    found
+        The session's fit on the drawing.
+    tolerance_m
+        Of the drawing.
+    """
+    drawing_held_out_m = held_out_mean(found.problem, found.model, found.mode.z)
+    found = _without_open_offsets(found)
+    data = Residuals.of(found)
+    families = [
+        family
+        for members in (_lengths(data.context), _tilts(data.context))
+        if (family := Family.of(data, members[0].name, members, tolerance_m)) is not None
+    ]
+    solution = solve(data, [family.cell for family in families]) if families else None
+    if solution is None:
+        return None
+    factors = dict(zip(solution.cells, solution.smoothness, strict=True))
+    std_m = np.concatenate(
+        [np.full(len(one.members), factors[one.cell] ** -0.5) for one in families]
+    )
+    solution = by_members(solution, families)
+    members = solution.cells
+    try:
+        mode = estimate(found.problem, extension_of(data, solution, found)).mode
+    except InsufficientDataError:
+        return None
+    model = mode.linearisation.posterior.model
+    x = model.natural(mode.z)
+    k = model.joints
+    shifts, turns = np.zeros((2, k, 3))
+    for member, value in zip(members, model.theta(x), strict=True):
+        change = member.model_change
+        assert change is not None
+        shifts[change.joint] += value * change.shifts[0]
+        turns[change.joint] += value * change.turns[0]
+    # Lengths and tilts were linearised: all else settles on the arm that they make.
+    fit = estimate(replace(found.problem, chain=_moved(model.chain, shifts, turns)))
+    return GeometryModel(
+        tolerance_m,
+        members,
+        std_m,
+        _offset_moves(found, data, families) * std_m,
+        shifts,
+        turns,
+        fit.model.offsets(fit.mode.z),
+        held_out_mean(fit.problem, fit.model, fit.mode.z),
+        drawing_held_out_m,
+    )
+
+
+def held_out_mean(problem: Problem, model: Model, z: FloatArray) -> float:
+    """Return the mean 3-D error over the validation rows by pinned z, m; NaN without any."""
+    measurements = problem.measurements
+    errors = measurements.position - predicted_rows(problem, model, z)
+    held_out = np.linalg.norm(errors[measurements.is_validation], axis=1)
+    return float(held_out.mean()) if len(held_out) else float('nan')
+
+
+def _without_open_offsets(found: Estimate) -> Estimate:
+    """Return the fit with the zero-offsets at 0 that are known to no better than a degree.
+
+    Lengths and tilts linearised at an offset that is not there would be those of another arm.
+    """
+    _, std = offsets_of(found)
+    names = found.problem.chain.joint_names
+    unknown = {names[i]: (0.0, TIGHTEST_PRIOR) for i in np.flatnonzero(std > OPEN_ANGLE)}
+    if not unknown:
+        return found
+    priors = found.problem.priors
+    held = replace(priors, joint_offsets={**unknown, **priors.joint_offsets})
+    return estimate(replace(found.problem, priors=held))
+
+
+def _lengths(context: Context) -> list[Cell]:
+    # A link's own direction is one more where it is none of the axes of its frame.
+    cells = list(link_length.cells(context))
+    per_link = {joint: [c for c in cells if c.joints == (joint,)] for joint in context.links()}
+    return [
+        cell
+        for own in per_link.values()
+        for cell in own
+        if cell.variant != 'along' or len(own) <= len('xyz')
+    ]
+
+
+def _tilts(context: Context) -> list[Cell]:
+    return [cell for cell in joint_axis_tilt.cells(context) if cell.size == 1]
+
+
+def _offset_moves(found: Estimate, data: Residuals, families: Sequence[Family]) -> FloatArray:
+    """Return what a weight of each member does to the zero-offsets, rad per m, (k, m)."""
+    free = found.posterior.free
+    known = data.full_jacobian[data.rows.source][:, :, free]
+    x = found.model.natural(found.mode.z)
+    rows = prior_rows(found.model, found.posterior.priors, x, natural=True)[1][:, free]
+    both = np.concatenate((known, data.columns([one.cell for one in families])), axis=2)
+    white = data.noise_model.whitened(both, data.noise).reshape(3 * len(data), -1)
+    moved = np.zeros((found.model.size, white.shape[1] - len(free)))
+    # The fit of the offsets to errors of that size.
+    own = white[:, : len(free)]
+    root = root_of_inverse(own.T @ own + rows.T @ rows)
+    moved[free] = root @ (root.T @ (own.T @ white[:, len(free) :]))
+    return moved[: found.model.joints]
+
+
+def _moved(chain: SerialChain, shifts: FloatArray, turns: FloatArray) -> SerialChain:
+    """Return an arm with its joints' origins shifted, m, and turned, rad, (k, 3) each."""
+    T_fixed = chain.T_fixed.copy()
+    T_fixed[:-1, :3, 3] += shifts
+    T_fixed[:-1, :3, :3] = T_fixed[:-1, :3, :3] @ rotation_vector_to_matrix(turns)
+    return replace(chain, T_fixed=T_fixed)

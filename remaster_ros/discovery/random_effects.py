@@ -1,0 +1,174 @@
+"""Kinds of errors as random effects: all members of a kind at once, with one variance.
+
+No joint is quite stiff, no link its drawing, no code disc centred. Which member of a kind errs is
+not chosen: every one does by some amount, drawn from one normal distribution whose variance the
+restricted likelihood gives (`evidence`; Patterson & Thompson 1971). A kind that the data do not
+show gets none, and costs the others nothing.
+
+The columns of a member are scaled so that its weight is the RMS displacement of the marker over
+the rows worked on, m: one variance then serves joints and links far from the marker and near it. A
+member with a smoothness penalty P enters by the columns of P^(−1/2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from remaster_ros.discovery.effects.base import Cell, Design
+from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Covariances, Solution
+from remaster_ros.types import FloatArray
+
+# A member that displaces the markers by no more than this per unit is not seen, m.
+NOTHING = 1e-12
+# Directions of a penalised member with a smaller share of its largest displacement, in square.
+# Coarser, and a fit of curves ends on a plateau, four times as far from held-out poses.
+LEAST_SHARE = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """All members of one kind of error.
+
+    Attributes
+    ----------
+    cell
+        Of the weights of all members, m, with a penalty of one.
+    members
+        The cells that displace a marker.
+    maps
+        Parameters of each member, in its unit, from its weights, (member's size, weights).
+    scales
+        Factor from the smoothness of the family to that of each penalised member, and from the
+        precision of the weights to that of the parameters of the others: RMS displacement per unit
+        squared, (member's size,) or (1,).
+    """
+
+    cell: Cell
+    members: tuple[Cell, ...]
+    maps: tuple[FloatArray, ...]
+    scales: tuple[FloatArray, ...]
+
+    @classmethod
+    def of(
+        cls, data: Residuals, name: str, members: Sequence[Cell], least: float = 0.0
+    ) -> Family | None:
+        """Make the family of some cells; None where none of them displaces a marker.
+
+        Parameters
+        ----------
+        data
+            The rows worked on.
+        name
+            Of its cell.
+        members
+            Cells of any effects.
+        least
+            Standard deviation of the weights that the family does not go below, m.
+        """
+        seen, maps, scales = [], [], []
+        for member in members:
+            displaced = data.columns([member])
+            square = np.sum(displaced**2, axis=(0, 1)) / len(data)
+            if member.penalty is None:
+                parts = square > NOTHING**2
+                if parts.any():
+                    unit = np.sqrt(np.where(parts, square, 1.0))
+                    seen.append(member)
+                    maps.append((np.eye(member.size) / unit)[:, parts])
+                    scales.append(square)
+                continue
+            values, vectors = np.linalg.eigh(member.penalty)
+            root = vectors / np.sqrt(np.maximum(values, np.finfo(float).eps * values[-1]))
+            share = np.sum((displaced @ root) ** 2, axis=(0, 1)) / len(data)
+            if share.sum() > NOTHING**2:
+                seen.append(member)
+                kept = share > LEAST_SHARE * share.max()
+                maps.append(root[:, kept] / np.sqrt(share.sum()))
+                scales.append(np.array([share.sum()]))
+        if not seen:
+            return None
+        count = sum(one.shape[1] for one in maps)
+        cell = Cell(
+            name=name,
+            place=seen[0].place,
+            driver=seen[0].driver,
+            form='random',
+            parameters=tuple(f'{name}#{index}' for index in range(count)),
+            unit='m',
+            columns=partial(_columns, members=tuple(seen), maps=tuple(maps)),
+            drawn_from=1,
+            penalty=np.eye(count),
+            least=least,
+        )
+        return cls(cell, tuple(seen), tuple(maps), tuple(scales))
+
+
+def _columns(context: Context, members: Sequence[Cell], maps: Sequence[FloatArray]) -> Design:
+    parts = [
+        member.columns(context).displacement(context) @ one
+        for member, one in zip(members, maps, strict=True)
+    ]
+    return Design(None, np.concatenate(parts, axis=2))
+
+
+def by_members(solution: Solution, families: Sequence[Family]) -> Solution:
+    """Return a solution with the members of its families in the place of these.
+
+    The same fit: each member has the prior that the family gives it.
+    """
+    known = {family.cell: family for family in families}
+    cells: list[Cell] = []
+    maps: list[FloatArray] = []
+    smoothness: list[float] = []
+    ridge: list[FloatArray] = []
+    for cell, where, factor in zip(
+        solution.cells, solution.slices(), solution.smoothness, strict=True
+    ):
+        family = known.get(cell)
+        if family is None:
+            cells.append(cell)
+            maps.append(np.eye(cell.size))
+            smoothness.append(factor)
+            ridge.append(solution.ridge[where])
+            continue
+        cells += family.members
+        maps += family.maps
+        for member, scale in zip(family.members, family.scales, strict=True):
+            if member.penalty is None:
+                smoothness.append(np.nan)
+                ridge.append(factor * scale)
+            else:
+                smoothness.append(float(factor * scale[0]))
+                ridge.append(np.zeros(member.size))
+    together = _diagonal(maps)
+    p = len(solution.base)
+
+    def covariances() -> tuple[FloatArray, FloatArray]:
+        whole = _diagonal([np.eye(p), together])
+        full = whole @ solution.full_covariance @ whole.T
+        return full, full
+
+    return replace(
+        solution,
+        cells=tuple(cells),
+        parameters=together @ solution.parameters,
+        smoothness=np.array(smoothness),
+        ridge=np.concatenate(ridge) if ridge else np.zeros(0),
+        covariances=Covariances(covariances),
+    )
+
+
+def _diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
+    """Return a matrix with these on its diagonal."""
+    rows = np.cumsum([0, *(block.shape[0] for block in blocks)])
+    columns = np.cumsum([0, *(block.shape[1] for block in blocks)])
+    result = np.zeros((rows[-1], columns[-1]))
+    for block, row, column in zip(blocks, rows, columns, strict=False):
+        result[row : row + block.shape[0], column : column + block.shape[1]] = block
+    return result
