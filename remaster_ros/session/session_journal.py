@@ -237,10 +237,15 @@ class SessionJournal:
                 frame=writer.configurations
                 if markers[reading.sensor] > 1 and reading.std is not None
                 else None,
-                **vars(replace(reading, stamp_s=reading.stamp_s + self._shift_s)),
+                **self._columns(reading),
             )
             for number, (reading, temperature_c) in enumerate(pairs)
         ]
+
+    def _columns(self, reading: PairedReading) -> dict[str, Any]:
+        """Return what a row has of a reading; what it left out is counted in the status."""
+        values = vars(replace(reading, stamp_s=reading.stamp_s + self._shift_s))
+        return {name: value for name, value in values.items() if name != 'dropped'}
 
     def _keep_time(self, stamp_s: float) -> None:
         """Time never runs backwards in a session, whatever the clock does between its rows."""
