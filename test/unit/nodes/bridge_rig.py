@@ -338,7 +338,9 @@ class Rig:
     def say(self, body):
         """Publish a state or an event in the name of the node that publishes it."""
         node = f'/{body.sender or "optimizer"}'
-        record = EventRecord(node=node, body=body, model=self.models.get(node, MODEL))
+        # All nodes are started with the bridge's cell, where a test has them no other.
+        mine = read_cell(self.bridge.p.cell).model()
+        record = EventRecord(node=node, body=body, model=self.models.get(node, mine))
         self.taken(self.said, String(data=encode(record)), 'records')
 
     def say_planner(self, state=None):
