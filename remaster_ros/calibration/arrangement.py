@@ -24,6 +24,7 @@ import numpy as np
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.initial_guess import MEDIAN_CHI3, closest_start, robust_spread
+from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.outliers import LARGEST_SHARE
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import LIMIT_TOLERANCE_RAD, SerialChain
@@ -280,15 +281,14 @@ def some_rows(session: Session) -> Session:
     return session.select(rows)
 
 
-def fit_arrangement(session: Session, arrangement: Arrangement) -> Fitted:
-    """Fit one arrangement robustly, however badly it fits.
+def closest_fit(problem: Problem) -> tuple[Model, FloatArray, Rows]:
+    """Return the model, its parameters (size,) and the rows of the best of a few starts.
 
     Raises
     ------
     InsufficientDataError
         Too few rows or poses to register a sensor.
     """
-    problem = Problem.of(some_rows(arranged(session, arrangement)))
     model = problem.empty_model()
     start, z = closest_start(
         model,
@@ -298,7 +298,19 @@ def fit_arrangement(session: Session, arrangement: Arrangement) -> Fitted:
         float(np.max(problem.marker_std_m)),
         problem.marker_priors(model),
     )
-    rows = Rows.of(problem.measurements, problem.fitted, start.reference)
+    return start, z, Rows.of(problem.measurements, problem.fitted, start.reference)
+
+
+def fit_arrangement(session: Session, arrangement: Arrangement) -> Fitted:
+    """Fit one arrangement robustly, however badly it fits.
+
+    Raises
+    ------
+    InsufficientDataError
+        Too few rows or poses to register a sensor.
+    """
+    problem = Problem.of(some_rows(arranged(session, arrangement)))
+    start, z, rows = closest_fit(problem)
     errors = rows.target - start.predict(z, rows)
     spread = robust_spread(errors, rows)
     most = max(

@@ -27,6 +27,7 @@ from remaster_ros.calibration.arrangement import (
     arranged,
     came_from,
     closest,
+    closest_fit,
     exchanged,
     fit_arrangement,
     search,
@@ -34,7 +35,7 @@ from remaster_ros.calibration.arrangement import (
 )
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.grouped_rows import Rows
-from remaster_ros.calibration.initial_guess import CAUCHY_WIDTH, closest_start, robust_spread
+from remaster_ros.calibration.initial_guess import CAUCHY_WIDTH, robust_spread
 from remaster_ros.errors import (
     InputError,
     InsufficientDataError,
@@ -255,18 +256,9 @@ def _costs(
 
     try:
         fitted = problem(some_rows(replace(session, measurements=part)).measurements)
-        model = fitted.empty_model()
-        start, z = closest_start(
-            model,
-            fitted.measurements,
-            fitted.fitted,
-            fitted.markers,
-            float(np.max(fitted.marker_std_m)),
-            fitted.marker_priors(model),
-        )
+        start, z, rows = closest_fit(fitted)
     except (InsufficientDataError, np.linalg.LinAlgError):
         return None
-    rows = Rows.of(fitted.measurements, fitted.fitted, start.reference)
     spread = robust_spread(rows.target - start.predict(z, rows), rows)
     costs = []
     for table in (before, after):
