@@ -292,8 +292,8 @@ def test_progress_and_seconds_come_from_outside() -> None:
     [
         ('validation only', 'no optimization rows'),
         ('two poses', 'saw 2 poses'),
-        ('joints reversed', 'check units, joint order'),
-        ('millimetres', 'check units'),
+        ('joints reversed', 'with the joints in the order joint_7, joint_6, .* the data fit to 0'),
+        ('millimetres', 'with the points in mm the data fit to 0'),
     ],
 )
 def test_data_that_allow_no_answer_say_why(change: str, message: str) -> None:
