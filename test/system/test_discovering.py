@@ -56,7 +56,7 @@ def test_a_healthy_arm_is_answered_with_figures_and_again(start, client, tmp_pat
         assert response.success, response.message
         assert response.message == str(out / 'report.html')
     assert json.loads((out / 'discovery.json').read_text())['verdict'] == 'none'
-    assert 'None. Every combination' in (out / 'report.html').read_text()
+    assert 'None is named. Every combination' in (out / 'report.html').read_text()
 
 
 @pytest.mark.qualify

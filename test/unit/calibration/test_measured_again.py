@@ -59,7 +59,7 @@ def test_poses_that_were_fitted_as_well_prove_nothing() -> None:
     assert discovery.verdict == 'none'
     page = judgement(discovery, None, discovery_content(discovery))
     assert page.mood == 'caution'
-    assert any('were fitted as well' in point for point in page.points)
+    assert any('were fitted as well' in point for point in page.doubts)
 
 
 def test_a_few_of_many_are_said_and_no_more() -> None:
