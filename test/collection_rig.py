@@ -62,8 +62,12 @@ class Cell:
                 'reference_every': reference_every,
                 'discovery': discovery or folder / 'discovery',
             },
-            'robot_bridge': {},
-            'recorder': {'session': self.session, 'require': require},
+            'robot_bridge': {'simulated_clock_rate': rate},
+            'recorder': {
+                'session': self.session,
+                'require': require,
+                'simulated_clock_rate': rate,
+            },
         }
         if 'mocap' in sensors:
             ports = {'command_port': command, 'data_port': data}

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from fault_observer import Observer
 from fault_relay import Relay
+from ros_rig import PATIENCE
 
 from remaster_ros.collection.events import ConfigurationEnded, PoseAnnounced, SolutionSettled
 from remaster_ros.nodes.demo import free_ports
@@ -113,9 +114,13 @@ class Bench:
             },
             'robot_bridge': {
                 'speed_share': SPEED_SHARE, 'settle_s': 0.6, 'answer_timeout_s': 30.0,
+                'simulated_clock_rate': RATE,
                 **({'emergency_stop_topic': EMERGENCY} if emergency else {}),
             },
-            'recorder': {'session': str(self.session), 'require': require, 'bag': False},
+            'recorder': {
+                'session': str(self.session), 'require': require, 'bag': False,
+                'simulated_clock_rate': RATE,
+            },
             'optitrack_markers': ports,
             'laser_tracker_markers': {'port': tracker},
         }  # fmt: skip
@@ -229,7 +234,7 @@ class Bench:
 
     def until(self, condition: Callable[[], object], timeout_s: float, what: str) -> None:
         """Wait; fail where it takes longer, or where a process has ended by itself."""
-        deadline = time.monotonic() + timeout_s
+        deadline = time.monotonic() + PATIENCE * timeout_s
         while not condition():
             for name, process in self.processes.items():
                 status = process.poll()

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from fault_bench import Bench
 from fault_observer import plain
+from ros_rig import PATIENCE
 
 from remaster_ros.collection.events import (
     ArmHalted,
@@ -196,7 +197,7 @@ def _blocked(bench: Bench, began: float, ended: float) -> bool:
 def _go_on(bench: Bench) -> str:
     """Let the collection go on until another configuration is recorded; say who had to do what."""
     took: list[str] = []
-    deadline = time.monotonic() + GOES_ON_S
+    deadline = time.monotonic() + PATIENCE * GOES_ON_S
     since = time.monotonic()
     while True:
         assert time.monotonic() < deadline, f'it does not go on: {bench.halted}, {bench.planner}'

@@ -26,6 +26,9 @@ class MarkerWorld:
     def sleep(self, seconds: float) -> None:
         time.sleep(max(seconds, 0.0) / RATE)
 
+    def kept_up(self, sensor: str, t: float) -> None:
+        pass
+
     def marker_in_sensor(self, sensor: str, t: float) -> np.ndarray:
         assert sensor == SENSOR
         return np.array([0.3 * np.cos(t), 0.3 * np.sin(t), 2.0])

@@ -20,6 +20,9 @@ DOMAINS_HELD = 4
 """A test uses at most so many at a time."""
 FOUND_S = 0.5
 """A service may find its caller so much later than it is found; an answer before that is lost."""
+PATIENCE = 10.0
+"""What is waited for takes so many times as long at the most as a test says: a process that has a
+tenth of a processor is no failure."""
 
 
 def free_domains() -> Iterator[int]:
@@ -84,7 +87,7 @@ def start(ros_environment):
             process.send_signal(signal.SIGINT)
     for process in running:
         try:
-            process.communicate(timeout=15)
+            process.communicate(timeout=15 * PATIENCE)
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()
@@ -120,17 +123,18 @@ def node_arguments(params_file=None, **values):
 
 
 def wait_until(condition, timeout_s, what):
-    """Poll until `condition()` holds; fail the test after `timeout_s`."""
+    """Poll until `condition()` holds; fail the test where it takes `PATIENCE` times this long."""
+    timeout_s *= PATIENCE
     deadline = time.monotonic() + timeout_s
     while not condition():
-        assert time.monotonic() < deadline, f'waited {timeout_s} s in vain for {what}'
+        assert time.monotonic() < deadline, f'waited {timeout_s:.0f} s in vain for {what}'
         time.sleep(0.05)
 
 
 def found(*callers):
     """Wait until services and their callers have found each other."""
     for caller in callers:
-        assert caller.wait_for_service(timeout_sec=20.0), caller.srv_name
+        assert caller.wait_for_service(timeout_sec=20.0 * PATIENCE), caller.srv_name
     time.sleep(FOUND_S)
 
 
@@ -141,7 +145,7 @@ def call(client, service, timeout_s=120):
     caller = client.create_client(Trigger, service)
     found(caller)
     future = caller.call_async(Trigger.Request())
-    deadline = time.monotonic() + timeout_s
+    deadline = time.monotonic() + timeout_s * PATIENCE
     while not future.done():
         assert time.monotonic() < deadline, f'no answer of {service}'
         client.spin_some()

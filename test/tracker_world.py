@@ -28,6 +28,9 @@ class ReflectorWorld:
     def sleep(self, seconds: float) -> None:
         time.sleep(max(seconds, 0.0) / RATE)
 
+    def kept_up(self, sensor: str, t: float) -> None:
+        pass
+
     def marker_in_sensor(self, sensor: str, t: float, marker: str = '') -> np.ndarray:
         return np.asarray(self.path(t), float) + (OTHER_BESIDE if marker else 0.0)
 

@@ -11,6 +11,7 @@ from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.nodes.parameters import parameter
+from remaster_ros.nodes.simulated_clock import SimulationParameters
 from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
 from remaster_ros.types import FloatArray
 
@@ -21,7 +22,7 @@ OFFSET_STDS = 3.0
 
 
 @dataclass(frozen=True)
-class Parameters:
+class Parameters(SimulationParameters):
     """Parameters of the bridge."""
 
     cell: str = parameter('', 'cell file: a path, or the name of a shipped one; must be given')

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Callable
 
@@ -21,6 +20,7 @@ from remaster_ros.nodes.bagging import BagRecorder
 from remaster_ros.nodes.messages import seconds, temperature_topic
 from remaster_ros.nodes.recorder_parameters import Parameters
 from remaster_ros.nodes.running import RemasterNode
+from remaster_ros.nodes.simulated_clock import SteadyTime
 from remaster_ros.nodes.triggered_sensors import TriggeredSensors
 from remaster_ros.sensors.topic.messages import unit_quaternion
 from remaster_ros.session.workcell import Workcell
@@ -67,7 +67,8 @@ class CellSensors:
         except InputError as error:
             raise InputError(f'{node.get_name()}: {error}') from None
         streams = [name for name, sensor in cell.sensors.items() if not sensor.single_shot]
-        self._liveness = Liveness(cell.sensors, p.heartbeat_s, streams, since_s=time.monotonic())
+        self._steady_s = SteadyTime(node, p.simulated_clock_rate)
+        self._liveness = Liveness(cell.sensors, p.heartbeat_s, streams, since_s=self._steady_s())
         self._sensors, self._recording, self._on_reading = cell.sensors, recording, on_reading
         self.not_finite: Counter[str] = Counter()
         self._shots = TriggeredSensors(
@@ -94,7 +95,7 @@ class CellSensors:
             report.sensor,
             report.ready,
             report.message,
-            time.monotonic(),
+            self._steady_s(),
             record.started,
             hidden=report.hidden,
         )
@@ -105,21 +106,21 @@ class CellSensors:
 
     def read_age_s(self) -> dict[str, float | None]:
         """Return the time since the last reading of each sensor, s; None for never."""
-        now = time.monotonic()
+        now = self._steady_s()
         ages_s = {name: self._liveness.read_age_s(name, now) for name in self._sensors}
         return {name: age_s if np.isfinite(age_s) else None for name, age_s in ages_s.items()}
 
     def trigger(self) -> None:
         """Have single-shot sensors measure for the reading under way."""
         if self._recording.pairing is not None:
-            self._shots.look(self._recording.pairing, self._absent())
+            self._shots.look(self._recording.pairing, self._absent(), self._steady_s())
 
     def give_up(self) -> None:
         """Reject what does not come in time."""
         self._recording.give_up(self._absent(), self._liveness.reports)
 
     def _absent(self) -> dict[str, str]:
-        return self._liveness.absent(time.monotonic(), self.required.names)
+        return self._liveness.absent(self._steady_s(), self.required.names)
 
     def _on_point(self, sensor: str, marker: str) -> Callable[[PointStamped], None]:
         take = self._taker(sensor, marker)
@@ -145,7 +146,7 @@ class CellSensors:
                 self.not_finite[sensor] += 1
                 return
             if not hidden:
-                self._liveness.reads(sensor, time.monotonic())
+                self._liveness.reads(sensor, self._steady_s())
             self._recording.take_reading(sensor, reading)
             self._on_reading()
 

@@ -207,7 +207,8 @@ class Demo:
                 'validation_candidates': self.p.held_out_candidates or size,
                 'reference_every': self.p.reference_every,
             },
-            'recorder': {'session': session},
+            'robot_bridge': {'simulated_clock_rate': self.p.rate},
+            'recorder': {'session': session, 'simulated_clock_rate': self.p.rate},
             'optimizer': {
                 'session': session,
                 'out': str(self.fit),

@@ -6,10 +6,10 @@ remapping ``/clock:=clock`` (rclpy itself subscribes to /clock).
 
 from __future__ import annotations
 
+import math
 import shutil
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,13 +17,16 @@ import numpy as np
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.nodes.messages import seconds, stamp_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.simulated_clock import TAKEN
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.arm_motion import ServoPoint
+from remaster_ros.simulation.pace import Pace
 from remaster_ros.simulation.robot import FakeArm
 from remaster_ros.simulation.setup import (
     default_folder,
@@ -31,6 +34,10 @@ from remaster_ros.simulation.setup import (
     make_world,
     open_world,
 )
+from remaster_ros.simulation.world_clock import POLL_WALL_S
+
+STANDING_CLOCK_WALL_S = 0.1
+"""A clock that stands is published so often, s of wall time."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +56,11 @@ class Parameters:
         50.0, 'joint_states per second of world time', unit='Hz', low=1.0, high=1000.0
     )
     clock_rate: float = parameter(
-        40.0, 'clock messages per second of wall time', unit='Hz', low=10.0, high=1000.0
+        100.0,
+        'clock messages per second of wall time while the world runs at its rate',
+        unit='Hz',
+        low=10.0,
+        high=1000.0,
     )
 
 
@@ -78,27 +89,34 @@ class FakeRobotNode(RemasterNode):
             self._on_trajectory,
             reliable,
         )
-        # Threads of their own: a timer of rclpy costs several times what the message does.
+        self._pace = Pace(self.world.clock)
+        self.create_subscription(Header, TAKEN, self._on_taken, reliable)
+        # A thread of its own: a timer of rclpy costs several times what the message does.
         self._ending = threading.Event()
-        self._threads = [
-            threading.Thread(target=self._repeat, args=args, daemon=True)
-            for args in (
-                (self._publish_state, 1.0 / (self.p.joint_state_rate * self.world.rate)),
-                (self._publish_clock, 1.0 / self.p.clock_rate),
-            )
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
 
-    def _repeat(self, publish: Callable[[], None], period_s: float) -> None:
-        """Call `publish` every `period_s` of wall time; what comes too late is left out."""
-        due = time.monotonic()
-        while not self._ending.wait(max(0.0, due - time.monotonic())):
-            publish()
-            due = max(due + period_s, time.monotonic())
+    def _run(self) -> None:
+        """Publish states and the clock, and let world time go on; what is late is left out."""
+        state_s, clock_s = 1.0 / self.p.joint_state_rate, self.world.rate / self.p.clock_rate
+        state_due = clock_due = self.world.now()
+        clock_wall, wait_s = 0.0, 0.0
+        while not self._ending.wait(wait_s):
+            if (now := self.world.now()) >= state_due:
+                self._publish_state()
+                state_due = _next_due(state_due, state_s, now)
+            wall = time.monotonic()
+            # Also where time stands, for a node that has just been started.
+            if now >= clock_due or wall - clock_wall > STANDING_CLOCK_WALL_S:
+                self._clock_publisher.publish(ClockMessage(clock=stamp_of(now)))
+                clock_due, clock_wall = _next_due(clock_due, clock_s, now), wall
+            self._pace.go_on()
+            left_s = min(state_due, clock_due) - self.world.now()
+            wait_s = max(left_s / self.world.rate, POLL_WALL_S)
 
-    def _publish_clock(self) -> None:
-        self._clock_publisher.publish(ClockMessage(clock=stamp_of(self.world.now())))
+    def _on_taken(self, message: Header) -> None:
+        if message.frame_id.isdecimal():
+            self._pace.took(int(message.frame_id), seconds(message.stamp))
 
     def _publish_state(self) -> None:
         state = self.arm.joint_state()
@@ -107,6 +125,7 @@ class FakeRobotNode(RemasterNode):
         now, names, q, velocity = state
         message = JointState(name=names, position=q.tolist(), velocity=velocity.tolist())
         message.header.stamp = stamp_of(now)
+        self._pace.published(seconds(message.header.stamp))
         for _ in range(self.arm.copies):
             self._states.publish(message)
 
@@ -124,13 +143,17 @@ class FakeRobotNode(RemasterNode):
             self.get_logger().error(f'trajectory dropped: {dropped}')
 
     def close(self) -> None:
-        """End the threads; remove a World that was drawn here."""
+        """End the thread; remove a World that was drawn here."""
         self._ending.set()
-        for thread in self._threads:
-            thread.join()
+        self._thread.join()
         self.world.close()
         if self._drawn is not None:
             shutil.rmtree(self._drawn, ignore_errors=True)
+
+
+def _next_due(due: float, period: float, now: float) -> float:
+    """Return when something of this period is due after `now`; what is late is left out."""
+    return due + period * max(math.floor((now - due) / period) + 1, 0)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -41,6 +41,7 @@ from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.recorder_parameters import Parameters, sensor_rules, session_header
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.session_keeper import SessionKeeper
+from remaster_ros.nodes.simulated_clock import ReportsTaken
 from remaster_ros.nodes.status import (
     EVENTS,
     JOINT_STATES,
@@ -98,6 +99,7 @@ class Recorder(RemasterNode):
         header = session_header(self.cell, self.p.settle_s)
         self.keeper = SessionKeeper(self, Path(self.p.session), header, with_bag=self.p.bag)
         self.journal = self.keeper.journal
+        self._taken = ReportsTaken(self, self.p.simulated_clock_rate)
         self._subscribe()
         # A group of its own: while it waits for the reading, what makes the reading goes on.
         self.create_service(
@@ -135,6 +137,7 @@ class Recorder(RemasterNode):
             return None
 
     def _on_joint_state(self, message: JointState) -> None:
+        self._taken.take(message.header.stamp)
         if (q := self._positions(message)) is not None:
             self._trouble = ''
             self.recording.take_joints(seconds(message.header.stamp), q)

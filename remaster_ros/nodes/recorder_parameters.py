@@ -9,12 +9,13 @@ import numpy as np
 
 from remaster_ros.collection.pairing import SensorRules
 from remaster_ros.nodes.parameters import parameter
+from remaster_ros.nodes.simulated_clock import SimulationParameters
 from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import Measurements, Session
 
 
 @dataclass(frozen=True)
-class Parameters:
+class Parameters(SimulationParameters):
     """Parameters of the recorder."""
 
     cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')

@@ -54,6 +54,7 @@ from remaster_ros.nodes.messages import (
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, run
+from remaster_ros.nodes.simulated_clock import ReportsTaken, SteadyTime
 from remaster_ros.nodes.status import LEASED, RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.nodes.waypoints import waypoints_by_solution
 from remaster_ros.sensors.registry import kind_of
@@ -118,7 +119,9 @@ class RobotBridge(RemasterNode):
         self._search = PathSearch(model, speeds)
         self._paths, self._disk = Background(self), Background(self)
         self._pose_stamp = self._run = ''
-        self._settled_wall = time.monotonic()
+        self.steady_s = SteadyTime(self, self.p.simulated_clock_rate)
+        self._taken = ReportsTaken(self, self.p.simulated_clock_rate)
+        self._settled_wall = self.steady_s()
         self._waypoints = JointTrajectory()
         self.counts = {'commanded': 0, 'settled': 0, 'failed': 0, 'stopped': 0}
         # Made when this bridge is known to be the only one of its name.
@@ -165,7 +168,7 @@ class RobotBridge(RemasterNode):
         """Go on with other speeds."""
         self.p = p
         limits = p.limits(self.chain, self._offsets, self._acceleration)
-        self._do(self.supervisor.use_limits(limits, time.monotonic()))
+        self._do(self.supervisor.use_limits(limits, self.steady_s()))
         self.get_logger().info(
             f'speed_share is {p.speed_share:g}, cartesian_speed_limit_m_s '
             f'{p.cartesian_speed_limit_m_s:g}'
@@ -174,7 +177,7 @@ class RobotBridge(RemasterNode):
     # What comes in
 
     def _on_record(self, record: events.EventRecord) -> None:
-        now = time.monotonic()
+        now = self.steady_s()
         self._models.take(record, now)
         match record.body:
             case events.PlannerState(state=state, run=run):
@@ -212,10 +215,15 @@ class RobotBridge(RemasterNode):
             self.get_logger().error(f'joint_solutions dropped: {error}')
             return
         self._pose_stamp = stamp_key(message.header.stamp)
-        self._do(self.supervisor.plan(targets, time.monotonic(), waypoints))
+        self._do(self.supervisor.plan(targets, self.steady_s(), waypoints))
 
     def _on_joint_state(self, message: JointState) -> None:
-        now = time.monotonic()
+        self._take_report(message)
+        # Last: what was decided by this report has been published.
+        self._taken.take(message.header.stamp)
+
+    def _take_report(self, message: JointState) -> None:
+        now = self.steady_s()
         if self.clock_trouble:
             self._do(self.supervisor.observe('clock', self.clock_trouble, now))
             return
@@ -228,7 +236,7 @@ class RobotBridge(RemasterNode):
         self._do(self.supervisor.report(report))
 
     def _on_emergency_stop(self, stopped: bool) -> None:
-        self._do(self.supervisor.emergency(stopped, time.monotonic()))
+        self._do(self.supervisor.emergency(stopped, self.steady_s()))
 
     def _on_clear_halt(self, request: Trigger.Request, response: Trigger.Response) -> Any:
         refusal = self.supervisor.clear_halt()
@@ -241,12 +249,12 @@ class RobotBridge(RemasterNode):
         return response
 
     def _watch(self) -> None:
-        now = time.monotonic()
+        now = self.steady_s()
         rivals = next(filter(None, (only.trouble() for only in self._only)), '')
         for name, trouble in (
             ('rivals', rivals),
             ('model', self._model_trouble(now)),
-            ('controller', self._controller_trouble(now)),
+            ('controller', self._controller_trouble(time.monotonic())),
             ('clock', self.clock_trouble),
             ('safety_link', self._emergency.trouble()),
         ):
@@ -281,10 +289,12 @@ class RobotBridge(RemasterNode):
                     self._paths.submit(
                         partial(self._search.find, action), partial(self._on_path, action.number)
                     )
-                case Drive() | Stop() if _age_s(action) > LATE_WALL_S[type(action)]:
+                case Drive() | Stop() if (
+                    self.steady_s() - action.wall_s > LATE_WALL_S[type(action)]
+                ):
                     # Paused in between (SIGSTOP, a host that swaps): the arm is elsewhere now, or
                     # must not move any more.
-                    self._do(self.supervisor.not_sent(action, time.monotonic()))
+                    self._do(self.supervisor.not_sent(action, self.steady_s()))
                 case Drive():
                     self._publish(action.admitted)
                     self._on_commanded(action.solution)
@@ -331,7 +341,7 @@ class RobotBridge(RemasterNode):
             events.SolutionCommanded(
                 stamp=self._pose_stamp,
                 solution=solution,
-                since_settled_wall_s=time.monotonic() - self._settled_wall,
+                since_settled_wall_s=self.steady_s() - self._settled_wall,
             )
         )
 
@@ -339,14 +349,14 @@ class RobotBridge(RemasterNode):
         if isinstance(answer, Exception):
             self.get_logger().error(f'the path could not be checked: {answer!r}')
             answer = PathAnswer(None, f'it could not be checked ({answer})')
-        self._do(self.supervisor.path_found(number, answer, time.monotonic()))
+        self._do(self.supervisor.path_found(number, answer, self.steady_s()))
 
     def _on_written(self, result: object) -> None:
         if isinstance(result, Exception):
             self.get_logger().error(f'{self._halt_file.path}: the halt is not kept ({result})')
 
     def _announce(self, settled: Settled) -> None:
-        self._settled_wall = time.monotonic()
+        self._settled_wall = self.steady_s()
         self.counts['settled'] += 1
         message = JointState(name=list(self.chain.joint_names), position=settled.q.tolist())
         message.header.stamp = stamp_of(settled.stamp_s)
@@ -361,7 +371,7 @@ class RobotBridge(RemasterNode):
         )
 
     def _summary(self) -> Summary:
-        supervisor, now = self.supervisor, time.monotonic()
+        supervisor, now = self.supervisor, self.steady_s()
         blocked = supervisor.blocked(now)
         text = 'moving or measuring' if supervisor.busy else 'waiting for a pose'
         refused = supervisor.reports.refused
@@ -383,14 +393,9 @@ class RobotBridge(RemasterNode):
 
     def close(self) -> None:
         """Leave the arm standing still."""
-        self._do(self.supervisor.planner_is('gone: the bridge stops', time.monotonic()))
+        self._do(self.supervisor.planner_is('gone: the bridge stops', self.steady_s()))
         self._paths.close(0.5)
         self._disk.close()
-
-
-def _age_s(command: Drive | Stop) -> float:
-    """Return how long ago a command was decided, s of wall time."""
-    return time.monotonic() - command.wall_s
 
 
 def main(args: list[str] | None = None) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -42,15 +41,16 @@ class TriggeredSensors:
         self._pairing: Pairing | None = None
         self._shots: dict[str, _Shot] = {}
 
-    def look(self, pairing: Pairing, absent: Mapping[str, str]) -> None:
+    def look(self, pairing: Pairing, absent: Mapping[str, str], now: float) -> None:
         """Send the requests that this pairing still needs, and note the refusals.
+
+        ``now`` is of the recorder's watchdogs, s.
 
         The request is sent again to a sensor that was absent meanwhile, and to one whose reading
         was lost.
         """
         if pairing is not self._pairing:
             self._pairing, self._shots = pairing, {}
-        now = time.monotonic()
         for name, client in self._clients.items():
             if name in absent or name in pairing.decided:
                 self._shots.pop(name, None)

@@ -154,6 +154,7 @@ class FakeLaserTracker:
     def _serve(self) -> None:
         while not self._closing.is_set():
             ready = [key.fileobj for key, _ in self._selector.select(_POLL_WALL_S)]
+            began_s = self._world.now()
             with self._lock:
                 faults = self._world.faults(self._sensor)
                 self._apply(faults)
@@ -164,6 +165,7 @@ class FakeLaserTracker:
                     self._receive()
                 if self._listener in ready:
                     self._accept()
+            self._world.kept_up(self._sensor, began_s)
         self._drop_client()
 
     def _instrument_time(self, faults: Numbers) -> float:

@@ -202,10 +202,12 @@ class FakeOptiTrackServer:
         while not self._closing.is_set():
             number = max(number + 1, int((self._world.now() - start_s) * self._rate_hz))
             self._world.sleep(max(0.0, start_s + number / self._rate_hz - self._world.now()))
+            began_s = self._world.now()
             frame = self._scene.frame(number, self._version)
             self._latest = frame
             for message in self._spoiler.spoil(frame, self._world.faults(self._sensor)):
                 self._distribute(message)
+            self._world.kept_up(self._sensor, began_s)
 
     def _distribute(self, frame: Frame | bytes) -> None:
         if self._data is not None:

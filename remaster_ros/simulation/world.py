@@ -6,8 +6,8 @@ that the fake robot has begun, a line each. The arm's motion is a closed form of
 `arm_motion`), so every process computes the same joint positions at the same world time. A killed
 fake reads the folder again and goes on.
 
-World time runs `rate` times as fast as the wall clock: a 3 s settle is 3 s of world time. All
-processes of one machine read the same monotonic clock.
+World time runs `rate` times as fast as the wall clock: a 3 s settle is 3 s of world time. It waits
+for who cannot keep up, see `world_clock`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import json
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
@@ -30,6 +30,7 @@ from remaster_ros.session.files import write_atomically
 from remaster_ros.simulation.arm_motion import Motion, ServoPoint
 from remaster_ros.simulation.faults import Faults, Numbers, is_out
 from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor, from_plain, to_plain
+from remaster_ros.simulation.world_clock import WorldClock
 from remaster_ros.simulation.wrong_arm import WrongArm
 from remaster_ros.types import FloatArray
 
@@ -57,8 +58,6 @@ class WorldContent:
         Reported joint positions at the beginning, rad, (k,).
     link_radius_m
         Of the links that can stand between sensor and marker.
-    started_monotonic_s
-        Of the wall clock when world time was `START_S`.
     """
 
     truth: SessionTruth
@@ -69,21 +68,20 @@ class WorldContent:
     tip_link: str | None
     start_q: FloatArray
     link_radius_m: float
-    started_monotonic_s: float = field(default_factory=time.monotonic)
 
 
 class World:
     """The true arm in front of the true sensors.
 
     Make one with `create` (the demo) or `open` (a fake); see the module's text. A fake sensor uses
-    `now`, `sleep`, `faults`, `marker_in_sensor`, `line_of_sight`, `warming_k`, `is_moving` and
-    `joint_speed` alone, so that its tests need no arm.
+    `now`, `sleep`, `kept_up`, `faults`, `marker_in_sensor`, `line_of_sight`, `warming_k`,
+    `is_moving` and `joint_speed` alone, so that its tests need no arm.
     """
 
     def __init__(self, folder: Path, content: WorldContent) -> None:
         self.folder = folder
         self.truth, self.seed, self.rate = content.truth, content.seed, content.rate
-        self._started = content.started_monotonic_s
+        self.clock = WorldClock(folder, content.rate)
         self.chain = SerialChain.from_urdf(content.urdf, content.base_link, content.tip_link)
         self._capsules = LinkCapsules(self.chain, content.link_radius_m)
         self.start_q = content.start_q
@@ -101,6 +99,7 @@ class World:
         """Write a new World into `folder`."""
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         (folder / MOTION_FILE).write_text('')
+        WorldClock.create(folder, START_S, time.monotonic())
         # At once, and last: other processes wait for this file, and then read it.
         write_atomically(folder / WORLD_FILE, json.dumps(to_plain(content)))
         return cls(folder, content)
@@ -135,12 +134,16 @@ class World:
 
     def now(self) -> float:
         """World time, s."""
-        return START_S + (time.monotonic() - self._started) * self.rate
+        return self.clock.now()
 
     def sleep(self, seconds: float) -> None:
         """Wait that much world time."""
-        if seconds > 0:
-            time.sleep(seconds / self.rate)
+        self.clock.sleep(seconds)
+
+    def kept_up(self, sensor: str, t: float) -> None:
+        """Note that the fake of a sensor has done all that was due until world time t."""
+        if sensor in self.truth.sensors:
+            self.clock.kept_up(list(self.truth.sensors).index(sensor), t)
 
     # Motion
 

@@ -16,7 +16,7 @@ from remaster_ros.session.bag import BagReader
 from remaster_ros.session.reader import read_session
 from remaster_ros.simulation.truth import SessionTruth, from_plain
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(420)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
 
 SEED = 10
 """Of few configurations: 11 of four poses to fit, 8 of two to validate."""
@@ -43,7 +43,7 @@ def demo(ros_environment, tmp_path_factory):
         env={**ros_environment, 'COLUMNS': '200'},
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=900,
         check=False,
     )
     logs = ''.join(path.read_text() for path in (out / 'log').glob('*.log'))

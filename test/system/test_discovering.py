@@ -9,7 +9,7 @@ import yaml
 from command_line import remaster
 from ros_rig import call, node_arguments, wait_until
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(420)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
 
 
 def test_the_optimizer_discovers_on_request(start, client, tmp_path):
@@ -71,7 +71,7 @@ def test_a_demo_finds_what_is_hidden_and_opens_the_truth_at_the_end(ros_environm
         env={**ros_environment, 'COLUMNS': '200'},
         capture_output=True,
         text=True,
-        timeout=400,
+        timeout=900,
         check=False,
     )  # fmt: skip
     logs = ''.join(path.read_text() for path in (out / 'log').glob('*.log'))

@@ -10,7 +10,7 @@ from ros_rig import ROOT, node_arguments, wait_until
 
 from remaster_ros.collection.plan_confirmation import service_name
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
 
 POLICY = ROOT / 'config' / 'sros2' / 'policy.xml'
 NODES = (
@@ -24,6 +24,8 @@ NODES = (
 )
 PLANS = '/remaster/confirm/plan_*'
 OWN = {
+    'robot_bridge': {'simulated_clock_rate': 0.0},
+    'recorder': {'simulated_clock_rate': 0.0},
     'optitrack_markers': {'start_timeout_s': 600.0},
     'laser_tracker_markers': {'start_timeout_s': 600.0},
     'watch': {'port': 0},

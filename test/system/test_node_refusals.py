@@ -7,10 +7,10 @@ import sys
 import pytest
 from ros_rig import node_arguments
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
 
 
-def refuse(start, node, *, timeout=60, **parameters):
+def refuse(start, node, *, timeout=900, **parameters):
     """Start a node that must refuse; return its one line."""
     process = start(f'remaster_ros.nodes.{node}', *node_arguments(**parameters))
     out, err = process.communicate(timeout=timeout)
@@ -122,7 +122,7 @@ def test_a_node_that_ends_while_callbacks_are_queued_prints_nothing(ros_environm
         env=ros_environment,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=900,
         check=False,
     )
     assert (done.returncode, done.stderr) == (0, '')

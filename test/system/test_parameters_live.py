@@ -11,7 +11,7 @@ import time
 import pytest
 from ros_rig import FOUND_S, node_arguments, wait_until
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
 
 # A node with a live parameter, another one, and a change that it refuses.
 NODE = """
@@ -129,7 +129,7 @@ def test_the_real_command_line(start, ros_environment, live, client):
     def ros2(*args):
         return subprocess.run(
             ['ros2', 'param', 'set', '/live', *args],
-            env=ros_environment, capture_output=True, text=True, timeout=60, check=False,
+            env=ros_environment, capture_output=True, text=True, timeout=900, check=False,
         )  # fmt: skip
 
     assert 'successful' in ros2('share', '0.1').stdout

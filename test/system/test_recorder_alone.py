@@ -27,7 +27,7 @@ from remaster_ros.kinematics.transforms import (
 )
 from remaster_ros.session.reader import read_session
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
 
 URDF = ROOT / 'config' / 'robots' / 'lwr4plus.urdf'
 CHAIN = SerialChain.from_urdf(URDF.read_text(encoding='utf-8'), 'base_link', 'tool')
@@ -186,7 +186,7 @@ class Rig:
 
     def rows(self):
         self.node.send_signal(signal.SIGINT)
-        assert self.node.wait(20) == 0
+        assert self.node.wait(900) == 0
         return read_session(self.session).measurements
 
 

@@ -8,7 +8,7 @@ from remaster_ros.session.bag import BagReader
 from remaster_ros.session.bag_writer import BagWriter
 from remaster_ros.session.workcell import read_cell
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
 
 COMMANDS = '/joint_trajectory_controller/joint_trajectory'
 STATE, TRAJECTORY = 'sensor_msgs/msg/JointState', 'trajectory_msgs/msg/JointTrajectory'
@@ -54,7 +54,7 @@ def until(client, condition, timeout_s, what):
 
 
 def refusal(process):
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=900)
     assert process.returncode == 2, out + err
     (line,) = (line for line in err.splitlines() if line.startswith('error:'))
     assert 'Traceback' not in err
@@ -173,7 +173,7 @@ def test_a_recorder_only_listens_and_writes_commands_under_another_name(
     )
     assert spun(client, process).returncode == 0, process.communicate()
     recorder.terminate()
-    assert recorder.wait(20) == 0
+    assert recorder.wait(900) == 0
     counts = BagReader(session / 'bag').counts
     assert counts['/remaster/recorded/joint_trajectory'] == counts['/joint_states'] == 40
     assert COMMANDS not in counts

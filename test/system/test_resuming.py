@@ -5,11 +5,11 @@ import time
 
 import pytest
 from collection_rig import Cell
-from ros_rig import call, node_arguments
+from ros_rig import PATIENCE, call, node_arguments
 
 from remaster_ros.collection.events import BridgeState
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
 
 
 @pytest.fixture
@@ -121,7 +121,7 @@ def test_a_halted_arm_is_not_collected_with(start, client, tmp_path):
     names = list(read_cell('demo').chain().joint_names)
 
     def until(condition, what, timeout_s=60):
-        deadline = time.monotonic() + timeout_s
+        deadline = time.monotonic() + PATIENCE * timeout_s
         while not condition():
             assert time.monotonic() < deadline, what
             joints.publish(JointState(name=names, position=[0.1] * 7))

@@ -13,14 +13,14 @@ from hostile_bench import Bench
 from hostile_lines import EMERGENCY
 from hostile_process import environment
 from hostile_scene import HOME
-from ros_rig import found
+from ros_rig import PATIENCE, found
 from simple_cells import write_cell
 from std_msgs.msg import String
 
 from remaster_ros.collection.events import SolutionFailed
 from remaster_ros.session.workcell import read_cell
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(150)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
 
 CHAIN = read_cell('demo').chain()
 FAST = {'settle_s': 0.5, 'heartbeat_s': 1.0, 'reaction_s': 1.0, 'cartesian_speed_limit_m_s': 0.5}
@@ -70,7 +70,7 @@ def failures(bench):
 
 
 def wait(bench, condition, timeout_s=30):
-    assert bench.until(condition, timeout_s), bench.log.read_text()[-2000:]
+    assert bench.until(condition, PATIENCE * timeout_s), bench.log.read_text()[-2000:]
 
 
 def settle(bench, seconds):

@@ -14,14 +14,14 @@ from remaster_ros.session.bag import BagReader
 from remaster_ros.session.bag_writer import BagWriter
 from remaster_ros.session.workcell import read_cell
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
 
 needs_ros2 = pytest.mark.skipif(shutil.which('ros2') is None, reason='no ros2 command line here')
 COMMANDS = '/joint_trajectory_controller/joint_trajectory'
 NAMES = list(read_cell('demo').chain().joint_names)
 
 
-def ros2(environment, *args, timeout=90):
+def ros2(environment, *args, timeout=900):
     return subprocess.run(
         ['ros2', *map(str, args)],
         env=environment, capture_output=True, text=True, timeout=timeout, check=False,

@@ -16,7 +16,7 @@ from remaster_ros.session.bag import BagReader
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
 
 TIME_S = 5000
 
@@ -140,7 +140,7 @@ def test_a_bag_begins_with_the_clock_and_keeps_what_came_before(start, client, s
     for i in range(150):
         tick(client, clock, 0.02 * i)
     node.send_signal(signal.SIGINT)
-    assert node.wait(20) == 0
+    assert node.wait(900) == 0
     reader = BagReader(session / 'bag')
     assert reader.whole.first_ns >= TIME_S * 10**9
     assert reader.whole.last_ns - reader.whole.first_ns < 20 * 10**9

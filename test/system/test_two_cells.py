@@ -13,7 +13,7 @@ from remaster_ros.session.bag import BagReader
 from remaster_ros.session.reader import read_session
 from remaster_ros.simulation.world import World
 
-pytestmark = [pytest.mark.qualify, pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.qualify, pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
 
 SEEDS = {'left': 21, 'right': 22}
 
@@ -50,8 +50,12 @@ class OneCell:
                 'registration_candidates': 6,
                 'reference_every': 0,
             },
-            'robot_bridge': {},
-            'recorder': {'session': self.session, 'require': 'mocap'},
+            'robot_bridge': {'simulated_clock_rate': 10.0},
+            'recorder': {
+                'session': self.session,
+                'require': 'mocap',
+                'simulated_clock_rate': 10.0,
+            },
         }
         self.processes = {}
         for node, values in own.items():

@@ -30,7 +30,7 @@ from remaster_ros.collection.events import (
     decode,
     encode,
 )
-from remaster_ros.nodes import emergency_link, rivals, robot_bridge, status
+from remaster_ros.nodes import emergency_link, rivals, robot_bridge, simulated_clock, status
 from remaster_ros.nodes.messages import seconds
 from remaster_ros.session.workcell import read_cell
 
@@ -137,7 +137,7 @@ class Rig:
     def __init__(self, monkeypatch, folder, home=HOME, controller=True, **parameters):
         self.wall = 1000.0
         clock = SimpleNamespace(monotonic=lambda: self.wall, time_ns=time.time_ns)
-        for module in (robot_bridge, status, rivals, emergency_link):
+        for module in (robot_bridge, simulated_clock, status, rivals, emergency_link):
             monkeypatch.setattr(module, 'time', clock)
         monkeypatch.setenv('ROS_HOME', str(folder))
         monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

@@ -13,6 +13,7 @@ from remaster_ros.nodes.bridge_parameters import Parameters
 pytestmark = pytest.mark.ros
 
 RANGES = {
+    'simulated_clock_rate': (0.0, 0.0, 100.0, ''),
     'cell': ('', None, None, ''),
     'speed_share': (0.3, 0.01, 1.0, ''),
     'cartesian_speed_limit_m_s': (0.25, 0.0, 10.0, 'm/s'),

@@ -39,10 +39,9 @@ class Client:
 
 
 @pytest.fixture
-def scene(monkeypatch):
+def scene():
     """Shots of one tracker, a pairing for it, and a clock that is set by hand."""
     clock = SimpleNamespace(now=100.0)
-    monkeypatch.setattr(triggered_sensors.time, 'monotonic', lambda: clock.now)
     client = Client()
     rules = SensorRules('tracker', 'smr', single_shot=True, timeout_s=60.0)
     pairing = Pairing(10.0, Q, (rules,))
@@ -50,7 +49,7 @@ def scene(monkeypatch):
 
     def look(at, absent=()):
         clock.now = at
-        asking.look(pairing, dict.fromkeys(absent, 'why'))
+        asking.look(pairing, dict.fromkeys(absent, 'why'), clock.now)
         return len(client.asked)
 
     return SimpleNamespace(client=client, pairing=pairing, look=look)

@@ -1,0 +1,117 @@
+"""Nodes in a simulation that waits for them.
+
+The watchdogs of a node measure silence in wall time, since a clock that is published may stand
+still. A simulation on a busy machine stands still on purpose, until its nodes have kept up, and
+nothing is missed meanwhile. In such a one, and there alone, watchdogs follow the simulated clock.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from dataclasses import dataclass
+
+from builtin_interfaces.msg import Time
+from std_msgs.msg import Header
+
+from remaster_ros.errors import InputError
+from remaster_ros.nodes.messages import seconds
+from remaster_ros.nodes.parameters import parameter
+from remaster_ros.nodes.running import RemasterNode
+
+TAKEN = 'remaster/joint_states_taken'
+TAKEN_EVERY_S = 0.1
+"""No more often than this are reports confirmed, s of their stamps."""
+STANDS_WALL_S = 5.0
+"""A clock that stands longer than this has ended, and watchdogs follow the wall's, s."""
+
+
+@dataclass(frozen=True)
+class SimulationParameters:
+    """What nodes with watchdogs need in a simulation; their parameters derive from this."""
+
+    simulated_clock_rate: float = parameter(
+        0.0,
+        'in a simulation that waits for its nodes, how many times as fast as the wall clock its '
+        'time runs: watchdogs then follow it; 0: they follow the wall clock',
+        low=0.0,
+        high=100.0,
+    )
+
+
+class SteadyTime:
+    """The time of a node's watchdogs, s: the wall clock's, monotonic.
+
+    In a simulation that waits for its nodes it is the simulated clock's divided by its rate, which
+    never runs faster than the wall's; and the wall's where the simulated clock has ended.
+
+    Parameters
+    ----------
+    node
+        Its clock is read.
+    rate
+        `simulated_clock_rate`; 0 for the wall clock.
+
+    Raises
+    ------
+    InputError
+        A rate without ``use_sim_time``.
+    """
+
+    def __init__(self, node: RemasterNode, rate: float) -> None:
+        self._node, self._rate = node, rate
+        if rate and not node.get_parameter('use_sim_time').value:
+            raise InputError(
+                f'{node.get_name()}: simulated_clock_rate is {rate:g}, but use_sim_time is not '
+                'set; beside a real arm leave it out'
+            )
+        self._lock = threading.Lock()
+        # Of the last look, but `_advanced_wall`: when the simulated clock was seen to advance.
+        self._wall = self._value = self._advanced_wall = time.monotonic()
+        self._simulated = 0.0
+        # Between value and simulated clock.
+        self._offset = 0.0
+
+    def __call__(self) -> float:
+        """Return the time now, s."""
+        wall = time.monotonic()
+        if not self._rate:
+            return wall
+        with self._lock:
+            simulated = self._node.now_s() / self._rate
+            ended = wall - self._advanced_wall > STANDS_WALL_S
+            most = self._value + wall - self._wall
+            if simulated != self._simulated:
+                if ended or not self._simulated or simulated < self._simulated:
+                    # It begins, again or anew: it goes on from here.
+                    self._offset = self._value - simulated
+                self._simulated, self._advanced_wall = simulated, wall
+                self._value = max(self._value, min(simulated + self._offset, most))
+            elif ended:
+                self._value = most
+            self._wall = wall
+            return self._value
+
+
+class ReportsTaken:
+    """Publishes, in a simulation, up to which stamp a node has taken `joint_states`.
+
+    Parameters
+    ----------
+    node
+        The node.
+    rate
+        `simulated_clock_rate`; with 0 nothing is published.
+    """
+
+    def __init__(self, node: RemasterNode, rate: float) -> None:
+        self._publisher = node.create_publisher(Header, TAKEN, 10) if rate else None
+        self._last_s = -TAKEN_EVERY_S
+
+    def take(self, stamp: Time) -> None:
+        """Process that a report with this stamp was taken."""
+        if self._publisher is None or abs(seconds(stamp) - self._last_s) < TAKEN_EVERY_S:
+            return
+        self._last_s = seconds(stamp)
+        self._publisher.publish(Header(stamp=stamp, frame_id=str(os.getpid())))

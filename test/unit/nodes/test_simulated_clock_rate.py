@@ -1,0 +1,84 @@
+"""Time of a node's watchdogs: the wall clock's beside an arm, and never faster than that."""
+
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
+
+from remaster_ros.errors import InputError
+from remaster_ros.nodes import simulated_clock
+from remaster_ros.nodes.simulated_clock import STANDS_WALL_S, SteadyTime
+
+pytestmark = pytest.mark.ros
+
+RATE = 10.0
+
+
+class Node:
+    """Whose clock is set by hand."""
+
+    def __init__(self, simulated=True):
+        self.simulated, self.now = simulated, 0.0
+
+    def get_name(self):
+        return 'robot_bridge'
+
+    def get_parameter(self, name):
+        assert name == 'use_sim_time'
+        return SimpleNamespace(value=self.simulated)
+
+    def now_s(self):
+        return self.now
+
+
+@pytest.fixture
+def wall(monkeypatch):
+    wall = SimpleNamespace(now=500.0)
+    monkeypatch.setattr(simulated_clock, 'time', SimpleNamespace(monotonic=lambda: wall.now))
+    return wall
+
+
+def passes(steady, node, wall, seconds, rate, step=0.01):
+    """Return how much watchdog time passes while the clock runs at this rate."""
+    before = steady()
+    for _ in range(round(seconds / step)):
+        wall.now += step
+        node.now += rate * step
+        steady()
+    return steady() - before
+
+
+def test_without_a_rate_it_is_the_wall_clock_whatever_the_node_s_clock_does(wall):
+    node = Node()
+    steady = SteadyTime(node, 0.0)
+    for wall.now, node.now in ((501.0, 100.0), (501.5, 100.0), (502.25, 5.0), (599.0, 9000.0)):
+        assert steady() == wall.now
+
+
+def test_a_rate_beside_a_real_arm_is_refused(wall):
+    with pytest.raises(InputError, match='simulated_clock_rate is 10, but use_sim_time'):
+        SteadyTime(Node(simulated=False), RATE)
+
+
+def test_it_follows_a_clock_that_waits_and_is_never_faster_than_the_wall(wall):
+    node = Node()
+    steady = SteadyTime(node, RATE)
+    node.now = 1000.0
+    assert passes(steady, node, wall, 1.0, RATE) == pytest.approx(1.0, abs=0.02)
+    assert passes(steady, node, wall, 1.0, 0.25 * RATE) == pytest.approx(0.25, abs=0.02)
+    assert passes(steady, node, wall, 0.9 * STANDS_WALL_S, 0.0) == pytest.approx(0.0, abs=0.02)
+    assert passes(steady, node, wall, 1.0, 5 * RATE) <= 1.0 + 1e-9
+    node.now += 3600.0
+    assert passes(steady, node, wall, 0.5, RATE) <= 0.5 + 1e-9
+
+
+def test_silence_is_noticed_where_the_simulation_has_ended(wall):
+    """Killed, not waiting: watchdogs go on with the wall clock, and with the next simulation."""
+    node = Node()
+    steady = SteadyTime(node, RATE)
+    node.now = 1000.0
+    passes(steady, node, wall, 1.0, RATE)
+    assert passes(steady, node, wall, STANDS_WALL_S + 4.0, 0.0) == pytest.approx(4.0, abs=0.05)
+    node.now = 0.5
+    assert passes(steady, node, wall, 1.0, RATE) == pytest.approx(1.0, abs=0.05)

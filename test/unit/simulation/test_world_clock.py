@@ -1,0 +1,109 @@
+"""World time on a clock that the test moves on: it runs at its rate, and waits for who is late."""
+
+import os
+import signal
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from remaster_ros.simulation import pace as pace_module
+from remaster_ros.simulation import world_clock
+from remaster_ros.simulation.pace import AHEAD_S, AHEAD_WALL_S, PATIENCE_WALL_S, Pace
+from remaster_ros.simulation.world_clock import HELD_WALL_S, WorldClock
+
+START_S, RATE, ME = 1000.0, 10.0, os.getpid()
+AHEAD = AHEAD_S + AHEAD_WALL_S * RATE
+TICK_WALL_S = 0.002
+
+
+class Scene:
+    """A World's clock, its owner, and wall time."""
+
+    def __init__(self, monkeypatch, folder):
+        self.wall = 50.0
+        time = SimpleNamespace(monotonic=lambda: self.wall, sleep=self.run)
+        for module in (world_clock, pace_module):
+            monkeypatch.setattr(module, 'time', time)
+        WorldClock.create(folder, START_S, self.wall)
+        self.clock, self.other = WorldClock(folder, RATE), WorldClock(folder, RATE)
+        self.pace = Pace(self.clock)
+
+    def run(self, wall_s, taken=False, fake=False):
+        """Let wall time pass while the owner works; others take reports and keep up, or not."""
+        until = self.wall + wall_s
+        while self.wall < until - 1e-9:
+            self.wall += TICK_WALL_S
+            now = self.clock.now()
+            self.pace.published(now)
+            if taken:
+                self.pace.took(ME, now)
+            if fake:
+                self.other.kept_up(0, now)
+            self.pace.go_on()
+
+    def passed(self):
+        return self.other.now() - START_S
+
+
+@pytest.fixture
+def scene(monkeypatch, tmp_path):
+    return Scene(monkeypatch, tmp_path)
+
+
+def test_it_runs_at_its_rate_where_all_keep_up(scene):
+    scene.run(2.0, taken=True, fake=True)
+    assert scene.passed() == pytest.approx(2.0 * RATE, abs=RATE * TICK_WALL_S)
+    before = scene.other.now()
+    scene.other.sleep(0.5)
+    assert scene.other.now() - before >= 0.5
+
+
+@pytest.mark.parametrize('late', ['taken', 'fake'])
+def test_it_stands_until_the_slowest_has_kept_up(scene, late):
+    """A node that takes no reports, and a fake sensor that does not get on."""
+    everybody = {'taken': True, 'fake': True}
+    scene.run(1.0, **everybody)
+    before = scene.passed()
+    scene.run(5.0, **(everybody | {late: False}))
+    assert 0.0 < scene.passed() - before <= AHEAD + RATE * TICK_WALL_S
+    stood = scene.passed()
+    scene.run(1.0, **everybody)
+    # No jump: what was not lived through is not made up for.
+    assert scene.passed() - stood == pytest.approx(RATE, abs=AHEAD + 2 * RATE * TICK_WALL_S)
+
+
+def test_a_process_that_does_nothing_for_long_is_not_waited_for(scene):
+    scene.run(0.1, taken=True)
+    scene.run(PATIENCE_WALL_S + 5.0)
+    assert scene.passed() > 3.0 * RATE
+
+
+def test_a_killed_or_paused_process_is_a_fault_and_not_waited_for(scene):
+    process = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])
+    try:
+        scene.pace.published(scene.clock.now())
+        scene.pace.took(process.pid, scene.clock.now())
+        scene.run(1.0)
+        assert scene.passed() <= AHEAD + RATE * TICK_WALL_S
+        process.send_signal(signal.SIGSTOP)
+        os.waitpid(process.pid, os.WUNTRACED)
+        before = scene.passed()
+        scene.run(1.0)
+        assert scene.passed() - before > 0.8 * RATE
+    finally:
+        process.kill()
+        process.wait()
+    assert not world_clock.is_running(process.pid)
+
+
+def test_it_goes_on_where_the_owner_is_gone_and_never_back(scene):
+    scene.run(0.1, taken=True)
+    scene.run(1.0)
+    stood, last = scene.passed(), 0.0
+    for _ in range(1000):
+        scene.wall += HELD_WALL_S / 250
+        assert scene.passed() >= last
+        last = scene.passed()
+    assert last - stood == pytest.approx(3 * HELD_WALL_S * RATE, abs=0.1 * RATE)
