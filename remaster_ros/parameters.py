@@ -91,3 +91,16 @@ def check_all(owner: str, values: Any) -> None:
     """Check every field of `values` that was made by `parameter`; errors as of `check`."""
     for name, field in parameter_fields(values).items():
         check(owner, field, getattr(values, name))
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulationParameters:
+    """What nodes with watchdogs need in a simulation; their parameters derive from this."""
+
+    simulated_clock_rate: float = parameter(
+        0.0,
+        'in a simulation that waits for its nodes, how many times as fast as the wall clock its '
+        'time runs: watchdogs then follow it; 0: they follow the wall clock',
+        low=0.0,
+        high=100.0,
+    )

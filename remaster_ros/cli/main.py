@@ -31,7 +31,7 @@ VERBS = {
     'accuracy': 'Judge the zero-offsets of a fit on any session: the three metrics.',
     'recover': 'Finish the files of a session whose recorder was killed; print what was lost.',
     'watch': 'Show a collection under way on a local web page.',
-    'replay': 'Publish a recorded session again (as `ros2 bag play` does).',
+    'replay': 'Make the rows of a session again from its bag, or publish the bag again (ROS).',
 }
 SHELLS = ('bash', 'zsh', 'fish')
 TRACEBACK = 'REMASTER_TRACEBACK'

@@ -306,10 +306,29 @@ class SetupChanged(Body, frozen=True, kw_only=True, tag='changed'):
     size_m: float = 0.0
 
 
-class RecorderBegan(Body, frozen=True, tag='began'):
-    """In a bag: its recorder was started (again) here, with no reading under way."""
+class ReadByHand(Body, frozen=True, kw_only=True, tag='by_hand'):
+    """The recorder reads where a person has driven the arm: joints, rad, and since when, s."""
 
     sender: ClassVar[str] = 'recorder'
+    stamp_s: float
+    q: tuple[float, ...]
+
+
+class RecorderBegan(Body, frozen=True, kw_only=True, tag='began'):
+    """In a bag: its recorder was started (again) here, with no reading under way.
+
+    Attributes
+    ----------
+    parameters, cell
+        Its parameters, and its cell as JSON: with them the bag gives the same rows again.
+    continued
+        It is the same process as before, which has opened a closed session again.
+    """
+
+    sender: ClassVar[str] = 'recorder'
+    parameters: dict[str, bool | int | float | str] = msgspec.field(default_factory=dict)
+    cell: str = ''
+    continued: bool = False
 
 
 class ShotMeasured(Body, frozen=True, tag='measured'):
@@ -330,6 +349,7 @@ Event = (
     | HaltCleared
     | ConfigurationEnded
     | SetupChanged
+    | ReadByHand
     | RecorderBegan
     | ShotMeasured
 )

@@ -50,6 +50,11 @@ class SensorRules:
     timeout_s: float = 2.0
     further: tuple[str, ...] = ()
 
+    @property
+    def allowed_s(self) -> float:
+        """How long after the settling a reading may stay out, s."""
+        return (0.0 if self.single_shot else self.dwell_s) + self.timeout_s
+
 
 @dataclass(frozen=True)
 class PairedReading:
@@ -124,6 +129,9 @@ class Pairing:
     require
         What the arm waits for: ``all`` sensors, ``any`` of them, or one by its name. A sensor
         that is not required and has no reading by then is left out.
+    patient
+        Whether nothing is late before `end_as_recorded`: how long a sensor was silent is in no
+        message.
 
     Attributes
     ----------
@@ -142,7 +150,10 @@ class Pairing:
         sensors: tuple[SensorRules, ...],
         motion_tolerance: float = 5e-4,
         require: str = 'all',
+        *,
+        patient: bool = False,
     ) -> None:
+        self._patient = patient
         self.settled_stamp_s = settled_stamp_s
         self.q_settled = np.asarray(q_settled, float)
         self.rules = {rules.sensor: rules for rules in sensors}
@@ -222,6 +233,28 @@ class Pairing:
             else:
                 self._set(self._late(rules, allowed))
 
+    def end_as_recorded(self, result: str, reason: str) -> None:
+        """Decide on every sensor now, at the point where the recorder of a bag had decided.
+
+        By its messages some are not decided: their time was over, or their nodes were absent, or
+        their devices answered that there is no measurement.
+
+        Parameters
+        ----------
+        result, reason
+            What the recorder published (`events.ConfigurationEnded`).
+        """
+        for name, rules in self.rules.items():
+            if name in self.decided:
+                continue
+            late = self._now_s > self.settled_stamp_s + rules.allowed_s
+            used = self._used(rules, waits=False) if late else None
+            if used and self._joints and self._joints[-1][0] >= used[0]:
+                self._settle(rules, *used)
+            else:
+                kind = 'absent' if result == 'recorded' else 'stale'
+                self._set(Rejection(name, kind, reason or 'as recorded'))
+
     def _add_silence(
         self, counts: Mapping[str, int], passed_s: float, absent: Collection[str]
     ) -> None:
@@ -271,8 +304,7 @@ class Pairing:
 
     def _allowed_s(self, rules: SensorRules) -> float:
         """How long after the settling a sensor may stay out, s."""
-        dwell_s = 0.0 if rules.single_shot else rules.dwell_s
-        return dwell_s + rules.timeout_s + self._excused_s[rules.sensor]
+        return np.inf if self._patient else rules.allowed_s + self._excused_s[rules.sensor]
 
     def _late(self, rules: SensorRules, allowed: float) -> Rejection:
         count = max(len(_seen(part)) for part in self._by_marker(rules).values())

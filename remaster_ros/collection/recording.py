@@ -123,6 +123,8 @@ class Recording:
         ``all``, ``any``, or the name of the sensor that the arm waits for.
     plausibility
         Judges readings by where the robot has the marker.
+    patient
+        Whether the messages are those of a bag; see `Pairing`.
 
     Attributes
     ----------
@@ -140,7 +142,10 @@ class Recording:
         motion_tolerance: float,
         require: str,
         plausibility: Plausibility,
+        *,
+        patient: bool = False,
     ) -> None:
+        self._patient = patient
         self._rules, self._tolerance, self._require = rules, motion_tolerance, require
         self._plausibility = plausibility
         self.announced: PoseAnnounced | None = None
@@ -207,11 +212,6 @@ class Recording:
         """Take it that the arm was stopped on its way: where it comes from next is not known."""
         self._from_q = None
 
-    def forget(self) -> None:
-        """Drop what is under way: in a bag, its recorder was started again here."""
-        self.pairing = self._settled = None
-        self._due.clear()
-
     # What is known
 
     @property
@@ -258,13 +258,19 @@ class Recording:
         # Now, not when the reading is done: a stop may come in between.
         self._came_from, self._from_q = self._from_q, settled.q
 
-    def begin_here(self) -> None:
-        """Begin to read where the arm stands now, for a registration by hand."""
-        assert self.q is not None
-        self.begin(SettledArm(self.q, self.now_s, BY_HAND, 0))
+    def begin_by_hand(self, stamp_s: float, q: FloatArray) -> None:
+        """Begin to read where a person has driven the arm: joints, rad, (k,), and since when."""
+        self.begin(SettledArm(q, stamp_s, BY_HAND, 0))
 
     def _new_pairing(self, settled: SettledArm) -> Pairing:
-        pairing = Pairing(settled.stamp_s, settled.q, self._rules, self._tolerance, self._require)
+        pairing = Pairing(
+            settled.stamp_s,
+            settled.q,
+            self._rules,
+            self._tolerance,
+            self._require,
+            patient=self._patient,
+        )
         for stamp_s, joints in self._joints:
             pairing.add_joint_state(stamp_s, joints)
         for sensor, reading in self._readings:
@@ -275,6 +281,23 @@ class Recording:
         """Reject what does not come in time; see `Pairing.give_up`."""
         if self.pairing is not None:
             self.pairing.give_up(self.now_s, absent, words)
+
+    def is_open(self, stamp: str, solution: int) -> bool:
+        """Whether a configuration is under way or due, by its announcement's stamp and index."""
+        under_way = [] if self._settled is None else [self._settled]
+        return any(
+            (one.pose.stamp, one.solution) == (stamp, solution) for one in (*under_way, *self._due)
+        )
+
+    @property
+    def is_by_hand(self) -> bool:
+        """Whether a reading for a registration by hand is under way."""
+        return self._settled is not None and self._settled.pose == BY_HAND
+
+    def end_as_recorded(self, result: str, reason: str) -> None:
+        """Decide what is under way as the recorder of a bag had; see `Pairing`."""
+        if self.pairing is not None:
+            self.pairing.end_as_recorded(result, reason)
 
     def end(self, T_R_N: Mapping[str, FloatArray]) -> EndedReading | None:
         """Return what became of the configuration, once it is decided; None before.

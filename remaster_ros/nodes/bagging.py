@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.node import Node
@@ -34,8 +36,9 @@ class BagRecorder:
     node
         The node that subscribes.
     folder
-        The bag's folder, gone on with where there is one; None records nothing and only hands
-        messages on.
+        The bag's folder, gone on with where there is one.
+    began
+        What it begins with; None records nothing and only hands messages on.
     begin
         False to record nothing before `reopen`.
 
@@ -45,10 +48,15 @@ class BagRecorder:
         How the bag was found, for the user.
     dropped
         Messages that found no room, neither on the disk nor in memory.
+    taken
+        How many messages of each topic, by its name in bags, were handed on and received.
     """
 
-    def __init__(self, node: Node, folder: Path | None, *, begin: bool = True) -> None:
-        self._node, self._folder = node, folder
+    def __init__(
+        self, node: Node, folder: Path, began: RecorderBegan | None, *, begin: bool = True
+    ) -> None:
+        self._node, self._folder, self._began = node, folder, began
+        self.taken: Counter[str] = Counter()
         self._writer: BagWriter | None = None
         # Received while the node's clock, a simulated one, had no time: topic, type, bytes.
         self._early: list[tuple[str, str, bytes]] = []
@@ -59,7 +67,7 @@ class BagRecorder:
 
     def reopen(self) -> None:
         """Go on with the bag after it was closed."""
-        if self._folder is None:
+        if self._began is None:
             return
         try:
             self._writer = BagWriter(self._folder, resume=True)
@@ -68,8 +76,9 @@ class BagRecorder:
             self._folder = _free(self._folder)
             self.notes.append(f'{error}; recording into {self._folder}')
             self._writer = BagWriter(self._folder)
-        # First in each file, so that a replay forgets the reading that was under way before it.
-        began = EventRecord(node=self._node.get_fully_qualified_name(), body=RecorderBegan())
+        # First in each file: a replay begins anew there, as this recorder did.
+        began = EventRecord(node=self._node.get_fully_qualified_name(), body=self._began)
+        self._began = msgspec.structs.replace(self._began, continued=True)
         data = serialize_message(String(data=encode(began)))
         self._write(name_in_bag(EVENTS), 'std_msgs/msg/String', data)
 
@@ -109,18 +118,21 @@ class BagRecorder:
         module = kind.__module__.split('.')[0]
         type_name = f'{module}/msg/{kind.__name__}'
         name = name_in_bag(topic)
+        if receive is not None:
+            self.taken[name] = 0
 
         def take(data: bytes) -> None:
             # Raw, because serialising again can leave uninitialised bytes behind the message.
             self._write(name, type_name, data)
             if receive is not None:
                 receive(deserialize_message(data, kind))
+                self.taken[name] += 1
 
         self._node.create_subscription(kind, topic, take, qos, raw=True)
 
     def subscribe_rest(self) -> None:
         """Record the topics that the recorder itself has no use for."""
-        if self._folder is None:
+        if self._began is None:
             return
         self.subscribe(PoseStamped, 'remaster/target_pose')
         self.subscribe(DiagnosticArray, TOPIC)

@@ -11,7 +11,7 @@ from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.settling import SettleRules
 from remaster_ros.nodes.parameters import parameter
-from remaster_ros.nodes.simulated_clock import SimulationParameters
+from remaster_ros.parameters import SimulationParameters
 from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit
 from remaster_ros.types import FloatArray
 

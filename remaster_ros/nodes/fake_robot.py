@@ -20,7 +20,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
-from remaster_ros.nodes.messages import seconds, stamp_of
+from remaster_ros.collection.message_fields import seconds
+from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.simulated_clock import TAKEN

@@ -23,14 +23,10 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.collection.events import ShotMeasured
+from remaster_ros.collection.message_fields import JointOrder, temperature_topic
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.kinematics import transforms
-from remaster_ros.nodes.messages import (
-    JointOrder,
-    stamp_of,
-    temperature_topic,
-    transform_array,
-)
+from remaster_ros.nodes.messages import stamp_of, transform_array
 from remaster_ros.nodes.status import LATCHED, RELIABLE
 from remaster_ros.sensors.driver import TriggeredDriver
 from remaster_ros.sensors.registry import kind_of

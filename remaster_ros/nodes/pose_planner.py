@@ -31,6 +31,7 @@ from std_srvs.srv import Trigger
 from remaster_ros.collection import events
 from remaster_ros.collection.announcements import Announcements
 from remaster_ros.collection.collection_run import CollectionRun
+from remaster_ros.collection.message_fields import JointOrder
 from remaster_ros.collection.optimizer_state import OptimizerState
 from remaster_ros.collection.peer_models import PeerModels
 from remaster_ros.collection.plan_confirmation import service_name
@@ -40,7 +41,7 @@ from remaster_ros.errors import InputError, RemasterError
 from remaster_ros.motion.preflight import preflight
 from remaster_ros.nodes.further_measuring import FurtherMeasuring
 from remaster_ros.nodes.measure_calls import MeasureCalls
-from remaster_ros.nodes.messages import JointOrder, transform_array
+from remaster_ros.nodes.messages import transform_array
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.plan_preview import PlanPreview
 from remaster_ros.nodes.planner_parameters import Parameters

@@ -6,9 +6,10 @@ from geometry_msgs.msg import PoseStamped
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.collection.events import PoseAnnounced
+from remaster_ros.collection.message_fields import stamp_key
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.nodes.messages import duration_of, stamp_key
+from remaster_ros.nodes.messages import duration_of
 from remaster_ros.nodes.running import RemasterNode
 from remaster_ros.nodes.status import LEASED, NodeStatus
 from remaster_ros.nodes.waypoints import waypoints_message

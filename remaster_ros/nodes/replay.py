@@ -2,13 +2,15 @@
 
 It never publishes onto a live graph: where other nodes publish what robot, bridge and planner
 publish, or where a controller subscribes, it ends. Commands to the arm are left out by default.
-Other messages are not: where some did not reach a subscriber, or a bag has a torn end, it names
-them and ends with status 1.
+Other messages are not: it waits for a recorder until that has taken what was sent, so that no rate
+is too fast; where some messages did not reach a subscriber, or a bag has a torn end, it names them
+and ends with status 1.
 """
 
 from __future__ import annotations
 
 import importlib
+import json
 import threading
 import time
 from collections import Counter
@@ -19,16 +21,19 @@ from typing import Any
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rosgraph_msgs.msg import Clock as ClockMessage
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
+from remaster_ros.collection import events
 from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
 from remaster_ros.nodes.endpoints import node_of
 from remaster_ros.nodes.messages import stamp_of
-from remaster_ros.nodes.old_bags import records_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import EVENTS
+from remaster_ros.nodes.status import EVENTS, MESSAGES_TAKEN, taken_key
 from remaster_ros.nodes.status import TOPIC as STATUS
 from remaster_ros.session.bag import LATCHED_TOPICS, RECORDED, BagReader, live_name
 
@@ -53,6 +58,11 @@ BEHIND_S = 0.05
 """So much of a delay of its own a replay makes up for, s; the rest it goes on later."""
 TAKEN_S = 10.0
 """How long a subscriber may take for half of them before they count as dropped, s."""
+WINDOW_S = 0.2
+"""So often a recorder is waited for, s of the bag: in less than a dwell. In between, topics come
+in any order, which their stamps make good."""
+IN_ORDER = ('/remaster/settled', '/remaster/joint_solutions')
+"""Between these and what was sent before and after, the order counts as well."""
 SHOWN_S = 5.0
 """How often it is logged how far the replay is, s."""
 LOOK_S = 1.0
@@ -98,6 +108,7 @@ class Replay(RemasterNode):
         # Sent since all subscribers had taken all, by topic; and what they did not take.
         self._untaken: Counter[str] = Counter()
         self._dropped: Counter[str] = Counter()
+        self._acknowledged = Acknowledged(self)
         # Before anything is published, and again when discovery has found the other nodes.
         self._refuse_live()
         for topic, type_name in self._reader.topics.items():
@@ -105,12 +116,6 @@ class Replay(RemasterNode):
             left_out = name == COMMANDS and not self.p.with_commands
             if not left_out and (topic != CLOCK or self._clock_publisher is None):
                 self._publishers_by_topic[topic] = self._publisher(name, type_name)
-        # Bags of older versions have the events among the status messages.
-        self._old_events = (
-            self._publisher(f'/{EVENTS}', 'std_msgs/msg/String')
-            if f'/{EVENTS}' not in self._reader.topics
-            else None
-        )
         self._thread = threading.Thread(target=self._play, daemon=True)
         self._thread.start()
 
@@ -129,6 +134,7 @@ class Replay(RemasterNode):
         try:
             self._wait_for_subscriber()
             self._refuse_live()
+            self._acknowledged.begin(self.p.wait_s, self._ending)
             self._send_all()
             # Give DDS the time to hand the last messages over.
             self._ending.wait(1.0)
@@ -192,6 +198,8 @@ class Replay(RemasterNode):
         start_wall = first = None
         looked = shown = time.monotonic()
         last = self._reader.whole.last_ns or 0
+        planner: events.PlannerState | None = None
+        window_ns = 0
         for topic, _, data, stamp_ns in self._reader:
             if start_wall is None or first is None:
                 start_wall, first = time.monotonic(), stamp_ns
@@ -214,6 +222,16 @@ class Replay(RemasterNode):
             self._publish_clock(stamp_ns)
             publisher = self._publishers_by_topic.get(topic)
             if publisher is not None:
+                record = _record(data) if topic == f'/{EVENTS}' else None
+                in_order = live_name(topic) in IN_ORDER
+                if record is not None and isinstance(record.body, events.PlannerState):
+                    # Twice a second; what it changes counts.
+                    in_order, planner = record.body != planner, record.body
+                elif record is not None:
+                    in_order = not isinstance(record.body, events.STATES)
+                if in_order or stamp_ns > window_ns:
+                    self._await_recorder()
+                    window_ns = stamp_ns + round(WINDOW_S * 1e9)
                 if live_name(topic) in RECORDED:
                     self._look_who_listens(publisher)
                 publisher.publish(data)
@@ -221,10 +239,15 @@ class Replay(RemasterNode):
                 self._untaken[topic] += 1
                 if self._untaken[topic] >= DEPTH // 2:
                     self._await_taken(topic)
-            if self._old_events is not None and topic == f'/{STATUS}':
-                for message in records_of(data):
-                    self._old_events.publish(message)
+                self._acknowledged.sent[topic if record is None else taken_key(record)] += 1
+                if in_order:
+                    self._await_recorder()
         self.get_logger().info(f'{self.sent} messages published')
+
+    def _await_recorder(self) -> None:
+        """Wait until the recorder, where there is one, has taken what was sent."""
+        for topic, count in self._acknowledged.wait(self._ending).items():
+            self._dropped[topic] += count
 
     def _await_taken(self, topic: str) -> None:
         """Wait until the subscribers of a topic have all that was sent, or count it as dropped.
@@ -247,6 +270,7 @@ class Replay(RemasterNode):
         """
         for topic in list(self._untaken):
             self._await_taken(topic)
+        self._await_recorder()
         lost = [
             f'up to {count} messages of {topic} did not reach a subscriber in {TAKEN_S:g} s'
             for topic, count in sorted(self._dropped.items())
@@ -269,6 +293,105 @@ class Replay(RemasterNode):
         """Stop publishing."""
         self._ending.set()
         self._thread.join(2.0)
+
+
+class Acknowledged:
+    """What of the messages sent a recorder has taken, as it answers; nothing where there is none.
+
+    Parameters
+    ----------
+    node
+        The replay, which is spun by another thread than the one that waits here.
+
+    Attributes
+    ----------
+    sent
+        Messages sent by topic, and on remaster/events by `taken_key`.
+    """
+
+    def __init__(self, node: RemasterNode) -> None:
+        self._node, self._client = node, node.create_client(Trigger, MESSAGES_TAKEN)
+        self.sent: Counter[str] = Counter()
+        self._before: dict[str, int] | None = None
+
+    def begin(self, wait_s: float, ending: threading.Event) -> None:
+        """Find out whether a recorder is there, and how many messages it has taken already.
+
+        Raises
+        ------
+        InputError
+            It is there and does not answer.
+        """
+        settled = self._node.resolve_topic_name(IN_ORDER[0].lstrip('/'))
+        subscribers = self._node.get_subscriptions_info_by_topic(settled)
+        if not any(info.node_name == 'recorder' for info in subscribers):
+            return
+        deadline = time.monotonic() + wait_s
+        while not self._client.service_is_ready() and not ending.is_set():
+            if time.monotonic() > deadline:
+                raise InputError(
+                    f'replay: no {self._client.srv_name} of the recorder in {wait_s:g} s: is it '
+                    'of the same version of remaster_ros?'
+                )
+            ending.wait(0.05)
+        self._before = self._ask(ending)
+
+    def _ask(self, ending: threading.Event) -> dict[str, int] | None:
+        """Return how many messages the recorder has taken; None where it gives no answer."""
+        answered = threading.Event()
+        future = self._client.call_async(Trigger.Request())
+        future.add_done_callback(lambda _: answered.set())
+        deadline = time.monotonic() + TAKEN_S
+        while not answered.wait(0.05):
+            if ending.is_set() or time.monotonic() > deadline:
+                self._client.remove_pending_request(future)
+                return None
+        response = future.result()
+        return None if response is None else json.loads(response.message)
+
+    def wait(self, ending: threading.Event) -> dict[str, int]:
+        """Wait until the recorder has taken what was sent since the last call.
+
+        Returns
+        -------
+        dict
+            How many messages it has not taken, where for `TAKEN_S` it took no more of them.
+        """
+        if self._before is None or not self.sent:
+            return {}
+        missing: dict[str, int] = {}
+        since = time.monotonic()
+        while not ending.is_set():
+            taken = self._ask(ending) or {}
+            left = {
+                name: count - taken.get(name, 0) + self._before.get(name, 0)
+                for name, count in self.sent.items()
+                # It lists the topics that it takes; of records those that have come.
+                if name in taken or ' ' in name
+            }
+            left = {name: count for name, count in left.items() if count > 0}
+            if not left:
+                break
+            if left != missing:
+                missing, since = left, time.monotonic()
+            elif time.monotonic() - since > TAKEN_S:
+                self._before, self.sent = taken, Counter()
+                return left
+            ending.wait(0.001)
+        self._before = {
+            name: self._before.get(name, 0) + self.sent[name]
+            for name in {*self._before, *self.sent}
+        }
+        self.sent = Counter()
+        return {}
+
+
+def _record(data: bytes) -> events.EventRecord | None:
+    """Return the record in a serialised message; None where a recorder takes none from it."""
+    try:
+        return events.decode(deserialize_message(data, String).data)
+    except InputError:
+        return None
 
 
 def _live(info: TopicEndpointInfo, does: str) -> str:

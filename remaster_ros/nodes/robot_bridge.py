@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from remaster_ros.collection import events
+from remaster_ros.collection.message_fields import JointOrder, seconds, solutions_of, stamp_key
 from remaster_ros.collection.peer_models import PeerModels
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.same_arm import difference
@@ -43,14 +44,7 @@ from remaster_ros.motion.path_search import PathSearch
 from remaster_ros.nodes.background import Background
 from remaster_ros.nodes.bridge_parameters import Parameters
 from remaster_ros.nodes.emergency_link import EmergencyLink
-from remaster_ros.nodes.messages import (
-    JointOrder,
-    duration_of,
-    seconds,
-    solutions_of,
-    stamp_key,
-    stamp_of,
-)
+from remaster_ros.nodes.messages import duration_of, stamp_of
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, run

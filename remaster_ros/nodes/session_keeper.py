@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from remaster_ros.collection.events import RecorderBegan
 from remaster_ros.errors import DiskError, MovedError
 from remaster_ros.nodes.bagging import BagRecorder
 from remaster_ros.nodes.running import RemasterNode
@@ -30,8 +31,8 @@ class SessionKeeper:
         The session's.
     header
         The session without observations.
-    with_bag
-        Whether to record a bag into it.
+    began
+        What a bag begins with; None to record none.
 
     Attributes
     ----------
@@ -44,13 +45,11 @@ class SessionKeeper:
     """
 
     def __init__(
-        self, node: RemasterNode, folder: Path, header: Session, *, with_bag: bool
+        self, node: RemasterNode, folder: Path, header: Session, began: RecorderBegan | None
     ) -> None:
         self._node = node
         self.journal = SessionJournal(folder, header)
-        self.bag = BagRecorder(
-            node, folder / 'bag' if with_bag else None, begin=not self.journal.closed
-        )
+        self.bag = BagRecorder(node, folder / 'bag', began, begin=not self.journal.closed)
         self._waiting: Callable[[], object] | None = None
         self._tried_wall = self._checked_wall = time.monotonic()
         self._moved = False

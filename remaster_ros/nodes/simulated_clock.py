@@ -10,14 +10,12 @@ from __future__ import annotations
 import os
 import threading
 import time
-from dataclasses import dataclass
 
 from builtin_interfaces.msg import Time
 from std_msgs.msg import Header
 
+from remaster_ros.collection.message_fields import seconds
 from remaster_ros.errors import InputError
-from remaster_ros.nodes.messages import seconds
-from remaster_ros.nodes.parameters import parameter
 from remaster_ros.nodes.running import RemasterNode
 
 TAKEN = 'remaster/joint_states_taken'
@@ -25,19 +23,6 @@ TAKEN_EVERY_S = 0.1
 """No more often than this are reports confirmed, s of their stamps."""
 STANDS_WALL_S = 5.0
 """A clock that stands longer than this has ended, and watchdogs follow the wall's, s."""
-
-
-@dataclass(frozen=True)
-class SimulationParameters:
-    """What nodes with watchdogs need in a simulation; their parameters derive from this."""
-
-    simulated_clock_rate: float = parameter(
-        0.0,
-        'in a simulation that waits for its nodes, how many times as fast as the wall clock its '
-        'time runs: watchdogs then follow it; 0: they follow the wall clock',
-        low=0.0,
-        high=100.0,
-    )
 
 
 class SteadyTime:

@@ -39,6 +39,7 @@ from remaster_ros.session.bag_metadata import LATCHED_DEPTH
 TOPIC = 'remaster/status'
 EVENTS = 'remaster/events'
 DIAGNOSTICS = 'diagnostics'
+MESSAGES_TAKEN = 'remaster/taken'
 """Relative like every name: a cell in a namespace has its own, for an aggregator of its own."""
 RELIABLE = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 JOINT_STATES = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -136,6 +137,11 @@ class NodeStatus:
             node.create_timer(period_s, callback, callback_group=group, clock=self.steady)
         receive = receiver(node, self._on_record)
         node.create_subscription(String, EVENTS, receive, RELIABLE, callback_group=group)
+
+    @property
+    def started(self) -> str:
+        """What its records have of when the node was started."""
+        return self._started
 
     @property
     def alone_since(self) -> float | None:
@@ -249,6 +255,11 @@ def _text(value: Any) -> str:
     if isinstance(value, bool):
         return 'yes' if value else 'no'
     return f'{value:.1f}' if isinstance(value, float) else 'none' if value is None else str(value)
+
+
+def taken_key(record: EventRecord) -> str:
+    """Return by what a recorder counts the records that it has taken."""
+    return f'{record.node} {record.started}'
 
 
 def receiver(node: Node, on_record: Callable[[EventRecord], None]) -> Callable[[String], None]:

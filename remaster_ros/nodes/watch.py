@@ -30,11 +30,12 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.collection.events import EventRecord
+from remaster_ros.collection.message_fields import JointOrder, solutions_of
 from remaster_ros.collection.plan_confirmation import service_name
 from remaster_ros.errors import RemasterError
 from remaster_ros.kinematics import transforms
 from remaster_ros.nodes.background import Background
-from remaster_ros.nodes.messages import JointOrder, solutions_of, transform_array
+from remaster_ros.nodes.messages import transform_array
 from remaster_ros.nodes.page_address import opening_file, page_name
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.precision_watch import TOPIC as PRECISION

@@ -105,7 +105,7 @@ def test_a_settled_arm_is_measured_though_its_pose_arrives_later(start, client, 
     from std_msgs.msg import String
     from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-    from remaster_ros.nodes.messages import stamp_key
+    from remaster_ros.collection.message_fields import stamp_key
     from remaster_ros.nodes.status import RELIABLE, listen
 
     cell = read_cell('demo')

@@ -133,7 +133,7 @@ class Rig:
         """Announce the next pose with these joint solutions; return its number."""
         from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-        from remaster_ros.nodes.messages import stamp_key
+        from remaster_ros.collection.message_fields import stamp_key
 
         number = next(self.pose)
         message = self.header(JointTrajectory(joint_names=list(CHAIN.joint_names)), self.t)

@@ -1,10 +1,16 @@
 """A replay moves no arm: on a live graph it ends with status 2, and it leaves commands out."""
 
+import os
+import subprocess
+import sys
+
+import numpy as np
 import pytest
+from recorded_bags import RecordedArm
 from ros_rig import node_arguments, wait_until
 
-from remaster_ros.collection.events import Alive, PoseAnnounced, RecorderBegan
 from remaster_ros.session.bag import BagReader
+from remaster_ros.session.bag_replay import differences, record_from_bag
 from remaster_ros.session.bag_writer import BagWriter
 from remaster_ros.session.workcell import read_cell
 
@@ -13,6 +19,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
 COMMANDS = '/joint_trajectory_controller/joint_trajectory'
 STATE, TRAJECTORY = 'sensor_msgs/msg/JointState', 'trajectory_msgs/msg/JointTrajectory'
 NAMES = list(read_cell('demo').chain().joint_names)
+AT_REST = np.full(len(NAMES), 0.2)
 
 
 @pytest.fixture(params=[pytest.param('old', marks=pytest.mark.qualify), 'new'])
@@ -77,30 +84,6 @@ def test_commands_are_left_out(start, client, bag):
     until(client, lambda: process.poll() is not None, 60, 'the end')
     assert process.returncode == 0, process.communicate()
     assert len(heard) == 40
-
-
-def test_the_events_of_an_old_bag_are_published_as_records(start, client, tmp_path):
-    """They stood as pairs of text among the status messages."""
-    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-    from rclpy.serialization import serialize_message
-
-    from remaster_ros.nodes.status import listen
-
-    pairs = {'stamp': '5.000000001', 'pose': '3', 'split': 'optimization', 'solutions': '2'}
-    values = [KeyValue(key=key, value=value) for key, value in pairs.items()]
-    with BagWriter(tmp_path / 'bag') as writer:
-        for number, name in enumerate(('recorder: began', 'pose_planner: pose', 'a stranger')):
-            status = DiagnosticStatus(name=name, values=values)
-            data = serialize_message(DiagnosticArray(status=[status]))
-            kind = 'diagnostic_msgs/msg/DiagnosticArray'
-            writer.write('/remaster/status', kind, data, 10**18 + number * 10**8)
-    found = []
-    listen(client, lambda record: found.append(record.body))
-    wait_for = ('--wait-for', '/remaster/events')
-    process = start('remaster_ros.cli.main', 'replay', tmp_path / 'bag', *wait_for)
-    assert spun(client, process).returncode == 0, process.communicate()
-    pose = PoseAnnounced(stamp='5.000000001', pose=3, split='optimization', ids=(0, 1))
-    assert found == [RecorderBegan(), pose, Alive()]
 
 
 @pytest.mark.parametrize('more', [(), ('--with-commands',)])
@@ -234,3 +217,47 @@ def test_messages_that_a_subscriber_does_not_take_are_told(monkeypatch, bag):
         node.destroy_node()
     finally:
         rclpy.try_shutdown()
+
+
+@pytest.fixture
+def busy():
+    """Run beside it what takes all processors."""
+    loop = [sys.executable, '-c', 'while True: pass']
+    processes = [subprocess.Popen(loop) for _ in range(4 * (os.cpu_count() or 1))]
+    yield
+    for process in processes:
+        process.kill()
+        process.wait()
+
+
+def test_a_replay_waits_for_a_busy_recorder_and_gives_every_row(start, client, tmp_path, busy):
+    """As fast as it can be asked to, on a machine that is busy with other work."""
+    arm = RecordedArm(tmp_path / 'session' / 'bag', 5)
+    arm.began()
+    arm.register()
+    for _ in range(8):
+        arm.visit()
+    # A device that refuses: its end is in no message but the recorder's own event.
+    arm.announce('optimization', [AT_REST])
+    arm.stand(AT_REST, 0.8)
+    arm.ended(0, 'partial', 'tracker: device: no reflector')
+    arm.visit('validation')
+    arm.planner('complete')
+    arm.close()
+    session, offline = tmp_path / 'again', tmp_path / 'offline'
+    done = record_from_bag(BagReader(tmp_path / 'session' / 'bag'), offline)
+    assert done.observations == 2 * 18 + 1
+    recorder = start(
+        'remaster_ros.nodes.recorder', *node_arguments(session=session, call_measure=False)
+    )
+    settled = '/remaster/settled'
+    until(client, lambda: client.get_subscriptions_info_by_topic(settled), 90, 'the recorder')
+    process = start(
+        'remaster_ros.cli.main', 'replay', tmp_path / 'session', '--rate', '100', '--wait-for',
+        settled,
+    )  # fmt: skip
+    until(client, lambda: process.poll() is not None, 150, 'the replay to end')
+    assert process.returncode == 0, process.communicate()
+    recorder.terminate()
+    assert recorder.wait(60) == 0
+    assert not differences(offline, session)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from remaster_ros.collection.message_fields import unit_quaternion
 from remaster_ros.types import FloatArray
 
 
@@ -30,17 +31,6 @@ class Sighting(NamedTuple):
     frame: str
     position: FloatArray | None
     orientation: FloatArray | None = None
-
-
-LENGTH_TOLERANCE = 1e-3
-"""By so much the length of a quaternion may differ from 1: some drivers send single precision."""
-
-
-def unit_quaternion(turn: Any) -> FloatArray | None:
-    """Return a geometry_msgs/Quaternion as x, y, z, w of length 1, (4,); None where it is none."""
-    xyzw = np.array([turn.x, turn.y, turn.z, turn.w], dtype=float)
-    length = np.linalg.norm(xyzw)
-    return xyzw / length if abs(length - 1.0) < LENGTH_TOLERANCE else None
 
 
 def _sighting(message: Any, place: Any, turn: Any = None) -> Sighting:

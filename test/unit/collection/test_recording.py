@@ -173,16 +173,6 @@ def test_one_after_the_other():
     assert bench.recording.next().id == 2
 
 
-def test_a_recorder_that_was_started_again_in_a_bag_has_nothing_under_way():
-    bench = Bench()
-    bench.announce()
-    bench.settle(Q)
-    bench.recording.take_settled(bench.t, OTHER)
-    bench.recording.forget()
-    assert bench.recording.is_idle
-    assert bench.stand(Q, 1.0) == []
-
-
 @pytest.mark.parametrize(
     ('require', 'sensors', 'refused', 'result', 'reasons'),
     [
@@ -253,7 +243,7 @@ def test_the_temperature_is_the_last_one_before_the_arm_settled():
 def test_a_point_by_hand_is_read_where_the_arm_stands():
     bench = Bench()
     bench.stand(Q, 0.1)
-    bench.recording.begin_here()
+    bench.recording.begin_by_hand(bench.recording.now_s, bench.recording.q)
     (ended,) = bench.stand(Q, 1.0)
     assert ended.settled.pose is BY_HAND
     np.testing.assert_array_equal(ended.settled.q, Q)

@@ -30,8 +30,8 @@ from remaster_ros.collection.events import (
     decode,
     encode,
 )
+from remaster_ros.collection.message_fields import seconds
 from remaster_ros.nodes import emergency_link, rivals, robot_bridge, simulated_clock, status
-from remaster_ros.nodes.messages import seconds
 from remaster_ros.session.workcell import read_cell
 
 CELL = read_cell('demo')

@@ -17,9 +17,10 @@ from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
 
+from remaster_ros.collection.message_fields import seconds
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.kinematics.transforms import transform
-from remaster_ros.nodes.messages import seconds, transform_message
+from remaster_ros.nodes.messages import transform_message
 from remaster_ros.nodes.sensor_node import SensorNode
 from remaster_ros.nodes.status import LATCHED, pairs
 from remaster_ros.parameters import parameter

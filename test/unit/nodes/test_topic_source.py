@@ -15,8 +15,9 @@ from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from remaster_ros.collection.events import SensorReport
+from remaster_ros.collection.message_fields import seconds
 from remaster_ros.errors import InputError
-from remaster_ros.nodes.messages import seconds, stamp_of
+from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.sensor_node import SensorNode
 from remaster_ros.sensors.registry import GENERIC
 from remaster_ros.session.workcell import config_path

@@ -8,8 +8,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from remaster_ros.collection.pairing import SensorRules
-from remaster_ros.nodes.parameters import parameter
-from remaster_ros.nodes.simulated_clock import SimulationParameters
+from remaster_ros.parameters import SimulationParameters, parameter
 from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import Measurements, Session
 

@@ -1,0 +1,279 @@
+"""A session from its bag, without ROS: its messages, in order, through the recorder's code.
+
+A recorder writes each message into the bag when it takes it, so the order is the one in which it
+had them. The times of wall clocks are in no message; what was decided by them is taken from the
+recorder's own events (`SessionRecorder.take_record`). So the same bag always gives the same rows.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from remaster_ros.collection import events
+from remaster_ros.collection.message_fields import temperature_topic
+from remaster_ros.errors import InputError
+from remaster_ros.parameters import check_all
+from remaster_ros.session.bag import BagReader, live_name
+from remaster_ros.session.files import decode_text, read_limited
+from remaster_ros.session.reader import HEADER, OBSERVATIONS_LIMIT, ROWS
+from remaster_ros.session.recorder_parameters import Parameters, session_header
+from remaster_ros.session.session_journal import SessionJournal
+from remaster_ros.session.session_recorder import Outlet, SessionRecorder
+from remaster_ros.session.session_yaml import ExitStatus
+from remaster_ros.session.workcell import Workcell
+
+log = logging.getLogger('remaster_ros')
+
+EVENTS = '/remaster/events'
+
+
+class _Keeper:
+    """Writes at once: nothing waits for room on a disk."""
+
+    full = ''
+
+    def __init__(self, journal: SessionJournal) -> None:
+        self.journal = journal
+
+    def write(self, write: Callable[[], object]) -> None:
+        write()
+
+    def reopen(self, *, go_further: bool = False) -> None:
+        self.journal.reopen(go_further=go_further)
+
+    def close(self, exit_status: ExitStatus) -> None:
+        self.journal.close(exit_status)
+
+
+class _Log(Outlet):
+    """What concerns a person is told; a registration and a summary are not."""
+
+    def log(self, level: int, text: str) -> None:
+        if level >= logging.WARNING:
+            log.log(level, text)
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What came of a bag.
+
+    Attributes
+    ----------
+    observations
+        Rows that were written.
+    counts
+        What became of readings and configurations.
+    torn_bytes
+        At the end of the bag, of a message that is not whole.
+    """
+
+    observations: int
+    counts: dict[str, int]
+    torn_bytes: int
+
+
+def bag_folder(path: Path) -> Path:
+    """Return the bag at a path, which may be that of the session with it."""
+    return path / 'bag' if (path / 'bag').is_dir() else path
+
+
+def session_beside(bag: Path) -> Path | None:
+    """Return the session that holds a bag; None where there is none."""
+    folder = (bag if bag.is_dir() else bag.parent).absolute().parent
+    return folder if (folder / HEADER).exists() else None
+
+
+def record_from_bag(
+    bag: BagReader,
+    out: Path,
+    cell: Workcell | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Replayed:
+    """Write the session of a bag.
+
+    Parameters
+    ----------
+    bag
+        Of the recorder.
+    out
+        The session's folder, new or empty.
+    cell
+        In place of the cell that the recorder wrote into the bag.
+    progress
+        Called with the share done.
+
+    Raises
+    ------
+    InputError
+        No bag of a recorder, a damaged message, or a folder that holds something.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f'{out}: there is something already; name a new folder for the session')
+    # Imported here: it takes a quarter of a second.
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.ROS2_JAZZY)
+    began, from_bag = _first_start(bag, types)
+    cell = cell or from_bag
+    if cell is None:
+        raise InputError(
+            f'{bag.path}: it does not hold the cell that it was recorded with; name the file with '
+            '--cell'
+        )
+    p = replace(_parameters(bag, began), session=str(out))
+    journal = SessionJournal(out, session_header(cell, p.settle_s))
+    recorder = SessionRecorder(cell, p, _Keeper(journal), _Log())
+    take = _takers(cell, recorder)
+    total = sum(bag.counts.values())
+    for number, (recorded, kind, data, _) in enumerate(bag):
+        topic = live_name(recorded)
+        if number % 1000 == 0:
+            progress(number / total)
+        if topic == EVENTS:
+            for record in _records(bag, types, data, kind):
+                recorder.take_record(record)
+        elif topic in take:
+            take[topic](_decoded(bag, types, data, kind))
+        else:
+            continue
+        recorder.look()
+    if not journal.closed:
+        recorder.close('stopped')
+    return Replayed(journal.observations, dict(sorted(recorder.counts.items())), bag.torn_bytes)
+
+
+def _takers(cell: Workcell, recorder: SessionRecorder) -> dict[str, Callable[[Any], object]]:
+    """Return what takes the messages of each topic."""
+    take: dict[str, Callable[[Any], object]] = {
+        '/joint_states': recorder.take_joints,
+        '/remaster/settled': recorder.take_settled,
+        '/remaster/joint_solutions': recorder.take_solutions,
+    }
+    for name, sensor in cell.sensors.items():
+        take[_absolute(temperature_topic(sensor.topic))] = recorder.take_temperature
+        topics = {sensor.marker: sensor.pose_topic} if sensor.pose_topic else sensor.topics
+        for marker, topic in topics.items():
+            take[_absolute(topic)] = _marker_taker(recorder, name, marker)
+    return take
+
+
+def _marker_taker(recorder: SessionRecorder, sensor: str, marker: str) -> Callable[[Any], object]:
+    return lambda message: recorder.take_marker(sensor, marker, message)
+
+
+def _absolute(topic: str) -> str:
+    return f'/{topic.lstrip("/")}'
+
+
+def _decoded(bag: BagReader, types: Any, data: bytes, kind: str) -> Any:
+    try:
+        return types.deserialize_cdr(data, kind)
+    # rosbags raises whatever bad bytes lead to.
+    except Exception as error:
+        what = ' '.join(str(error).split())[:120]
+        raise InputError(
+            f'{bag.path}: a damaged message ({type(error).__name__}: {what}); take another copy '
+            'of the bag'
+        ) from None
+
+
+def _records(bag: BagReader, types: Any, data: bytes, kind: str) -> list[events.EventRecord]:
+    """Return the record in a message; one of no program that is known here is left out."""
+    try:
+        return [events.decode(_decoded(bag, types, data, kind).data)]
+    except InputError as error:
+        log.warning('%s: %s', bag.path, error)
+        return []
+
+
+def _first_start(bag: BagReader, types: Any) -> tuple[events.RecorderBegan, Workcell | None]:
+    """Return the first start of a recorder in a bag, and its cell."""
+    for topic, kind, data, _ in bag:
+        if topic != EVENTS:
+            continue
+        for record in _records(bag, types, data, kind):
+            if isinstance(record.body, events.RecorderBegan):
+                return record.body, _cell(bag, record.body.cell)
+    raise InputError(
+        f'{bag.path}: no recorder of remaster_ros has written it; `remaster import` makes a '
+        'session of joint states and points'
+    )
+
+
+def _cell(bag: BagReader, text: str) -> Workcell | None:
+    if not text:
+        return None
+    try:
+        return msgspec.json.decode(text, type=Workcell)
+    except msgspec.MsgspecError as error:
+        raise InputError(
+            f'{bag.path}: the cell in it is of another version ({error}); name its file with '
+            '--cell'
+        ) from None
+
+
+def _parameters(bag: BagReader, began: events.RecorderBegan) -> Parameters:
+    known = {field.name for field in fields(Parameters)}
+    given: dict[str, Any] = {k: v for k, v in began.parameters.items() if k in known}
+    p = Parameters(**given)
+    check_all(str(bag.path), p)
+    return p
+
+
+def differences(session: Path, other: Path) -> list[str]:
+    """Return how the rows of two sessions differ, a line for each row.
+
+    Parameters
+    ----------
+    session, other
+        The session recorded, and the one of its bag. A row is found in the other by its pose,
+        split, sensor and marker and by where the arm came from, so that one which is missing is
+        named alone.
+    """
+    ours, theirs = _rows(session), _rows(other)
+    found = []
+    for key, row in ours.items():
+        again = theirs.pop(key, None)
+        if again is None:
+            found.append(f'{_name(row)} is missing')
+            continue
+        differs = [
+            f'{column} is {again.get(column) or "empty"} instead of {value or "empty"}'
+            for column, value in row.items()
+            if column not in _COUNTED and again.get(column, '') != value
+        ]
+        if differs:
+            found.append(f'{_name(row)}: {", ".join(differs)}')
+    found += [f'{_name(row)} is not in the session recorded' for row in theirs.values()]
+    return found
+
+
+def _rows(session: Path) -> dict[tuple[str, ...], dict[str, str]]:
+    """Return the rows of a session by what they are of."""
+    path = session / ROWS
+    data = read_limited(path, OBSERVATIONS_LIMIT, 'it is part of a session')
+    found: dict[tuple[str, ...], dict[str, str]] = {}
+    seen: Counter[tuple[str, ...]] = Counter()
+    for row in csv.DictReader(decode_text(data, path).splitlines()):
+        of = tuple(v for k, v in row.items() if k in _OF or k.startswith('from_q'))
+        found[*of, str(seen[of])] = row
+        seen[of] += 1
+    return found
+
+
+_OF = ('pose', 'split', 'sensor', 'marker')
+_COUNTED = ('observation', 'configuration', 'frame')
+"""Columns that count the rows of their own session: one that is missing shifts all after it."""
+
+
+def _name(row: dict[str, str]) -> str:
+    place = f'pose {row["pose"]}, {row["sensor"]}, {row["marker"]}, {row["stamp_s"]} s'
+    return f'observation {row["observation"]} ({place})'

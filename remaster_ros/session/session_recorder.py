@@ -1,0 +1,415 @@
+"""From messages to a session: what the recorder's node does, and what a bag gives again.
+
+Messages and records come in through `SessionRecorder.take_joints` and the like, in the order in
+which they arrive. Which of them belong together is decided by their stamps, in
+`collection.recording`. The event of a configuration goes out after its observations are on the
+disk; the bridge moves on only then.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+
+from remaster_ros.collection import events
+from remaster_ros.collection.first_registration import FirstRegistration
+from remaster_ros.collection.message_fields import (
+    JointOrder,
+    seconds,
+    solutions_of,
+    stamp_key,
+    unit_quaternion,
+)
+from remaster_ros.collection.pairing import PairedReading
+from remaster_ros.collection.plausibility import Plausibility
+from remaster_ros.collection.recording import BY_HAND, EndedReading, Recording
+from remaster_ros.collection.required_sensors import RequiredSensors
+from remaster_ros.collection.setup_changes import SetupChanges
+from remaster_ros.errors import InputError
+from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
+from remaster_ros.session.recorder_parameters import Parameters, sensor_rules
+from remaster_ros.session.session_journal import SessionJournal
+from remaster_ros.session.session_yaml import ExitStatus
+from remaster_ros.session.workcell import Workcell
+from remaster_ros.types import FloatArray, MarkerReading
+
+
+class Keeper(Protocol):
+    """Writes the session; what the disk does not take is written later.
+
+    Attributes
+    ----------
+    journal
+        What is written.
+    full
+        Why nothing can be written now; ''.
+    """
+
+    journal: SessionJournal
+    full: str
+
+    def write(self, write: Callable[[], object]) -> None:
+        """Call `write`, now or when there is room."""
+
+    def reopen(self, *, go_further: bool = False) -> None:
+        """Go on with a session that was stopped; with `go_further`, with one that is complete."""
+
+    def close(self, exit_status: ExitStatus) -> None:
+        """Close the session."""
+
+
+class Outlet:
+    """What becomes known while a session is recorded; does nothing with it.
+
+    A node publishes it.
+    """
+
+    def event(self, event: events.Event) -> None:
+        """Take an event of this recorder."""
+
+    def state(self) -> None:
+        """Take it that the recorder's state has changed."""
+
+    def registered(self, sensor: str, T_R_N: FloatArray) -> None:
+        """Take a registration, (4, 4)."""
+
+    def measure(self) -> None:
+        """Take it that a reading has begun: single-shot sensors are to measure."""
+
+    def ended_by_hand(self, ended: EndedReading) -> None:
+        """Take what became of a reading for a registration by hand."""
+
+    def log(self, level: int, text: str) -> None:
+        """Take a line for a person; `level` as of `logging`."""
+
+
+class SessionRecorder:
+    """See the module's text.
+
+    Parameters
+    ----------
+    cell, p
+        What is measured, and how.
+    keeper, outlet
+        Where it goes.
+
+    Attributes
+    ----------
+    recording
+        The readings under way.
+    registration
+        Of the sensors, so far.
+    changes
+        At the references.
+    required
+        The sensors that the arm waits for.
+    counts, not_finite, waited_s
+        What became of readings and configurations; readings that are no numbers, and how long the
+        arm stood, s, per sensor.
+    trouble
+        What is wrong with the last message; ''.
+    run
+        The token of the planner's run; in memory alone, so that it lives no longer than this.
+    from_bag
+        Whether the messages are those of a bag.
+    """
+
+    def __init__(self, cell: Workcell, p: Parameters, keeper: Keeper, outlet: Outlet) -> None:
+        self.cell, self.keeper, self._outlet = cell, keeper, outlet
+        self.chain = cell.chain()
+        self._order = JointOrder(self.chain.joint_names)
+        self.required = RequiredSensors(cell.sensors, p.require)
+        self.counts: Counter[str] = Counter()
+        self.not_finite: Counter[str] = Counter()
+        self.waited_s = dict.fromkeys(cell.sensors, 0.0)
+        self.trouble = self.run = ''
+        self.from_bag = False
+        self._p = p
+        self._begin()
+
+    @property
+    def journal(self) -> SessionJournal:
+        """What is on the disk."""
+        return self.keeper.journal
+
+    def _begin(self) -> None:
+        """Begin with what the session holds, as a recorder that was just started."""
+        cell, p = self.cell, self._p
+        markers = {name: np.array(position) for name, position in cell.markers.items()}
+        self.recording = Recording(
+            sensor_rules(cell, p),
+            p.motion_tolerance,
+            p.require,
+            Plausibility(self.chain, markers, p.max_deviation_m, cell.marker_std_m),
+            patient=self.from_bag,
+        )
+        self.registration = FirstRegistration(
+            self.chain,
+            markers,
+            cell.sensors,
+            p.max_deviation_m / 2,
+            {
+                name: sensor.markers
+                for name, sensor in cell.sensors.items()
+                if sensor.single_shot and sensor.further_markers
+            },
+        )
+        self.changes = SetupChanges(self.chain, markers, p.reference_stop_m)
+        self._take_back()
+
+    def _take_back(self) -> None:
+        """Take up what the session holds of registration and references."""
+        self._register(self.journal.registration)
+        self.changes.take_back(self.journal.watched, self.registration.T_R_N)
+
+    # What comes in
+
+    def _positions(self, message: Any) -> FloatArray | None:
+        """Return the positions of the cell's joints, rad, (k,); None, with a reason, without."""
+        try:
+            return self._order.positions(message)
+        except InputError as error:
+            self.trouble = str(error)
+            return None
+
+    def take_joints(self, message: Any) -> None:
+        """Take a sensor_msgs/JointState of the robot."""
+        if (q := self._positions(message)) is not None:
+            self.trouble = ''
+            self.recording.take_joints(seconds(message.header.stamp), q)
+            self.end_reading()
+
+    def take_solutions(self, message: Any) -> None:
+        """Take a trajectory_msgs/JointTrajectory with the solutions of the announced pose."""
+        try:
+            solutions = solutions_of(message, self.chain.joint_names)
+        except InputError as error:
+            self.trouble = f'joint_solutions dropped: {error}'
+            solutions = np.empty((0, len(self.chain)))
+        self.recording.take_solutions(stamp_key(message.header.stamp), solutions)
+
+    def take_settled(self, message: Any) -> None:
+        """Take a sensor_msgs/JointState of an arm that has settled."""
+        if (q := self._positions(message)) is None:
+            return
+        if self.from_bag and self.recording.is_by_hand:
+            # Its end is in no message; the arm has gone on.
+            self._end_as_recorded('rejected', '')
+        if self.recording.take_settled(seconds(message.header.stamp), q):
+            # The bridge waits for an answer, but a bag does not: a reading under way is
+            # finished first, by the stamps of its own messages.
+            self.take_next()
+        else:
+            self.counts['settled_unknown'] += 1
+            self.trouble = 'settled at no joint solution of an announced pose'
+
+    def take_marker(self, sensor: str, marker: str, message: Any) -> bool:
+        """Take a geometry_msgs/PointStamped or PoseStamped; return whether it is a reading."""
+        body = getattr(message, 'pose', None)
+        point = message.point if body is None else body.position
+        position = np.array([point.x, point.y, point.z])
+        hidden = bool(np.all(np.isnan(position))) and len(self.cell.sensors[sensor].markers) > 1
+        # Hidden, while others of the frame are seen on topics of their own.
+        if not (hidden or np.all(np.isfinite(position))):
+            self.not_finite[sensor] += 1
+            return False
+        turn = None if body is None else unit_quaternion(body.orientation)
+        reading = MarkerReading(
+            seconds(message.header.stamp), position, marker=marker, orientation=turn
+        )
+        self.recording.take_reading(sensor, reading)
+        self.end_reading()
+        return not hidden
+
+    def take_temperature(self, message: Any) -> None:
+        """Take a sensor_msgs/Temperature."""
+        if np.isfinite(message.temperature):
+            self.recording.take_temperature(seconds(message.header.stamp), message.temperature)
+
+    def take_record(self, record: events.EventRecord) -> None:
+        """Take a record of another node, or of the recorder of a bag."""
+        match record.body:
+            case events.PoseAnnounced() as pose:
+                self._on_pose(pose)
+            case events.PlannerState() as planner:
+                self._on_planner(planner)
+            case events.ArmStopped():
+                self.recording.take_stop()
+            case events.RecorderBegan() as began:
+                self._on_began(began)
+            case events.ConfigurationEnded() as end if self.from_bag:
+                # What is decided by now is decided by the messages; the rest as it was then.
+                while self.recording.is_open(end.stamp, end.solution) and (
+                    self.recording.pairing is not None
+                ):
+                    self._end_as_recorded(end.result, end.reason)
+            case events.ReadByHand() as read if self.from_bag:
+                if self.recording.is_by_hand:
+                    self._end_as_recorded('rejected', '')
+                self.recording.begin_by_hand(read.stamp_s, np.array(read.q))
+
+    def _on_began(self, began: events.RecorderBegan) -> None:
+        """Begin anew where the recorder of a bag did, with what its session held then."""
+        first, self.from_bag = not self.from_bag, True
+        if began.continued:
+            return
+        if not first and not self.journal.closed:
+            self.keeper.close('stopped')
+            self.keeper.reopen()
+        self._begin()
+
+    def _end_as_recorded(self, result: str, reason: str) -> None:
+        self.recording.end_as_recorded(result, reason)
+        self.end_reading()
+
+    def _on_pose(self, pose: events.PoseAnnounced) -> None:
+        self.recording.announced = pose
+        if pose.split not in (REFERENCE, REGISTRATION):
+            self._report_change(self.changes.leave(self.registration.T_R_N))
+        if not self.keeper.full and not self.journal.closed:
+            # Before the arm gets there: it is held where there is no room.
+            self.keeper.write(partial(self.journal.follow, pose.plan))
+
+    def _on_planner(self, planner: events.PlannerState) -> None:
+        self.run = planner.run_held(self.run)
+        accepted = self.changes.follow(planner.state, self.run)
+        if accepted and not self.keeper.full and not self.journal.closed:
+            self.keeper.write(self._accept_change)
+        if self.keeper.full or not self.recording.is_idle:
+            return
+        if planner.state == 'complete':
+            self.keeper.write(partial(self.close, 'complete'))
+        elif planner.state == 'stopped' and self.journal.observations:
+            self.keeper.write(partial(self.close, 'stopped'))
+        elif planner.state == 'running' and self.journal.closed == 'stopped':
+            self.keeper.write(self.keeper.reopen)
+        elif planner.goes_further(self.journal.plan_id) and self.journal.closed == 'complete':
+            self.keeper.write(self._go_further)
+
+    def _go_further(self) -> None:
+        """Open the complete session again, for what separates causes."""
+        try:
+            self.keeper.reopen(go_further=True)
+        except InputError as error:
+            self.trouble = str(error)
+        if not self.registration.T_R_N:
+            # This recorder was started when the session was complete already.
+            self._take_back()
+        self._outlet.state()
+
+    # A configuration
+
+    def look(self) -> None:
+        """Take up what messages alone did not: what is known late, and what is due."""
+        self.end_reading()
+        self.recording.look_again()
+        self.take_next()
+
+    def take_next(self) -> None:
+        """Begin the reading that is due, unless one is under way or written down."""
+        while not self.keeper.full and (settled := self.recording.next()) is not None:
+            pose = settled.pose
+            if self.journal.closed or not self.journal.follow(pose.plan):
+                self.trouble = 'settled, but the session is closed, or was begun with another plan'
+                continue
+            known = self.journal.result(pose.pose, settled.id)
+            if known is None:
+                self.recording.begin(settled)
+                self._outlet.measure()
+                continue
+            self._report(settled.recorded_before(known, registered=self.is_registered))
+
+    def read_by_hand(self) -> None:
+        """Begin to read where the arm stands now, for a registration by hand."""
+        q, now_s = self.recording.q, self.recording.now_s
+        assert q is not None
+        self._outlet.event(events.ReadByHand(stamp_s=now_s, q=tuple(q.tolist())))
+        self.recording.begin_by_hand(now_s, q)
+        self._outlet.measure()
+
+    @property
+    def is_registered(self) -> bool:
+        """Whether every sensor that the arm waits for is registered."""
+        return self.required.are_among(self.registration.T_R_N)
+
+    def end_reading(self) -> None:
+        """Write down the configuration under way, once it is decided."""
+        ended = self.recording.end(self.registration.T_R_N)
+        if ended is None:
+            return
+        for name, waited_s in ended.waited_s.items():
+            self.waited_s[name] += waited_s
+        refused = (*ended.rejected, *ended.left_out)
+        self.counts.update(f'{item.sensor}_{item.reason}' for item in refused)
+        for item in ended.accepted:
+            if item.dropped:
+                self.counts[f'{item.sensor}_frames_dropped'] += item.dropped
+        self.counts.update(f'{name}_accepted' for name in {item.sensor for item in ended.accepted})
+        self.keeper.write(partial(self._write_down, ended))
+
+    def _write_down(self, ended: EndedReading) -> None:
+        """Write what became of a configuration; publish it after that, and not before."""
+        settled, pose = ended.settled, ended.settled.pose
+        number = self.journal.write(
+            pose=pose.pose,
+            solution=settled.id,
+            split=pose.split,
+            result=ended.result,
+            reason=ended.why,
+            readings=ended.accepted,
+            from_q=ended.from_q,
+            temperatures_c=[ended.temperature_c] * len(ended.accepted),
+        )
+        if pose.split == REGISTRATION:
+            self._register(ended.accepted)
+        if pose.split == REFERENCE:
+            # Before the planner learns that it may go on.
+            known = self.registration.T_R_N
+            self._report_change(self.changes.read(number, ended.accepted, known, pose.last))
+        if pose == BY_HAND:
+            self._outlet.ended_by_hand(ended)
+            return
+        self._report(ended.event(registered=self.is_registered))
+        self.take_next()
+
+    def _register(self, readings: Sequence[PairedReading]) -> None:
+        """Take readings at registration poses; tell what they register."""
+        for name in self.registration.add(readings):
+            self._outlet.registered(name, self.registration.T_R_N[name])
+            self._outlet.log(logging.INFO, f'{name} is registered; {self.registration.describe()}')
+        for name in {reading.sensor for reading in readings} & self.registration.troubles.keys():
+            self._outlet.log(logging.WARNING, self.registration.troubles[name])
+
+    def _report(self, end: events.ConfigurationEnded) -> None:
+        self.counts[f'configurations_{end.result}'] += 1
+        self._outlet.event(end)
+
+    # The references
+
+    def _report_change(self, new: bool) -> None:
+        """Report what has changed at the references; the planner pauses where it is large."""
+        event = self.changes.report(self.run) if new else None
+        if event is not None:
+            self._outlet.log(logging.ERROR, event.text)
+            self._outlet.event(event)
+            self._outlet.state()
+
+    def _accept_change(self) -> None:
+        self.journal.note_accepted()
+        self.changes.accept()
+        self._outlet.state()
+
+    def close(self, exit_status: ExitStatus) -> None:
+        """Close the session; closing again does nothing."""
+        if self.journal.closed:
+            return
+        self._report_change(self.changes.judge(self.registration.T_R_N))
+        self.keeper.close(exit_status)
+        waited = ', '.join(f'{name} {s:.1f} s' for name, s in self.waited_s.items())
+        self._outlet.log(logging.INFO, f'the arm stood still for measuring: {waited} (sum)')
+        self._outlet.state()
