@@ -105,6 +105,81 @@ def random_configurations(
     )
 
 
+class PredictedAccuracy(NamedTuple):
+    """Where the marker is at n configurations, and how far it is from there, after.
+
+    Attributes
+    ----------
+    place
+        By the estimate, in the robot base, m, (n, 3).
+    error
+        Mean distance over the draws, without the sensor's noise, m, (n,).
+    """
+
+    place: FloatArray
+    error: FloatArray
+
+
+def predicted_accuracy(
+    predictive: Predictive, seen: Measurements, count: int, rng: np.random.Generator
+) -> PredictedAccuracy:
+    """Return the accuracy at random configurations, invariant; see `random_configurations`."""
+    bare = predictive.without_extension()
+    m = random_configurations(bare.model, seen, count, rng)
+    taken = rng.permutation(len(bare.draws))[: max(1, PAIRS // count)]
+    places, errors = np.empty((count, 3)), np.empty(count)
+    for block in np.array_split(np.arange(count), -(-count // _BLOCK_ROWS)):
+        rows = Rows.of(m, block, bare.model.reference)
+        place = bare.model.predict(bare.after, rows)
+        drawn = bare.model.predict(bare.draws[taken], rows)
+        places[rows.source] = place
+        errors[rows.source] = np.linalg.norm(drawn - place, axis=-1).mean(axis=0)
+    return PredictedAccuracy(places, errors)
+
+
+class ToolPlaces(NamedTuple):
+    """Places of the marker at one configuration, in the robot base, m (Fig. 5 of the paper).
+
+    Attributes
+    ----------
+    before, after
+        With offsets at zero and as estimated, (3,).
+    drawn, noisy
+        With the offsets of draws, without and with the noise of a reading, (draws, 3).
+    """
+
+    before: FloatArray
+    after: FloatArray
+    drawn: FloatArray
+    noisy: FloatArray
+
+
+def tool_places(
+    predictive: Predictive, seen: Measurements, row: int, count: int, rng: np.random.Generator
+) -> ToolPlaces:
+    """Return where the marker may be at the configuration of a row, the paper's version.
+
+    Parameters
+    ----------
+    count
+        Draws that are taken at most.
+    """
+    bare = predictive.without_extension()
+    model, taken = bare.model, rng.permutation(len(bare.draws))[:count]
+    q, sensor = seen.q[row], seen.sensor[row]
+    marker = model.markers(model.natural(bare.after))[seen.marker[row]]
+    offsets = np.concatenate(
+        (
+            np.zeros((1, model.joints)),
+            predictive.mean_offsets[None],
+            model.offsets(bare.draws[taken]),
+        )
+    )
+    before, after, *drawn = model.chain.positions(q, marker, offsets)
+    noise = rng.standard_normal((len(taken), 3)) * bare.sigma[taken, sensor, 1:]
+    return ToolPlaces(before, after, np.array(drawn), np.array(drawn) + noise)
+
+
 def theoretical_distances(
     predictive: Predictive,
     before: FloatArray,

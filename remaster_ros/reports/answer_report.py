@@ -35,7 +35,8 @@ PDF_FILE = 'report.pdf'
 ANSWER_GENERATOR = 'remaster report'
 WORST_ROWS = 10
 # Of the figures that `fit` and `discover` wrote, those that this page shows.
-FIT_FIGURES, FOUND_FIGURES = ('posteriors', 'traces'), ('causes', 'drivers')
+FIT_FIGURES = ('posteriors', 'traces', 'tool_places', 'accuracy_map')
+FOUND_FIGURES = ('causes', 'drivers')
 FILE_LIMIT = 64 * 1024**2
 PDF_REMEDY = "pip install 'remaster_ros[pdf]'"
 

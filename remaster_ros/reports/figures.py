@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
+from remaster_ros.calibration.predictive_accuracy import predicted_accuracy, tool_places
 from remaster_ros.types import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -31,7 +32,10 @@ INK, GRID, PAPER = '#1b1f25', '#d8dce1', '#fefefd'
 BEFORE, AFTER = '#e07b39', '#3b82c4'
 CHAINS = ('#3b82c4', '#e07b39', '#2f9e78', '#b05fb5', '#b08a1e', '#d1495b', '#5f7d95', '#7a6ff0')
 SENSOR_MARKERS = 'os^Dv'
+FAINT = '#808a96'
 WIDTH_IN = 8.4
+TOOL_DRAWS = 400
+MAP_POINTS, MAP_TILES = 4000, 22
 TRACE_POINTS = 1500
 SCATTER_POINTS = 1500
 WHOLE_TURN_DEG = 359.999
@@ -78,6 +82,8 @@ def draw_figures(result: FitResult) -> dict[str, str]:
         'traces': traces,
         'errors': errors_by_configuration,
         'residuals': residual_distribution,
+        'tool_places': tool_places_of_one,
+        'accuracy_map': accuracy_map,
     }
     return as_svg(figures, result)
 
@@ -201,6 +207,84 @@ def residual_distribution(result: FitResult) -> Figure:
         error_histograms(ax, before[rows], after[rows])
         ax.set_title(title)
         legend_above(ax)
+    return figure
+
+
+def tool_places_of_one(result: FitResult) -> Figure:
+    """Draw where the marker may be at one configuration, from three sides (Fig. 5)."""
+    m = result.session.measurements
+    lengths = np.linalg.norm(result.residuals_before, axis=1)
+    fitted = np.flatnonzero(~m.is_validation)
+    # The one whose error before is the median.
+    row = int(fitted[np.argsort(lengths[fitted])[len(fitted) // 2]])
+    places = tool_places(result.predictive, m, row, TOOL_DRAWS, np.random.default_rng(0))
+    before, after, drawn, noisy = (1e3 * (place - places.after) for place in places)
+    figure = Figure(figsize=(WIDTH_IN, 3.2), layout='constrained')
+    for ax, (i, j) in zip(figure.subplots(1, 3), ((0, 1), (0, 2), (1, 2)), strict=True):
+        ax.plot(*noisy[:, [i, j]].T, '.', color=FAINT, markersize=2.0, alpha=0.5)
+        ax.plot(*drawn[:, [i, j]].T, '.', color=AFTER, markersize=2.0, alpha=0.5)
+        ax.plot(after[i], after[j], '+', color=INK, markersize=8, markeredgewidth=1.4)
+        ax.plot(before[i], before[j], 'x', color=BEFORE, markersize=7, markeredgewidth=2.0)
+        ax.set_xlabel(f'{"xyz"[i]} (mm)')
+        ax.set_ylabel(f'{"xyz"[j]} (mm)')
+        ax.set_aspect('equal', adjustable='datalim')
+        ax.xaxis.set_major_locator(MaxNLocator(5))
+        ax.yaxis.set_major_locator(MaxNLocator(5))
+    handles = [
+        legend_entry('x', BEFORE, 'offsets at zero'),
+        legend_entry('+', INK, 'offsets estimated'),
+        legend_entry('.', AFTER, 'offsets drawn'),
+        legend_entry('.', FAINT, '… and noise'),
+    ]
+    for handle in handles[:2]:
+        handle.set_markeredgewidth(1.6)
+    figure.legend(handles=handles, loc='outside upper right', ncols=len(handles))
+    configuration = int(m.configuration[row])
+    sensor = result.session.sensor_names[m.sensor[row]]
+    figure.suptitle(f'configuration {configuration}, {sensor}', fontsize=8, ha='left', x=0.01)
+    return figure
+
+
+def accuracy_map(result: FitResult) -> Figure:
+    """Draw the predicted error over the workspace: from the side and from above."""
+    m = result.session.measurements
+    found = predicted_accuracy(result.predictive, m, MAP_POINTS, np.random.default_rng(0))
+    error_mm = 1e3 * found.error
+    markers = np.array([result.marker_positions[name] for name in result.session.marker_names])
+    measured = result.chain.positions(m.q, markers[m.marker], result.joint_offsets)
+    figure = Figure(figsize=(WIDTH_IN, 4.0), layout='constrained')
+    views: tuple[tuple[str, str, Callable[[FloatArray], FloatArray]], ...] = (
+        (
+            'distance from the axis of the base (m)',
+            'height (m)',
+            lambda p: np.column_stack((np.hypot(p[:, 0], p[:, 1]), p[:, 2])),
+        ),
+        ('x (m)', 'y (m)', lambda p: p[:, :2]),
+    )
+    low, high = np.quantile(error_mm, (0.02, 0.98))
+    for ax, (across, up, seen) in zip(figure.subplots(1, 2), views, strict=True):
+        places = seen(found.place)
+        across_tiles, up_tiles = MAP_TILES * np.ptp(places, axis=0) / np.ptp(found.place[:, 0])
+        tiles = ax.hexbin(
+            *places.T,
+            C=error_mm,
+            reduce_C_function=np.mean,
+            # Hexagons with sides of one length, in both views.
+            gridsize=(max(1, round(across_tiles)), max(1, round(up_tiles / np.sqrt(3.0)))),
+            cmap='viridis',
+            vmin=low,
+            vmax=high,
+            linewidths=0.1,
+        )
+        ax.plot(*seen(measured).T, '.', color=BEFORE, markersize=2.5)
+        ax.set_xlabel(across)
+        ax.set_ylabel(up)
+        ax.set_aspect('equal')
+        ax.grid(False)
+    bar = figure.colorbar(tiles, ax=figure.axes, label='predicted error (mm)', shrink=0.85)
+    # Drawn as a picture it would be the only one of a page that is not lines.
+    if bar.solids is not None:
+        bar.solids.set(rasterized=False, edgecolor='face')
     return figure
 
 

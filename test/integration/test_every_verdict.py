@@ -97,7 +97,9 @@ def test_fit(case: str, healthy: Path, tmp_path: Path) -> None:
     process = remaster('fit', session, '--out', out, *options)
     assert process.returncode == 0, process.stderr
     page, found, names = page_of(out)
-    assert names == {'stages', 'posteriors', 'traces', 'errors', 'residuals'}
+    assert names == {
+        'stages', 'posteriors', 'traces', 'errors', 'residuals', 'tool_places', 'accuracy_map',
+    }  # fmt: skip
     assert found == mood if mood else found != 'good'
     assert re.search(words, page)
     assert 'written: ' in process.stdout

@@ -80,10 +80,12 @@ def test_all_files_are_there(folder):
         'apply/offset_layer.yaml',
         'apply/remaster.txt',
         'apply/robot_calibrated.urdf',
+        'figures/accuracy_map.svg',
         'figures/errors.svg',
         'figures/posteriors.svg',
         'figures/residuals.svg',
         'figures/stages.svg',
+        'figures/tool_places.svg',
         'figures/traces.svg',
         'fit.json',
         'report.html',
@@ -142,7 +144,9 @@ def test_the_size_is_bounded(folder):
     assert (folder / 'report.html').stat().st_size < 8e6
 
 
-@pytest.mark.parametrize('name', ['posteriors', 'traces', 'errors', 'residuals'])
+@pytest.mark.parametrize(
+    'name', ['posteriors', 'traces', 'errors', 'residuals', 'tool_places', 'accuracy_map']
+)
 def test_figures_are_svg_with_nothing_cut_off(folder, name):
     root = ElementTree.parse(folder / 'figures' / f'{name}.svg').getroot()
     width, height = map(float, root.get('viewBox').split()[2:])
@@ -165,7 +169,7 @@ def test_figures_name_units_and_joints(fit_result, folder):
         assert joint in figures['traces']
     assert 'degrees' in figures['posteriors']
     assert 'chain 4' in figures['traces']
-    for name in ('errors', 'residuals'):
+    for name in ('errors', 'residuals', 'tool_places', 'accuracy_map'):
         assert '(mm)' in figures[name]
     for word in ('mocap', 'before', 'after'):
         assert word in figures['errors']
