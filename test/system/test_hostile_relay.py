@@ -118,6 +118,9 @@ def relay(start, client, ros_environment, tmp_path):
         'robot_bridge': {'settle_s': 0.5, 'heartbeat_s': 1.0, 'cartesian_speed_limit_m_s': 0.25},
         'recorder': {'session': tmp_path / 'session', 'require': 'mocap', 'settle_s': 0.5},
     }
+    # The world must not wait for reports that the relay keeps.
+    for name in ('robot_bridge', 'recorder'):
+        own[name]['simulated_clock_rate'] = 0.0
     between = Relay(client)
     for name, values in own.items():
         named = {f'{name}:{key}': value for key, value in values.items()}
