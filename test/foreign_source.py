@@ -37,7 +37,9 @@ def main() -> None:
     publisher = node.create_publisher(kind, topic, qos_profile_sensor_data)
     frames, frozen = 0, None
     while rclpy.ok():
-        world.sleep(1.0 / RATE_HZ)
+        due = world.now() + 1.0 / RATE_HZ
+        world.kept_up(sensor, due)
+        world.sleep_until(due)
         frames, faults, t = frames + 1, world.faults(sensor), world.now()
         if 'stopped' in faults or frames % int(faults.get('slow', 1)):
             continue

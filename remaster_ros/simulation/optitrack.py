@@ -201,13 +201,14 @@ class FakeOptiTrackServer:
         number = 0
         while not self._closing.is_set():
             number = max(number + 1, int((self._world.now() - start_s) * self._rate_hz))
-            self._world.sleep(max(0.0, start_s + number / self._rate_hz - self._world.now()))
-            began_s = self._world.now()
+            due_s = start_s + number / self._rate_hz
+            # Before the wait: time that stood until this frame is sent would never get there.
+            self._world.kept_up(self._sensor, due_s)
+            self._world.sleep_until(due_s)
             frame = self._scene.frame(number, self._version)
             self._latest = frame
             for message in self._spoiler.spoil(frame, self._world.faults(self._sensor)):
                 self._distribute(message)
-            self._world.kept_up(self._sensor, began_s)
 
     def _distribute(self, frame: Frame | bytes) -> None:
         if self._data is not None:

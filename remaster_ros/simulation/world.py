@@ -74,7 +74,7 @@ class World:
     """The true arm in front of the true sensors.
 
     Make one with `create` (the demo) or `open` (a fake); see the module's text. A fake sensor uses
-    `now`, `sleep`, `kept_up`, `faults`, `marker_in_sensor`, `line_of_sight`, `warming_k`,
+    `now`, `sleep_until`, `kept_up`, `faults`, `marker_in_sensor`, `line_of_sight`, `warming_k`,
     `is_moving` and `joint_speed` alone, so that its tests need no arm.
     """
 
@@ -136,9 +136,9 @@ class World:
         """World time, s."""
         return self.clock.now()
 
-    def sleep(self, seconds: float) -> None:
-        """Wait that much world time."""
-        self.clock.sleep(seconds)
+    def sleep_until(self, t: float) -> None:
+        """Wait until world time t."""
+        self.clock.sleep_until(t)
 
     def kept_up(self, sensor: str, t: float) -> None:
         """Note that the fake of a sensor has done all that was due until world time t."""

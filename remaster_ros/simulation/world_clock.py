@@ -57,10 +57,13 @@ class WorldClock:
         held = min(base + (min(wall, held_until) - base_wall) * self.rate, limit)
         return held + max(wall - held_until, 0.0) * self.rate
 
-    def sleep(self, seconds: float) -> None:
-        """Wait that much world time."""
-        until = self.now() + seconds
-        while (left := until - self.now()) > 0.0:
+    def sleep_until(self, t: float) -> None:
+        """Wait until world time t.
+
+        Not for a while: who is held up before such a wait begins would wait for a time that
+        comes after the limit, and the limit waits for him.
+        """
+        while (left := t - self.now()) > 0.0:
             # Where time stands what is left does not shrink.
             time.sleep(max(left / self.rate, POLL_WALL_S))
 

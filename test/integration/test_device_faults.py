@@ -89,8 +89,8 @@ class FaultyMarkerWorld(optitrack_world.MarkerWorld):
     def now(self):
         return time.monotonic()
 
-    def sleep(self, seconds):
-        time.sleep(max(seconds, 0.0))
+    def sleep_until(self, t):
+        time.sleep(max(t - self.now(), 0.0))
 
     def faults(self, device):
         return self.numbers

@@ -38,8 +38,8 @@ class StillWorld(MarkerWorld):
     def now(self):
         return time.monotonic()
 
-    def sleep(self, seconds):
-        time.sleep(max(seconds, 0.0))
+    def sleep_until(self, t):
+        time.sleep(max(t - self.now(), 0.0))
 
     def marker_in_sensor(self, sensor, t):
         return np.array([0.3, 0.0, HERE])

@@ -4,12 +4,16 @@ import os
 import signal
 import subprocess
 import sys
+from functools import partial
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from optitrack_world import SENSOR, MarkerWorld
 
 from remaster_ros.simulation import pace as pace_module
 from remaster_ros.simulation import world_clock
+from remaster_ros.simulation.optitrack import FakeOptiTrackServer
 from remaster_ros.simulation.pace import AHEAD_S, AHEAD_WALL_S, PATIENCE_WALL_S, Pace
 from remaster_ros.simulation.world_clock import HELD_WALL_S, WorldClock
 
@@ -23,7 +27,8 @@ class Scene:
 
     def __init__(self, monkeypatch, folder):
         self.wall = 50.0
-        time = SimpleNamespace(monotonic=lambda: self.wall, sleep=self.run)
+        sleep = partial(self.run, taken=True)
+        time = SimpleNamespace(monotonic=lambda: self.wall, sleep=sleep)
         for module in (world_clock, pace_module):
             monkeypatch.setattr(module, 'time', time)
         WorldClock.create(folder, START_S, self.wall)
@@ -55,9 +60,9 @@ def scene(monkeypatch, tmp_path):
 def test_it_runs_at_its_rate_where_all_keep_up(scene):
     scene.run(2.0, taken=True, fake=True)
     assert scene.passed() == pytest.approx(2.0 * RATE, abs=RATE * TICK_WALL_S)
-    before = scene.other.now()
-    scene.other.sleep(0.5)
-    assert scene.other.now() - before >= 0.5
+    until = scene.other.now() + 0.5
+    scene.other.sleep_until(until)
+    assert until <= scene.other.now() < until + RATE * 2 * TICK_WALL_S
 
 
 @pytest.mark.parametrize('late', ['taken', 'fake'])
@@ -72,6 +77,35 @@ def test_it_stands_until_the_slowest_has_kept_up(scene, late):
     scene.run(1.0, **everybody)
     # No jump: what was not lived through is not made up for.
     assert scene.passed() - stood == pytest.approx(RATE, abs=AHEAD + 2 * RATE * TICK_WALL_S)
+
+
+@pytest.mark.parametrize('rate_hz', [30.0, 0.5 / AHEAD])
+def test_a_bar_that_is_held_up_anywhere_gets_to_its_next_frame(scene, monkeypatch, rate_hz):
+    """Time that waited for a frame that is not due, or comes behind the limit, stands for ever."""
+    world, sent, rng = MarkerWorld(), [], np.random.default_rng(5)
+
+    def now():
+        t = scene.other.now()
+        # Another process has the processor, and the owner works.
+        scene.run(rng.uniform(0.0, 0.3), taken=True)
+        return t
+
+    def sleep_until(t):
+        before = scene.wall
+        scene.other.sleep_until(t)
+        assert scene.wall - before < 1.0
+
+    world.now, world.sleep_until = now, sleep_until
+    world.kept_up = lambda sensor, t: scene.other.kept_up(0, t)
+
+    def distribute(server, frame):
+        sent.append(scene.passed())
+        if len(sent) == 30:
+            server._closing.set()
+
+    monkeypatch.setattr(FakeOptiTrackServer, '_distribute', distribute)
+    FakeOptiTrackServer(world, SENSOR, rng, rate_hz=rate_hz)._stream()
+    assert len(sent) == 30
 
 
 def test_a_process_that_does_nothing_for_long_is_not_waited_for(scene):
