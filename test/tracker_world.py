@@ -25,8 +25,8 @@ class ReflectorWorld:
     def now(self) -> float:
         return 100.0 + (time.monotonic() - self._started) * RATE
 
-    def sleep_until(self, t: float) -> None:
-        time.sleep(max(t - self.now(), 0.0) / RATE)
+    def sleep(self, seconds: float) -> None:
+        time.sleep(max(seconds, 0.0) / RATE)
 
     def kept_up(self, sensor: str, t: float) -> None:
         pass
