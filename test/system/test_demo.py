@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from command_line import remaster
 from ros_rig import ROOT, call, node_arguments, wait_until
 
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.motion.settling import SettleRules
 from remaster_ros.session.bag import BagReader
 from remaster_ros.session.reader import read_session
 from remaster_ros.simulation.truth import SessionTruth, from_plain
@@ -147,8 +149,11 @@ def test_the_arm_had_settled_before_every_reading(demo):
     stamps, q = np.array([s for s, _ in states]), np.array([q for _, q in states])
     assert len(settled) > 10
     for stamp, _ in settled:
-        window = q[(stamps >= stamp - 3.0) & (stamps <= stamp)]
-        assert len(window) > 20
+        inside = (stamps >= stamp - 3.0) & (stamps <= stamp)
+        window = q[inside]
+        # Over a longer gap the bridge has not seen the arm, however busy the machine is.
+        gaps = np.diff(stamps[inside], prepend=stamp - 3.0, append=stamp)
+        assert gaps.max() <= SettleRules().max_gap_s
         assert np.ptp(window, axis=0).max() <= 2e-4 + 1e-12
 
 
@@ -174,6 +179,12 @@ def test_third_parties_open_the_bag(demo):
         )
     }
     assert frames == {'mocap'}
+
+
+def test_the_bag_gives_every_row_again_without_ros(demo, tmp_path):
+    done = remaster('replay', demo[0] / 'session', '--out', tmp_path / 'again')
+    assert done.returncode == 0, done.stderr
+    assert 'all rows are those of' in done.stdout
 
 
 @pytest.mark.qualify
