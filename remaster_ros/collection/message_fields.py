@@ -47,7 +47,7 @@ class JointOrder:
         Raises
         ------
         InputError
-            If a joint is missing; names it.
+            If a joint is missing or named more than once; names it.
         """
         names = tuple(message.name)
         if names != self._seen:
@@ -57,12 +57,29 @@ class JointOrder:
                     f'joint_states lacks {", ".join(missing)}; it has {", ".join(names)}: '
                     'does the cell file name the robot that is running?'
                 )
+            refuse_repeated(self.names, names, 'joint_states')
             self._columns = [names.index(name) for name in self.names]
             self._seen = names
         positions = message.position
         if len(positions) != len(names):
             raise InputError(f'joint_states has {len(positions)} positions for {len(names)} names')
         return np.array([positions[column] for column in self._columns])
+
+
+def refuse_repeated(wanted: Sequence[str], given: Sequence[str], topic: str) -> None:
+    """Refuse a message in which a wanted joint stands twice: which value is right is not known.
+
+    Raises
+    ------
+    InputError
+        Names the joints.
+    """
+    repeated = [name for name in wanted if list(given).count(name) > 1]
+    if repeated:
+        raise InputError(
+            f'{topic} has {", ".join(repeated)} more than once: are two arms merged in it? Give '
+            'the joints of each a prefix, or each arm a namespace'
+        )
 
 
 def solutions_of(message: Any, joint_names: Sequence[str]) -> FloatArray:
@@ -76,7 +93,8 @@ def solutions_of(message: Any, joint_names: Sequence[str]) -> FloatArray:
     Raises
     ------
     InputError
-        The solutions are for other joints, or a point has not one position for each.
+        The solutions are for other joints or name one twice, or a point has not one position
+        for each.
     """
     given = list(message.joint_names)
     if not message.points:
@@ -84,6 +102,7 @@ def solutions_of(message: Any, joint_names: Sequence[str]) -> FloatArray:
         return np.empty((0, len(joint_names)))
     if not set(joint_names) <= set(given):
         raise InputError(f'they are for {", ".join(given)}, the cell has {", ".join(joint_names)}')
+    refuse_repeated(joint_names, given, 'joint_solutions')
     if any(len(point.positions) != len(given) for point in message.points):
         raise InputError(f'a point has not as many positions as joints, {len(given)}')
     columns = [given.index(name) for name in joint_names]

@@ -204,7 +204,7 @@ class ArmSupervisor:
         if not self.halted:
             return 'the arm is not halted'
         self.halted = ''
-        self._interlocks.must_collect = True
+        self._interlocks.must_collect = 'the halt was cleared'
         self._queue.start_over()
         # Reports that were not believed may be right now: the robot was mastered, its clock was
         # set. What is usual is learned again while the arm stands.
@@ -213,10 +213,17 @@ class ArmSupervisor:
         self._interlocks.set('robot', '')
         return ''
 
-    def use_limits(self, limits: MotionLimits, wall_s: float) -> list[Action]:
-        """Use other limits from now on; a move under way is stopped and commanded again."""
+    def use_limits(
+        self, limits: MotionLimits, wall_s: float, *, raised: bool = False
+    ) -> list[Action]:
+        """Use other limits from now on; a move under way is stopped and commanded again.
+
+        After one that is `raised` nothing moves before a person begins the collection again.
+        """
         actions = self._stop('other limits', wall_s)
         self.gate.limits = limits
+        if raised:
+            self._interlocks.must_collect = 'a limit was raised'
         return actions + self.tick(wall_s)
 
     def not_sent(self, command: Drive | Stop, wall_s: float) -> list[Action]:
@@ -250,6 +257,12 @@ class ArmSupervisor:
         return self._stop(blocked, wall_s) if blocked else self._go_on(wall_s)
 
     # What is reported
+
+    @property
+    def under_way(self) -> bool:
+        """Whether a collection runs, or the arm may still move by a command of this program."""
+        running = self._interlocks.was_right('planner')
+        return running or not self._motion.is_idle or self._queue.pending is not None
 
     @property
     def busy(self) -> bool:

@@ -26,12 +26,11 @@ class Interlocks:
     Attributes
     ----------
     must_collect
-        Nothing moves before a collection is begun (again) by a person.
+        Why nothing moves before a person begins a collection (again); ''.
     """
 
     def __init__(self, heartbeat_s: float) -> None:
-        self.must_collect = False
-        self._run = ''
+        self.must_collect = self._run = ''
         self._planner_since_wall = -np.inf
         self._heartbeat_s = heartbeat_s
         self._seen: dict[str, float] = {}
@@ -65,7 +64,7 @@ class Interlocks:
         if is_new:
             self._run = run
             if wall_s - self._planner_since_wall >= KNOWN_S:
-                self.must_collect = False
+                self.must_collect = ''
         self.note_alive('planner', reason, wall_s)
         return began_another
 
@@ -113,5 +112,5 @@ class Interlocks:
             return f'no sign of {", ".join(silent)} for {limit:g} s'
         reason = next(filter(None, map(self.reason, (*NAMES, *OBSERVED))), '')
         if not reason and self.must_collect:
-            return 'the halt was cleared: /remaster/collect goes on'
+            return f'{self.must_collect}: /remaster/collect goes on'
         return reason

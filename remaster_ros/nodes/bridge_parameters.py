@@ -28,8 +28,8 @@ class Parameters(SimulationParameters):
     cell: str = parameter('', 'cell file: a path, or the name of a shipped one; must be given')
     speed_share: float = parameter(
         0.3,
-        'share of each joint velocity limit that is used; while the arm moves, it is stopped and '
-        'goes on with the new one',
+        'share of each joint velocity limit that is used; while a collection runs it can be '
+        'lowered: the arm is stopped and goes on with the new one',
         low=0.01,
         high=1.0,
         live=True,
@@ -37,7 +37,7 @@ class Parameters(SimulationParameters):
     cartesian_speed_limit_m_s: float = parameter(
         0.25,
         'largest speed of the fastest point of arm and tool; 0.25 is customary in manual mode, '
-        '0 means no such limit',
+        '0 means no such limit; while a collection runs it can be lowered',
         unit='m/s',
         low=0.0,
         high=10.0,
@@ -112,6 +112,13 @@ class Parameters(SimulationParameters):
             reaction_s=self.reaction_s,
             lag_s=self.lag_s,
         )
+
+    def raised_from(self, before: Parameters) -> str:
+        """Return which limit is higher than it was before; ''. No limit is higher than any."""
+        if self.speed_share > before.speed_share:
+            return 'speed_share'
+        now, then = (p.cartesian_speed_limit_m_s or np.inf for p in (self, before))
+        return 'cartesian_speed_limit_m_s' if now > then else ''
 
     def known_offsets(self, chain: SerialChain) -> tuple[FloatArray | None, float | None]:
         """Return the offsets in use, rad, (k,), and what a joint's may still be off by, rad.

@@ -159,10 +159,16 @@ class RobotBridge(RemasterNode):
             )
 
     def _on_parameters(self, p: Parameters) -> None:
-        """Go on with other speeds."""
+        """Go on with other speeds; higher ones are for an idle bridge."""
+        raised = p.raised_from(self.p)
+        if raised and self.supervisor.under_way:
+            raise InputError(
+                f'robot_bridge: {raised} can be lowered while a collection runs, not raised; call '
+                '/remaster/pause, set it when the arm stands, then call /remaster/collect'
+            )
         self.p = p
         limits = p.limits(self.chain, self._offsets, self._acceleration)
-        self._do(self.supervisor.use_limits(limits, self.steady_s()))
+        self._do(self.supervisor.use_limits(limits, self.steady_s(), raised=bool(raised)))
         self.get_logger().info(
             f'speed_share is {p.speed_share:g}, cartesian_speed_limit_m_s '
             f'{p.cartesian_speed_limit_m_s:g}'
@@ -224,6 +230,7 @@ class RobotBridge(RemasterNode):
         try:
             q = self._order.positions(message)
         except InputError as error:
+            self.supervisor.reports.refused['joints'] += 1
             self._do(self.supervisor.doubt(str(error), now))
             return
         report = JointReport(seconds(message.header.stamp), q, self.now_s(), now)

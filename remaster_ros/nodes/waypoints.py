@@ -8,6 +8,7 @@ import numpy as np
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from remaster_ros.collection.message_fields import refuse_repeated
 from remaster_ros.errors import InputError
 from remaster_ros.nodes.messages import duration_of
 from remaster_ros.planning.tour_order import PoseVisit
@@ -54,7 +55,8 @@ def waypoints_by_solution(
     Raises
     ------
     InputError
-        Joints that are missing, points of the wrong length, not finite or out of order.
+        Joints that are missing or named twice, points of the wrong length, not finite or out of
+        order.
     """
     if not message.points:
         return {}
@@ -62,6 +64,7 @@ def waypoints_by_solution(
     missing = [name for name in joint_names if name not in names]
     if missing:
         raise InputError(f'joint_waypoints: {missing[0]} is missing; it has {", ".join(names)}')
+    refuse_repeated(joint_names, names, 'joint_waypoints')
     columns = [names.index(name) for name in joint_names]
     found: dict[int, list[FloatArray]] = {}
     last = 0

@@ -303,6 +303,10 @@ def test_a_speed_that_is_changed_holds_at_once(bridge):
     assert 'speed_share' in refused.reason
     refused = set_to('settle_s', 1.0)
     assert not refused.successful
+    for name, higher in (('speed_share', 1.0), ('cartesian_speed_limit_m_s', 0.0)):
+        refused = set_to(name, higher)
+        assert not refused.successful
+        assert f'{name} can be lowered while a collection runs, not raised' in refused.reason
     changed = time.monotonic()
     assert set_to('speed_share', 0.05).successful
     wait(bench, lambda: bench.arm.speed() < 1e-3)

@@ -284,3 +284,23 @@ def test_how_old_the_last_report_is():
     assert arm.report_age_s(5.0) == np.inf
     arm.report(report(0.0, HOME, 7.0))
     assert arm.report_age_s(9.5) == 2.5
+
+
+def test_raised_limits_ask_for_another_run():
+    rig = Rig()
+    assert rig.supervisor.under_way
+    rig.state = 'paused'
+    rig.run(1.0)
+    assert not rig.supervisor.under_way
+    rig.do(rig.supervisor.use_limits(LIMITS, rig.wall, raised=True))
+    rig.plan([0.3, 0.0])
+    blocked = rig.supervisor.blocked(rig.wall)
+    # The run that was paused is reported late: it begins nothing.
+    rig.do(rig.supervisor.planner_is('running', rig.wall, f'run {rig.runs}'))
+    assert blocked == 'planner is paused'
+    assert rig.supervisor.blocked(rig.wall) == 'a limit was raised: /remaster/collect goes on'
+    rig.run(1.0)
+    assert not rig.said(Drive)
+    rig.state = 'running'
+    rig.run(1.0)
+    assert rig.said(Drive)

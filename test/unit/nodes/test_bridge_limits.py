@@ -100,6 +100,39 @@ def test_other_speeds_are_taken_while_it_runs(rig):
     assert np.all(np.abs(v) <= 0.25 * CHAIN.velocity_limits * 1.001)
 
 
+RAISED = [('speed_share', 0.5, 0.4), ('cartesian_speed_limit_m_s', 0.0, 0.2)]
+
+
+@pytest.mark.parametrize(('name', 'higher', 'lower'), RAISED)
+def test_a_limit_is_raised_at_an_idle_bridge_alone(rig, name, higher, lower):
+    """Refused in a run; in a pause it is taken, and the run that comes then is a person's."""
+    r = rig(speed_share=0.45, cartesian_speed_limit_m_s=0.25)
+    r.go(AWAY, speed=0.1)
+    before, sent = r.bridge.p, r.bridge.published
+    other = next(values for values in RAISED if values[0] != name)
+    # A lower one beside it does not help.
+    wanted = [Parameter(name, value=higher), Parameter(other[0], value=other[2])]
+    answer = r.bridge.set_parameters_atomically(wanted)
+    assert not answer.successful
+    assert answer.reason == (
+        f'robot_bridge: {name} can be lowered while a collection runs, not raised; call '
+        '/remaster/pause, set it when the arm stands, then call /remaster/collect'
+    )
+    assert r.bridge.p == before
+    assert r.bridge.published == sent
+    r.say_planner('paused')
+    # It brakes still.
+    assert not r.bridge.set_parameters([Parameter(name, value=higher)])[0].successful
+    r.run(3.0, lambda: r.arm.speed() < 1e-6)
+    r.run(1.0)
+    assert r.bridge.set_parameters([Parameter(name, value=higher)])[0].successful
+    r.run(0.5)
+    assert r.bridge.supervisor._interlocks.must_collect == 'a limit was raised'
+    r.say_planner('running')
+    r.run(20.0, lambda: r.settled)
+    assert getattr(r.bridge.p, name) == higher
+
+
 def test_the_fastest_point_keeps_the_cartesian_limit(rig):
     r = rig(cartesian_speed_limit_m_s=0.1)
     r.settle(HOME + np.array([0.0, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0]))

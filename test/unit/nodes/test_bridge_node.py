@@ -121,6 +121,25 @@ def test_reports_without_a_joint_halt_a_collection(rig):
     assert ('error', f'halted: {wanted}') in r.bridge.logged
 
 
+def test_reports_that_name_each_joint_twice_halt_a_collection_and_are_counted(rig):
+    """Two arms merged without prefix: whose joints the first ones are is not known."""
+    r = rig()
+    r.settle(TARGET)
+    sent = r.bridge.published
+    r.alter = lambda m: JointState(
+        header=m.header, name=[*m.name, *m.name], position=[*m.position, *([0.3] * 7)]
+    )
+    r.run(0.45)
+    assert not r.halted()
+    r.run(0.3)
+    assert r.halted() == (
+        f'joint_states has {", ".join(r.names)} more than once: are two arms merged in it? Give '
+        'the joints of each a prefix, or each arm a namespace'
+    )
+    assert int(r.summary()[2]['joints_refused_joints']) > 10
+    assert r.bridge.published == sent
+
+
 def test_the_halt_is_shown_at_once_and_with_its_level(rig):
     r = rig()
     r.quiet()
