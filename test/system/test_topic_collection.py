@@ -11,7 +11,7 @@ def test_sensors_of_other_packages_lose_nothing_to_faults_and_kills(start, clien
     c = Collection(start, client, tmp_path)
     # Of another clock: the arm waits.
     c.spoil('tracker', c.waits_for('synchronise the clocks'), late=60.0)
-    c.spoil('mocap', c.refused('mocap: unsteady'), jumping=1)
+    c.spoil('mocap', c.refused('mocap: scattered'), jumping=1)
     # The driver of the bar sends all the time: that it is gone is no hidden marker.
     c.kill_source('mocap', c.waits_for('nothing on /vrpn_mocap/tool/pose'))
     c.kill('recorder')
