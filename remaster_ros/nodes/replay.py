@@ -58,11 +58,19 @@ BEHIND_S = 0.05
 """So much of a delay of its own a replay makes up for, s; the rest it goes on later."""
 TAKEN_S = 10.0
 """How long a subscriber may take for half of them before they count as dropped, s."""
-WINDOW_S = 0.2
-"""So often a recorder is waited for, s of the bag: in less than a dwell. In between, topics come
-in any order, which their stamps make good."""
+WINDOW = 500
+"""So many messages are sent at most before a recorder is waited for: it keeps four times as many
+of each topic. Among them topics come in any order, which their stamps make good."""
 IN_ORDER = ('/remaster/settled', '/remaster/joint_solutions')
 """Between these and what was sent before and after, the order counts as well."""
+ORDERED_EVENTS = (
+    events.PoseAnnounced,
+    events.ArmStopped,
+    events.ConfigurationEnded,
+    events.ReadByHand,
+    events.RecorderBegan,
+)
+"""Events that a recorder acts on, besides changes of the planner's state."""
 SHOWN_S = 5.0
 """How often it is logged how far the replay is, s."""
 LOOK_S = 1.0
@@ -199,7 +207,6 @@ class Replay(RemasterNode):
         looked = shown = time.monotonic()
         last = self._reader.whole.last_ns or 0
         planner: events.PlannerState | None = None
-        window_ns = 0
         for topic, _, data, stamp_ns in self._reader:
             if start_wall is None or first is None:
                 start_wall, first = time.monotonic(), stamp_ns
@@ -228,10 +235,9 @@ class Replay(RemasterNode):
                     # Twice a second; what it changes counts.
                     in_order, planner = record.body != planner, record.body
                 elif record is not None:
-                    in_order = not isinstance(record.body, events.STATES)
-                if in_order or stamp_ns > window_ns:
+                    in_order = isinstance(record.body, ORDERED_EVENTS)
+                if in_order or self._acknowledged.sent.total() >= WINDOW:
                     self._await_recorder()
-                    window_ns = stamp_ns + round(WINDOW_S * 1e9)
                 if live_name(topic) in RECORDED:
                     self._look_who_listens(publisher)
                 publisher.publish(data)
