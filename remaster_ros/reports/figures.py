@@ -250,7 +250,9 @@ def accuracy_map(result: FitResult) -> Figure:
     m = result.session.measurements
     found = predicted_accuracy(result.predictive, m, MAP_POINTS, np.random.default_rng(0))
     error_mm = 1e3 * found.error
-    markers = np.array([result.marker_positions[name] for name in result.session.marker_names])
+    # A marker of the cell that nothing measured has no row.
+    known = {**result.session.markers, **result.marker_positions}
+    markers = np.array([known[name] for name in result.session.marker_names])
     measured = result.chain.positions(m.q, markers[m.marker], result.joint_offsets)
     figure = Figure(figsize=(WIDTH_IN, 4.0), layout='constrained')
     views: tuple[tuple[str, str, Callable[[FloatArray], FloatArray]], ...] = (
