@@ -121,7 +121,7 @@ class Observer:
         node.create_subscription(
             JointTrajectory,
             COMMANDS,
-            lambda message: self._messages.append((time.monotonic(), message)),
+            lambda message: self._messages.append((time.monotonic(), world.now(), message)),
             RELIABLE,
         )
 
@@ -141,10 +141,13 @@ class Observer:
             self._commands.append(self._command(*self._messages[len(self._commands)]))
         return self._commands
 
-    def _start(self, wall_s: float, points: int, end: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return where the arm was, and how fast, when a command to `end` began."""
+    def _start(self, came_s: float, points: int, end: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return where the arm was, and how fast, when a command to `end` began.
+
+        It came here at world time `came_s`, which may stand between two readings of a wall clock.
+        """
         lines = (self.world.folder / MOTION_FILE).read_text().splitlines()
-        motion, came_s = Motion(START_S, self.world.start_q), self._world_time(wall_s)
+        motion = Motion(START_S, self.world.start_q)
         nearest_s, begun = SAME_WALL_S * self.world.rate, None
         for start_s, plain in map(json.loads, lines):
             waypoints = from_plain(plain, list[ServoPoint])
@@ -155,13 +158,10 @@ class Observer:
         # One that the arm has dropped began when it came.
         return begun or motion.at(came_s)
 
-    def _world_time(self, wall_s: float) -> float:
-        return self.world.now() - self.world.rate * (time.monotonic() - wall_s)
-
-    def _command(self, wall_s: float, message) -> Command:
+    def _command(self, wall_s: float, came_s: float, message) -> Command:
         columns = [list(message.joint_names).index(name) for name in self.chain.joint_names]
         end = np.array(message.points[-1].positions)[columns]
-        q, velocity = self._start(wall_s, len(message.points), end)
+        q, velocity = self._start(came_s, len(message.points), end)
         times, places, speeds = [0.0], [q], [velocity]
         for point in message.points:
             times.append(point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec)
