@@ -61,6 +61,8 @@ class Cell:
                 'registration_candidates': 6,
                 'reference_every': reference_every,
                 'discovery': discovery or folder / 'discovery',
+                # A process starts as late as a busy machine lets it.
+                'resume_within_s': 600.0,
             },
             'robot_bridge': {'simulated_clock_rate': rate},
             'recorder': {

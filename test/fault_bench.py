@@ -110,7 +110,7 @@ class Bench:
             'pose_planner': {
                 'session': str(self.session), 'optimization_candidates': candidates,
                 'validation_candidates': 1, 'registration_candidates': 6, 'seed': SEED,
-                'reference_every': reference_every,
+                'reference_every': reference_every, 'resume_within_s': 600.0,
             },
             'robot_bridge': {
                 'speed_share': SPEED_SHARE, 'settle_s': 0.6, 'answer_timeout_s': 30.0,
