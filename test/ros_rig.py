@@ -20,7 +20,7 @@ DOMAINS_HELD = 4
 """A test uses at most so many at a time."""
 FOUND_S = 0.5
 """A service may find its caller so much later than it is found; an answer before that is lost."""
-PATIENCE = 10.0
+PATIENCE = 4.0
 """What is waited for takes so many times as long at the most as a test says: a process that has a
 tenth of a processor is no failure."""
 

@@ -5,7 +5,7 @@ from collection_rig import Cell
 from ros_rig import call
 from simple_cells import write_cell
 
-pytestmark = [pytest.mark.ros, pytest.mark.qualify, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.qualify, pytest.mark.timeout(900)]
 
 
 def test_nothing_moves_before_each_plan_is_confirmed(start, client, tmp_path):

@@ -18,7 +18,7 @@ from remaster_ros.session.bag import BagReader
 from remaster_ros.session.reader import read_session
 from remaster_ros.simulation.truth import SessionTruth, from_plain
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 SEED = 10
 """Of few configurations: 11 of four poses to fit, 8 of two to validate."""

@@ -10,7 +10,7 @@ from remaster_ros.planning.pose_design import Floors
 from remaster_ros.session.journal import read_journal
 from remaster_ros.session.workcell import config_path
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 DESIGN = """poses:
   design: optimal

@@ -9,7 +9,7 @@ import yaml
 from command_line import remaster
 from ros_rig import call, node_arguments, wait_until
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 def test_the_optimizer_discovers_on_request(start, client, tmp_path):

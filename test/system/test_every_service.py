@@ -9,7 +9,7 @@ from ros_rig import call, found, node_arguments, wait_until
 
 from remaster_ros.session.reader import read_session, write_session
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 def simulated(folder, *options):

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from ros_rig import ROOT, domains
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 ALL = bool(fault_page.MODE)
 TRIED = [row for row in fault_rows.ROWS if ALL or row.quick]

@@ -19,7 +19,7 @@ from remaster_ros.session.reader import read_session
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.faults import inject
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 @contextmanager

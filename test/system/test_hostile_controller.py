@@ -18,7 +18,7 @@ from hostile_judge import Rules
 from hostile_known import known_situations, situations
 from hostile_outcomes import report
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 # The demo cell states no bound of acceleration, so that the cautious default holds, rad/s².
 RULES = Rules(speed_share=0.3, cartesian_m_s=0.25, acceleration=np.full(7, 5.0))

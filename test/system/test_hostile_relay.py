@@ -23,7 +23,7 @@ from remaster_ros.nodes.demo import free_ports
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
 
-pytestmark = [pytest.mark.qualify, pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.qualify, pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 SEED = 21
 JOINTS, COMMANDS = '/joint_states', '/joint_trajectory_controller/joint_trajectory'

@@ -13,7 +13,7 @@ from remaster_ros.session.journal import read_journal
 from remaster_ros.session.reader import read_session
 from remaster_ros.simulation.effect_sampling import EffectSpec
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 def sag(size):

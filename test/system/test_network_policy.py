@@ -10,7 +10,7 @@ from ros_rig import ROOT, node_arguments, wait_until
 
 from remaster_ros.collection.plan_confirmation import service_name
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 POLICY = ROOT / 'config' / 'sros2' / 'policy.xml'
 NODES = (

@@ -7,7 +7,7 @@ import sys
 import pytest
 from ros_rig import node_arguments
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 
 
 def refuse(start, node, *, timeout=900, **parameters):

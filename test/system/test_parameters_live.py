@@ -11,7 +11,7 @@ import time
 import pytest
 from ros_rig import FOUND_S, node_arguments, wait_until
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 
 # A node with a live parameter, another one, and a change that it refuses.
 NODE = """

@@ -5,7 +5,7 @@ from ros_rig import node_arguments, wait_until
 
 from remaster_ros.session.workcell import read_cell
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 
 NAMES = list(read_cell('demo').chain().joint_names)
 

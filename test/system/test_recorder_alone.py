@@ -27,7 +27,7 @@ from remaster_ros.kinematics.transforms import (
 )
 from remaster_ros.session.reader import read_session
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 
 URDF = ROOT / 'config' / 'robots' / 'lwr4plus.urdf'
 CHAIN = SerialChain.from_urdf(URDF.read_text(encoding='utf-8'), 'base_link', 'tool')

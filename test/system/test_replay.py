@@ -14,7 +14,7 @@ from remaster_ros.session.bag_replay import differences, record_from_bag
 from remaster_ros.session.bag_writer import BagWriter
 from remaster_ros.session.workcell import read_cell
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 
 COMMANDS = '/joint_trajectory_controller/joint_trajectory'
 STATE, TRAJECTORY = 'sensor_msgs/msg/JointState', 'trajectory_msgs/msg/JointTrajectory'

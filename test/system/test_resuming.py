@@ -9,7 +9,7 @@ from ros_rig import PATIENCE, call, node_arguments
 
 from remaster_ros.collection.events import BridgeState
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 @pytest.fixture

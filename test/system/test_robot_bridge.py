@@ -20,7 +20,7 @@ from std_msgs.msg import String
 from remaster_ros.collection.events import SolutionFailed
 from remaster_ros.session.workcell import read_cell
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 
 CHAIN = read_cell('demo').chain()
 FAST = {'settle_s': 0.5, 'heartbeat_s': 1.0, 'reaction_s': 1.0, 'cartesian_speed_limit_m_s': 0.5}

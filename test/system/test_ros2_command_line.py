@@ -14,7 +14,7 @@ from remaster_ros.session.bag import BagReader
 from remaster_ros.session.bag_writer import BagWriter
 from remaster_ros.session.workcell import read_cell
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 
 needs_ros2 = pytest.mark.skipif(shutil.which('ros2') is None, reason='no ros2 command line here')
 COMMANDS = '/joint_trajectory_controller/joint_trajectory'

@@ -9,7 +9,7 @@ from remaster_ros.session.bag import BagReader
 from remaster_ros.session.workcell import config_path
 from remaster_ros.simulation.faults import inject
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 def test_markers_of_a_frame_are_recorded_together_and_a_hidden_one_costs_nothing(

@@ -8,7 +8,7 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.workcell import config_path
 from remaster_ros.simulation.faults import inject
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 @pytest.mark.qualify

@@ -16,7 +16,7 @@ from remaster_ros.session.bag import BagReader
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 
 TIME_S = 5000
 

@@ -11,7 +11,7 @@ from ros_rig import wait_until
 
 from remaster_ros.session.reader import read_session
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 def children(pid):

@@ -3,7 +3,7 @@
 import pytest
 from topic_rig import Collection
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 def test_sensors_of_other_packages_lose_nothing_to_faults_and_kills(start, client, tmp_path):

@@ -9,7 +9,7 @@ from collection_rig import Cell
 
 from remaster_ros.session.reader import read_session
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 SOON_S = 10
 """A few seconds, on a busy machine."""

@@ -6,7 +6,7 @@ import time
 import pytest
 from ros_rig import node_arguments, wait_until
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 
 TWICE = ('robot_bridge', 'pose_planner', 'recorder', 'optimizer')
 

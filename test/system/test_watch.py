@@ -9,7 +9,7 @@ import pytest
 from played_collection import CHAIN, T_R_N
 from ros_rig import found, node_arguments, wait_until
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 
 
 PLAN_HEAD = (
