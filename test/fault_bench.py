@@ -114,13 +114,9 @@ class Bench:
             },
             'robot_bridge': {
                 'speed_share': SPEED_SHARE, 'settle_s': 0.6, 'answer_timeout_s': 30.0,
-                'simulated_clock_rate': RATE,
                 **({'emergency_stop_topic': EMERGENCY} if emergency else {}),
             },
-            'recorder': {
-                'session': str(self.session), 'require': require, 'bag': False,
-                'simulated_clock_rate': RATE,
-            },
+            'recorder': {'session': str(self.session), 'require': require, 'bag': False},
             'optitrack_markers': ports,
             'laser_tracker_markers': {'port': tracker},
         }  # fmt: skip
