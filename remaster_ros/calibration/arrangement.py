@@ -26,6 +26,7 @@ from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.initial_guess import MEDIAN_CHI3, closest_start, robust_spread
 from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.outliers import LARGEST_SHARE
+from remaster_ros.calibration.priors import Prior, prior_rows
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import LIMIT_TOLERANCE_RAD, SerialChain
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix
@@ -169,7 +170,7 @@ class Fitted:
         The distance that nine of ten points keep within, as a median of Gaussian errors, m: larger
         than the median where a part of the points is off.
     joint_offsets
-        rad, (k,); the outer two are 0.
+        rad, (k,); 0 where the data do not determine them, as of the outer two.
     marker_shift_m
         Largest distance of a marker from where it was said to be, m.
     """
@@ -320,10 +321,31 @@ def fit_arrangement(session: Session, arrangement: Arrangement) -> Fitted:
     return Fitted(
         arrangement,
         MEDIAN_CHI3 * float(spread.max()),
-        start.offsets(z),
+        determined_offsets(start, z, rows, problem.marker_priors(start), float(spread.max())),
         float(shift.max()),
         most * MEDIAN_CHI3 / _MOST_CHI3,
     )
+
+
+def determined_offsets(
+    model: Model, z: FloatArray, rows: Rows, priors: Sequence[Prior], sigma: float
+) -> FloatArray:
+    """Return the offsets of a fit, rad, (k,); 0 where their value says nothing.
+
+    That of the joint before one that never moves, for instance, turns the marker about it.
+
+    Parameters
+    ----------
+    sigma
+        Standard deviation of the errors, per axis, m.
+    """
+    derivative = model.jacobian(z, rows).reshape(3 * len(rows), -1) / sigma
+    _, by_z = prior_rows(model, priors, z)
+    # So little that 10 rad and 10 m are known: what nothing determines has to have some value.
+    H = derivative.T @ derivative + by_z.T @ by_z + 1e-2 * np.eye(len(z))
+    std = np.sqrt(np.diag(np.linalg.inv(H)))
+    offsets = model.offsets(z)
+    return np.where(std[: len(offsets)] < GROSS_OFFSET_RAD, offsets, 0.0)
 
 
 def linear_errors(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,6 +34,8 @@ from remaster_ros.types import Session
 
 SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'bar': '|', 'blank': ' '}
 DECIMALS = {'comma': ',', 'point': '.'}
+
+log = logging.getLogger('remaster_ros')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -87,7 +90,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='add a joint to another (J3=J2 on FANUC; J3=-J2 subtracts); before the next two',
     )
     arm.add_argument(
-        '--reverse', metavar='JOINT,…', type=names, default=(), help='counts the other way round'
+        '--reverse',
+        metavar='JOINT,…',
+        type=names,
+        action='extend',
+        default=[],
+        help='counts the other way round; may be repeated, and a joint named twice is as it was',
     )
     arm.add_argument(
         '--offset',
@@ -240,6 +248,8 @@ def run(args: argparse.Namespace) -> int:
         raise InsufficientDataError(
             f'{sense.sentence}; {remedy}; to write it as it is, add --unchecked'
         )
+    if sense.warning:
+        log.warning('%s', sense.warning)
     if not args.json:
         show(args.quiet, sense.sentence)
         show(args.quiet, f'written: {args.out}; go on with: remaster fit {args.out} --out …')
@@ -257,7 +267,7 @@ def _mend(args: argparse.Namespace) -> int:
     told = Mending(
         order=args.joints,
         couple=args.couple,
-        reverse=args.reverse,
+        reverse=tuple(args.reverse),
         add_deg=args.offset,
         angle_scale=args.multiply_angles * ANGLES[args.angles or 'rad'],
         length_scale=args.multiply_points * LENGTHS[args.length or 'm'],
@@ -320,7 +330,7 @@ def _session_options(args: argparse.Namespace, cell: Workcell | None) -> Session
             std = 1e3 * cell.marker_std_m if std is None else std
     return SessionOptions(
         couple=tuple(args.couple),
-        reverse=args.reverse,
+        reverse=tuple(args.reverse),
         add_deg=tuple(args.offset),
         sensor=sensor or 'sensor',
         marker=marker or 'marker',
@@ -352,8 +362,9 @@ def _as_json(out: Path | None, rows: RawRows, sense: Sense) -> dict[str, Any]:
     return {
         'session': None if out is None else str(out),
         'columns': rows.columns,
-        'warnings': list(rows.warnings),
+        'warnings': [*rows.warnings, *filter(None, [sense.warning])],
         'hint': '' if sense.fits else f'{sense.sentence}; {sense.options}'.rstrip('; '),
         'fits': sense.fits,
+        'rows_off': [{'where': row, 'error_mm': 1e3 * error} for row, error in sense.rows_off],
         'error_mm': None if sense.error_m is None else 1e3 * sense.error_m,
     }

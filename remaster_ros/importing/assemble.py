@@ -96,7 +96,7 @@ def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) ->
         pads[i] = replace(pads[i], coupling={**pads[i].coupling, added: sign})
     for name in options.reverse:
         i = _joint(name, rows, chain, '--reverse')
-        pads[i] = replace(pads[i], sign=-1)
+        pads[i] = replace(pads[i], sign=1 if pads[i].sign < 0 else -1)
     for name, angle in options.add_deg:
         i = _joint(name, rows, chain, '--offset')
         pads[i] = replace(pads[i], zero_deg=pads[i].zero_deg + angle)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from remaster_ros.calibration import estimate
 from remaster_ros.calibration.arrangement import (
     FEWEST_ROWS,
+    GROSS_M,
     GROSS_OFFSET_RAD,
+    MOST_ROWS,
     Arrangement,
     Fitted,
     fit_arrangement,
@@ -24,11 +27,17 @@ from remaster_ros.calibration.mistakes import (
     in_a_sentence,
     shown_mm,
 )
-from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.calibration.rows_off import RowsOff, find_rows_off
+from remaster_ros.errors import InsufficientDataError
 from remaster_ros.importing.rows import RawRows
 from remaster_ros.importing.units import split_unit
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import Session
+
+# Angles that agree so well are one configuration, measured again: a pendant's last digits.
+SAME_JOINTS_RAD = 1e-3
+# Rows that a sentence names.
+SHOWN_ROWS = 5
 
 
 @dataclass(frozen=True)
@@ -45,12 +54,18 @@ class Sense:
         What to add to the command so that it fits; '' where nothing helps.
     error_m
         Median distance from the fit, m; None where there are too few rows to tell.
+    rows_off
+        Rows of the table that do not fit, with their distances, m, the farthest first.
+    warning
+        What to do about them where the rest fits; '' where there is nothing.
     """
 
     fits: bool
     sentence: str
     options: str = ''
     error_m: float | None = None
+    rows_off: tuple[tuple[str, float], ...] = ()
+    warning: str = ''
 
 
 def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float], None]) -> Sense:
@@ -66,21 +81,29 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
     # The marker is left free: one that is firm at a wrong place would bend the fit.
     part = replace(session, marker_std_m=UNKNOWN_MARKER_STD_M)
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    if too_few := _too_few(session, len(chain)):
+        return Sense(False, too_few)
     progress('trying', 0.1)
     try:
         as_given = fit_arrangement(part, Arrangement.given(len(chain)))
-    except (InputError, InsufficientDataError) as error:
-        return Sense(True, f'too little to try it against the robot: {error}')
+        off = find_rows_off(part, MOST_ROWS)
+    except InsufficientDataError as error:
+        return Sense(False, f'too little to try it against the robot: {error}')
     without = shown_mm(as_given.error_m)
+    beside = _beside(session, off, rows)
     allowed = max(MARKER_STDS * session.marker_std_m, MARKER_SHIFT_M)
-    if not as_given.gross and as_given.marker_shift_m < allowed:
+    if not as_given.gross and not off.too_many and as_given.marker_shift_m < allowed:
         return Sense(
             True,
             f'the robot fits to {without} (median), with zero-offsets of up to '
             f'{np.degrees(np.abs(as_given.joint_offsets).max()):.2f} degrees',
             error_m=as_given.error_m,
+            rows_off=beside,
+            warning=f'{_few_words(beside, rows)}; correct these rows or remove them'
+            if beside
+            else '',
         )
-    if len(part.measurements) < FEWEST_ROWS:
+    if as_given.gross and len(part.measurements) < FEWEST_ROWS:
         return Sense(
             False,
             f'the data fit to {without} only, and {len(part.measurements)} rows are too few to '
@@ -93,6 +116,8 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
     if mistakes.fitting:
         sentence, options = in_a_sentence(mistakes, session, columns_of(rows, chain))
         return Sense(False, sentence, options, as_given.error_m)
+    if off.too_many and as_given.error_m <= GROSS_M:
+        return _many_off(as_given, beside, rows)
     if not as_given.gross:
         return Sense(
             False,
@@ -102,6 +127,68 @@ def check_sense(session: Session, rows: RawRows, progress: Callable[[str, float]
             error_m=as_given.error_m,
         )
     return _nothing_found(as_given, without)
+
+
+def _too_few(session: Session, joints: int) -> str:
+    """Return that there are fewer configurations than unknowns can be found from; '' otherwise."""
+    m = session.measurements.select(~session.measurements.is_validation)
+    sensors, markers = len(np.unique(m.sensor)), len(np.unique(m.marker))
+    # A configuration that is measured again tells of the noise alone.
+    seen = np.column_stack((np.round(m.q / SAME_JOINTS_RAD), m.sensor, m.marker))
+    count = len(np.unique(seen[:, :joints], axis=0))
+    numbers = 3 * len(np.unique(seen, axis=0))
+    # The outer joints' offsets are those of registration and marker. One number has to be left
+    # over, or any data would fit.
+    unknowns = max(joints - 2, 0) + 6 * sensors + 3 * markers
+    if numbers > unknowns and count >= estimate.FEWEST_ROWS:
+        return ''
+    each = 3 * len(np.unique(seen[:, joints:], axis=0))
+    needed = max(unknowns // each + 1, estimate.FEWEST_ROWS)
+    return (
+        f'{count} different configurations to fit are too few: a fit of this arm has {unknowns} '
+        f'unknowns ({max(joints - 2, 0)} zero-offsets, 6 of each sensor, 3 of each marker), and '
+        f'each configuration gives {each} numbers, so it takes at least {needed}, and some forty '
+        'for a good result; measure more (of a bag only standstills of half a second and more '
+        'count)'
+    )
+
+
+def _beside(session: Session, off: RowsOff, rows: RawRows) -> tuple[tuple[str, float], ...]:
+    """Return the rows that do not fit, the farthest first, with their distances, m."""
+    found = np.flatnonzero(off.off)
+    order = found[np.argsort(-off.error_m[found], kind='stable')]
+    # Rows were left out where points were moved to other joints.
+    line = session.measurements.observation
+    return tuple((rows.where[line[row]], float(off.error_m[row])) for row in order)
+
+
+def _few_words(beside: Sequence[tuple[str, float]], rows: RawRows) -> str:
+    """Return how many rows do not fit, how far they are off, and the first of them."""
+    shown = [
+        f'{where.rpartition("/")[2]} ({shown_mm(error)})' for where, error in beside[:SHOWN_ROWS]
+    ]
+    more = f' and {len(beside) - SHOWN_ROWS} more' if len(beside) > SHOWN_ROWS else ''
+    errors = [error for _, error in beside]
+    least, far = shown_mm(min(errors)), shown_mm(max(errors))
+    far = far if least == far else f'{least} to {far}'
+    verb = 'does' if len(beside) == 1 else 'do'
+    return (
+        f'{len(beside)} of {len(rows.where)} rows {verb} not fit, {far} off: '
+        f'{", ".join(shown)}{more}'
+    )
+
+
+def _many_off(given: Fitted, beside: tuple[tuple[str, float], ...], rows: RawRows) -> Sense:
+    """Return that more rows are off than a fit would leave out."""
+    return Sense(
+        False,
+        f'half of the rows fit to {shown_mm(given.error_m)}, but {_few_words(beside, rows)}; that '
+        'is more than a fit leaves out: check whether each point stands beside its own joints, '
+        'whether one marker was measured throughout and stayed in its place, and correct these '
+        'rows or remove them',
+        error_m=given.error_m,
+        rows_off=beside,
+    )
 
 
 def _nothing_found(given: Fitted, without: str) -> Sense:

@@ -80,7 +80,7 @@ def arrangement_of(told: Mending, session: Session, joint_names: Sequence[str]) 
         raise InputError('--shift-points and --exchange-markers: give one at a time')
     signs, quarters, coupled = [1] * k, [0] * k, 0
     for name in told.reverse:
-        signs[_index(name, joint_names, '--reverse')] = -1
+        signs[_index(name, joint_names, '--reverse')] *= -1
     for name, angle in told.add_deg:
         quarters[_index(name, joint_names, '--offset')] += _quarters(angle, '--offset')
     for name, (other, sign) in told.couple:

@@ -109,11 +109,17 @@ def test_what_is_missing_is_named(bag, session, chain, tmp_path):
         read_bag(bag, chain)
 
 
-def test_the_command_makes_a_session_of_it(bag, session, tmp_path):
+def test_the_command_makes_a_session_of_it(bag, session, tmp_path, capsys):
     urdf = tmp_path / 'robot.urdf'
     urdf.write_text(session.urdf)
     args = ['--urdf', str(urdf), '--out', str(tmp_path / 'session')]
-    assert main(['import', str(bag), *args]) == 0
+    # Three standstills are refused: any data would fit.
+    assert main(['import', str(bag), *args]) == 1
+    error = capsys.readouterr().err
+    assert '3 different configurations to fit are too few' in error
+    assert 'it takes at least 4, ' in error
+    assert not (tmp_path / 'session').exists()
+    assert main(['import', str(bag), *args, '--unchecked']) == 0
     made = read_session(tmp_path / 'session')
     assert made.sensor_names == ('laser_tracker', 'optitrack')
     # Two sensors saw each configuration.

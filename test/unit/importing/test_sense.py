@@ -1,0 +1,167 @@
+"""What import says of rows that do not fit, of too few, and what it proposes."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foreign_tables import measured, text, write
+
+from remaster_ros.cli.main import main
+from remaster_ros.session.reader import read_session
+
+CASES = Path(__file__).parents[4] / 'shared' / 'cases'
+NAMES = [f'A{i}' for i in range(1, 7)]
+
+
+class Import:
+    def __init__(self, folder, capsys, rows):
+        self.folder, self.capsys, self.arm = folder, capsys, measured(rows=rows)
+        self.urdf = folder / 'robot.urdf'
+        self.urdf.write_text(self.arm.urdf)
+        self.q, self.points = np.rad2deg(self.arm.q), 1e3 * self.arm.points
+
+    def run(self, *args, points=('X', 'Y', 'Z'), limits=None):
+        """Import the table; return status, the JSON object, stderr and the session or None."""
+        table = text([*NAMES, *points], [*self.q.T, *self.points.T])
+        path = write(self.folder, 't.csv', table)
+        out = self.folder / 'session'
+        self.capsys.readouterr()
+        line = ['import', path, '--urdf', self.urdf, '--out', out, '--json', *args]
+        status = main([*map(str, line)])
+        printed = self.capsys.readouterr()
+        return status, json.loads(printed.out), printed.err, out
+
+
+@pytest.fixture
+def table(tmp_path, capsys):
+    return lambda rows=48: Import(tmp_path, capsys, rows)
+
+
+def exchanged(points, rows):
+    """Exchange the points of neighbours."""
+    moved = points.copy()
+    moved[rows] = points[np.array(rows).reshape(-1, 2)[:, ::-1].reshape(-1)]
+    return moved
+
+
+def test_a_few_rows_that_do_not_fit_are_named_and_the_session_is_written(table, caplog):
+    imported = table(72)
+    rows = [7, 8, 30, 31]
+    imported.points = exchanged(imported.points, rows)
+    status, found, _, out = imported.run()
+    assert (status, found['fits']) == (0, True)
+    # The header is line 1.
+    named = {row['where'] for row in found['rows_off']}
+    assert named == {f'{imported.folder / "t.csv"}, line {row + 2}' for row in rows}
+    moved = np.linalg.norm(imported.points - 1e3 * imported.arm.points, axis=1)[rows]
+    errors = sorted(row['error_mm'] for row in found['rows_off'])
+    np.testing.assert_allclose(errors, np.sort(moved), rtol=0.1)
+    assert '4 of 72 rows do not fit' in found['warnings'][-1]
+    assert 'line 9' in found['warnings'][-1]
+    assert '4 of 72 rows do not fit' in caplog.text
+    assert len(read_session(out).measurements) == 72
+
+
+@pytest.mark.parametrize('count', [8, 18])
+def test_more_rows_off_than_a_fit_leaves_out_are_no_session(table, count):
+    """Of 48, and of them so many in a row that the median does not show them."""
+    imported = table()
+    imported.points = exchanged(imported.points, list(range(4, 4 + count)))
+    status, found, error, out = imported.run()
+    assert (status, found['fits'], found['session']) == (1, False, None)
+    assert len(found['rows_off']) == count
+    assert f'{count} of 48 rows do not fit' in error
+    assert 'more than a fit leaves out' in error
+    assert not out.exists()
+    assert imported.run('--unchecked')[0] == 0
+
+
+def test_a_right_table_has_no_row_off(table):
+    status, found, error, _ = table(100).run()
+    assert (status, found['rows_off'], found['warnings'], error) == (0, [], [], '')
+
+
+@pytest.mark.parametrize(('rows', 'enough'), [(2, False), (4, False), (5, True)])
+def test_fewer_configurations_than_unknowns_are_refused(table, rows, enough):
+    """Four offsets, six of the sensor, three of the marker: 13 unknowns, 3 numbers a row."""
+    status, _found, error, out = table(rows).run()
+    assert status == (0 if enough else 1)
+    assert out.exists() == enough
+    if not enough:
+        assert f'{rows} different configurations to fit are too few' in error
+        assert '13 unknowns' in error
+        assert 'at least 5, ' in error
+
+
+def test_configurations_measured_again_count_once(table):
+    imported = table(2)
+    imported.q, imported.points = np.tile(imported.q, (20, 1)), np.tile(imported.points, (20, 1))
+    status, _, error, _ = imported.run()
+    assert status == 1
+    assert '2 different configurations to fit are too few' in error
+
+
+def test_a_proposal_is_one_that_the_program_accepts_and_that_helps(table):
+    """Whatever is proposed beside what was told already: added to the command, it is done."""
+    right = table().q
+    for spoil, told, points in (
+        (lambda q: q * [1, 1, -1, 1, -1, 1], ['--reverse', 'A3'], ('X', 'Y', 'Z')),
+        (lambda q: q, ['--reverse', 'A3'], ('X', 'Y', 'Z')),
+        (lambda q: q - [0, 90, 0, 0, 0, 0], [], ('px_mm', 'py_mm', 'pz_mm')),
+        (lambda q: q, [], ('Py [mm]', 'Px [mm]', 'Pz [mm]')),
+        (lambda q: q - np.eye(6)[2] * q[:, 1:2], ['--offset', 'A5=0'], ('X', 'Y', 'Z')),
+    ):
+        imported = table()
+        imported.q = spoil(right)
+        if points[0].startswith('Py'):
+            imported.points = imported.points[:, [1, 0, 2]]
+            points = ('Px [mm]', 'Py [mm]', 'Pz [mm]')
+        status, found, error, out = imported.run(*told, points=points)
+        assert status == 1, (told, points)
+        proposed = error.split('to write it so, add ')[1].split('; to write it as')[0]
+        status, found, _, out = imported.run(*told, *shlex.split(proposed), points=points)
+        assert (status, found['fits']) == (0, True), proposed
+        np.testing.assert_allclose(
+            read_session(out).measurements.q, imported.arm.q, atol=1e-6, err_msg=proposed
+        )
+        for path in out.iterdir():
+            path.unlink()
+        out.rmdir()
+
+
+def test_a_proposal_beyond_the_limits_of_the_robot_is_not_made(table):
+    """As if the arm were another: 90 degrees on joint 2 fits, and is refused by the URDF."""
+    imported = table()
+    right, spoilt = np.radians(imported.q[:, 1]), np.radians(imported.q[:, 1] - 90.0)
+    imported.q = imported.q - [0, 90, 0, 0, 0, 0]
+    before, joint = imported.arm.urdf.split('<joint name="joint_2" type', 1)
+    joint, end, after = joint.partition('</joint>')
+    low, high = spoilt.min() - 0.02, spoilt.max() + 0.02
+    assert high < right.max()
+    narrow = re.sub(
+        r'upper="[^"]*"', f'upper="{high}"', re.sub(r'lower="[^"]*"', f'lower="{low}"', joint)
+    )
+    assert narrow != joint
+    imported.urdf.write_text(f'{before}<joint name="joint_2" type{narrow}{end}{after}')
+    status, _found, error, _ = imported.run()
+    assert status == 1
+    assert 'to write it so, add' not in error
+    assert 'nothing was written' in error
+
+
+def test_an_offset_that_the_data_do_not_determine_is_no_reason_to_refuse(tmp_path, capsys):
+    """The last joint of the chain, a gripper's, never moves: the one before may be anywhere."""
+    if not CASES.is_dir():
+        pytest.skip('the tables of other arms are not part of this repository')
+    table, urdf = CASES / '12_so101_five_joints.csv', CASES / 'so101.urdf'
+    for tip in ([], ['--tip-link', 'gripper_frame_link']):
+        out = tmp_path / f'session{len(tip)}'
+        args = ['import', table, '--urdf', urdf, '--out', out, *tip]
+        assert main([*map(str, args)]) == 0, capsys.readouterr().err
+        assert 'the robot fits to 0.46 mm (median)' in capsys.readouterr().out
+        assert len(read_session(out).measurements) == 50
