@@ -16,7 +16,7 @@ from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.sessions import read_to_fit
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.fit_json import joint_offsets_rad, read_fit, require_own
-from remaster_ros.session.files import make_folder, write_atomically
+from remaster_ros.session.files import make_folder, undone_on_failure, write_atomically
 from remaster_ros.types import Session
 from remaster_ros.version import __version__
 
@@ -79,8 +79,9 @@ def run(args: argparse.Namespace) -> int:
         'left_out': [{'observation': row, 'why': why} for row, why in judged.left_out],
     }
     if args.out is not None:
-        make_folder(args.out.parent)
-        write_atomically(args.out, json.dumps(content, indent=2) + '\n')
+        with undone_on_failure():
+            make_folder(args.out.parent)
+            write_atomically(args.out, json.dumps(content, indent=2) + '\n')
     if args.json:
         print(json.dumps(content))
         return 0

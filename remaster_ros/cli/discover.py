@@ -33,6 +33,7 @@ from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.fit_json import DISCOVERY_FILE, prepare_folder
 from remaster_ros.reports.found_causes import earlier_pairs
 from remaster_ros.reports.schemas import Judgement
+from remaster_ros.session.files import undone_on_failure
 from remaster_ros.session.reader import read_session
 
 # Of a curve's hundred values the table has one line; discovery.json has them all.
@@ -72,8 +73,8 @@ def run(args: argparse.Namespace) -> int:
     if args.decide is not None:
         chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
         pairs = earlier_pairs(args.decide, chain.joint_names)
-    prepare_folder(args.out, DISCOVERY_FILE)
-    with progress_bar(args.quiet or args.json) as progress:
+    with undone_on_failure(), progress_bar(args.quiet or args.json) as progress:
+        prepare_folder(args.out, DISCOVERY_FILE)
         found = discover_session(
             session,
             rng=np.random.default_rng(args.seed),

@@ -22,6 +22,7 @@ from remaster_ros.cli.sessions import read_to_fit
 from remaster_ros.compensation.export import MODEL_FILE
 from remaster_ros.reports.fit_json import FIT_FILE, geometry_of, prepare_folder, save_fit
 from remaster_ros.reports.judgement import verdict
+from remaster_ros.session.files import undone_on_failure
 from remaster_ros.session.priors import read_priors
 
 log = logging.getLogger('remaster_ros')
@@ -68,9 +69,9 @@ def run(args: argparse.Namespace) -> int:
     """Fit, write, and print a summary of a few lines."""
     session = read_to_fit(args.session)
     priors = read_priors(args.prior) if args.prior is not None else None
-    # Before the fit: an hour of sampling must not end at a folder that cannot be written.
-    prepare_folder(args.out, FIT_FILE)
-    with progress_bar(args.quiet or args.json) as progress:
+    with undone_on_failure(), progress_bar(args.quiet or args.json) as progress:
+        # Before the fit: an hour of sampling must not end at a folder that cannot be written.
+        prepare_folder(args.out, FIT_FILE)
         result = fit_session(
             session,
             rng=np.random.default_rng(args.seed),

@@ -12,7 +12,7 @@ import numpy as np
 
 from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.cli.console import progress_bar, show
-from remaster_ros.cli.options import add_description, names, number
+from remaster_ros.cli.options import add_description, names, number, xacro_arguments
 from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
 from remaster_ros.importing.assemble import (
     SessionOptions,
@@ -59,6 +59,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--tip-link', metavar='LINK', help='frame T, in which the marker is (default: proposed)'
     )
     add_description(parser)
+    parser.add_argument(
+        '--xacro-argument',
+        metavar='NAME:=VALUE',
+        action='append',
+        default=[],
+        help='of a xacro file given with --urdf, such as ur_type:=ur5e; may be repeated',
+    )
     parser.add_argument('--json', action='store_true', help='print one JSON object')
     table = parser.add_argument_group('what the columns are, where it was not found')
     table.add_argument('--joints', metavar='COLUMN,…', type=names, default=(), help='base to tip')
@@ -213,10 +220,17 @@ def run(args: argparse.Namespace) -> int:
         return _mend(args)
     if args.urdf is None and args.cell is None:
         raise InputError('the table is of which arm? give --urdf FILE or --cell CELL')
+    if args.xacro_argument and args.urdf is None:
+        raise InputError('--xacro-argument is for a xacro file: give it with --urdf FILE')
     cell = None if args.cell is None else read_cell(args.cell)
     if cell is None:
         urdf, chain = read_robot(
-            args.urdf, args.base_link, args.tip_link, args.package_path, trusted=args.trust
+            args.urdf,
+            args.base_link,
+            args.tip_link,
+            xacro_arguments(args.xacro_argument),
+            args.package_path,
+            trusted=args.trust,
         )
     else:
         urdf, base = cell.urdf_text, args.base_link or cell.robot.base_link

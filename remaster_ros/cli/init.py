@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.cli.console import progress_bar, show
-from remaster_ros.cli.options import CANDIDATES, add_description, names, number
+from remaster_ros.cli.options import CANDIDATES, add_description, names, number, xacro_arguments
 from remaster_ros.errors import InputError, InsufficientDataError, did_you_mean
 from remaster_ros.kinematics.arm_ends import likely_base, likely_tips
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -35,7 +35,7 @@ from remaster_ros.session.cell_template import (
     CellProposal,
     cell_text,
 )
-from remaster_ros.session.files import make_folder, write_atomically
+from remaster_ros.session.files import make_folder, undone_on_failure, write_atomically
 from remaster_ros.session.meshes import find_mesh, mesh_reader
 from remaster_ros.session.packages import package_of
 from remaster_ros.session.robot_description import is_xacro, read_description
@@ -93,10 +93,10 @@ def run(args: argparse.Namespace) -> int:
     if args.out.exists():
         raise InputError(f'{args.out}: already there, and not overwritten; {REMEDY}')
     rng = np.random.default_rng(args.seed)
-    with progress_bar(args.quiet or args.json) as progress:
+    with undone_on_failure(), progress_bar(args.quiet or args.json) as progress:
         progress('reading', 0.0)
         description = read_description(
-            args.robot, _arguments(args.arguments), args.package_path, trusted=args.trust
+            args.robot, xacro_arguments(args.arguments), args.package_path, trusted=args.trust
         )
         urdf = _urdf_file(args.robot, args.out, description)
         make_folder(args.out.parent)
@@ -121,17 +121,6 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _arguments(given: list[str]) -> dict[str, str]:
-    """Return the arguments of a xacro file."""
-    found = {}
-    for text in given:
-        name, sign, value = text.partition(':=')
-        if not sign or not name:
-            raise InputError(f'{text!r} is not NAME:=VALUE, such as ur_type:=ur5e')
-        found[name] = value
-    return found
-
-
 def _urdf_file(robot: Path, out: Path, text: str) -> Path:
     """Return the URDF that the cell names: the robot's own, or what xacro was made into."""
     if not is_xacro(robot):
@@ -139,7 +128,10 @@ def _urdf_file(robot: Path, out: Path, text: str) -> Path:
     name = robot.name.removesuffix('.xacro').removesuffix('.urdf')
     urdf = out.parent / f'{name}.urdf'
     if urdf.exists() and urdf.read_text(errors='replace') != text:
-        raise InputError(f'{urdf}: already there with other content; move it, or {REMEDY}')
+        raise InputError(
+            f'{urdf}: already there with other content; move it, or name '
+            'another folder with --out, such as new/cell.yaml'
+        )
     return urdf
 
 

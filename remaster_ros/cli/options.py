@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
+
+from remaster_ros.errors import InputError
 
 Number = TypeVar('Number', int, float)
 # Of the source paper.
@@ -66,6 +68,17 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
             metavar='N',
             help=f'candidate poses {what} (default {CANDIDATES}; those out of reach are dropped)',
         )
+
+
+def xacro_arguments(given: Iterable[object]) -> dict[str, str]:
+    """Return the arguments of a xacro file, each given as NAME:=VALUE."""
+    found = {}
+    for text in map(str, given):
+        name, sign, value = text.partition(':=')
+        if not sign or not name:
+            raise InputError(f'{text!r} is not NAME:=VALUE, such as ur_type:=ur5e')
+        found[name] = value
+    return found
 
 
 def add_description(parser: argparse.ArgumentParser) -> None:

@@ -10,6 +10,7 @@ from remaster_ros.cli.demo import run_node
 from remaster_ros.cli.options import number
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.session.bag import BagReader
+from remaster_ros.session.files import undone_on_failure
 
 SHOWN = 5
 """So many rows that differ are named; the rest is counted."""
@@ -90,7 +91,7 @@ def _write(args: argparse.Namespace) -> int:
     folder = bag_folder(Path(args.bag))
     bag = BagReader(folder)
     cell = None if args.cell is None else read_cell(args.cell)
-    with progress_bar(args.quiet) as progress:
+    with undone_on_failure(), progress_bar(args.quiet) as progress:
         done = record_from_bag(bag, args.out, cell, lambda share: progress('pairing', share))
     show(args.quiet, f'written: {args.out}, {done.observations} observations')
     beside = session_beside(folder)

@@ -18,6 +18,7 @@ from remaster_ros.reports.answer import Answer
 from remaster_ros.reports.answer_inputs import parts, read_inputs
 from remaster_ros.reports.answer_plan import PlanFacts, plan_facts, plan_to_dict
 from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE, prepare_folder, save_fit
+from remaster_ros.session.files import undone_on_failure
 from remaster_ros.session.recorded_plan import read_plan
 
 FIT_FOLDER = 'fit'
@@ -55,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     from remaster_ros.reports.answer_report import require_ready, write_answer
 
     require_ready(out, args.pdf)
-    with progress_bar(args.quiet or args.json) as progress:
+    with undone_on_failure(), progress_bar(args.quiet or args.json) as progress:
         if fit_path is None:
             fit_path = out / FIT_FOLDER / FIT_FILE
             prepare_folder(fit_path.parent, FIT_FILE)

@@ -10,7 +10,7 @@ import numpy as np
 
 from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.options import add_poses, names, number
-from remaster_ros.session.files import write_atomically
+from remaster_ros.session.files import undone_on_failure, write_atomically
 from remaster_ros.session.reader import write_session
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.simulation.effect_sampling import EffectSpec
@@ -100,9 +100,10 @@ def run(args: argparse.Namespace) -> int:
             effects=args.effect,
             measuring=lambda: progress('measuring', 0.9),
         )
-        write_session(args.out, made.session)
         truth = truth_to_dict(made.truth, chain, args.seed)
-        write_atomically(args.out / TRUTH_FILE, json.dumps(truth, indent=2) + '\n')
+        with undone_on_failure():
+            write_session(args.out, made.session)
+            write_atomically(args.out / TRUTH_FILE, json.dumps(truth, indent=2) + '\n')
     if args.json:
         print(json.dumps(truth))
         return 0

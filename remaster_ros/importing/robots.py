@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from remaster_ros.errors import InputError
@@ -16,6 +16,7 @@ def read_robot(
     path: Path,
     base_link: str | None = None,
     tip_link: str | None = None,
+    arguments: Mapping[str, str] | None = None,
     package_path: Sequence[Path] = (),
     *,
     trusted: bool = False,
@@ -26,7 +27,7 @@ def read_robot(
     ----------
     base_link, tip_link
         As told; None for the likely ones.
-    package_path, trusted
+    arguments, package_path, trusted
         As of `read_description`.
 
     Raises
@@ -34,7 +35,7 @@ def read_robot(
     InputError
         Naming the file and the remedy.
     """
-    urdf = read_description(path, None, package_path, trusted=trusted)
+    urdf = read_description(path, arguments, package_path, trusted=trusted)
     try:
         model = parse_urdf(urdf)
         base = likely_base(model) if base_link is None else base_link

@@ -29,9 +29,20 @@ from remaster_ros.types import FloatArray
 
 FREE_JOINTS = 6
 
+OWN_CONFIGURATIONS = (
+    'poses cannot be planned for it; measure configurations of your own choice, and make a '
+    'session of their table: remaster import TABLE --urdf FILE --out SESSION'
+)
+"""What can be done with an arm that has no closed form."""
+
 # Entries of the arm's fixed rotations and translations below this count as a zero that was
 # rounded (rpy="1.5708 0 0", a 0.4 mm CAD artefact). Newton's method takes the difference back.
 SNAP = 1e-3
+# As calibrated, axes that are drawn parallel are so no longer.
+_OF_ONE_ARM = (
+    " (that is so of a description with one arm's own calibration in it, as kinematics_params of "
+    'a UR)'
+)
 # What forward kinematics may leave of a solution: 10 nm and 10 nrad.
 CERTIFIED = 1e-8
 # Solutions whose joints all agree within this, rad, are one.
@@ -87,9 +98,11 @@ class InverseKinematics:
         try:
             self._prepare(chain, held)
         except InputError as error:
-            if len(chain) != FREE_JOINTS + 1:
-                raise
-            raise InputError(f'{error}; {_what_may_be_held(chain)}') from None
+            if len(chain) == FREE_JOINTS + 1:
+                raise InputError(f'{error}; {_what_may_be_held(chain)}') from None
+            if len(chain) == FREE_JOINTS:
+                raise InputError(f'{error}{_OF_ONE_ARM}; {OWN_CONFIGURATIONS}') from None
+            raise
 
     def _prepare(self, chain: SerialChain, held: Mapping[int, Sequence[float]]) -> None:
         """Set up the closed forms; an `InputError` where these held joints leave none."""
@@ -283,10 +296,7 @@ def _what_may_be_held(chain: SerialChain) -> str:
             break
     if good:
         return f'held_joint in the cell file may be {" or ".join(good)}'
-    return (
-        'no joint of this arm may be held instead: poses cannot be planned for it, but a session '
-        'of configurations of your own can be fitted'
-    )
+    return f'no joint of this arm may be held instead: {OWN_CONFIGURATIONS}'
 
 
 def _trial_values(chain: SerialChain, joint: int) -> list[float]:

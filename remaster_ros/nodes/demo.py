@@ -45,9 +45,9 @@ from remaster_ros.nodes.running import report
 from remaster_ros.nodes.status import listen
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import read_fit
-from remaster_ros.session.files import cannot_write
+from remaster_ros.session.files import cannot_write, make_folder, undone_on_failure
+from remaster_ros.session.reader import HEADER
 from remaster_ros.session.session_journal import is_complete
-from remaster_ros.session.session_opening import JOURNAL
 from remaster_ros.session.workcell import config_path, read_cell
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.setup import make_world
@@ -61,6 +61,8 @@ HAVE_CELL = (
     'laser_tracker_markers',
 )
 """Nodes with the parameter ``cell``."""
+BEFORE_SESSION = {'log', 'ros_home', 'session'}
+"""What a demo that was interrupted leaves in its folder; while there is no session yet, all."""
 
 
 @dataclass(frozen=True)
@@ -136,12 +138,25 @@ class Demo:
         self.console = Console(quiet=self.p.quiet)
         # Refused before anything is written.
         self.requests = [EffectSpec.parse(text) for text in self.p.hide.split(',') if text]
-        self.out = output_folder(Path(self.p.out))
+        self.hidden = Path(tempfile.mkdtemp(prefix='remaster_world_'))
+        try:
+            with undone_on_failure():
+                self.out = output_folder(Path(self.p.out))
+                self.world = make_world(
+                    self.hidden,
+                    read_cell(self.p.cell),
+                    self.p.seed,
+                    self.p.rate,
+                    self.requests,
+                    self.p.candidates,
+                )
+        except BaseException:
+            shutil.rmtree(self.hidden, ignore_errors=True)
+            raise
         self.session, self.fit = self.out / 'session', self.out / 'fit'
         self.discovery = self.out / 'discovery'
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
-        self.hidden = Path(tempfile.mkdtemp(prefix='remaster_world_'))
         self.processes = NodeProcesses(
             self.out / 'log',
             {
@@ -155,10 +170,6 @@ class Demo:
 
     def run(self) -> None:
         """Collect, fit, print."""
-        cell = read_cell(self.p.cell)
-        world = make_world(
-            self.hidden, cell, self.p.seed, self.p.rate, self.requests, self.p.candidates
-        )
         self.console.print(f'hidden world drawn with seed {self.p.seed}; starting the nodes')
         self.console.print(
             'the fake arm moves without a Cartesian speed limit (real.yaml: 0.25 m/s)'
@@ -179,11 +190,11 @@ class Demo:
         self.processes.stop()
         print_times(self.console, self.node.times)
         # Only here, after everything that estimates has ended, is the truth opened.
-        print_offsets(self.console, read_fit(self.fit / 'fit.json'), world.truth)
+        print_offsets(self.console, read_fit(self.fit / 'fit.json'), self.world.truth)
         if self.requests:
             discovery = read_discovery(self.discovery / 'discovery.json')
-            print_hidden(self.console, discovery, world.truth)
-        (self.out / 'truth.yaml').write_text(yaml.safe_dump(to_plain(world.truth)))
+            print_hidden(self.console, discovery, self.world.truth)
+        (self.out / 'truth.yaml').write_text(yaml.safe_dump(to_plain(self.world.truth)))
         self.console.print(f'session: {self.session}')
         for label, folder, data in results:
             self.console.print(f'{label}: {folder / ("report.html" if self.p.figures else data)}')
@@ -336,6 +347,8 @@ class Demo:
 def output_folder(path: Path) -> Path:
     """Make a new folder and its log/, use an empty one, or that of an interrupted demo.
 
+    A demo that was interrupted before its session began has left nothing but logs.
+
     Raises
     ------
     InputError
@@ -343,13 +356,16 @@ def output_folder(path: Path) -> Path:
     """
     session = path / 'session'
     try:
-        path.mkdir(parents=True, exist_ok=True)
-        unfinished = (session / JOURNAL).exists() and not is_complete(session)
-        if any(path.iterdir()) and not unfinished:
+        make_folder(path)
+        if (session / HEADER).exists():
+            unfinished = not is_complete(session)
+        else:
+            unfinished = {entry.name for entry in path.iterdir()} <= BEFORE_SESSION
+        if not unfinished:
             raise InputError(
                 f'{path} is not empty, and holds no unfinished session; give --out a new folder'
             )
-        (path / 'log').mkdir(exist_ok=True)
+        make_folder(path / 'log')
     except OSError as error:
         raise cannot_write(path, error) from None
     return path

@@ -13,7 +13,11 @@ import numpy as np
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.bodies import Body
-from remaster_ros.kinematics.inverse_kinematics import FREE_JOINTS, InverseKinematics
+from remaster_ros.kinematics.inverse_kinematics import (
+    FREE_JOINTS,
+    OWN_CONFIGURATIONS,
+    InverseKinematics,
+)
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, inverse
 from remaster_ros.planning.candidates import PoseRanges
@@ -90,7 +94,8 @@ def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
     if best is None:
         reasons = '; '.join(f'{name}: {why}' for name, why in tried.items())
         raise InputError(
-            f"robot '{chain.name}' has no closed form, whichever joint is held: {reasons}"
+            f"robot '{chain.name}' has no closed form, whichever joint is held: {reasons}; "
+            f'{OWN_CONFIGURATIONS}'
         )
     count, joint, value = best
     values = (value,)

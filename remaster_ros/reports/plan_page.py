@@ -20,7 +20,7 @@ from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.reports.plan_json import HELD_OUT, minutes_text, missed_goal
 from remaster_ros.reports.robot_scene import RobotScene
 from remaster_ros.reports.scene_view import compressed, scene_to_dict, view_script
-from remaster_ros.session.files import make_folder, write_atomically
+from remaster_ros.session.files import make_folder, undone_on_failure, write_atomically
 from remaster_ros.version import __version__
 
 GENERATOR = 'remaster plan'
@@ -150,8 +150,9 @@ def write_plan_page(path: Path, html: str) -> None:
         Something else is there, or it cannot be written.
     """
     check_plan_page(path)
-    make_folder(path.parent)
-    write_atomically(path, html)
+    with undone_on_failure():
+        make_folder(path.parent)
+        write_atomically(path, html)
 
 
 def _points(plan: CollectionPlan) -> list[str]:

@@ -5,12 +5,45 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator
+from contextvars import ContextVar
 from pathlib import Path
 
 from remaster_ros.errors import DiskError, InputError
 
 URDF_LIMIT = 16 * 1024**2
 """Largest robot description that is read, bytes."""
+
+# The new files and folders of an `undone_on_failure` under way, in the order made.
+_MADE: ContextVar[list[Path] | None] = ContextVar('made', default=None)
+
+
+@contextlib.contextmanager
+def undone_on_failure() -> Iterator[None]:
+    """Remove the files and folders that what follows makes, where it fails or is interrupted.
+
+    What was there before stays, and what others put there meanwhile, with its folder.
+    """
+    outer, made = _MADE.get(), list[Path]()
+    token = _MADE.set(made)
+    try:
+        yield
+    except BaseException:
+        for path in reversed(made):
+            # A folder that holds what others made is not empty, and stays.
+            with contextlib.suppress(OSError):
+                path.rmdir() if path.is_dir() else path.unlink()
+        raise
+    finally:
+        _MADE.reset(token)
+    if outer is not None:
+        outer += made
+
+
+def made_if_new(path: Path) -> None:
+    """Note a file or folder that is about to be made, for `undone_on_failure`."""
+    made = _MADE.get()
+    if made is not None and not os.path.lexists(path):
+        made.append(path)
 
 
 def read_limited(path: Path, limit: int, missing: str) -> bytes:
@@ -73,6 +106,8 @@ def make_folder(folder: Path) -> None:
     """Create an output folder with its parents, durable on return; `InputError` if impossible."""
     with writing(folder):
         new = [path for path in (folder, *folder.parents) if not path.exists()]
+        for path in reversed(new):
+            made_if_new(path)
         folder.mkdir(parents=True, exist_ok=True)
         # From the top: a folder whose own name is lost takes all in it along.
         for path in reversed(new):
@@ -99,6 +134,7 @@ def write_atomically(path: Path, data: str | bytes | bytearray) -> None:
         The folder cannot be written to, or the disk is full.
     """
     temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
+    made_if_new(path)
     with writing(path):
         try:
             descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
@@ -109,7 +145,8 @@ def write_atomically(path: Path, data: str | bytes | bytearray) -> None:
                 os.close(descriptor)
             os.replace(temporary, path)
             sync_folder(path.parent)
-        except OSError:
+        except BaseException:
+            # Also of an interrupt: a folder with it would not be empty.
             with contextlib.suppress(OSError):
                 temporary.unlink()
             raise
@@ -139,6 +176,7 @@ class AppendFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._descriptor: int | None = None
+        made_if_new(path)
         try:
             self._descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
             self.size = os.fstat(self._descriptor).st_size

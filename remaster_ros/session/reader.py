@@ -19,6 +19,7 @@ from remaster_ros.session.files import (
     decode_text,
     make_new_folder,
     read_limited,
+    undone_on_failure,
     write_atomically,
 )
 from remaster_ros.session.manifest import check_data, read_manifest
@@ -136,10 +137,11 @@ def write_session(folder: str | os.PathLike[str], session: Session) -> None:
     names = session.sensor_names, session.marker_names
     rows = format_measurements(all_rows(session), *names).encode()
     RowFormat(folder / ROWS, chain, *names).parse(rows)
-    make_new_folder(folder)
-    write_atomically(folder / URDF, session.urdf)
-    write_atomically(folder / ROWS, rows)
-    write_atomically(folder / HEADER, header)
+    with undone_on_failure():
+        make_new_folder(folder)
+        write_atomically(folder / URDF, session.urdf)
+        write_atomically(folder / ROWS, rows)
+        write_atomically(folder / HEADER, header)
 
 
 def all_rows(session: Session) -> Measurements:

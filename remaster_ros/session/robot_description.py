@@ -65,6 +65,11 @@ def read_description(
     """
     text = decode_text(read_limited(path, URDF_LIMIT, 'name a URDF or xacro file'), path)
     if not is_xacro(path):
+        if arguments:
+            raise InputError(
+                f'{path}: is no .xacro file, which alone takes arguments; leave out '
+                f'{" ".join(f"{name}:={value}" for name, value in arguments.items())}'
+            )
         return text
     request = {
         'file': str(path.absolute()),

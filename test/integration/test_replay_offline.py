@@ -195,3 +195,13 @@ def test_what_is_wrong_is_refused_in_a_line(arm, tmp_path):
     done = remaster('replay', tmp_path / 'other', '--out', tmp_path / 'c')
     assert done.returncode == 2
     assert 'no recorder of remaster_ros has written it; `remaster import`' in done.stderr
+
+
+def test_a_bag_with_a_damaged_message_leaves_no_half_a_session_in_the_way(arm, tmp_path):
+    arm.visit()
+    arm.writer.write('/joint_states', 'sensor_msgs/msg/JointState', b'damaged', round(arm.t * 1e9))
+    arm.close()
+    for _ in range(2):
+        done = replay(arm, tmp_path, out='new/again', status=2)
+        assert 'a damaged message' in done.stderr
+        assert not (tmp_path / 'new').exists()

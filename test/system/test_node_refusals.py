@@ -7,6 +7,8 @@ import sys
 import pytest
 from ros_rig import node_arguments
 
+from remaster_ros.errors import InputError
+
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 
 
@@ -74,6 +76,22 @@ def test_a_laser_tracker_that_is_not_there(start):
         port = probe.getsockname()[1]
     line = refuse(start, 'laser_tracker_markers', host='127.0.0.1', port=port, start_timeout_s=1.0)
     assert f'127.0.0.1:{port}' in line
+
+
+def test_a_demo_that_is_refused_or_stopped_before_its_session_does_not_block_the_next(
+    start, tmp_path
+):
+    from remaster_ros.nodes.demo import output_folder
+
+    line = refuse(start, 'demo', out=tmp_path / 'demo', hide='backlash@9:0.3')
+    assert 'backlash@9: the arm has 7 joints; give 1 to 7' in line
+    assert not (tmp_path / 'demo').exists()
+    (tmp_path / 'demo' / 'log').mkdir(parents=True)
+    (tmp_path / 'demo' / 'log' / 'recorder.log').write_text('it was starting\n')
+    assert output_folder(tmp_path / 'demo') == tmp_path / 'demo'
+    (tmp_path / 'demo' / 'thesis.tex').write_text('mine')
+    with pytest.raises(InputError, match='is not empty, and holds no unfinished session'):
+        output_folder(tmp_path / 'demo')
 
 
 @pytest.mark.parametrize('fake', ['fake_optitrack', 'fake_laser_tracker'])

@@ -10,6 +10,7 @@ from robot_descriptions import ROBOTS, Description, xarm7
 
 from remaster_ros.cli.main import main
 from remaster_ros.cli.plan import free_start
+from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.workcell import read_cell
 
 XACRO = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
@@ -236,3 +237,54 @@ def test_an_arm_that_lies_on_the_floor_at_zero_is_planned_from_elsewhere(do, tmp
     few = ('--poses', '4', '--validation', '0', '--reference-every', '0', '--json')
     assert main(['plan', str(tmp_path / 'cell.yaml'), *few]) == 0
     assert json.loads(capsys.readouterr().out)['configurations'] > 0
+
+
+def test_an_arm_with_its_makers_calibration_is_refused_and_its_table_is_imported(
+    do, tmp_path, capsys
+):
+    """Literally what docs/apply.md and the refusal tell the owner of a UR."""
+    urdf = ROBOTS['ur5e']().urdf
+    joint = '<joint name="elbow_joint" type="revolute">\n    '
+    roll = f'{joint}<origin rpy="0 0 0" xyz="-0.425 0 0"/>'
+    assert urdf.count(roll) == 1
+    text = urdf.replace('<robot ', f'<robot {XACRO} ').replace(
+        roll,
+        '<xacro:arg name="kinematics_params" default="none.yaml"/>'
+        '<xacro:property name="k" value="${xacro.load_yaml(\'$(arg kinematics_params)\')}"/>'
+        f'{joint}<origin rpy="${{k[\'roll\']}} 0 0" xyz="-0.425 0 0"/>',
+    )
+    path, calibration = tmp_path / 'ur.urdf.xacro', tmp_path / 'my_calibration.yaml'
+    path.write_text(text)
+    calibration.write_text('roll: 0.00179822366464\n')
+    argument = f'kinematics_params:={calibration}'
+    before = sorted(tmp_path.iterdir())
+    status, _, error = do(path, argument)
+    assert status == 2
+    assert 'has no closed form' in error
+    assert 'remaster import TABLE --urdf FILE --out SESSION' in error
+    assert sorted(tmp_path.iterdir()) == before
+
+    chain = SerialChain.from_urdf(
+        urdf.replace(roll, roll.replace('rpy="0 ', 'rpy="0.00179822366464 ')),
+        'base_link',
+        'tool0',
+    )
+    rng = np.random.default_rng(5)
+    q = rng.uniform(-60, 60, (20, 6))
+    points = chain.positions(np.deg2rad(q), np.array([0.03, -0.02, 0.12]))
+    rows = np.hstack((q, 1e3 * points + rng.normal(0, 0.03, (20, 3))))
+    table, out = tmp_path / 'table.csv', tmp_path / 'session'
+    lines = [';'.join(f'{value:.4f}' for value in row) for row in rows]
+    table.write_text('A1;A2;A3;A4;A5;A6;X;Y;Z\n' + '\n'.join(lines) + '\n')
+    arguments = [table, '--urdf', path, '--xacro-argument', argument, '--out', out]
+    assert main(['import', *map(str, arguments)]) == 0
+    assert 'rpy="0.00179822366464 0 0"' in (out / 'robot.urdf').read_text()
+    with pytest.raises(SystemExit) as refused:
+        main(['import', str(table), '--urdf', str(path), '--out', str(out), '--xacro-argument'])
+    assert refused.value.code == 2
+    capsys.readouterr()
+    plain = written(tmp_path, ROBOTS['irb120']())
+    assert main(['import', *map(str, [table, '--urdf', plain, *arguments[3:]])]) == 2
+    assert f'is no .xacro file, which alone takes arguments; leave out {argument}' in (
+        capsys.readouterr().err
+    )

@@ -276,6 +276,8 @@ def test_an_arm_without_closed_form_is_refused_quietly(capfd):
     with pytest.raises(InputError, match="robot 'random' has no closed form") as error:
         InverseKinematics(chain)
     assert '\n' not in str(error.value)
+    assert "one arm's own calibration in it, as kinematics_params of a UR" in str(error.value)
+    assert 'remaster import TABLE --urdf FILE --out SESSION' in str(error.value)
     assert capfd.readouterr() == ('', '')
 
 
