@@ -22,7 +22,8 @@ class Cell:
     """A small collection of real nodes on fake devices, and what they publish.
 
     `foreign` gives sensors that are read from the topic of a node of another package: sensor ->
-    (message type, topic), as in the cell file.
+    (message type, topic), as in the cell file. `by_action` gives the arm's controller the action
+    FollowJointTrajectory in place of the topic.
     """
 
     def __init__(
@@ -41,7 +42,9 @@ class Cell:
         foreign=None,
         discovery='',
         hidden=(),
+        by_action=False,
     ):
+        from remaster_ros.nodes.controller_link import COMMANDS
         from remaster_ros.nodes.status import listen
 
         self.client, self.folder, self.session = client, folder, folder / 'session'
@@ -71,6 +74,8 @@ class Cell:
                 'simulated_clock_rate': rate,
             },
         }
+        if by_action:
+            own['robot_bridge']['command_interface'] = 'action'
         if 'mocap' in sensors:
             ports = {'command_port': command, 'data_port': data}
             own['fake_optitrack'] = {'world': folder / 'world', **ports}
@@ -89,6 +94,9 @@ class Cell:
         common = ROOT / 'config' / 'fake.yaml'
 
         def begin(name):
+            if name == 'action_adapter':
+                sim_time = node_arguments(use_sim_time=True)
+                return start('action_adapter', *sim_time, cwd=ROOT / 'test')
             if name.startswith('vendor_'):
                 sensor = name.removeprefix('vendor_')
                 where = folder / 'world', sensor, *foreign[sensor]
@@ -100,11 +108,15 @@ class Cell:
                 return start(
                     'remaster_ros.nodes.sensor_markers', *arguments, '-r', f'__node:={name}'
                 )
+            if by_action and name == 'fake_robot':
+                arguments += ['-r', f'{COMMANDS}:=arm/joint_trajectory']
             return start(f'remaster_ros.nodes.{name}', *arguments)
 
         self._begin = begin
         self.nodes = {name: begin(name) for name in own}
         self.nodes |= {f'vendor_{name}': begin(f'vendor_{name}') for name in foreign or {}}
+        if by_action:
+            self.nodes['action_adapter'] = begin('action_adapter')
         self.until(lambda: self.said.get('pose_planner', {}).get('robot') == 'heard', 'the robot')
         if collect:
             response = call(client, '/remaster/collect')

@@ -226,6 +226,12 @@ class ArmSupervisor:
             self._interlocks.must_collect = 'a limit was raised'
         return actions + self.tick(wall_s)
 
+    def given_up(self, why: str) -> list[Action]:
+        """Process that the controller refuses the newest command, or does not go on with it."""
+        # Where a stop was refused the arm is not judged by it any more.
+        self._motion.braking = None
+        return [] if self.halted else self._halt(why)
+
     def not_sent(self, command: Drive | Stop, wall_s: float) -> list[Action]:
         """Process that a command was not published, as this process was paused since its decision.
 

@@ -240,6 +240,21 @@ class Following:
         return lag, off, is_near
 
 
+def path_tolerance(speeds: FloatArray, rules: SupervisorRules) -> FloatArray:
+    """Return how far joints may be from where they should be at a time, rad, (k,).
+
+    The same as of `Following`, for a controller that follows too: beside the path and behind it.
+
+    Parameters
+    ----------
+    speeds
+        The largest of the move, rad/s, (k,).
+    rules
+        How far the arm may lag.
+    """
+    return ON_PATH_RAD + allowed_lag_s(rules, 1.0) * speeds
+
+
 def allowed_lag_s(rules: SupervisorRules, rate: float) -> float:
     """Return how far an arm may be behind its trajectory, s of robot time."""
     return rules.lag_s + LATENCY_S * max(rate, 1.0)

@@ -97,6 +97,12 @@ class Parameters(SimulationParameters):
         low=0.05,
         high=2.0,
     )
+    command_interface: str = parameter(
+        'topic',
+        'how the controller is commanded: by its topic …/joint_trajectory, or by its action '
+        '…/follow_joint_trajectory (needs control_msgs)',
+        choices=('topic', 'action'),
+    )
     emergency_stop_topic: str = parameter(
         '', "std_msgs/Bool, true while the robot's own safety stops it; empty where there is none"
     )

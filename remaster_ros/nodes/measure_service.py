@@ -26,6 +26,7 @@ from remaster_ros.collection.events import ShotMeasured
 from remaster_ros.collection.message_fields import JointOrder, temperature_topic
 from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.kinematics import transforms
+from remaster_ros.nodes.controller_link import COMMANDS, COPIES
 from remaster_ros.nodes.messages import stamp_of, transform_array
 from remaster_ros.nodes.status import LATCHED, RELIABLE
 from remaster_ros.sensors.driver import TriggeredDriver
@@ -97,12 +98,8 @@ class MeasureService:
                     'robot_bridge takes a node of this name for a controller; begin its name '
                     f'with {node.kind}'
                 )
-            node.create_subscription(
-                JointTrajectory,
-                'joint_trajectory_controller/joint_trajectory',
-                self._on_trajectory,
-                RELIABLE,
-            )
+            for commands in (COMMANDS, COPIES):
+                node.create_subscription(JointTrajectory, commands, self._on_trajectory, RELIABLE)
         node.create_service(
             Trigger,
             sensor.measure_service or f'{node.kind.removesuffix("_markers")}/measure',

@@ -28,6 +28,7 @@ from remaster_ros.collection import events
 from remaster_ros.collection.recording import EndedReading
 from remaster_ros.errors import DiskError
 from remaster_ros.nodes.cell_sensors import CellSensors
+from remaster_ros.nodes.controller_link import COMMANDS, COPIES
 from remaster_ros.nodes.messages import transform_message
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.running import RemasterNode, run
@@ -92,7 +93,8 @@ class Recorder(RemasterNode):
         bag.subscribe(JointState, 'joint_states', self._on_joint_state, JOINT_STATES)
         bag.subscribe(JointState, 'remaster/settled', recorder.take_settled)
         bag.subscribe(JointTrajectory, 'remaster/joint_solutions', recorder.take_solutions)
-        bag.subscribe(JointTrajectory, 'joint_trajectory_controller/joint_trajectory')
+        for commands in (COMMANDS, COPIES):
+            bag.subscribe(JointTrajectory, commands)
         self.sensors.subscribe(bag, recorder)
         bag.subscribe(String, EVENTS, receiver(self, self._on_record))
         bag.subscribe_rest()

@@ -25,7 +25,7 @@ COUNT_WALL_S = 3.0
 
 
 class OnlyPublisher:
-    """See that a topic has one publisher.
+    """See that a topic has one publisher, or none.
 
     Parameters
     ----------
@@ -33,10 +33,12 @@ class OnlyPublisher:
         The node that depends on it.
     topic, message_type
         The topic.
+    allowed
+        How many publishers it may have: 1, or 0.
     """
 
-    def __init__(self, node: Node, topic: str, message_type: Any) -> None:
-        self._node, self._type = node, message_type
+    def __init__(self, node: Node, topic: str, message_type: Any, allowed: int = 1) -> None:
+        self._node, self._type, self._allowed = node, message_type, allowed
         self._topic = node.resolve_topic_name(topic)
         self._counter: Subscription | None = None
         # Since when several are listed, all of them with a lease; wall time, s.
@@ -45,20 +47,20 @@ class OnlyPublisher:
 
     def trouble(self) -> str:
         """Return who publishes there, if they are more than one; ''."""
-        if self._node.count_publishers(self._topic) <= 1:
+        if self._node.count_publishers(self._topic) <= self._allowed:
             self._several_wall = None
             return ''
         listed = self._node.get_publishers_info_by_topic(self._topic)
         leased = [info for info in listed if _has_lease(info)]
         if len(leased) < len(listed):
             # One without a lease beside another one.
-            return self._words(listed) if len(listed) > 1 else ''
+            return self._words(listed) if len(listed) > self._allowed else ''
         self._count()
         now = time.monotonic()
         if self._several_wall is None:
             self._several_wall = now
         known = now - self._several_wall > COUNT_WALL_S
-        return self._words(listed) if known and self._alive + self._own() > 1 else ''
+        return self._words(listed) if known and self._alive + self._own() > self._allowed else ''
 
     def _own(self) -> int:
         """Return how many publishers are this node's own: Fast DDS counts no lease of theirs."""
@@ -86,8 +88,10 @@ class OnlyPublisher:
 
     def _words(self, listed: list[TopicEndpointInfo]) -> str:
         names = sorted(node_of(info) for info in listed)
+        count = '1 publisher' if len(listed) == 1 else f'{len(listed)} publishers'
+        may = 'one' if self._allowed else 'none'
         return (
-            f'{len(listed)} publishers on {self._topic}, where one may be: {", ".join(names)}; '
+            f'{count} on {self._topic}, where {may} may be: {", ".join(names)}; '
             'end the others (those of a killed process are listed for some 20 s)'
         )
 

@@ -43,19 +43,24 @@ from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.motion.path_search import PathSearch
 from remaster_ros.nodes.background import Background
 from remaster_ros.nodes.bridge_parameters import Parameters
+from remaster_ros.nodes.controller_link import (
+    COMMANDS,
+    ActionLink,
+    ForeignGoals,
+    TopicLink,
+    control_messages,
+)
 from remaster_ros.nodes.emergency_link import EmergencyLink
 from remaster_ros.nodes.messages import duration_of, stamp_of
 from remaster_ros.nodes.parameters import declare
 from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.simulated_clock import ReportsTaken, SteadyTime
-from remaster_ros.nodes.status import LEASED, RELIABLE, NodeStatus, Summary, listen
+from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.nodes.waypoints import waypoints_by_solution
-from remaster_ros.sensors.registry import kind_of
 from remaster_ros.session.halt_file import HaltFile
 from remaster_ros.session.workcell import read_cell
 
-COMMANDS = 'joint_trajectory_controller/joint_trajectory'
 JOINTS = 'joint_states'
 SOLUTIONS = 'remaster/joint_solutions'
 WAYPOINTS = 'remaster/joint_waypoints'
@@ -78,8 +83,6 @@ longer with it, a paused process may not.
 """
 WATCH_WALL_S = 0.05
 """How often silence and the graph are looked at."""
-LISTENERS = ('robot_bridge', 'recorder')
-"""Nodes of this package that subscribe to the commands; those of sensors do so as well."""
 
 
 class RobotBridge(RemasterNode):
@@ -118,8 +121,13 @@ class RobotBridge(RemasterNode):
         self._settled_wall = self.steady_s()
         self._waypoints = JointTrajectory()
         self.counts = {'commanded': 0, 'settled': 0, 'failed': 0, 'stopped': 0}
+        by_action = self.p.command_interface == 'action'
+        if by_action:
+            control_messages()
+        self._foreign = ForeignGoals(self)
+        self._closing = False
         # Made when this bridge is known to be the only one of its name.
-        self._controller: Any = None
+        self._controller: TopicLink | ActionLink | None = None
         # Since when a controller listens; a command before that would be lost.
         self._listened_wall: float | None = None
         self._settled = self.create_publisher(JointState, 'remaster/settled', RELIABLE)
@@ -137,12 +145,12 @@ class RobotBridge(RemasterNode):
             self, self.p.emergency_stop_topic, self._on_emergency_stop, self.p.heartbeat_s
         )
         self._only = [
-            OnlyPublisher(self, topic, kind)
-            for topic, kind in (
-                (JOINTS, JointState),
-                (SOLUTIONS, JointTrajectory),
-                (WAYPOINTS, JointTrajectory),
-                (COMMANDS, JointTrajectory),
+            OnlyPublisher(self, topic, kind, allowed)
+            for topic, kind, allowed in (
+                (JOINTS, JointState, 1),
+                (SOLUTIONS, JointTrajectory, 1),
+                (WAYPOINTS, JointTrajectory, 1),
+                (COMMANDS, JointTrajectory, 0 if by_action else 1),
             )
         ]
         self.create_service(Trigger, 'remaster/clear_halt', self._on_clear_halt)
@@ -252,6 +260,8 @@ class RobotBridge(RemasterNode):
     def _watch(self) -> None:
         now = self.steady_s()
         rivals = next(filter(None, (only.trouble() for only in self._only)), '')
+        if self._controller is not None:
+            rivals = rivals or self._controller.rival()
         for name, trouble in (
             ('rivals', rivals),
             ('model', self._model_trouble(now)),
@@ -266,26 +276,32 @@ class RobotBridge(RemasterNode):
         if self._controller is None:
             if not self.status.alone(now):
                 return 'looking for another robot_bridge of this name'
-            self._controller = self.create_publisher(JointTrajectory, COMMANDS, LEASED)
-        if not (self._controller.get_subscription_count() and self._controller_is_listed()):
+            if self.p.command_interface == 'action':
+                rules = self.supervisor.rules
+                self._controller = ActionLink(self, rules, self._foreign, self._on_given_up)
+            else:
+                self._controller = TopicLink(self)
+        if not self._controller.listens():
             self._listened_wall = None
         elif self._listened_wall is None:
             self._listened_wall = now
         if self._listened_wall is None or now - self._listened_wall < MATCHED_WALL_S:
-            return f'no controller listens to {self.resolve_topic_name(COMMANDS)}'
-        return ''
+            self._foreign.begin()
+            return self._controller.missing
+        return self._foreign.trouble()
 
-    def _controller_is_listed(self) -> bool:
-        """Whether a node other than ours subscribes to the commands."""
-        found = self.get_subscriptions_info_by_topic(self.resolve_topic_name(COMMANDS))
-        names = [info.node_name for info in found]
-        return any(name not in LISTENERS and not kind_of(name) for name in names)
+    def _on_given_up(self, why: str) -> None:
+        self.get_logger().error(why)
+        self._do(self.supervisor.given_up(why))
 
     # What goes out
 
     def _do(self, actions: list[Action]) -> None:
+        stops = any(isinstance(action, Stop) for action in actions)
         for action in actions:
             match action:
+                case Drive() if self._closing:
+                    pass
                 case CheckPath():
                     self._paths.submit(
                         partial(self._search.find, action), partial(self._on_path, action.number)
@@ -300,7 +316,7 @@ class RobotBridge(RemasterNode):
                     self._publish(action.admitted)
                     self._on_commanded(action.solution)
                 case Stop(admitted, reason):
-                    self._publish(admitted)
+                    self._publish(admitted, stop=True)
                     self.counts['stopped'] += 1
                     self.status.event(events.ArmStopped(stamp=self._pose_stamp, reason=reason))
                     self.get_logger().info(f'stopping the arm: {reason}')
@@ -314,12 +330,15 @@ class RobotBridge(RemasterNode):
                         )
                     )
                 case Halted(reason):
+                    if self._controller is not None and not stops:
+                        # Nothing else follows.
+                        self._controller.cancel()
                     self._disk.submit(partial(self._halt_file.write, reason), self._on_written)
                     self.status.event(events.ArmHalted(stamp=self._pose_stamp, reason=reason))
                     self.status.publish()
                     self.get_logger().error(f'halted: {reason}')
 
-    def _publish(self, admitted: Admitted) -> None:
+    def _publish(self, admitted: Admitted, *, stop: bool = False) -> None:
         """Publish what the gate has admitted; nothing else is ever published to a controller."""
         # A stop is a trajectory too: an empty one is refused by some versions of
         # joint_trajectory_controller, and the arm goes on.
@@ -332,7 +351,8 @@ class RobotBridge(RemasterNode):
             )
             for point in admitted.waypoints
         ]
-        self._controller.publish(message)
+        assert self._controller is not None
+        self._controller.send(message, stop=stop)
 
     def _on_commanded(self, solution: int) -> None:
         if solution < 0:
@@ -394,7 +414,10 @@ class RobotBridge(RemasterNode):
 
     def close(self) -> None:
         """Leave the arm standing still."""
+        self._closing = True
         self._do(self.supervisor.planner_is('gone: the bridge stops', self.steady_s()))
+        if self._controller is not None:
+            self._controller.close()
         self._paths.close(0.5)
         self._disk.close()
 

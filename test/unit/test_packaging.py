@@ -43,7 +43,7 @@ DISTRIBUTION = {
     'dateutil': 'python-dateutil',
 }
 # Brought by rclpy itself, as wheel and as Debian package.
-WITH_RCLPY = {'rcl_interfaces'}
+WITH_RCLPY = {'rcl_interfaces', 'action_msgs'}
 
 
 @pytest.fixture

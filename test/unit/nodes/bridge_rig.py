@@ -104,8 +104,8 @@ class CountedBridge(robot_bridge.RobotBridge):
         super()._on_waypoints(message)
         self.taken['ways'] += 1
 
-    def _publish(self, admitted):
-        super()._publish(admitted)
+    def _publish(self, admitted, **how):
+        super()._publish(admitted, **how)
         self.published += 1
 
     def _summary(self):
@@ -315,7 +315,7 @@ class Rig:
         """Let the bridge find itself alone, its controller there and its arm standing."""
         self.alone()
         if self.controller is not None:
-            self.wait(self.bridge._controller.get_subscription_count, 'the controller')
+            self.wait(self.bridge._controller.matched, 'the controller')
         self.bridge._watch()
         self.wall += robot_bridge.MATCHED_WALL_S
         self.run(2.5, lambda: not self.bridge.supervisor.blocked(self.wall))

@@ -225,7 +225,7 @@ def test_nothing_is_commanded_before_a_controller_listens(rig):
     assert r.summary()[:2] == ('warn', wanted)
     assert not r.bridge.published
     r.open_controller()
-    r.wait(r.bridge._controller.get_subscription_count, 'the controller')
+    r.wait(r.bridge._controller.matched, 'the controller')
     # A time to which half a second can be added exactly.
     r.wall = np.ceil(r.wall * 1024.0) / 1024.0
     r.bridge._watch()
@@ -244,7 +244,7 @@ def test_a_controller_that_goes_halts_the_arm(rig):
     r.go(AWAY, speed=0.2)
     r.close_controller()
     r.controller = None
-    r.wait(lambda: not r.bridge._controller.get_subscription_count(), 'the end of the match')
+    r.wait(lambda: not r.bridge._controller.matched(), 'the end of the match')
     sent = r.bridge.published
     r.bridge._watch()
     assert r.halted() == 'no controller listens to /joint_trajectory_controller/joint_trajectory'
@@ -262,7 +262,7 @@ def test_a_recorder_that_listens_is_no_controller(rig, name):
     node = robot_bridge.RemasterNode.__mro__[1](name, context=r.context)
     node.create_subscription(JointTrajectory, robot_bridge.COMMANDS, print, 10)
     r.alone()
-    r.wait(r.bridge._controller.get_subscription_count, 'the match')
+    r.wait(r.bridge._controller.matched, 'the match')
     r.plan(TARGET)
     r.run(1.5)
     assert r.summary()[1].startswith('no controller listens to ')

@@ -28,6 +28,7 @@ RANGES = {
     'stall_s': (1.0, 0.2, 60.0, 's'),
     'reaction_s': (2.0, 0.1, 60.0, 's'),
     'lag_s': (0.35, 0.05, 2.0, 's'),
+    'command_interface': ('topic', None, None, ''),
     'emergency_stop_topic': ('', None, None, ''),
 }
 """What an arm is left to: whoever changes one of them has to change it here as well."""

@@ -1,0 +1,347 @@
+"""How the admitted commands reach the arm's controller: by its topic, or as goals of its action.
+
+Both are of one controller, ``…/joint_trajectory`` and ``…/follow_joint_trajectory``, and carry the
+same trajectory. A goal replaces the one before it as a newer message on the topic does, so that an
+arm is stopped by a goal too, along its line. A goal is cancelled only where no command is to
+follow, or where the controller does not take the stop: a controller that cancels a goal holds the
+arm where it is just then (joint_trajectory_controller: at once, whatever its speed).
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+from action_msgs.msg import GoalInfo, GoalStatus, GoalStatusArray
+from action_msgs.srv import CancelGoal
+from rclpy.action import ActionClient
+from rclpy.node import Node
+from rclpy.qos import qos_profile_action_status_default
+from rclpy.task import Future
+from trajectory_msgs.msg import JointTrajectory
+
+from remaster_ros.errors import InputError
+from remaster_ros.motion.actions import SupervisorRules
+from remaster_ros.motion.following import path_tolerance
+from remaster_ros.nodes.endpoints import UNNAMED
+from remaster_ros.nodes.messages import duration_of
+from remaster_ros.nodes.status import LEASED, RELIABLE
+from remaster_ros.sensors.registry import kind_of
+from remaster_ros.types import FloatArray
+
+COMMANDS = 'joint_trajectory_controller/joint_trajectory'
+COPIES = 'remaster/recorded/joint_trajectory'
+"""Where goals are published for those who listen to commands (the bag, a tracker): nothing moves
+by it."""
+LISTENERS = ('robot_bridge', 'recorder')
+"""Nodes of this package that subscribe to the commands; those of sensors do so as well."""
+CODES = {
+    'INVALID_GOAL': 'it cannot be followed',
+    'INVALID_JOINTS': 'its joints are not those of the controller',
+    'OLD_HEADER_TIMESTAMP': 'it is over already',
+    'PATH_TOLERANCE_VIOLATED': 'the arm left its path',
+    'GOAL_TOLERANCE_VIOLATED': 'the arm did not reach its end in time',
+}
+"""What a controller may give as the reason: constants of the result, and what they mean."""
+UNDER_WAY = (GoalStatus.STATUS_ACCEPTED, GoalStatus.STATUS_EXECUTING, GoalStatus.STATUS_CANCELING)
+OVER = (CancelGoal.Response.ERROR_UNKNOWN_GOAL_ID, CancelGoal.Response.ERROR_GOAL_TERMINATED)
+"""Answers to the cancelling of a goal that is over."""
+LAST_ANSWER_WALL_S = 0.5
+"""A bridge that ends waits so long for the answer to its last stop, s: much longer than a request
+and its answer take on one computer, and no one who ends it notices."""
+
+
+def action_of(topic: str) -> str:
+    """Return the action of the controller that has this topic of commands."""
+    return f'{topic.rpartition("/")[0]}/follow_joint_trajectory'
+
+
+class ForeignGoals:
+    """Whether another client than the bridge sends goals; the topic is no way round them.
+
+    Parameters
+    ----------
+    node
+        The node that depends on it.
+
+    Attributes
+    ----------
+    own
+        The goals that are the bridge's.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.own: set[bytes] = set()
+        self._action = action_of(node.resolve_topic_name(COMMANDS))
+        self._active: set[bytes] = set()
+        self._earlier: set[bytes] = set()
+        node.create_subscription(
+            GoalStatusArray,
+            f'{self._action}/_action/status',
+            self._on_status,
+            qos_profile_action_status_default,
+        )
+
+    def _on_status(self, message: GoalStatusArray) -> None:
+        self._active = {
+            bytes(status.goal_info.goal_id.uuid)
+            for status in message.status_list
+            if status.status in UNDER_WAY
+        }
+
+    def begin(self) -> None:
+        """Count only goals that come from now on.
+
+        joint_trajectory_controller may list one that was replaced as under way until the next one
+        comes, so that what a former bridge has left says nothing. Where the arm really moves by
+        it, nothing is commanded before it stands.
+        """
+        self._earlier = set(self._active)
+
+    def trouble(self) -> str:
+        """Return that another client has a goal under way, ''."""
+        if self._active <= self.own | self._earlier:
+            return ''
+        return f'another client has sent a goal to {self._action}: end that client'
+
+
+class TopicLink:
+    """Publish the commands on the controller's topic.
+
+    Parameters
+    ----------
+    node
+        The bridge.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._topic = node.resolve_topic_name(COMMANDS)
+        self._publisher = node.create_publisher(JointTrajectory, COMMANDS, LEASED)
+        self.missing = f'no controller listens to {self._topic}'
+
+    def matched(self) -> bool:
+        """Whether anybody listens."""
+        return bool(self._publisher.get_subscription_count())
+
+    def listens(self) -> bool:
+        """Whether a node other than ours subscribes to the commands."""
+        if not self.matched():
+            return False
+        found = self._node.get_subscriptions_info_by_topic(self._topic)
+        names = [info.node_name for info in found]
+        return any(name not in LISTENERS and not kind_of(name) for name in names)
+
+    def rival(self) -> str:
+        """Return who else commands the controller, ''; publishers are counted elsewhere."""
+        return ''
+
+    def send(self, message: JointTrajectory, *, stop: bool = False) -> None:
+        """Send a trajectory that the motion gate has admitted."""
+        self._publisher.publish(message)
+
+    def cancel(self) -> None:
+        """Do nothing: what was published is not taken back."""
+
+    def close(self) -> None:
+        """Do nothing: a message that was published is sent."""
+
+
+@dataclass(eq=False)
+class _Goal:
+    """A goal that was sent; `handle` once the controller has accepted it."""
+
+    key: bytes = field(default_factory=lambda: uuid.uuid4().bytes)
+    handle: Any = None
+    cancelled: bool = False
+    over: bool = False
+
+
+class ActionLink:
+    """Send the commands as goals of FollowJointTrajectory.
+
+    Parameters
+    ----------
+    node
+        The bridge.
+    rules
+        What the arm is judged by here is what the controller is told to keep.
+    foreign
+        Is told which goals are ours.
+    failed
+        Called with the reason where the controller does not take the newest goal, or gives it up.
+
+    Raises
+    ------
+    InputError
+        control_msgs is not installed.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        rules: SupervisorRules,
+        foreign: ForeignGoals,
+        failed: Callable[[str], None],
+    ) -> None:
+        self._action_type, self._tolerance_type = control_messages()
+        self._node, self._rules, self._foreign, self._failed = node, rules, foreign, failed
+        self._action = action_of(node.resolve_topic_name(COMMANDS))
+        self._client = ActionClient(node, self._action_type, self._action)
+        self._copies = node.create_publisher(JointTrajectory, COPIES, RELIABLE)
+        # The last move and the stops of it. Before a move the arm stands: earlier ones are over.
+        self._goals: list[_Goal] = []
+        self._speeds: FloatArray = np.zeros(0)
+        self._awaited: list[Future] = []
+        self.missing = f'no controller has the action {self._action}'
+
+    def matched(self) -> bool:
+        """Whether a server is there, with all that belongs to it."""
+        return bool(self._client.server_is_ready())
+
+    listens = matched
+
+    def rival(self) -> str:
+        """Return which other node is a client of the action, ''."""
+        service = f'{self._action}/_action/send_goal'
+        if self._node.count_clients(service) <= 1:
+            return ''
+        own = self._node.get_name(), self._node.get_namespace()
+        found = []
+        for name, namespace in self._node.get_node_names_and_namespaces():
+            if (name, namespace) == own or name == UNNAMED:
+                continue
+            try:
+                clients = self._node.get_client_names_and_types_by_node(name, namespace)
+            except RuntimeError:  # It has gone meanwhile.
+                continue
+            if any(client == service for client, _ in clients):
+                found.append(f'{namespace.rstrip("/")}/{name}')
+        if not found:
+            # Of this bridge before it was killed: that there is one of its name is seen elsewhere.
+            return ''
+        return (
+            f'other clients of {self._action}, where the bridge may be the only one: '
+            f'{", ".join(sorted(found))}; end them (those of a killed process are listed for '
+            'some 20 s)'
+        )
+
+    def send(self, message: JointTrajectory, *, stop: bool = False) -> None:
+        """Send a trajectory that the motion gate has admitted, in place of the one under way."""
+        names, rules = message.joint_names, self._rules
+        end = np.full(len(names), rules.settle.arrive_tolerance)
+        if stop:
+            # No target: where on its line the arm comes to rest is enough.
+            end = path_tolerance(np.zeros(len(names)), rules)
+        else:
+            self._goals.clear()
+            # A stop begins with the speeds of its move.
+            self._speeds = np.max(np.abs([point.velocities for point in message.points]), axis=0)
+        goal = self._action_type.Goal(
+            trajectory=message,
+            path_tolerance=self._tolerances(names, path_tolerance(self._speeds, rules)),
+            goal_tolerance=self._tolerances(names, end),
+            # The bridge gives up first, by the same rule.
+            goal_time_tolerance=duration_of(rules.arrive_timeout_s),
+        )
+        sent = _Goal()
+        self._goals.append(sent)
+        self._foreign.own.add(sent.key)
+        key = GoalInfo().goal_id
+        key.uuid = np.frombuffer(sent.key, dtype=np.uint8)
+        self._await(self._client.send_goal_async(goal, goal_uuid=key), self._on_answer, sent)
+        self._copies.publish(message)
+
+    def cancel(self) -> None:
+        """Let the controller hold the arm where it is, as no command is to follow."""
+        for goal in self._goals:
+            if goal.handle is not None and not (goal.cancelled or goal.over):
+                self._await(goal.handle.cancel_goal_async(), self._on_cancelled, goal)
+            goal.cancelled = True
+
+    def close(self) -> None:
+        """Wait for the answers: a stop that is refused is followed by a cancelling."""
+        executor, end = self._node.executor, time.monotonic() + LAST_ANSWER_WALL_S
+        while executor is not None and self._awaited and self._node.context.ok():
+            if time.monotonic() > end:
+                return
+            executor.spin_once(timeout_sec=0.01)
+
+    def _tolerances(self, names: Sequence[str], values: FloatArray) -> list[Any]:
+        pairs = zip(names, values, strict=True)
+        return [self._tolerance_type(name=name, position=float(value)) for name, value in pairs]
+
+    def _await(self, future: Future, done: Callable[[_Goal, Any], None], goal: _Goal) -> None:
+        self._awaited.append(future)
+        future.add_done_callback(partial(self._take, done, goal))
+
+    def _take(self, done: Callable[[_Goal, Any], None], goal: _Goal, future: Future) -> None:
+        self._awaited.remove(future)
+        if not future.cancelled() and future.result() is not None:
+            done(goal, future.result())
+
+    def _on_answer(self, goal: _Goal, handle: Any) -> None:
+        if not handle.accepted:
+            if goal in self._goals:
+                self._goals.remove(goal)
+                self._give_up(f'{self._action}: the controller refuses a command; its log has why')
+            return
+        goal.handle = handle
+        handle.get_result_async().add_done_callback(partial(self._on_result, goal))
+        if goal.cancelled:
+            goal.cancelled = False
+            self.cancel()
+
+    def _on_result(self, goal: _Goal, future: Future) -> None:
+        goal.over = True
+        # A goal that was replaced ends as cancelled: that is how it is meant.
+        newest = bool(self._goals) and goal is self._goals[-1]
+        if future.result() is None or not newest or goal.cancelled:
+            return
+        status, result = future.result().status, future.result().result
+        if status == GoalStatus.STATUS_SUCCEEDED and result.error_code == result.SUCCESSFUL:
+            return
+        number = result.error_code
+        named = (f'{k}: {v}' for k, v in CODES.items() if getattr(result, k) == number)
+        why = next(named, f'error {number}' if number else '')
+        if status == GoalStatus.STATUS_CANCELED:
+            why = 'cancelled or replaced by another client'
+        why = '; '.join(filter(None, (why, result.error_string))) or 'without a reason'
+        self._give_up(f'{self._action}: the controller has given up a command ({why})')
+
+    def _give_up(self, why: str) -> None:
+        # What it had before may still be under way: an arm that refuses to be stopped, say.
+        self.cancel()
+        self._failed(why)
+
+    def _on_cancelled(self, goal: _Goal, response: CancelGoal.Response) -> None:
+        if not response.goals_canceling and response.return_code not in OVER:
+            self._node.get_logger().error(
+                f'{self._action}: the controller refuses to cancel a command; if the arm moves, '
+                'use the emergency stop'
+            )
+
+
+def control_messages() -> tuple[Any, Any]:
+    """Return FollowJointTrajectory and JointTolerance.
+
+    Raises
+    ------
+    InputError
+        They are not installed.
+    """
+    try:
+        action = importlib.import_module('control_msgs.action').FollowJointTrajectory
+        return action, importlib.import_module('control_msgs.msg').JointTolerance
+    except ImportError:
+        raise InputError(
+            'command_interface is action, and control_msgs is not installed: '
+            'apt install ros-jazzy-control-msgs (there is no wheel of it), or set '
+            'command_interface to topic'
+        ) from None
