@@ -39,6 +39,8 @@ class ActionController:
         Whether it refuses a request.
     cancels
         Whether it lets a goal be cancelled.
+    replaces
+        Whether a goal takes the place of the one under way; else it waits for ever behind it.
     """
 
     def __init__(self, node, name, obey, hold, now):
@@ -48,7 +50,7 @@ class ActionController:
         self._node, self._obey, self._hold, self._now = node, obey, hold, now
         self.goals, self.cancelled = [], 0
         self.refuses = lambda goal: False
-        self.cancels = True
+        self.cancels = self.replaces = True
         self._active = self._end_s = None
         self._server = ActionServer(
             node,
@@ -70,6 +72,8 @@ class ActionController:
         return GoalResponse.REJECT if self.refuses(goal) else GoalResponse.ACCEPT
 
     def _on_accepted(self, handle):
+        if self._active is not None and not self.replaces:
+            return
         trajectory = handle.request.trajectory
         last = trajectory.points[-1].time_from_start
         self._active, self._end_s = handle, self._now() + last.sec + 1e-9 * last.nanosec

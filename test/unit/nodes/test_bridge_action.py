@@ -195,6 +195,19 @@ def test_a_controller_that_refuses_to_be_stopped_is_cancelled(rig):
     assert r.arm.q[0] < 0.55, 'it went on to its end'
 
 
+def test_a_controller_that_puts_the_stop_behind_the_move_is_cancelled(rig):
+    """It accepts the stop, and the arm goes on."""
+    r = rig(speed_share=0.1)
+    r.controller.replaces = False
+    r.go(AWAY)
+    r.say_planner('paused')
+    r.run(3.0, r.halted)
+    r.run(0.5)
+    assert r.controller.cancelled == 1
+    assert r.arm.speed() < 1e-6
+    assert r.arm.q[0] < 0.55, 'it went on to its end'
+
+
 def test_a_controller_that_takes_neither_stop_nor_cancelling_is_named(rig):
     r = rig()
     r.controller.refuses, r.controller.cancels = is_stop, False
