@@ -12,6 +12,7 @@ import numpy as np
 from remaster_ros.calibration.comparison import Comparison, compared, predicted_rows
 from remaster_ros.calibration.convergence import SamplerInfo
 from remaster_ros.calibration.estimate import Estimate, Problem
+from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.held_out_tests import held_out_tests
 from remaster_ros.calibration.identifiability import Gauge, GaugeDirection, known_offsets
 from remaster_ros.calibration.laplace import Mode
@@ -33,6 +34,9 @@ from remaster_ros.types import BoolArray, FloatArray, IntArray, Session
 # A mastering is off by tenths of a degree. A larger offset is that of a joint that has lost its
 # mastering, or joints, signs or the robot model are not those of the arm that was measured.
 LARGEST_OFFSET = np.radians(5.0)
+# A marker where it was stated to be is that many times the stated std off in one of a million
+# sessions (square root of chi squared with three degrees of freedom).
+DISPLACED = 5.5
 # Of an unknown angle, uniform over the turn.
 UNKNOWN_STD = np.pi / np.sqrt(3.0)
 
@@ -172,6 +176,26 @@ class FitResult:
             )
             if known and abs(offset) > LARGEST_OFFSET
         )
+
+    @property
+    def displaced_markers(self) -> tuple[str, ...]:
+        """A line for each marker that is not where it was stated to be, as well as it was."""
+        if self.found is None:
+            return ()
+        problem, link = self.found.problem, self.session.tip_link
+        lines = []
+        for name, stated, std in zip(
+            problem.marker_names, problem.markers, problem.marker_std_m, strict=True
+        ):
+            off = float(np.linalg.norm(self.marker_positions[name] - stated))
+            if off > DISPLACED * std:
+                lines.append(
+                    f'{the("marker", name)}: the fit has it {1e3 * off:.1f} mm from its stated '
+                    f'place, {off / std:.1f} times what that is stated to be known to '
+                    f'({1e3 * std:.3g} mm). Check the place, its unit, and that {link} is the '
+                    'link that carries it; or state how well the place is known (marker_std_m)'
+                )
+        return tuple(lines)
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,13 +43,14 @@ def verdict(result: FitResult) -> Judgement:
     untold = [check for check in result.noise_checks if check.explained is None]
     changes = references(result)[1]
     spoilt = [check.spoilt for check in result.noise_checks if check.spoilt]
+    displaced = [f'{line}.' for line in result.displaced_markers]
     findings = [_compared(check) for check in unexplained] + _structure(result)
     doubts = [_compared(check) for check in untold]
-    disagreements = changes + spoilt
+    disagreements = changes + spoilt + displaced
     points = findings + doubts + _widening(result) + disagreements
     doubtful = bool(unexplained or untold) or result.other_errors
     few = result.structure is not None and result.structure.too_few
-    unproven = changes or spoilt or few or again.most or not validated
+    unproven = disagreements or few or again.most or not validated
     mood: Literal['good', 'caution', 'bad'] = 'caution'
     if result.sampler.wandering and not result.sampler.converged:
         mood = 'bad'

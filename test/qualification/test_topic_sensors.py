@@ -13,8 +13,8 @@ def test_every_fault_and_kill_in_one_collection(start, client, tmp_path, repetit
     c = Collection(start, client, tmp_path, candidates=12, rate=5.0)
     # Few messages: the dwell is prolonged, and the reading is taken all the same.
     c.spoil('mocap', c.says('mocap', 'fewer than min_rate_hz'), slow=20)
-    c.spoil('mocap', c.refused('mocap: unsteady'), jumping=1)
-    c.spoil('tracker', c.refused('tracker: unsteady'), jumping=1)
+    c.spoil('mocap', c.refused('mocap: scattered'), jumping=1)
+    c.spoil('tracker', c.refused('tracker: scattered'), jumping=1)
     c.spoil('mocap', c.waits_for('repeats one position to the last bit'), frozen=1)
     for sensor in ('mocap', 'tracker'):
         c.spoil(sensor, c.waits_for('synchronise the clocks'), late=60.0)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise_check import NoiseCheck
 from remaster_ros.calibration.residual_structure import ResidualStructure, StructureTest
 from remaster_ros.cli.fit import summary
@@ -122,3 +123,27 @@ def test_offsets_that_hardly_matter_where_noise_explains_the_rest(fit_result):
     assert judged.mood == 'caution'
     assert 'That is what noise explains' in judged.headline
     assert 'discover' not in judged.headline
+
+
+def test_a_marker_that_is_not_where_it_was_stated_to_be_is_named(fit_result):
+    """The fit takes it up, so that no residual shows it; 5 mm are ten times what was stated."""
+    assert fit_result.displaced_markers == ()
+    session = fit_result.session
+    assert session.marker_std_m == 0.5e-3
+    stated = {**session.markers, 'smr': session.markers['smr'] + np.array([0.0, 0.0, 5e-3])}
+    result = fit_session(
+        replace(session, markers=stated), rng=np.random.default_rng(0), draws=100, chains=2
+    )
+    (line,) = result.displaced_markers
+    off = np.linalg.norm(result.marker_positions['smr'] - stated['smr'])
+    assert off == pytest.approx(5e-3, abs=1e-3)
+    assert f'the marker smr: the fit has it {1e3 * off:.1f} mm from its stated place' in line
+    assert '(0.5 mm). Check the place, its unit, and that tool is the link that carries' in line
+    judged = verdict(result)
+    assert judged.mood != 'good'
+    assert f'{line}.' in judged.points
+    assert f'{line}.' in judged.disagreements
+    assert line in summary(result)
+    # Stated as well as it is known, the place contradicts nothing.
+    known = replace(session, markers=stated, marker_std_m=5e-3)
+    assert fit_session(known, rng=np.random.default_rng(0), draws=100).displaced_markers == ()
