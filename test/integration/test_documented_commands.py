@@ -88,7 +88,7 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
     arm = measured(rows=24)
     names, degrees, mm = [f'P{i}' for i in range(24)], np.rad2deg(arm.q).T, 1e3 * arm.points.T
     joints = [f'A{i}' for i in range(1, 7)]
-    for name in ('arm.urdf', 'robot.urdf', 'robot.urdf.xacro', 'my.urdf.xacro'):
+    for name in ('arm.urdf', 'robot.urdf', 'robot.urdf.xacro', 'my.urdf.xacro', 'ur.urdf.xacro'):
         (folder / name).write_text(arm.urdf, encoding='utf-8')
     write(folder, 'table.csv', text(['name', *joints, 'X', 'Y', 'Z'], [names, *degrees, *mm]))
     write(folder, 'points.csv', text(['name', 'X', 'Y', 'Z'], [names, *mm]))

@@ -54,6 +54,7 @@ def test_the_allowance_does_not_depend_on_the_machine(session, monkeypatch) -> N
 def test_chains_are_begun_only_where_enough_of_their_proposals_would_be_taken(
     session, monkeypatch, least
 ) -> None:
+    monkeypatch.setattr(sampling, 'EVALUATED_ROWS', 500_000)
     monkeypatch.setattr(sampling, 'HOPELESS_WEIGHTS', least)
     monkeypatch.setattr(sampling, 'DENSITY_ERROR_LIMIT', -1.0)
     begun = []

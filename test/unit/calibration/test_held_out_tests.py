@@ -115,14 +115,17 @@ def test_errors_that_differ_between_the_joint_solutions_are_seen_within_the_pose
     assert tests['tracker', False].p_value > 1e-3
 
 
-def test_healthy_sessions_are_left_alone():
-    """Of 240 p-values more than 8 are below 0.01 in 0.1 % of all seeds; the mean by 4.5 std."""
+@pytest.mark.parametrize(
+    ('seeds', 'most'), [(15, 4), pytest.param(60, 8, marks=pytest.mark.qualify)]
+)
+def test_healthy_sessions_are_left_alone(seeds, most):
+    """More p-values than `most` are below 0.01 in 0.1 % of all runs; the mean by 4.5 std."""
     values = []
-    for seed in range(60):
+    for seed in range(seeds):
         session, _ = scene(seed, poses=18, validation=12, sensor_count=2)
         values += [test.p_value for test in by_sensor(session).values()]
-    assert len(values) == 240
-    assert np.sum(np.array(values) < 0.01) <= 8
+    assert len(values) == 4 * seeds
+    assert np.sum(np.array(values) < 0.01) <= most
     assert abs(np.mean(values) - 0.5) < 4.5 / np.sqrt(12.0 * len(values))
 
 

@@ -106,32 +106,39 @@ def test_configurations_measured_again_count_once(table):
     assert '2 different configurations to fit are too few' in error
 
 
-def test_a_proposal_is_one_that_the_program_accepts_and_that_helps(table):
-    """Whatever is proposed beside what was told already: added to the command, it is done."""
-    right = table().q
-    for spoil, told, points in (
+@pytest.mark.parametrize(
+    ('spoil', 'told', 'points'),
+    [
         (lambda q: q * [1, 1, -1, 1, -1, 1], ['--reverse', 'A3'], ('X', 'Y', 'Z')),
-        (lambda q: q, ['--reverse', 'A3'], ('X', 'Y', 'Z')),
-        (lambda q: q - [0, 90, 0, 0, 0, 0], [], ('px_mm', 'py_mm', 'pz_mm')),
+        pytest.param(
+            *(lambda q: q, ['--reverse', 'A3'], ('X', 'Y', 'Z')), marks=pytest.mark.qualify
+        ),
+        pytest.param(
+            *(lambda q: q - [0, 90, 0, 0, 0, 0], [], ('px_mm', 'py_mm', 'pz_mm')),
+            marks=pytest.mark.qualify,
+        ),
         (lambda q: q, [], ('Py [mm]', 'Px [mm]', 'Pz [mm]')),
-        (lambda q: q - np.eye(6)[2] * q[:, 1:2], ['--offset', 'A5=0'], ('X', 'Y', 'Z')),
-    ):
-        imported = table()
-        imported.q = spoil(right)
-        if points[0].startswith('Py'):
-            imported.points = imported.points[:, [1, 0, 2]]
-            points = ('Px [mm]', 'Py [mm]', 'Pz [mm]')
-        status, found, error, out = imported.run(*told, points=points)
-        assert status == 1, (told, points)
-        proposed = error.split('to write it so, add ')[1].split('; to write it as')[0]
-        status, found, _, out = imported.run(*told, *shlex.split(proposed), points=points)
-        assert (status, found['fits']) == (0, True), proposed
-        np.testing.assert_allclose(
-            read_session(out).measurements.q, imported.arm.q, atol=1e-6, err_msg=proposed
-        )
-        for path in out.iterdir():
-            path.unlink()
-        out.rmdir()
+        pytest.param(
+            *(lambda q: q - np.eye(6)[2] * q[:, 1:2], ['--offset', 'A5=0'], ('X', 'Y', 'Z')),
+            marks=pytest.mark.qualify,
+        ),
+    ],
+)
+def test_a_proposal_is_one_that_the_program_accepts_and_that_helps(table, spoil, told, points):
+    """Whatever is proposed beside what was told already: added to the command, it is done."""
+    imported = table()
+    imported.q = spoil(imported.q)
+    if points[0].startswith('Py'):
+        imported.points = imported.points[:, [1, 0, 2]]
+        points = ('Px [mm]', 'Py [mm]', 'Pz [mm]')
+    status, found, error, out = imported.run(*told, points=points)
+    assert status == 1, (told, points)
+    proposed = error.split('to write it so, add ')[1].split('; to write it as')[0]
+    status, found, _, out = imported.run(*told, *shlex.split(proposed), points=points)
+    assert (status, found['fits']) == (0, True), proposed
+    np.testing.assert_allclose(
+        read_session(out).measurements.q, imported.arm.q, atol=1e-6, err_msg=proposed
+    )
 
 
 def test_a_proposal_beyond_the_limits_of_the_robot_is_not_made(table):

@@ -30,7 +30,7 @@ def test_a_sweep_finds_what_lies_between_its_ends_and_the_spot_checks_between():
 
 
 @pytest.mark.parametrize(
-    'seed', [0, 1, *(pytest.param(seed, marks=pytest.mark.qualify) for seed in (2, 3))]
+    'seed', [0, *(pytest.param(seed, marks=pytest.mark.qualify) for seed in (1, 2, 3))]
 )
 def test_sweeps_agree_with_the_finest_sampling(lwr, seed):
     print('seed', seed)
@@ -42,7 +42,7 @@ def test_sweeps_agree_with_the_finest_sampling(lwr, seed):
         obstacle('pole', [-0.4, 0.3, 0.5], [0.05, 0.05, 1.0]),
     ]
     model = capsules(lwr, 0.06, *things)
-    q = rng.uniform(lwr.lower, lwr.upper, (160, 7))
+    q = rng.uniform(lwr.lower, lwr.upper, (80, 7))
     q = q[model.free_mask(q)]
     outcomes = []
     for start, goal in zip(q[::2], q[1::2]):

@@ -28,7 +28,7 @@ def quick_folder(tmp_path):
         yield Path(folder)
 
 
-@pytest.mark.parametrize('states', [250, pytest.param(1000, marks=pytest.mark.qualify)])
+@pytest.mark.parametrize('states', [100, pytest.param(1000, marks=pytest.mark.qualify)])
 def test_no_crash_loses_what_was_acknowledged(states, quick_folder, caplog):
     caplog.set_level(logging.CRITICAL, 'remaster_ros')
     found: Counter[str] = Counter()

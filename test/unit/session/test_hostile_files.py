@@ -21,7 +21,7 @@ from remaster_ros.session.workcell import read_cell
 
 CONFIG = Path(__file__).parents[3] / 'config'
 SEED = random.SystemRandom().randrange(10**6)
-TIMES = 250
+TIMES = 100
 
 
 @pytest.fixture(autouse=True)
