@@ -172,7 +172,6 @@ def one(part: Part, session: Session, whole_file: Path) -> dict[str, Any]:
         'held_out_mm': mm,
         'held_out_inside': _share(predictions_of(found).inside[fitted.measurements.is_validation]),
         'widening': content.predicted_regions95.widening,
-        'stretches': [found.stretches.ratio, found.stretches.p_value],
         'third': {where: _third(found, session.select(rows)) for where, rows in third.items()},
         'seconds': seconds,
         'memory_mb': memory_mb,
@@ -215,7 +214,7 @@ def _third(found: Discovery, third: Session) -> dict[str, Any]:
 
 
 def _cells(found: Discovery) -> Iterator[tuple[str, Any, slice]]:
-    solution = found.selection.solution
+    solution = found.solution
     for cell, where in zip(solution.cells, solution.slices(), strict=True):
         if cell.penalty is None or cell.place == 'joint_angle':
             yield f'{cell.name}_{cell.joints}_{cell.variant}', cell, where

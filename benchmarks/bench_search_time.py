@@ -38,7 +38,7 @@ def one(rows: int, draw: int) -> dict[str, Any]:
     found = discover_session(session, rng=np.random.default_rng(draw))
     return {
         'seconds': time.process_time() - started,
-        'parameters': len(found.selection.solution.parameters),
+        'parameters': len(found.solution.parameters),
         'causes': len(found.groups),
         'held_out_mm': 1e3 * (found.gain.held_out_rms_after_m or float('nan')),
     }

@@ -68,7 +68,7 @@ def one(folder: Path, run: int) -> dict[str, Any]:
 
 def _sizes(found: Discovery) -> list[tuple[str, str, float, float]]:
     """Return cause, name, value and std of every parameter, curves at some angles instead."""
-    fit, sizes, solution = found.fit, [], found.selection.solution
+    fit, sizes, solution = found.fit, [], found.solution
     wheres = dict(zip(solution.cells, solution.slices(), strict=True))
     # An effect without cells is that of a marker, which has no parameters of its own.
     causes = [

@@ -24,10 +24,9 @@ sys.path.insert(0, str(ROOT / 'test'))
 from hidden_tours import world  # noqa: E402
 from hidden_world import Noise  # noqa: E402
 
-from remaster_ros.discovery.discover import find_causes  # noqa: E402
+from remaster_ros.discovery.discover import Discovery, discover_session  # noqa: E402
 from remaster_ros.discovery.effects.base import Cell  # noqa: E402
 from remaster_ros.discovery.effects.registry import EFFECTS  # noqa: E402
-from remaster_ros.discovery.findings import Findings  # noqa: E402
 from remaster_ros.discovery.residuals import Residuals  # noqa: E402
 from remaster_ros.simulation.hidden_effect import HiddenEffect  # noqa: E402
 
@@ -44,15 +43,15 @@ TRUTH = {'sag': 'joint_compliance [2, 4]', 'shared noise': 'nothing', 'depth': '
 SIGNIFICANCE = 0.01
 
 
-def searched(kind: str, seed: int) -> Findings:
+def searched(kind: str, seed: int) -> Discovery:
     """Make a session with one thing hidden, and search it."""
     rng = np.random.default_rng([seed, 5])
     noise = NOISE if HIDDEN[kind] else SHARED_NOISE
     session, _ = world('iiwa7', rng).measure(HIDDEN[kind], noise, rng)
-    return find_causes(session, rng=rng, progress=lambda stage, share: None)
+    return discover_session(session, rng=rng)
 
 
-def ours(found: Findings) -> str:
+def ours(found: Discovery) -> str:
     return ' + '.join(_named(e.name, e.joints) for e in found.effects) or 'nothing'
 
 
@@ -129,7 +128,7 @@ def _named(name: str, joints: tuple[int, ...]) -> str:
     return f'{name} {list(joints)}' if joints else name
 
 
-def draw(kind: str, found: Findings, path: Path) -> None:
+def draw(kind: str, found: Discovery, path: Path) -> None:
     """Draw what the two causes leave, against the torque, or the depth, that separates them."""
     from matplotlib.figure import Figure
 
@@ -137,8 +136,8 @@ def draw(kind: str, found: Findings, path: Path) -> None:
     scene, rows = data.context, data.rows.source
     figure = Figure(figsize=(8.4, 2.6), layout='constrained')
     axes = figure.subplots(1, 2, sharey=True)
-    left = data.unexplained(found.selection.empty)[rows]
-    after = data.unexplained(found.selection.solution)[rows]
+    left = data.unexplained(found.empty)[rows]
+    after = data.unexplained(found.solution)[rows]
     if kind == 'sag':
         motion = scene.jacobian[rows]
         length = np.linalg.norm(motion, axis=1)

@@ -9,6 +9,7 @@ import numpy as np
 from calibration_scenes import CHAIN, scene
 
 from remaster_ros.calibration.estimate import Problem, estimate
+from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.kinematics.transforms import apply, inverse
 from remaster_ros.types import FloatArray, Session
@@ -51,3 +52,8 @@ def at_joint(joint: int, values: FloatArray) -> FloatArray:
     angles = np.zeros((len(values), len(CHAIN)))
     angles[:, joint - 1] = values
     return angles
+
+
+def discovered(session: Session, seed: int = 0) -> Discovery:
+    """Search a session for causes."""
+    return discover_session(session, rng=np.random.default_rng(seed))

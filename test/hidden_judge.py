@@ -278,7 +278,7 @@ def _curve_deviation(effect: HiddenEffect, discovery: Any) -> float:
 
     Offset and slope of both are left out: the one is a zero-offset, the other hardly seen.
     """
-    context, solution = discovery.residuals.context, discovery.selection.solution
+    context, solution = discovery.residuals.context, discovery.solution
     q = context.measurements.q[:, effect.joints[0] - 1]
     estimated = np.zeros(len(q))
     for cell, where in zip(solution.cells, solution.slices(), strict=True):

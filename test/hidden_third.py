@@ -79,7 +79,7 @@ def predictions_elsewhere(found: Discovery, third: Session) -> Predictions:
     if model.extension is not None:
         terms, displacement0 = [], np.zeros((len(third.measurements), 3))
         # By their place: two cells without a name may call their parameters alike.
-        solution = found.selection.solution
+        solution = found.solution
         for cell, where in zip(solution.cells, solution.slices(), strict=True):
             if cell.driver == 'time' and not EFFECTS[cell.name].is_cause:
                 # Errors that follow each other belong to the readings, not to the poses.
@@ -95,7 +95,7 @@ def predictions_elsewhere(found: Discovery, third: Session) -> Predictions:
         fit = replace(fit, predictive=replace(fit.predictive, model=model))
     # The factor is that of the rows to fit: None would determine another with these rows.
     widening = predictions_of(found).widening
-    return predict(fit, third.measurements, widening, found.missed.covariance(context))
+    return predict(fit, third.measurements, widening)
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,7 +97,8 @@ class SamplerInfo:
     seconds
         By the clock passed in; NaN without one.
     converged
-        Every R-hat at most 1.01 (Pareto k below 0.7 of draws by importance) and every effective
+        Every R-hat at most 1.01 (Pareto k below 0.7 of draws by importance; nothing of a Gaussian
+        that was asked for) and every effective
         sample size at least what the precision takes, 400 where none was asked for.
     message
         The verdict with its figures, for the report.
@@ -158,9 +159,12 @@ class SamplerInfo:
         else:
             least = run.effective
             figures = (np.full(len(names), np.nan), *np.full((2, len(names)), least))
-            sound = run.method == 'importance' and run.pareto_k < PARETO_LIMIT
+            chosen = run.method == 'laplace' and np.isnan(run.pareto_k)
+            sound = chosen or (run.method == 'importance' and run.pareto_k < PARETO_LIMIT)
             agreement = (
-                f'Pareto k of the importance weights {run.pareto_k:.2f}, '
+                f'a Gaussian about the mode of {len(names)} parameters, which nothing has checked'
+                if chosen
+                else f'Pareto k of the importance weights {run.pareto_k:.2f}, '
                 f'{"below" if run.pareto_k < PARETO_LIMIT else "not below"} {PARETO_LIMIT:g}'
             )
         converged = sound and least >= needed

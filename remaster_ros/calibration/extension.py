@@ -78,9 +78,7 @@ class Extension:
     theta0
         Where it was linearised, (m,).
     prior_precision
-        Gaussian prior (plausible size, smoothness); zeros where flat, (m, m).
-    prior_mean
-        What it is about, (m,); None for 0.
+        Gaussian prior about 0 (plausible size, smoothness); zeros where flat, (m, m).
     joint_offsets
         Zero-offsets that the effects were searched with, those that the gauge held at 0, rad,
         (k,); None where nothing is known of them.
@@ -96,7 +94,6 @@ class Extension:
     displacement0: FloatArray
     theta0: FloatArray
     prior_precision: FloatArray
-    prior_mean: FloatArray | None = None
     joint_offsets: FloatArray | None = None
     step_std: float = np.inf
     start: Start | None = None
@@ -119,10 +116,6 @@ class Extension:
                 shift += _product(term.values[rows], step[..., term.where])
         shift += self.displacement0[rows]
         return shift
-
-    def from_prior_mean(self, theta: FloatArray) -> FloatArray:
-        """Return theta (..., m) less what its prior is about."""
-        return theta if self.prior_mean is None else theta - self.prior_mean
 
     def derivative(self, by_joints: FloatArray, base: FloatArray, rows: IntArray) -> FloatArray:
         """Return the derivative of n points by theta, m per unit, (n, 3, m).

@@ -156,6 +156,6 @@ class Posterior:
             for prior in self.priors:
                 value -= 0.5 * np.sum(prior.residual(x) ** 2, axis=-1)
         if self.model.extension is not None:
-            theta = self.model.extension.from_prior_mean(self.model.theta(z))
+            theta = self.model.theta(z)
             value -= 0.5 * np.sum((theta @ self.model.extension.prior_precision) * theta, axis=-1)
         return np.where(self.inside(points), value, -np.inf)

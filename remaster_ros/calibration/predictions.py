@@ -11,8 +11,7 @@ Mahalanobis distance is below the quantile of chi-squared with three degrees of 
 A model is never quite right, and its errors on poses that it was fitted to are smaller than on
 others. So C is multiplied by one factor, at least 1, such that 95 % of the fitted rows lie in
 their regions when their whole pose is left out (cross-validation; Vovk et al. 2005). Gross errors
-do not count. `remaster discover` leaves whole stretches of a session out instead
-(`discovery.stretches`). For a pose with the errors e, the rows' noise R and M = J Σ J' the errors
+do not count. For a pose with the errors e, the rows' noise R and M = J Σ J' the errors
 left out and their covariance are, without another fit::
 
     e_out = R (R − M)⁻¹ e,    C_out = R (R − M)⁻¹ R
@@ -95,7 +94,6 @@ def predict(
     fit: FitResult,
     measurements: Measurements,
     widening: float | None = None,
-    unmodelled: FloatArray | None = None,
 ) -> Predictions:
     """Predict all rows of a session.
 
@@ -107,9 +105,6 @@ def predict(
         Those that were fitted, in the model's order of sensors and markers.
     widening
         The factor on standard deviations; None where poses left out one by one determine it.
-    unmodelled
-        Covariance of what causes outside the model may displace, in the frame N of the row's
-        sensor, m², (n, 3, 3); None where none are expected.
     """
     model, draws = fit.predictive.model, fit.predictive.draws
     root = (draws - draws.mean(axis=0)) / np.sqrt(max(1, len(draws) - 1))
@@ -132,8 +127,6 @@ def predict(
         widening = 1.0
         if len(left_out) >= FEWEST_ROWS:
             widening = max(1.0, float(np.sqrt(np.quantile(left_out, REGION) / limit)))
-    if unmodelled is not None:
-        covariance += unmodelled
     covariance *= widening**2
     distance = squared_distances(measurements.position - position, covariance)
     return Predictions(position, covariance, distance <= limit, widening)

@@ -114,8 +114,6 @@ def prior_rows(
     by_z[:, :core] = (values[1 : core + 1] - values[core + 1 :]).T / 2e-6
     root = model.extension_root
     theta = model.theta(z)
-    if model.extension is not None:
-        theta = model.extension.from_prior_mean(theta)
     by_theta = np.concatenate((np.zeros((len(root), core)), root), axis=1)
     return (
         np.concatenate((values[0], root @ theta)),

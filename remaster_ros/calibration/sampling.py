@@ -174,6 +174,29 @@ def sample_posterior(
     return Sampling(run._replace(log_density_error=error, checked=len(points)), name)
 
 
+def gaussian_draws(mode: Mode, *, chains: int, rng: np.random.Generator) -> Sampling:
+    """Draw from the Gaussian about the mode, which the posterior of many linear effects is.
+
+    Parameters as by the linearised posterior at the mode's noise, the noise by its own curvature.
+    """
+    count = chains * FIRST_DRAWS
+    parts = []
+    for mean, covariance in (
+        (mode.z[mode.linearisation.posterior.free], mode.covariance),
+        (mode.eta, mode.eta_covariance),
+    ):
+        unit = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
+        scaled = covariance / np.outer(unit, unit)
+        values, vectors = np.linalg.eigh(scaled)
+        root = unit[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        parts.append(mean + rng.standard_normal((count, len(mean))) @ root.T)
+    points = np.concatenate(parts, axis=1).reshape(chains, FIRST_DRAWS, -1)
+    return Sampling(
+        Chains(points, float('nan'), points, method='laplace', effective=float(count)),
+        'Gaussian about the mode',
+    )
+
+
 def _proposed(
     proposal: LaplaceProposal, log_density: LogDensity, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:

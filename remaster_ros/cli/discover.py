@@ -125,7 +125,11 @@ def summary(
     """Return verdict, causes, gain and coverage of the held-out rows in a few lines."""
     lines = [f'verdict: {found.verdict}', judged.headline]
     for effect in found.effects:
-        share = '' if effect.share is None else f', {percent(effect.share)} of the gain'
+        share = (
+            ''
+            if effect.share is None
+            else f', without it {percent(effect.share)} of the gain is lost'
+        )
         lines.append(f'{effect.title}: {1e3 * effect.size_m:.3f} mm{share}; {effect.cause}')
         if effect.remedy:
             lines.append(f'    to do: {effect.remedy}')

@@ -28,11 +28,9 @@ from remaster_ros.discovery.side_by_side import (
     rms_sigmas,
 )
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.stretches import compare_stretches
-from remaster_ros.discovery.undetected import undetected
 from remaster_ros.errors import InputError
 from remaster_ros.linear_algebra import one_thread
-from remaster_ros.types import BoolArray, FloatArray, Session
+from remaster_ros.types import BoolArray, Session
 
 # Zero-offsets with which a session's error is so many times that with its own, and which differ
 # by so many standard deviations on the average, are not its own.
@@ -152,9 +150,7 @@ def confirm(discovery: Discovery, session: Session) -> Confirmation:
     every = [part.within for part in there.parts]
     before, own = there.error((), ()), there.error((), every)
     after = there.error(every, ())
-    offsets = compare_offsets(
-        discovery.fit, there.found, there.data, there.own, there.unmodelled, there.parts
-    )
+    offsets = compare_offsets(discovery.fit, there.found, there.data, there.own, there.parts)
     carried = share_of_gain(before, after, own)
     frozen_offsets = there.error_with_offsets(discovery)
     agree = not rms_sigmas(offsets) > OTHER_SIGMAS
@@ -216,9 +212,6 @@ class _OtherSession:
         Rows in which each cause was seen or has something in its place, (all rows,).
     own
         The fit with the causes and what lies beyond.
-    unmodelled
-        How causes too small to be found, and stretches that differ, move its parameters; see
-        `undetected` and `stretches`.
     """
 
     found: Estimate
@@ -229,7 +222,6 @@ class _OtherSession:
     beyond: tuple[Cell, ...]
     known: BoolArray
     own: Solution
-    unmodelled: FloatArray
 
     @classmethod
     def of(cls, discovery: Discovery, found: Estimate) -> _OtherSession:
@@ -261,9 +253,7 @@ class _OtherSession:
             parts = shown
         assert own is not None
         values = dict(zip(discovery.fit.theta_names, discovery.fit.theta, strict=True))
-        moves = undetected(found, data, own).moves, compare_stretches(found, data, own).moves
-        unmodelled = np.concatenate(moves, axis=1)
-        return cls(found, data, values, given, tuple(parts), tuple(beyond), known, own, unmodelled)
+        return cls(found, data, values, given, tuple(parts), tuple(beyond), known, own)
 
     def error(
         self,
@@ -327,9 +317,7 @@ def _confirmed(
         tuple(
             row
             for part in mine
-            for row in compare_cell(
-                discovery.fit, part, there.data.part, there.own, there.unmodelled
-            )
+            for row in compare_cell(discovery.fit, part, there.data.part, there.own)
         ),
     )
 

@@ -33,8 +33,7 @@ def refine_moments(
         Fits a set, with a start.
     """
     for cell in solution.cells:
-        between = EFFECTS[cell.name].between
-        if between is None:
+        if np.isnan(cell.moment) or (between := EFFECTS[cell.name].between) is None:
             continue
         moments = np.unique([other.moment for other in tried if other.name == cell.name])
         low = np.max(moments[moments < cell.moment], initial=-np.inf)

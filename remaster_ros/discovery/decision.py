@@ -14,12 +14,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.special import ndtri_exp
 
+from remaster_ros.discovery.causes import NEEDED
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
-from remaster_ros.discovery.explain import TIED
-from remaster_ros.discovery.families import family_log_prior
 from remaster_ros.discovery.words import called
 from remaster_ros.linear_algebra import one_thread
 
@@ -102,7 +101,7 @@ def _decision(found: Discovery, cause: Named, look_alike: Named) -> Decision:
     first, second = (bare if one is None else max(one, bare) for one in (first, second))
     difference = first - second
     winner = cause if difference > 0.0 else look_alike
-    decided = abs(difference) > TIED and winner in named
+    decided = abs(difference) > NEEDED and winner in named
     answer: Literal['cause', 'look_alike', 'open'] = 'open'
     if decided:
         answer = 'cause' if difference > 0.0 else 'look_alike'
@@ -110,7 +109,7 @@ def _decision(found: Discovery, cause: Named, look_alike: Named) -> Decision:
 
 
 def _rest(found: Discovery, *causes: Named) -> tuple[Cell, ...]:
-    cells = found.selection.chosen.cells
+    cells = found.named.cells
     return tuple(cell for cell in cells if not any(_belongs(cell, one) for one in causes))
 
 
@@ -120,15 +119,15 @@ def _belongs(cell: Cell, cause: Named) -> bool:
 
 
 def _without(found: Discovery, *causes: Named) -> float:
-    solution = found.selection.chosen
+    solution = found.named
     rest = _rest(found, *causes)
-    bare = solve(found.residuals, rest, solution, prior=family_log_prior(rest, _cells(found)))
+    bare = solve(found.residuals, rest, solution)
     return -np.inf if bare is None else bare.log_evidence
 
 
 def _evidence(found: Discovery, cause: Named, other: Named) -> float | None:
     """Return the log evidence with a cause in place of another; None where it cannot be fitted."""
-    solution, every = found.selection.chosen, _cells(found)
+    solution, every = found.named, _cells(found)
     rest = _rest(found, cause, other)
     present = tuple(cell for cell in solution.cells if _belongs(cell, cause))
     whole = {joint for cell in present for joint in cell.joints} == {*cause.joints}
@@ -136,8 +135,7 @@ def _evidence(found: Discovery, cause: Named, other: Named) -> float | None:
     best = None
     for cells in sets:
         together = (*rest, *cells)
-        prior = family_log_prior(together, every)
-        fit = solve(found.residuals, together, solution, prior=prior)
+        fit = solve(found.residuals, together, solution)
         if fit is None or fit.unphysical():
             continue
         if best is None or fit.log_evidence > best:

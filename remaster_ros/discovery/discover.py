@@ -1,15 +1,16 @@
 """What the simulation gets wrong: its cause by name, the model extended by it, the gain measured.
 
-`discover_session` takes the residuals of the offsets model, screens every cell (place, driver,
-form), and adds those that pass the tests of `stepwise_selection`. Optimization rows decide;
-validation rows only measure the gain.
+One model holds every kind of error (`random_effects`): what stands out of it is named (`causes`),
+and what does not keeps a variance of its own, so that offsets and predictions state what errors
+that nobody can name would do to them. Optimization rows decide; validation rows only measure the
+gain, and refuse a model that predicts them worse than the offsets do.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -20,13 +21,11 @@ from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
-from remaster_ros.discovery.beside_memory import withstanding_memory
-from remaster_ros.discovery.combined_searches import holds
+from remaster_ros.discovery.causes import NAMED, Search
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.explain import FoundEffect, describe
-from remaster_ros.discovery.findings import Findings
 from remaster_ros.discovery.gain import (
     Gain,
     gain_of,
@@ -34,37 +33,31 @@ from remaster_ros.discovery.gain import (
     pose_common_fraction,
     residuals_of,
 )
-from remaster_ros.discovery.guard import Unexplained, harm_of, held, is_harmful, unfitted
-from remaster_ros.discovery.marker_offsets import held_markers, loosened, moved_markers
-from remaster_ros.discovery.model_averaging import moved_by_look_alikes
+from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, unfitted
+from remaster_ros.discovery.marker_offsets import loosened, moved_markers
 from remaster_ros.discovery.omnibus import structure_left
-from remaster_ros.discovery.plain_forms import plainest
-from remaster_ros.discovery.repeated_search import RepeatedSearch, repeat_search
+from remaster_ros.discovery.random_effects import by_members, kinds
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.selection import Selection
-from remaster_ros.discovery.set_aside import (
-    moved_by_memory,
-    set_aside,
-)
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.stepwise_selection import Search
-from remaster_ros.discovery.stretches import Stretches, compare_stretches
 from remaster_ros.discovery.thinning import Thinning, draw_rows, judge_by_others
 from remaster_ros.discovery.to_extension import (
     extension_of,
+    moved_by,
     moved_by_open_offsets,
     offsets_of,
 )
-from remaster_ros.discovery.undetected import Undetected, undetected
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.linear_algebra import one_thread
-from remaster_ros.types import FloatArray, IntArray, Priors, Session
+from remaster_ros.types import FloatArray, IntArray, Session
 
 Verdict = Literal['effects', 'none', 'undetermined', 'unexplained']
 # Of the means, in standard deviations: 400 effective draws, enough for values of two figures.
 PRECISION = 0.05
 # A cause with this share of the gain is one of the leaders.
 LEADING_SHARE = 0.1
+# A kind of error whose members displace the marker by less than this share of the noise, RMS,
+# moves no offset and no prediction by a noticeable part of its standard deviation.
+LEAST_SHOWN = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,10 +82,10 @@ class Discovery:
     untestable
         Name of an effect -> why this session cannot show it.
     groups
-        The cells of each effect that was searched for, in the order of ``effects``; those of
-        structure without a cause are in ``selection`` alone.
-    selection
-        How the cells were found.
+        The cells of each effect that was searched for, in the order of ``effects``.
+    empty, named, solution
+        Fits of the offsets alone, of these with the causes and located structure, and of the whole
+        model with all kinds of errors that have no name of their own.
     residuals
         What the search worked on.
     offsets_before
@@ -102,17 +95,11 @@ class Discovery:
     thinning
         Which part of a large session was searched, and how the causes hold on the rest; None where
         all of it was searched.
-    stretches
-        How stretches of the session agree with each other.
-    missed
-        Causes that the search may have missed.
     residuals_before
         Measured minus modelled position of every row with the zero-offsets alone, in the frame of
         its sensor, m, (n, 3).
     unexplained
         Structure that no cause explains.
-    repeated
-        What the search finds without some of the poses; None where it was not repeated.
     """
 
     verdict: Verdict
@@ -124,22 +111,14 @@ class Discovery:
     untestable: Mapping[str, str]
     offsets_before: tuple[FloatArray, FloatArray]
     groups: tuple[tuple[Cell, ...], ...]
-    selection: Selection
+    empty: Solution
+    named: Solution
+    solution: Solution
     residuals: Residuals
     fit: FitResult
-    stretches: Stretches
-    missed: Undetected
     residuals_before: FloatArray
     thinning: Thinning | None = None
     unexplained: tuple[Unexplained, ...] = ()
-    repeated: RepeatedSearch | None = None
-
-    @property
-    def widening(self) -> float | None:
-        """Factor on the size of the predicted 95 % regions; None where nothing shows it."""
-        if self.repeated is None:
-            return self.stretches.widening
-        return max(self.repeated.widening, self.stretches.widening or 1.0)
 
 
 @one_thread
@@ -171,144 +150,9 @@ def discover_session(
         Data that do not allow an answer.
     """
     report = progress if progress is not None else silent
-    findings = find_causes(session, rng=rng, progress=report)
-    unexplained: tuple[Unexplained, ...] = ()
-    try:
-        findings, sampled = _combined_or_not(session, findings, rng, report, clock)
-        fit, gain, stretches, missed = sampled
-    except InsufficientDataError as error:
-        if not findings.selection.solution.cells:
-            raise
-        findings = findings.not_combined()
-        suggested = findings.effects + findings.structure
-        try:
-            markers = held_markers(findings.found)
-            fit, gain, stretches, missed = _sampled(session, findings, rng, report, clock, markers)
-            unexplained = (held(gain.noise_floor_m, markers, error),)
-        except InsufficientDataError:
-            unexplained = (unfitted(findings.residuals.errors, suggested, error),)
-            findings = findings.without_causes()
-            fit, gain, stretches, missed = _sampled(session, findings, rng, report, clock)
-    if (findings.effects or findings.structure) and is_harmful(gain):
-        unexplained = (harm_of(findings.before, fit, gain, findings.effects + findings.structure),)
-        findings = findings.without_causes()
-        fit, gain, stretches, missed = _sampled(session, findings, rng, report, clock)
-    residuals, solution = findings.residuals, findings.selection.solution
-    structure, gross = structure_left(
-        residuals, solution, fit, findings.structure, findings.searched
-    )
-    unexplained += structure
-    effects = tuple(
-        effect.sampled(fit, group, residuals.part)
-        for effect, group in itertools.zip_longest(findings.effects, findings.groups, fillvalue=())
-        if isinstance(effect, FoundEffect)
-    )
-    verdict: Verdict = 'effects' if effects else 'unexplained' if unexplained else 'none'
-    # A tie over a small remainder does not put the rest in doubt. The largest leads in any case:
-    # where held-out poses gain nothing no share is known.
-    leading = [effect for effect in effects if (effect.share or 0.0) > LEADING_SHARE]
-    if any(effect.tied for effect in (*effects[:1], *leading)):
-        verdict = 'undetermined'
-    return Discovery(
-        verdict=verdict,
-        effects=effects,
-        gain=gain,
-        pose_common_fraction=pose_common_fraction(residuals, solution),
-        noise_by_range=noise_by_range(residuals, solution),
-        outliers=fit.left_out + gross,
-        untestable=findings.untestable,
-        offsets_before=offsets_of(findings.before),
-        groups=findings.groups,
-        selection=findings.selection,
-        residuals=residuals,
-        fit=fit,
-        stretches=stretches,
-        missed=missed,
-        residuals_before=residuals_of(findings.before),
-        thinning=findings.thinning,
-        unexplained=unexplained,
-        repeated=findings.repeated,
-    )
-
-
-def _combined_or_not(
-    session: Session,
-    findings: Findings,
-    rng: np.random.Generator,
-    report: Progress,
-    clock: Callable[[], float] | None,
-) -> tuple[Findings, tuple[FitResult, Gain, Stretches, Undetected]]:
-    """Sample the model of several searches, or that of one where their mean does not hold."""
-    if findings.selection.before_combining is not None:
-        try:
-            sampled = _sampled(session, findings, rng, report, clock)
-        except InsufficientDataError:
-            pass
-        else:
-            fit, gain = sampled[:2]
-            as_meant = holds(findings.residuals, findings.selection.solution, fit.residuals_after)
-            if as_meant and fit.sampler.converged and not is_harmful(gain):
-                return findings, sampled
-    findings = findings.not_combined()
-    return findings, _sampled(session, findings, rng, report, clock)
-
-
-def _sampled(
-    session: Session,
-    findings: Findings,
-    rng: np.random.Generator,
-    report: Progress,
-    clock: Callable[[], float] | None,
-    priors: Priors | None = None,
-) -> tuple[FitResult, Gain, Stretches, Undetected]:
-    """Sample the model with the causes found, and measure its gain on held-out rows.
-
-    Priors are those that let moved markers go, where none are given.
-    """
-    residuals, solution, found = findings.residuals, findings.selection.solution, findings.found
-    chosen = findings.selection.chosen
-    stretches = compare_stretches(found, residuals, chosen)
-    missed = undetected(found, residuals, solution)
-    alike = moved_by_look_alikes(
-        found, residuals, findings.selection, findings.effects, findings.groups
-    )
-    # The cells of the search come first in what combines it with others.
-    more = len(solution.parameters) - len(chosen.parameters)
-    unmodelled = [missed.moves, np.pad(stretches.moves, ((0, more), (0, 0))), alike]
-    if solution.cells:
-        unmodelled.append(moved_by_open_offsets(found, residuals, solution))
-    if (aside := findings.aside) is not None:
-        unmodelled.append(moved_by_memory(found, residuals, solution, aside.memory))
-    if findings.repeated is not None:
-        unmodelled.append(findings.repeated.moves)
-    fit = fit_session(
-        session,
-        rng=rng,
-        clock=clock,
-        priors=loosened(session, findings.effects) if priors is None else priors,
-        precision=PRECISION,
-        extension=extension_of(residuals, solution, found) if solution.cells else None,
-        unmodelled=np.concatenate(unmodelled, axis=1),
-        progress=lambda _, share: report('sampling the extended model', share),
-    )
-    return fit, gain_of(findings.before, residuals, solution, fit, rng), stretches, missed
-
-
-def find_causes(session: Session, *, rng: np.random.Generator, progress: Progress) -> Findings:
-    """Search a session for causes; see `discover_session`."""
-    progress('offsets', 0.0)
-    before = found = sound_estimate(session)
-    residuals = Residuals.of(found)
-    bare = solve(residuals, ())
-    moved = moved_markers(found, residuals, bare) if bare is not None else ()
-    if moved:
-        # A marker that is pulled to where it is not leaves errors for other causes to explain.
-        found = estimate(Problem.of(session, loosened(session, moved)))
-        residuals = Residuals.of(found)
-    pool = draw_rows(found.problem.measurements, found.problem.fitted, rng)
-    thinned = len(pool) < len(found.problem.fitted)
-    if thinned:
-        residuals = residuals.only(np.intersect1d(pool, found.kept))
+    report('offsets', 0.0)
+    before = sound_estimate(session)
+    found, residuals, pool = _to_search(session, before, rng)
     untestable = {
         name: why for name, effect in EFFECTS.items() if (why := effect.needs(residuals.context))
     }
@@ -318,73 +162,197 @@ def find_causes(session: Session, *, rng: np.random.Generator, progress: Progres
         if name not in untestable and not effect.moves_the_fit
         for cell in effect.cells(residuals.context)
     ]
-    search = Search(
-        residuals,
-        tuple(cells),
-        rng,
-        lambda data, solution: _judged(found, data, solution, pool),
-        lambda share: progress('searching causes', share),
+    search = Search(residuals, cells, lambda share: report('searching causes', share))
+    named = search.run()
+    if (judged := _judged(found, residuals, named, search, pool)) is not residuals:
+        search, named = search.again(judged, named)
+    named, groups, described = _that_help(search, named, report)
+    unexplained: tuple[Unexplained, ...] = ()
+    sampled: _Sampled | None = None
+    try:
+        sampled = _sampled(session, before, found, search, named, described, rng, report, clock)
+        if is_harmful(sampled.gain):
+            if described:
+                unexplained = (harm_of(before, sampled.fit, sampled.gain, described),)
+            sampled = None
+    except InsufficientDataError as error:
+        if described:
+            unexplained = (unfitted(residuals.errors, described, error),)
+    if sampled is None:
+        found, search = before, Search(Residuals.of(before), ())
+        empty = search.fit(())
+        assert empty is not None
+        named, groups, described = empty, (), ()
+        sampled = _sampled(session, before, found, search, named, (), rng, report, clock)
+    data, solution, fit, gain = search.data, sampled.solution, sampled.fit, sampled.gain
+    is_cause = [EFFECTS[group[0].name].is_cause for group in groups]
+    structure = tuple(e for e, cause in zip(described, is_cause, strict=True) if not cause)
+    left, gross = structure_left(data, solution, fit, structure)
+    unexplained += left
+    groups = tuple(itertools.compress(groups, is_cause))
+    effects = tuple(
+        effect.sampled(fit, group, data.part)
+        for effect, group in zip(itertools.compress(described, is_cause), groups, strict=True)
     )
-    selection = search.run()
-    solution = withstanding_memory(search, selection.solution)
-    solution = plainest(solution, search.data, search.catalogue, search.fit)
-    selection = replace(selection, solution=solution)
-    residuals = search.data
-    groups, described = describe(
-        residuals,
-        selection,
-        search.catalogue,
-        search.fit,
-        lambda share: progress('comparing look-alikes', share),
-    )
-    causes = [EFFECTS[group[0].name].is_cause for group in groups]
-    effects = tuple(itertools.compress(described, causes))
-    structure = tuple(effect for effect, cause in zip(described, causes, strict=True) if not cause)
-    aside = set_aside(residuals, selection.solution, search.fit)
-    if aside is not None:
-        selection = replace(selection, solution=aside.solution)
-        structure = aside.said(structure)
-    repeated = repeat_search(
-        found,
-        search,
-        selection.solution,
-        lambda share: progress('searching again without some of the poses', share),
-        combine=aside is None,
-    )
-    if repeated is not None and repeated.solution is not selection.solution:
-        selection = replace(
-            selection, solution=repeated.solution, before_combining=selection.solution
-        )
-    memory = None if aside is None else aside.memory
-    effects += moved_markers(found, residuals, selection.chosen, memory)
+    effects += tuple(effect.sampled(fit) for effect in moved_markers(found, data, named))
+    verdict: Verdict = 'effects' if effects else 'unexplained' if unexplained else 'none'
+    # A tie over a small remainder does not put the rest in doubt. The largest leads in any case:
+    # where held-out poses gain nothing no share is known.
+    leading = [effect for effect in effects if (effect.share or 0.0) > LEADING_SHARE]
+    if any(effect.tied for effect in (*effects[:1], *leading)):
+        verdict = 'undetermined'
+    empty = search.fit(())
+    assert empty is not None
     thinning = None
-    if thinned:
-        thinning = judge_by_others(
-            residuals, found.kept, residuals.rows.source, selection.empty, selection.solution
-        )
-    groups = tuple(itertools.compress(groups, causes))
-    return Findings(
-        before,
-        found,
-        residuals,
-        selection,
-        groups,
-        effects,
-        structure,
-        untestable,
-        thinning,
-        aside,
-        repeated,
+    if len(pool) < len(found.problem.fitted):
+        thinning = judge_by_others(data, found.kept, data.rows.source, empty, solution)
+    return Discovery(
+        verdict=verdict,
+        effects=effects,
+        gain=gain,
+        pose_common_fraction=pose_common_fraction(data, solution),
+        noise_by_range=noise_by_range(data, solution),
+        outliers=fit.left_out + gross,
+        untestable=untestable,
+        offsets_before=offsets_of(before),
+        groups=groups,
+        empty=empty,
+        named=named,
+        solution=solution,
+        residuals=data,
+        fit=fit,
+        residuals_before=residuals_of(before),
+        thinning=thinning,
+        unexplained=unexplained,
     )
+
+
+def _to_search(
+    session: Session, before: Estimate, rng: np.random.Generator
+) -> tuple[Estimate, Residuals, IntArray]:
+    """Return the fit to search beside, its residuals, and the rows that may be searched."""
+    found, residuals = before, Residuals.of(before)
+    bare = solve(residuals, ())
+    moved = moved_markers(found, residuals, bare) if bare is not None else ()
+    if moved:
+        # A marker that is pulled to where it is not leaves errors for other causes to explain.
+        found = estimate(Problem.of(session, loosened(session, moved)))
+        residuals = Residuals.of(found)
+    pool = draw_rows(found.problem.measurements, found.problem.fitted, rng)
+    if len(pool) < len(found.problem.fitted):
+        residuals = residuals.only(np.intersect1d(pool, found.kept))
+    return found, residuals, pool
+
+
+def _that_help(
+    search: Search, named: Solution, report: Progress
+) -> tuple[Solution, tuple[tuple[Cell, ...], ...], tuple[FoundEffect, ...]]:
+    """Return the causes without those that take the held-out poses further off.
+
+    What they explain of the fitted rows is left to the variances of all kinds of errors.
+    """
+    while True:
+        groups, effects = describe(
+            search, named, lambda share: report('comparing look-alikes', share)
+        )
+        if not search.data.context.measurements.is_validation.any():
+            return named, groups, effects
+        worst = min(
+            (index for index, effect in enumerate(effects) if (effect.share or 0.0) < 0.0),
+            key=lambda index: effects[index].share or 0.0,
+            default=None,
+        )
+        if worst is None:
+            return named, groups, effects
+        out = set(groups[worst])
+        out |= {one.cell for one in search.families if out & set(one.members)}
+        fewer = search.fit([cell for cell in named.cells if cell not in out], named)
+        if fewer is None:
+            return named, groups, effects
+        named = fewer
+
+
+@dataclass(frozen=True, eq=False)
+class _Sampled:
+    solution: Solution
+    fit: FitResult
+    gain: Gain
+
+
+def _sampled(
+    session: Session,
+    before: Estimate,
+    found: Estimate,
+    search: Search,
+    named: Solution,
+    described: Sequence[FoundEffect],
+    rng: np.random.Generator,
+    report: Progress,
+    clock: Callable[[], float] | None,
+) -> _Sampled:
+    """Sample the model of the causes and of all kinds of errors, and measure its gain."""
+    data = search.data
+    solution, unmodelled = complete(found, search, named)
+    if solution.cells:
+        unmodelled = np.concatenate(
+            (unmodelled, moved_by_open_offsets(found, data, solution)), axis=1
+        )
+    fit = fit_session(
+        session,
+        rng=rng,
+        clock=clock,
+        # Priors that let moved markers go.
+        priors=None if found is before else found.problem.priors,
+        precision=PRECISION,
+        extension=extension_of(data, solution, found) if solution.cells else None,
+        unmodelled=unmodelled,
+        progress=lambda _, share: report('sampling the extended model', share),
+    )
+    return _Sampled(solution, fit, gain_of(before, data, solution, fit, rng))
+
+
+def complete(found: Estimate, search: Search, named: Solution) -> tuple[Solution, FloatArray]:
+    """Return the model of the causes, and how errors of all other kinds would move it.
+
+    Kinds without a name join the model, one variance each, where the evidence misses them all
+    together as it would miss a cause; else a model with them predicts worse than one without
+    (chance gives half of all variances a value). Their variances then move what was fitted.
+
+    Returns
+    -------
+    solution
+        The fit, by members.
+    moves
+        Of all natural parameters of the fit and those of the solution, one standard deviation of
+        each weight of a kind that did not join, (size + m, c).
+    """
+    data = search.data
+    members = by_members(named, search.families)
+    rest = kinds(data, search.catalogue.cells, members.cells)
+    whole = solve(data, (*named.cells, *(family.cell for family in rest)), named) if rest else None
+    if whole is None:
+        return members, np.zeros((found.model.size + len(members.parameters), 0))
+    weights = dict(zip(whole.cells, whole.smoothness, strict=True))
+    if whole.log_evidence > named.log_evidence + NAMED:
+        least = LEAST_SHOWN * data.noise_model.sensor_noise(whole.noise).total.min()
+        shown = [family for family in rest if weights[family.cell] ** -0.5 > least]
+        whole = solve(data, (*named.cells, *(family.cell for family in shown)), whole) or whole
+        joined = [family for family in rest if family.cell in whole.cells]
+        joint = by_members(whole, [*search.families, *joined])
+        return joint, np.zeros((found.model.size + len(joint.parameters), 0))
+    unseen = np.concatenate(
+        [data.columns([family.cell]) * weights[family.cell] ** -0.5 for family in rest], axis=2
+    )
+    return members, moved_by(found, data, members, unseen)
 
 
 def _judged(
-    found: Estimate, residuals: Residuals, solution: Solution, pool: IntArray
+    found: Estimate, residuals: Residuals, solution: Solution, search: Search, pool: IntArray
 ) -> Residuals:
-    """Return the residuals of the rows of the pool that the extended model does not call gross."""
+    """Return the residuals of the rows of the pool that the causes do not show to be gross."""
     problem = found.problem
     every = residuals.only(pool)
-    left = every.left(solution)
+    left = every.left(by_members(solution, search.families))
     try:
         gross = find_outliers(every.rows, lambda keep: left, left, problem.sensor_names).gross
     except InsufficientDataError:

@@ -9,16 +9,12 @@ import numpy as np
 
 from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.result import FitResult
-from remaster_ros.discovery.catalogue import Catalogue
+from remaster_ros.discovery.causes import FEWEST_MEMBERS, NEEDED, Search, grouped, p_value
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
-from remaster_ros.discovery.families import WHOLE, grouped
-from remaster_ros.discovery.plain_forms import AS_WELL, SCREENING_ERROR, is_special_case
-from remaster_ros.discovery.proposals import Fit
+from remaster_ros.discovery.random_effects import by_members
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.screening import screen
-from remaster_ros.discovery.selection import Selection
 from remaster_ros.discovery.shares import shares
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.words import (
@@ -31,8 +27,6 @@ from remaster_ros.discovery.words import (
 
 # Look-alikes within this of the evidence are named; within the other, the leaders tie.
 CONFUSABLE = 5.0
-# Odds of exp(3), twenty to one, do not decide between two causes.
-TIED = AS_WELL
 SHORTLIST = 10
 # A cause of a smaller size, in its standard deviations, was as often wrong as right in the hidden
 # world (benchmarks/RESULTS.md).
@@ -182,53 +176,44 @@ def with_sizes(cause: str, sizes: Sequence[str]) -> str:
 
 
 def describe(
-    data: Residuals,
-    selection: Selection,
-    catalogue: Catalogue,
-    fit: Fit,
-    progress: Callable[[float], None],
+    search: Search, solution: Solution, progress: Callable[[float], None]
 ) -> tuple[tuple[tuple[Cell, ...], ...], tuple[FoundEffect, ...]]:
-    """Return the chosen cells grouped to causes, and the causes, the largest first.
+    """Return the cells of a solution grouped to causes, and the causes, the largest first.
 
     Parameters
     ----------
-    data, selection, catalogue
-        What was searched, what was found, and all cells that were tried.
-    fit
-        Fits a set of cells, as the search does.
+    search
+        What found them.
+    solution
+        With the cells of families as one.
     progress
         Called with the share that is done.
     """
-    solution = selection.solution
-    if not solution.cells:
+    data = search.data
+    members = by_members(solution, search.families)
+    if not members.cells:
         return (), ()
-    groups = sorted(grouped(solution.cells), key=lambda group: -_size(data, solution, group))
-    parts = shares(data, groups, solution)
+    groups = sorted(grouped(members.cells), key=lambda group: -_size(data, members, group))
+    parts = shares(data, groups, members)
     effects = []
     for count, (group, share) in enumerate(zip(groups, parts, strict=True)):
         progress(count / len(groups))
-        effects.append(_described(data, selection, catalogue, fit, group, share))
+        effects.append(_described(search, solution, members, group, share))
     return tuple(groups), tuple(effects)
 
 
 def _described(
-    data: Residuals,
-    selection: Selection,
-    catalogue: Catalogue,
-    fit: Fit,
-    group: tuple[Cell, ...],
-    share: float,
+    search: Search, solution: Solution, members: Solution, group: tuple[Cell, ...], share: float
 ) -> FoundEffect:
-    solution = selection.solution
-    first = group[0]
-    wheres = dict(zip(solution.cells, solution.slices(), strict=True))
+    data, first = search.data, group[0]
+    wheres = dict(zip(members.cells, members.slices(), strict=True))
     parameters = tuple(
         Parameter(name, float(value), float(np.sqrt(variance)), cell.unit)
         for cell in group
         for name, value, variance in zip(
             cell.parameters,
-            solution.parameters[wheres[cell]],
-            np.diag(solution.covariance)[wheres[cell]],
+            members.parameters[wheres[cell]],
+            np.diag(members.covariance)[wheres[cell]],
             strict=True,
         )
     )
@@ -238,30 +223,27 @@ def _described(
         gap = elapsed[elapsed > first.moment].min() - elapsed[elapsed <= first.moment].max()
         std = float(np.hypot(first.moment_std, gap / np.sqrt(12.0)))
         parameters += (Parameter('moment', first.moment, std, 's'),)
-    rest = tuple(cell for cell in solution.cells if cell not in group)
-    without = fit(rest, solution)
-    gain = sum(step.log_evidence_gain for step in selection.steps)
-    if without is not None:
-        gain = solution.log_evidence - without.log_evidence
-    p_values = [step.p_value for step in selection.steps if set(step.cells) & set(group)]
-    if not p_values:
-        # It came in exchange for what had passed.
-        p_values = [max(step.p_value for step in selection.steps)]
+    # A family is one cell of the search, whichever of its kinds this is.
+    families = {family.cell for family in search.families if set(group) & set(family.members)}
+    mine = {cell for cell in solution.cells if cell in group or cell in families}
+    without = search.fit([cell for cell in solution.cells if cell not in mine], solution)
+    # What cannot be fitted without it is there by all that is known.
+    gain = np.inf if without is None else solution.log_evidence - without.log_evidence
     alike: tuple[LookAlike, ...] = ()
-    if without is not None and len(group) < WHOLE:
-        alike = _look_alikes(data, solution, without, catalogue, fit, group)
-    effect = FoundEffect(
+    if without is not None and len(mine) < FEWEST_MEMBERS and not mine & families:
+        alike = _look_alikes(search, solution, without, group)
+    return FoundEffect(
         name=EFFECTS[first.name].reported_as or first.name,
         joints=_joints(group),
         place=first.place,
         driver=first.driver,
         form=first.form,
         parameters=parameters,
-        p_value=float(min(p_values)),
-        log_evidence_gain=float(gain),
+        p_value=p_value(gain),
+        log_evidence_gain=float(min(gain, solution.log_evidence)),
         confusable_with=alike,
         cause=in_words(group, data.part) + _also_called(alike),
-        size_m=_size(data, solution, group),
+        size_m=_size(data, members, group),
         share=share,
         remedy=EFFECTS[first.name].remedy.format(driver=first.driver.replace('_', ' ')),
         title=titled(first, _joints(group)),
@@ -269,11 +251,10 @@ def _described(
         of_measurement=first.of_measurement,
         moment_s=first.moment if first.happened else None,
         tied=any(
-            not (other.same or other.general) and other.log_evidence_gain > gain - TIED
+            not (other.same or other.general) and other.log_evidence_gain > gain - NEEDED
             for other in alike
         ),
     )
-    return effect
 
 
 def _also_called(alike: Sequence[LookAlike]) -> str:
@@ -294,32 +275,21 @@ def _joints(group: Sequence[Cell]) -> tuple[int, ...]:
 
 
 def _look_alikes(
-    data: Residuals,
-    solution: Solution,
-    without: Solution,
-    catalogue: Catalogue,
-    fit: Fit,
-    group: tuple[Cell, ...],
+    search: Search, solution: Solution, without: Solution, group: tuple[Cell, ...]
 ) -> tuple[LookAlike, ...]:
     """Return the other causes that explain nearly as much in a group's place.
 
     Of one cell; those of two cells may be one of the two alone.
     """
-    rest = replace(without, noise=solution.noise)
-    score = screen(data, catalogue, rest, chosen=catalogue.cheap).score
+    data, cell = search.data, group[0]
     best: dict[tuple[str, tuple[int, ...]], LookAlike] = {}
-    cell, own = group[0], solution.log_evidence - without.log_evidence
-    if len(group) == 1:
-        own = float(np.max(score[catalogue.which([cell])], initial=-np.inf))
-    least = own - SCREENING_ERROR - CONFUSABLE
-    for index in np.argsort(-score)[:SHORTLIST]:
-        other = catalogue.cells[index]
-        if score[index] < least or not np.isfinite(score[index]):
-            break
+    rest = replace(without, noise=solution.noise)
+    least = solution.log_evidence - CONFUSABLE
+    for found in search.in_place(rest, least):
+        other = next(one for one in found.cells if one not in without.cells)
         if (other.name, other.joints) == (cell.name, _joints(group)):
             continue
-        found = fit((*without.cells, other), solution)
-        if found is None or found.log_evidence < solution.log_evidence - CONFUSABLE:
+        if found.log_evidence < least:
             continue
         gain = found.log_evidence - without.log_evidence
         key = (other.name, other.joints)
@@ -336,6 +306,16 @@ def _look_alikes(
             titled(other, other.joints),
         )
     return tuple(sorted(best.values(), key=lambda alike: -alike.log_evidence_gain))
+
+
+def is_special_case(cell: Cell, form: Cell) -> bool:
+    """Return whether a cell is one of the shapes that a free form can have."""
+    return (
+        form.penalty is not None
+        and cell.penalty is None
+        and (cell.place, cell.driver, cell.joints, cell.subject)
+        == (form.place, form.driver, form.joints, form.subject)
+    )
 
 
 def _same(data: Residuals, solution: Solution, cell: Cell, other: Cell) -> bool:

@@ -31,8 +31,7 @@ from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.random_effects import Family, by_members
 from remaster_ros.discovery.residuals import Residuals
-from remaster_ros.discovery.stretches import root_of_inverse
-from remaster_ros.discovery.to_extension import extension_of, offsets_of
+from remaster_ros.discovery.to_extension import extension_of, offsets_of, root_of_inverse
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix

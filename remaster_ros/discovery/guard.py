@@ -16,7 +16,7 @@ from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.gain import Gain
 from remaster_ros.discovery.words import sentence_case
 from remaster_ros.errors import InsufficientDataError
-from remaster_ros.types import FloatArray, Priors
+from remaster_ros.types import FloatArray
 
 # Causes with an error on the held-out poses of so many times that of the offsets are not returned.
 MOST_HARM = 1.05
@@ -133,37 +133,5 @@ def unfitted(
             f'The residuals suggest {names}, but these poses do not determine that together with '
             f'everything else ({reason}): it is not taken as a cause. Measure poses that are '
             'spread further and turn the tool, and search again.'
-        ),
-    )
-
-
-def held(size_m: float, markers: Priors, reason: InsufficientDataError) -> Unexplained:
-    """Return what is left open where the model with causes settles only with markers held.
-
-    Parameters
-    ----------
-    size_m
-        The noise that it then leaves, m.
-    markers
-        Their places.
-    reason
-        Why it does not settle otherwise.
-    """
-    places = ', '.join(
-        f'{name} at ({", ".join(f"{1e3 * value:.1f}" for value in place)}) mm'
-        for name, (place, _) in markers.markers.items()
-    )
-    std = max(std for _, std in markers.markers.values())
-    return Unexplained(
-        where='marker',
-        driver='registration',
-        size_m=size_m,
-        p_value=np.nan,
-        next=(
-            'With the causes these poses do not determine where markers and sensors are '
-            f'({str(reason).partition(";")[0]}). Markers are held where the fit without causes '
-            f'has them, to {1e3 * std:.0f} mm: {places}. All standard deviations are for markers '
-            'there. Measure poses that turn the tool, or state in session.yaml how well the '
-            'place of the marker is known (marker_std_m).'
         ),
     )

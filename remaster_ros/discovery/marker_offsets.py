@@ -17,7 +17,6 @@ from remaster_ros.calibration.gauge_words import the
 from remaster_ros.discovery.effects.marker_offset import EFFECT as MARKER_OFFSET
 from remaster_ros.discovery.effects.sizes import number
 from remaster_ros.discovery.explain import FoundEffect, Parameter
-from remaster_ros.discovery.memory import Memory, draws_of
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray, Priors, Session
@@ -29,17 +28,13 @@ SIGNIFICANCE = 0.002
 # A direction counts where the data determine it so many times better than the session states it,
 # in variance.
 KNOWN_BETTER = 4.0
-# A marker that is held, since nothing determines its place, is known to this, m per axis.
-HELD_M = 1e-3
 # Directions of columns below this share of the largest are rounding.
 ROUNDING = 1e-9
 # An axis of the tool with this share in directions that the data leave open is called hidden.
 HIDDEN = 0.1
 
 
-def moved_markers(
-    found: Estimate, data: Residuals, solution: Solution, memory: Memory | None = None
-) -> tuple[FoundEffect, ...]:
+def moved_markers(found: Estimate, data: Residuals, solution: Solution) -> tuple[FoundEffect, ...]:
     """Return an effect for every marker that the fit moved beyond its stated accuracy.
 
     Parameters
@@ -48,8 +43,6 @@ def moved_markers(
         The fit.
     data, solution
         What it leaves, and the causes beside.
-    memory
-        Of the errors that they leave; None where the errors do not remember.
     """
     model, problem = found.model, found.problem
     x = model.natural(found.mode.z)
@@ -75,9 +68,6 @@ def moved_markers(
             continue
         u = axes[:, seen].T @ pull
         noise = np.diag(values[seen])
-        if memory is not None:
-            (drawn,) = draws_of(memory, [((own @ axes[:, seen]).T, solution)])
-            noise = drawn @ drawn.T / drawn.shape[1]
         square = float(u @ np.linalg.solve(noise + np.diag((values[seen] * std) ** 2), u))
         p_value = float(scipy.stats.chi2.sf(square, seen.sum()))
         if p_value * len(problem.marker_names) > SIGNIFICANCE:
@@ -109,15 +99,6 @@ def loosened(session: Session, moved: Sequence[FoundEffect]) -> Priors | None:
             std = float(np.hypot(session.marker_std_m, FURTHER * (effect.size_m or 0.0)))
             places[name] = (session.markers[name], std)
     return Priors(markers=places) if places else None
-
-
-def held_markers(found: Estimate) -> Priors:
-    """Return priors that hold all markers where a fit has them, to `HELD_M`."""
-    markers = found.model.markers(found.model.natural(found.mode.z))
-    names = found.problem.marker_names
-    return Priors(
-        markers={name: (place, HELD_M) for name, place in zip(names, markers, strict=True)}
-    )
 
 
 def _unseen(moved: FloatArray, place: FloatArray, axes: FloatArray, seen: BoolArray) -> FloatArray:

@@ -44,7 +44,6 @@ def structure_left(
     solution: Solution,
     fit: FitResult,
     located: Sequence[FoundEffect],
-    searched: Solution,
 ) -> tuple[tuple[Unexplained, ...], tuple[tuple[int, str], ...]]:
     """Return all structure that no cause explains, and the gross errors among held-out rows.
 
@@ -56,8 +55,6 @@ def structure_left(
         The sampled fit with it.
     located
         Structure without a cause that the search found.
-    searched
-        The solution with that.
 
     Returns
     -------
@@ -66,13 +63,13 @@ def structure_left(
     gross
         (observation, what is wrong) of every held-out row.
     """
-    checks = _Checks(data, solution, fit, searched)
+    checks = _Checks(data, solution, fit)
     unexplained = (
         *(
             Unexplained(found.place, found.driver, found.size_m, found.p_value, found.cause)
             for found in located
         ),
-        *errors_by_place(data, searched, SIGNIFICANCE),
+        *errors_by_place(data, solution, SIGNIFICANCE),
         *checks.pairing(),
         *far_off(data.context, checks.errors, checks.gross & ~checks.mispaired),
         *checks.held_out(),
@@ -88,7 +85,6 @@ class _Checks:
     data: Residuals
     solution: Solution
     fit: FitResult
-    searched: Solution
 
     @property
     def errors(self) -> FloatArray:
@@ -183,7 +179,7 @@ class _Checks:
         """Held-out poses with larger errors than poses that were left out of the fit in turn."""
         data = self.data
         held_out = data.context.measurements.is_validation & ~self.gross
-        compared = compare_held_out(data, self.searched, np.flatnonzero(held_out))
+        compared = compare_held_out(data, self.solution, np.flatnonzero(held_out))
         if compared is None or compared.p_value > SIGNIFICANCE:
             return
         moved = [

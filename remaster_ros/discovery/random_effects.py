@@ -20,6 +20,7 @@ import numpy as np
 
 from remaster_ros.discovery.effects.base import Cell, Design
 from remaster_ros.discovery.effects.context import Context
+from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Covariances, Solution
 from remaster_ros.types import FloatArray
@@ -115,6 +116,35 @@ def _columns(context: Context, members: Sequence[Cell], maps: Sequence[FloatArra
         for member, one in zip(members, maps, strict=True)
     ]
     return Design(None, np.concatenate(parts, axis=2))
+
+
+def kinds(data: Residuals, cells: Sequence[Cell], apart: Sequence[Cell] = ()) -> list[Family]:
+    """Return a family for each effect of some cells, without members that are found by themselves.
+
+    Parameters
+    ----------
+    data
+        The rows worked on.
+    cells
+        All that are tried. Of a joint with several variants those of `Effect.in_family` are
+        members, and of two with a parameter in common the larger. What is drawn from thousands
+        (orders of a gear, moments of a step, what has no name) is no family: with one variance
+        each would be lost among the others.
+    apart
+        Cells that have parameters of their own.
+    """
+    taken = {name for cell in apart for name in cell.parameters}
+    taken_places = {(cell.name, cell.joints, cell.subject) for cell in apart}
+    members: dict[str, list[Cell]] = {}
+    for cell in sorted(cells, key=lambda cell: -cell.size):
+        effect = EFFECTS[cell.name]
+        if effect.many or not effect.in_family(cell) or taken & set(cell.parameters):
+            continue
+        if (cell.name, cell.joints, cell.subject) not in taken_places:
+            members.setdefault(cell.name, []).append(cell)
+            taken |= set(cell.parameters)
+    families = (Family.of(data, f'every {name}', mine) for name, mine in members.items())
+    return [family for family in families if family is not None]
 
 
 def by_members(solution: Solution, families: Sequence[Family]) -> Solution:

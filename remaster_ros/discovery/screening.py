@@ -1,40 +1,30 @@
-"""Screening: every cell tried beside a set already found, with p-values over all of them.
+"""Screening: every cell tried beside a set already found.
 
 In units of the noise a cell explains ``gain`` of the squared residuals; its score is the log
 evidence with the noise's scale integrated out::
 
     S = −½ N log(1 − gain / total) − ½ k log N − log(cells of its kind)
 
-The p-value of the best cell is the share of surrogate residuals whose best cell, of *all* cells,
-scores as high: the family-wise error is held whatever the number of cells and their likeness
-(Westfall & Young 1993). Surrogates of two kinds, and the larger p-value counts: signs of whole
-poses flipped at random, which holds for any symmetric noise independent between poses, of any
-spread (Winkler et al. 2014); and draws from the fitted noise, exact where that is Gaussian. A
-few poses have too few patterns of signs (8 give 128, one of which is the observed one): there the
-whitened rows are flipped one by one, which relies on the noise model's independence.
+It chooses which cells are fitted; the evidence of the fits decides.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from remaster_ros.calibration.noise import Noise
-from remaster_ros.discovery.at_joints import AtJoints, Products, suit
 from remaster_ros.discovery.catalogue import Catalogue
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
-# Number and generator to that many sets of errors of all rows, m, (n, 3, draws).
-Draw = Callable[[int, np.random.Generator], FloatArray]
-# With fewer, flips of whole poses meet the observed pattern, or its like, by chance.
+# Poses from which on a search for causes is worth its while.
 FEWEST_POSES = 12
 # Smoothness tried for free forms: penalty over data, in the trace.
 SMOOTHNESS = (0.1, 1.0, 10.0)
@@ -43,40 +33,21 @@ ABSORBED = 1e-6
 SINGLE_ROUNDING = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class Screening:
-    """Scores of all cells beside a set of others.
+class Products(NamedTuple):
+    """Of the columns of a batch of cells, what the others explain taken out.
 
-    Attributes
-    ----------
-    score
-        Log evidence gained, with the prior probability of each cell, (cells,); -inf where it
-        adds nothing to the set.
-    null
-        Best score of any cell on each surrogate, of both kinds, (2, draws).
+    ``norm`` (cells, m) before that, in units of which ``gram`` (cells, m, m) has their products
+    with each other, and ``pull`` (cells, m, 1) those with the residuals.
     """
 
-    score: FloatArray
-    null: FloatArray
-
-    def p_value(self, score: float) -> float:
-        """Return the share of surrogates whose best cell scores as high."""
-        if self.null.shape[1] == 0:
-            return float('nan')
-        as_high = np.sum(self.null >= score, axis=1)
-        return float(np.max(1.0 + as_high) / (1.0 + self.null.shape[1]))
+    norm: FloatArray
+    gram: FloatArray
+    pull: FloatArray
 
 
 def screen(
-    data: Residuals,
-    catalogue: Catalogue,
-    given: Solution,
-    *,
-    rng: np.random.Generator | None = None,
-    draws: int = 0,
-    chosen: BoolArray | None = None,
-    errors: Draw | None = None,
-) -> Screening:
+    data: Residuals, catalogue: Catalogue, given: Solution, *, chosen: BoolArray | None = None
+) -> FloatArray:
     """Score all cells beside the given ones, under their noise.
 
     Parameters
@@ -85,62 +56,27 @@ def screen(
         The residuals and the cells.
     given
         The set already found: projected out, with its penalties.
-    rng, draws
-        For surrogates of each kind; none by default.
     chosen
         Which cells to score; all by default.
-    errors
-        To draw surrogates with; by default the noise of the given ones.
+
+    Returns
+    -------
+    ndarray
+        Log evidence gained, with the prior probability of each cell, (cells,); -inf where it adds
+        nothing to the set.
     """
-    noise = given.noise
     project = _Projection(data, given)
-    observed = project.residual(data.noise_model.whitened(data.errors, noise).reshape(-1, 1))
-    surrogates = observed.astype(np.float32)
-    if draws and rng is not None:
-        drawn = project.residual(_surrogates(data, observed, draws, rng, noise, errors))
-        surrogates = np.concatenate((surrogates, drawn), axis=1)
-    surrogates /= np.linalg.norm(surrogates, axis=0)
+    white = data.noise_model.whitened(data.errors, given.noise).reshape(-1, 1)
+    residual = project.residual(white).astype(np.float32)
+    residual /= np.linalg.norm(residual)
     n_eff = 3 * len(data) - data.base.shape[2]
     scores = np.full(len(catalogue.cells), -np.inf)
-    best = np.full(surrogates.shape[1], -np.inf)
     others = ~catalogue.which(given.cells)
     wanted = np.flatnonzero(others if chosen is None else others & chosen)
-
-    def take(batch: IntArray, products: Products) -> None:
-        value = _scores([catalogue.cells[i] for i in batch], products, n_eff)
-        scores[batch] = value[:, 0]
-        np.maximum(best, value.max(axis=0), out=best)
-
-    suiting = suit(data, catalogue)[wanted]
-    few = wanted[suiting]
-    # For fewer columns it is more work than it saves.
-    if catalogue.sizes[few].sum() > surrogates.shape[1] + project.top.shape[1]:
-        wanted = wanted[~suiting]
-        pulled = project.residual(surrogates)
-        at_joints = AtJoints.of(data, catalogue, noise, pulled, project.twice())
-        for batch in catalogue.batches(few, by_joint=True):
-            products, clear = at_joints.products(batch)
-            if clear.any():
-                take(batch[clear], products.of(clear))
-            wanted = np.append(wanted, batch[~clear])
     for batch in catalogue.batches(wanted):
-        take(batch, _products(data, catalogue, batch, project, surrogates, noise))
-    return Screening(scores, best[1:].reshape(2, -1) if draws else np.zeros((2, 0)))
-
-
-def scores_in_place(
-    data: Residuals, catalogue: Catalogue, solution: Solution, cell: Cell, others: Sequence[Cell]
-) -> FloatArray:
-    """Return the score of a cell beside the rest of a set, and of others in its place.
-
-    With the noise and the smoothness of the whole set, (1 + others,); -inf for what is not among
-    all that are tried.
-    """
-    index = solution.cells.index(cell)
-    without = solution.less(index, solution.evidence_without(index, len(data)))
-    score = screen(data, catalogue, without, chosen=catalogue.which((cell, *others))).score
-    places = [catalogue.places.get(one.key) for one in (cell, *others)]
-    return np.array([-np.inf if place is None else score[place] for place in places])
+        products = _products(data, catalogue, batch, project, residual, given.noise)
+        scores[batch] = _scores([catalogue.cells[i] for i in batch], products, n_eff)[:, 0]
+    return scores
 
 
 class _Projection:
@@ -160,36 +96,10 @@ class _Projection:
         self.top = solve_triangular(root, (white / scale).T, lower=True, check_finite=False).T
         self.single = self.top.astype(np.float32)
 
-    def twice(self) -> NDArray[np.float32]:
-        """T with M'M = I − T T', (3n, p)."""
-        # M = I − Q Q' is no projection where there are penalties: M'M = I − Q (2 I − Q'Q) Q'.
-        inner = np.linalg.cholesky(2.0 * np.eye(self.top.shape[1]) - self.top.T @ self.top)
-        twice: NDArray[np.float32] = self.single @ inner.astype(np.float32)
-        return twice
-
     def residual(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return (M v) of values (3n, c), M = I − Z (Z'Z + Λ)⁻¹ Z' restricted to the rows."""
         top = self.single if values.dtype == np.float32 else self.top
         return values - top @ (top.T @ values)
-
-
-def _surrogates(
-    data: Residuals,
-    observed: FloatArray,
-    draws: int,
-    rng: np.random.Generator,
-    noise: Noise,
-    errors: Draw | None,
-) -> NDArray[np.float32]:
-    """Return residuals with flipped poses, and drawn ones, (3n, 2 draws), single precision."""
-    unit = data.pose_of_row if data.poses >= FEWEST_POSES else np.arange(len(data))
-    signs = rng.integers(0, 2, (int(unit.max()) + 1, draws)) * 2.0 - 1.0
-    flipped = observed * np.repeat(signs[unit], 3, axis=0)
-    if errors is None:
-        drawn = rng.standard_normal((len(observed), draws))
-    else:
-        drawn = data.noise_model.whitened(errors(draws, rng), noise).reshape(-1, draws)
-    return np.concatenate((flipped, drawn), axis=1, dtype=np.float32)
 
 
 def _products(
@@ -212,7 +122,7 @@ def _products(
     pull = (left.T @ residuals).reshape(count, m, -1)
     blocks = left.reshape(len(left), count, m).transpose(1, 2, 0)
     gram = np.asarray(blocks @ blocks.transpose(0, 2, 1), dtype=float)
-    return Products(norm, gram, pull)
+    return Products(norm, gram, np.asarray(pull, dtype=float))
 
 
 def _scores(cells: Sequence[Cell], products: Products, n_eff: int) -> FloatArray:

@@ -1,18 +1,13 @@
-"""How much of the gain each cause has, whatever the order in which they are added.
+"""How much of the gain is lost without each cause, everything else fitted again.
 
-What a cause takes away depends on what is there already: the length of a link and the error curves
-of two joints imitate each other, and the first of them takes what they have in common. Added the
-largest first, two causes of about one size changed places from search to search, and their shares
-with them. So each has the mean over all orders, its Shapley value (Shapley 1953; of a regression,
-Lindeman, Merenda & Gold 1980, Introduction to Bivariate and Multivariate Analysis, section 4.9).
-Noise and smoothness stay those of all causes together.
+Two causes that imitate each other lose little each: the other takes its place. Together the shares
+need not make 1. Noise and variances stay those of all causes together.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -22,17 +17,15 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
-# All orders of so many causes, 120, and half as many drawn ones of more, each also backwards.
-ALL_ORDERS = 5
-DRAWN_ORDERS = 30
 # Of a matrix with ones on its diagonal.
 ROUNDING = 1e-12
 
 
 def shares(data: Residuals, groups: Sequence[tuple[Cell, ...]], solution: Solution) -> list[float]:
-    """Return how much of the mean-square error each cause takes away.
+    """Return the share of the gain in mean square that is lost without each cause.
 
-    On held-out rows where there are any. Together they make 1; all are 0 where nothing is gained.
+    On held-out rows where there are any; negative where they are predicted better without it.
+    All are 0 where nothing is gained.
 
     Parameters
     ----------
@@ -45,25 +38,12 @@ def shares(data: Residuals, groups: Sequence[tuple[Cell, ...]], solution: Soluti
     if not rows.any():
         rows = np.isin(np.arange(len(rows)), data.rows.source)
     parts = _Parts.of(data, groups, solution, rows)
-    taken = np.zeros(len(groups))
-    orders = list(_orders(len(groups)))
-    for order in orders:
-        left = [parts.left(frozenset(order[:count])) for count in range(len(order) + 1)]
-        taken[list(order)] -= np.diff(left)
-    total = taken.sum()
-    return (taken / total if total > 0.0 else 0.0 * taken).tolist()
-
-
-def _orders(count: int) -> Iterator[tuple[int, ...]]:
-    if count <= ALL_ORDERS:
-        yield from itertools.permutations(range(count))
-        return
-    # A fixed seed: the same causes have the same shares.
-    rng = np.random.default_rng(0)
-    for _ in range(DRAWN_ORDERS):
-        order = tuple(rng.permutation(count).tolist())
-        yield order
-        yield order[::-1]
+    every = set(range(len(groups)))
+    with_all = parts.left(every)
+    gain = parts.left(set()) - with_all
+    if gain <= 0.0:
+        return [0.0] * len(groups)
+    return [(parts.left(every - {index}) - with_all) / gain for index in every]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +66,6 @@ class _Parts:
     gram: FloatArray
     base: IntArray
     where: list[IntArray]
-    known: dict[frozenset[int], float] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -120,16 +99,14 @@ class _Parts:
         where = [np.concatenate([places[cell] for cell in group]) for group in groups]
         return cls(H, pull, gram, np.arange(p), where)
 
-    def left(self, causes: frozenset[int]) -> float:
+    def left(self, causes: set[int]) -> float:
         """Return the sum of squares that the fit of some causes leaves, m²."""
-        if causes not in self.known:
-            chosen = np.concatenate((self.base, *(self.where[index] for index in sorted(causes))))
-            H, pull = self.H[np.ix_(chosen, chosen)], self.pull[chosen]
-            # In units of each parameter's own: those of rad and of m/s differ by ten decades.
-            unit = np.diag(H) ** -0.5
-            scaled = H * np.outer(unit, unit) + ROUNDING * np.eye(len(H))
-            step = unit * cho_solve(cho_factor(scaled), unit * pull)
-            fit = np.append(-step, 1.0)
-            chosen = np.append(chosen, len(self.gram) - 1)
-            self.known[causes] = float(fit @ self.gram[np.ix_(chosen, chosen)] @ fit)
-        return self.known[causes]
+        chosen = np.concatenate((self.base, *(self.where[index] for index in sorted(causes))))
+        H, pull = self.H[np.ix_(chosen, chosen)], self.pull[chosen]
+        # In units of each parameter's own: those of rad and of m/s differ by ten decades.
+        unit = np.diag(H) ** -0.5
+        scaled = H * np.outer(unit, unit) + ROUNDING * np.eye(len(H))
+        step = unit * cho_solve(cho_factor(scaled), unit * pull)
+        fit = np.append(-step, 1.0)
+        chosen = np.append(chosen, len(self.gram) - 1)
+        return float(fit @ self.gram[np.ix_(chosen, chosen)] @ fit)

@@ -73,7 +73,6 @@ def compare_offsets(
     found: Estimate,
     data: Residuals,
     own: Solution,
-    unmodelled: FloatArray,
     parts: Sequence[Split],
 ) -> tuple[Compared, ...]:
     """Compare the zero-offsets that both sessions determine.
@@ -84,8 +83,6 @@ def compare_offsets(
         Of the first session, with its causes.
     found, data, own
         The other session: without causes, its residuals, and with the causes fitted to it.
-    unmodelled
-        How causes too small to be found move its parameters, see `undetected`.
     parts
         The cells of the causes on its rows.
     """
@@ -108,8 +105,7 @@ def compare_offsets(
     there += added @ own.parameters
     joined = np.concatenate((by_base, added), axis=1)
     there_variance = np.einsum('ki,ij,kj->k', joined, own.full_covariance, joined)
-    widened = unmodelled[:k] + added @ unmodelled[found.model.size :]
-    there_std = np.sqrt(there_variance + np.sum(widened**2, axis=1))
+    there_std = np.sqrt(there_variance)
     here_std = here_draws.std(axis=0, ddof=1)
     return tuple(
         Compared.of(
@@ -137,7 +133,7 @@ def _natural(data: Residuals) -> FloatArray:
 
 
 def compare_cell(
-    fit: FitResult, part: Split, rows: Context, own: Solution, unmodelled: FloatArray
+    fit: FitResult, part: Split, rows: Context, own: Solution
 ) -> tuple[Compared, ...]:
     """Compare the parameters of a cell: as they are, or a curve at its places.
 
@@ -149,15 +145,14 @@ def compare_cell(
         One of its cells on the rows of the other.
     rows
         Those rows.
-    own, unmodelled
-        The causes fitted to them, and how causes outside the model move their parameters.
+    own
+        The causes fitted to them.
     """
     cell = part.cell
     where = dict(zip(own.cells, own.slices(), strict=True))[part.within]
     theta, draws = _posterior(fit, cell)
-    widened = unmodelled[-len(own.parameters) :][where]
     other = own.parameters[where]
-    covariance = own.covariance[where, where] + widened @ widened.T
+    covariance = own.covariance[where, where]
     names = cell.parameters
     if cell.curve is not None:
         driver = driver_named(cell.driver, cell.joints[-1] if cell.joints else 0)

@@ -56,11 +56,6 @@ class Solution:
         Of base and parameters, in this order.
     log_evidence
         With the prior probability of the cells.
-    drawn
-        Further precision of the prior on the parameters, because not all searches found them
-        (`combined_searches`), (m, m); None where there is none.
-    prior_mean
-        What the prior on the parameters is about, (m,); None for 0.
     """
 
     cells: tuple[Cell, ...]
@@ -71,8 +66,6 @@ class Solution:
     ridge: FloatArray
     covariances: Covariances
     log_evidence: float
-    drawn: FloatArray | None = None
-    prior_mean: FloatArray | None = None
 
     @property
     def full_covariance(self) -> FloatArray:
@@ -161,8 +154,6 @@ class Solution:
     def prior_precision(self) -> FloatArray:
         """Return the precision of the Gaussian prior on the parameters, (m, m)."""
         precision = np.diag(self.ridge)
-        if self.drawn is not None:
-            precision += self.drawn
         for cell, factor, where in zip(self.cells, self.smoothness, self.slices(), strict=True):
             if cell.penalty is not None:
                 precision[where, where] += factor * cell.penalty

@@ -6,14 +6,12 @@ import numpy as np
 
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.extension import Extension, Start, Term
-from remaster_ros.calibration.priors import OFFSET_STD, STEP_STD
+from remaster_ros.calibration.priors import OFFSET_STD, STEP_STD, prior_rows
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.stretches import root_of_inverse
-from remaster_ros.discovery.undetected import fitted_columns, natural_parameters
-from remaster_ros.types import FloatArray
+from remaster_ros.types import FloatArray, IntArray
 
 # Where the prior on steps takes a smaller share of its variance off an offset nothing is added.
 NOTICEABLE = 0.1
@@ -48,7 +46,6 @@ def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> E
         displacement0,
         solution.parameters,
         solution.prior_precision(),
-        solution.prior_mean,
         offsets_of(found)[0],
         STEP_STD,
         Start(model.offsets(x), model.T_R_N(x), model.markers(x)),
@@ -98,6 +95,40 @@ def moved_by_open_offsets(found: Estimate, data: Residuals, solution: Solution) 
     return moves
 
 
+def moved_by(
+    found: Estimate, data: Residuals, solution: Solution, displacements: FloatArray
+) -> FloatArray:
+    """Return how displacements that the model does not have move what is fitted to them.
+
+    Parameters
+    ----------
+    found, data, solution
+        The fit that the search began with, what it worked on and found.
+    displacements
+        Of the rows worked on, m, (n, 3, c).
+
+    Returns
+    -------
+    ndarray
+        (size + m, c), as in `moved_by_open_offsets`.
+    """
+    columns, precision, where = fitted_columns(found, data, solution)
+    white = data.noise_model.whitened(columns, solution.noise).reshape(3 * len(data), -1)
+    others = data.noise_model.whitened(displacements, solution.noise).reshape(3 * len(data), -1)
+    root = root_of_inverse(white.T @ white + precision)
+    moves = np.zeros((found.model.size + len(solution.parameters), others.shape[1]))
+    moves[where] = root @ (root.T @ (white.T @ others))
+    return moves
+
+
+def root_of_inverse(precision: FloatArray) -> FloatArray:
+    """Return L with L L' the inverse of a matrix of parameters in units far apart, (P, P)."""
+    unit = np.maximum(np.diag(precision), np.finfo(float).tiny) ** -0.5
+    scaled = precision * np.outer(unit, unit) + 1e-12 * np.eye(len(precision))
+    root: FloatArray = unit[:, None] * np.linalg.inv(np.linalg.cholesky(scaled)).T
+    return root
+
+
 def offsets_of(found: Estimate) -> tuple[FloatArray, FloatArray]:
     """Return the zero-offsets of the fit without effects and their stds, rad, (k,) each."""
     joints = found.model.joints
@@ -112,3 +143,67 @@ def _columns(cell: Cell, context: Context) -> tuple[int | None, FloatArray]:
     """Return joint and values of a cell's columns in every row of a session."""
     blocks = [cell.columns(block) for _, block in context.blocks()]
     return blocks[0].at, np.concatenate([block.values for block in blocks])
+
+
+def fitted_columns(
+    found: Estimate, data: Residuals, solution: Solution
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return what all parameters of the extended model do, and what is known of them beforehand.
+
+    Parameters
+    ----------
+    found, data, solution
+        The fit that the search began with, what it worked on and found.
+
+    Returns
+    -------
+    columns
+        What a unit of each free parameter of the fit and of the m of the cells displaces in the
+        rows worked on, (n, 3, f + m).
+    precision
+        Of their priors, (f + m, f + m).
+    where
+        Their indices among all the natural parameters and the m, (f + m,).
+    """
+    free, size = found.posterior.free, found.model.size
+    own = data.columns(solution.cells)
+    columns = np.concatenate((data.full_jacobian[data.rows.source][:, :, free], own), axis=2)
+    x = found.model.natural(found.mode.z)
+    rows = prior_rows(found.model, found.posterior.priors, x, natural=True)[1][:, free]
+    precision = np.zeros((columns.shape[2],) * 2)
+    precision[: len(free), : len(free)] = rows.T @ rows
+    precision[len(free) :, len(free) :] = solution.prior_precision()
+    return columns, precision, np.concatenate((free, size + np.arange(own.shape[2])))
+
+
+def natural_parameters(
+    found: Estimate, data: Residuals, solution: Solution, other: Solution
+) -> FloatArray:
+    """Return the parameters of another set of cells, as those of a solution, (size + m,).
+
+    Parameters
+    ----------
+    found, data, solution
+        The fit that the search began with, what it worked on and found.
+    other
+        The other set, fitted to the same rows.
+
+    Returns
+    -------
+    ndarray
+        Steps of the natural parameters of the fit from where the search began, zeros where the
+        gauge holds; and the parameters of the solution's m cells, 0 of those that the other set
+        does not have.
+    """
+    free, size = found.posterior.free, found.model.size
+    values = np.zeros(size + len(solution.parameters))
+    columns = data.full_jacobian[data.rows.source][:, :, free].reshape(-1, len(free))
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0.0] = 1.0
+    step = (data.base @ other.base).ravel()
+    values[free] = np.linalg.lstsq(columns / scale, step, rcond=None)[0] / scale
+    found_again = dict(zip(other.cells, other.slices(), strict=True))
+    for cell, where in zip(solution.cells, solution.slices(), strict=True):
+        if cell in found_again:
+            values[size:][where] = other.parameters[found_again[cell]]
+    return values

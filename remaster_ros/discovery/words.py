@@ -29,6 +29,8 @@ KIND_OF_SUBJECT = {'sensor_frame': 'sensor', 'marker': 'marker'}
 
 # Stamps between 2001 and 2100 are counted from 1970 on, smaller ones from the start of something.
 EARLIEST_S, LATEST_S = 1e9, 4.1e9
+# Below it a p-value's figures tell nobody more.
+LEAST_P_VALUE = 1e-4
 
 
 def shown(value: float, std: float, unit: str) -> tuple[str, str, str]:
@@ -42,11 +44,11 @@ def percent(share: float) -> str:
     return f'{round(100.0 * share)} %'.replace('-', '−')
 
 
-def p_value_text(p_value: float, floor: float) -> str:
-    """Return 'p = 0.012', or 'p < 0.0033' where it lies at the floor of what was drawn."""
+def p_value_text(p_value: float) -> str:
+    """Return 'p = 0.012'; 'p < 0.0001' of what needs no more figures."""
     if np.isnan(p_value):
         return 'p unknown'
-    return f'p < {floor:.2g}' if p_value <= floor * (1.0 + 1e-9) else f'p = {p_value:.2g}'
+    return f'p < {LEAST_P_VALUE:.4f}' if p_value < LEAST_P_VALUE else f'p = {p_value:.2g}'
 
 
 def clock_time(stamp_s: float) -> str:

@@ -57,7 +57,7 @@ def gain(discovery: Discovery) -> Figure:
     """Draw the errors before and after, and what a pose's readings share of them, where known."""
     figure = Figure(figsize=(WIDTH_IN, 2.6), layout='constrained')
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    data, selection = discovery.residuals, discovery.selection
+    data = discovery.residuals
     held_out = data.context.measurements.is_validation
     rows = held_out if held_out.any() else np.isin(np.arange(len(held_out)), data.rows.source)
     errors = discovery.residuals_before, discovery.fit.residuals_after
@@ -67,7 +67,7 @@ def gain(discovery: Discovery) -> Figure:
     legend_above(left)
 
     model = data.noise_model
-    fits = selection.empty, selection.solution
+    fits = discovery.empty, discovery.solution
     noises = [model.sensor_noise(fit.noise) for fit in fits]
     # Where a sensor has one reading at every pose, what they share is not known.
     separable = {model.channels[index].sensor for index in model.separable}
@@ -94,7 +94,7 @@ def gain(discovery: Discovery) -> Figure:
 
 def drivers(discovery: Discovery) -> Figure:
     """Draw, joint by joint, the errors along the joint's motion against every driver."""
-    data, selection = discovery.residuals, discovery.selection
+    data = discovery.residuals
     context = data.part
     candidates: list[tuple[bool, str, Callable[[int], FloatArray]]] = [
         (True, 'own angle (°)', lambda j: np.degrees(context.measurements.q[:, j])),
@@ -119,9 +119,9 @@ def drivers(discovery: Discovery) -> Figure:
     )
     motion = context.jacobian
     length = np.maximum(np.linalg.norm(motion, axis=1), 1e-6)
-    fits = [(selection.empty, BEFORE, 'before')]
+    fits = [(discovery.empty, BEFORE, 'before')]
     if discovery.groups:
-        fits.append((selection.solution, AFTER, 'after'))
+        fits.append((discovery.solution, AFTER, 'after'))
     for fit, color, _ in fits:
         left = data.left(fit)
         along = 1e3 * np.einsum('nij,ni->nj', motion, left) / length
@@ -210,7 +210,7 @@ def _sizes(ax: Axes, discovery: Discovery, effects: Sequence[FoundEffect]) -> No
 
 def _step(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     """Draw a jump of a sensor, marker or base over time, along its own direction, mm."""
-    data, solution = discovery.residuals, discovery.selection.solution
+    data, solution = discovery.residuals, discovery.solution
     context = data.part
     columns = cell.columns(context).displacement(context)
     where = dict(zip(solution.cells, solution.slices(), strict=True))[cell]
@@ -256,7 +256,7 @@ def _driver(context: Context, cell: Cell, features: FloatArray) -> tuple[str, Fl
 
 def _cause(ax: Axes, discovery: Discovery, cell: Cell) -> None:
     """Draw one cause at a joint's angle, in arc minutes."""
-    data, solution = discovery.residuals, discovery.selection.solution
+    data, solution = discovery.residuals, discovery.solution
     whole = len(data.context) <= MOST_DRAWN
     context = data.context if whole else data.part
     left = data.unexplained(solution) if whole else data.left(solution)

@@ -14,8 +14,6 @@ from remaster_ros.compensation.export import GEOMETRY_FILE
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.decision import Decision
 from remaster_ros.discovery.discover import Discovery
-from remaster_ros.discovery.repeated_search import RepeatedSearch
-from remaster_ros.discovery.stepwise_selection import DRAWS
 from remaster_ros.reports import schemas
 from remaster_ros.reports.discovery_apply import applied
 from remaster_ros.reports.discovery_judgement import judgement
@@ -32,14 +30,11 @@ from remaster_ros.reports.predictions_csv import PREDICTIONS_FILE, predictions_t
 from remaster_ros.session.files import make_folder, write_atomically
 from remaster_ros.version import __version__
 
-LEAST_P_VALUE = 1.0 / (1.0 + DRAWS)
-
 
 def predictions_of(discovery: Discovery) -> Predictions:
     """Return where the final model predicts every row of the session."""
     context = discovery.residuals.context
-    missed = discovery.missed.covariance(context)
-    return predict(discovery.fit, context.measurements, discovery.widening, missed)
+    return predict(discovery.fit, context.measurements)
 
 
 def discovery_content(
@@ -79,26 +74,8 @@ def discovery_content(
         'registration': fit['registration'],
         'markers': fit['markers'],
         'covariance': _covariance(discovery),
-        # That of a cause which no surrogate residuals reach: its p-value is below.
-        'least_p_value': LEAST_P_VALUE,
         'predicted_regions95': _regions(discovery, predictions),
     }
-    stretches = discovery.stretches
-    if stretches.count:
-        content['stretches'] = {
-            'count': stretches.count,
-            'ratio': stretches.ratio,
-            'p_value': stretches.p_value,
-            'widened': stretches.widened,
-        }
-    if discovery.repeated is not None:
-        content['repeated_search'] = {
-            'count': discovery.repeated.count,
-            'same': discovery.repeated.same,
-            'widening': discovery.repeated.widening,
-            'combined': discovery.selection.before_combining is not None,
-            'found': _found_by(discovery, discovery.repeated),
-        }
     if discovery.thinning is not None:
         content['rows_searched'] = discovery.thinning
     if decided:
@@ -128,7 +105,7 @@ def discovery_content(
 
 
 def _covariance(discovery: Discovery) -> dict[str, Any]:
-    fit, solution = discovery.fit, discovery.selection.solution
+    fit, solution = discovery.fit, discovery.solution
     units = {name: cell.unit for cell in solution.cells for name in cell.parameters}
     known = np.flatnonzero(fit.identifiable)
     draws = np.concatenate((fit.joint_offset_draws[..., known], fit.theta_draws), axis=-1)
@@ -140,26 +117,6 @@ def _covariance(discovery: Discovery) -> dict[str, Any]:
         'units': [*('rad' for _ in known), *(units[name] for name in fit.theta_names)],
         'matrix': [[float(f'{value:.5e}') for value in row] for row in matrix],
     }
-
-
-def _found_by(discovery: Discovery, repeated: RepeatedSearch) -> list[dict[str, Any]]:
-    """Return for each cause in the model how many searches found it, those of most first."""
-    named = {cell.key for group in discovery.groups for cell in group}
-    found: dict[tuple[Any, ...], dict[str, Any]] = {}
-    for cell, searches in zip(repeated.solution.cells, repeated.found_by, strict=True):
-        one = found.setdefault(
-            (cell.name, cell.joints, cell.subject),
-            {
-                'name': cell.name,
-                'joints': list(cell.joints),
-                'subject': cell.subject,
-                'searches': 0,
-                'named': False,
-            },
-        )
-        one['searches'] = max(one['searches'], searches)
-        one['named'] |= cell.key in named
-    return sorted(found.values(), key=lambda one: -one['searches'])
 
 
 def held_out_coverage(discovery: Discovery, predictions: Predictions) -> Coverage:

@@ -12,7 +12,6 @@ from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.explain import UNCERTAIN
 from remaster_ros.discovery.gain import held_out_words
-from remaster_ros.discovery.undetected import DETECTED
 from remaster_ros.discovery.words import sentence_case
 from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.schemas import Judgement
@@ -24,6 +23,8 @@ MOST_OVER_NOISE = 1.25
 # Where a cause could move the marker by more than this share of the noise and not be found, it
 # proves nothing that none is.
 MOST_UNSEEN = 0.5
+# A cause is found from about so many standard deviations on.
+DETECTED = 4.5
 
 
 def judgement(
@@ -78,8 +79,6 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
         return False
     if not discovery.fit.sampler.converged:
         return False
-    if _other_choices(discovery):
-        return False
     if any(effect.sigmas < UNCERTAIN for effect in discovery.effects):
         return False
     if any(effect.moment_s is not None for effect in discovery.effects):
@@ -127,17 +126,6 @@ def _gross(discovery: Discovery) -> str:
 def _would_show(discovery: Discovery) -> bool:
     """Whether a cause that matters beside the noise would have been found."""
     return least_seen_m(discovery) < MOST_UNSEEN * discovery.gain.noise_floor_m
-
-
-def _other_choices(discovery: Discovery) -> str:
-    """Return that most searches without some of the poses found other causes; ''."""
-    repeated = discovery.repeated
-    if repeated is None or repeated.same >= 0.5 * repeated.count:
-        return ''
-    return (
-        f' Which causes are named depends on the poses: of {repeated.count} searches without '
-        f'some of them {repeated.same or "none"} found the same.'
-    )
 
 
 def _uncertain(discovery: Discovery) -> str:
@@ -192,7 +180,7 @@ def _result(discovery: Discovery, confirmation: Confirmation | None, *, left: bo
             f'Something is there, but two explanations fit equally well: see which measurements '
             f'would decide.{change}'
         )
-    change += _other_choices(discovery) + _uncertain(discovery)
+    change += _uncertain(discovery)
     if confirmation is not None and not confirmation.confirmed:
         change += f' The other session does not confirm {"it" if count == 1 else "them"}' + (
             '.'

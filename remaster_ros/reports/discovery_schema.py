@@ -190,51 +190,12 @@ class Coverage(Struct):
 class PredictedRegions(Struct):
     """The 95 % regions of predictions.csv: ``widening`` is the factor on their size.
 
-    It is what the fitted rows take when their stretch of the session is left out, so that 95 % of
-    them lie inside; in sessions of few poses their pose.
+    It is what the fitted rows take when their pose is left out, so that 95 % of them lie inside.
     """
 
     widening: float
     held_out: Coverage
     fitted: Coverage
-
-
-class Stretches(Struct):
-    """How the parameters of ``count`` stretches of the session agree with each other.
-
-    ``ratio`` is the variance between them over that by the noise, ``p_value`` that of so much by
-    chance (1/301 stands for that or less), ``widened`` whether the standard deviations contain it.
-    """
-
-    count: int
-    ratio: float
-    p_value: float
-    widened: bool
-
-
-class FoundBy(Struct):
-    """How many searches found what the model has; ``named`` where it is among the effects."""
-
-    name: str
-    joints: list[int]
-    subject: str
-    searches: int
-    named: bool
-
-
-class RepeatedSearch(Struct):
-    """What ``count`` searches found that each did without some of the poses.
-
-    ``same`` of them found the same causes; ``widening`` is the factor by which regions hold the
-    poses left out. Where ``combined``, the model is the mean of several sets of causes that these
-    and the search of all poses found. The standard deviations contain how far the searches differ.
-    """
-
-    count: int
-    same: int
-    widening: float
-    combined: bool
-    found: list[FoundBy]
 
 
 class JointCovariance(Struct):
@@ -278,10 +239,7 @@ class Discovered(Struct):
     registration: dict[str, Registration] | UnsetType = UNSET
     markers: dict[str, Marker] | UnsetType = UNSET
     covariance: JointCovariance | UnsetType = UNSET
-    least_p_value: float | UnsetType = UNSET
     predicted_regions95: PredictedRegions | UnsetType = UNSET
-    stretches: Stretches | UnsetType = UNSET
-    repeated_search: RepeatedSearch | UnsetType = UNSET
     rows_searched: SearchedRows | UnsetType = UNSET
     confirmation: Confirmed | UnsetType = UNSET
     decided: list[Decided] | UnsetType = UNSET

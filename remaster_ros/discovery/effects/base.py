@@ -215,6 +215,8 @@ class Effect:
         ``joints``, or those of the same joints and ``variant``.
     costly
         It has too many cells to be tried again and again.
+    many
+        Its cells are drawn from thousands: they are no family of one variance.
     moves_the_fit
         The offsets model absorbs it: it is judged by how far that fit moved the markers
         (`marker_offsets`), not by the residuals.
@@ -247,6 +249,7 @@ class Effect:
     in_family: Callable[[Cell], bool] = field(default=lambda cell: True)
     cause_per: Literal['effect', 'joints', 'variant'] = 'effect'
     costly: bool = False
+    many: bool = False
     moves_the_fit: bool = False
     driven_by_joint: bool = False
     sign: int = 0

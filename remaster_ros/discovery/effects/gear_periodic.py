@@ -60,4 +60,5 @@ EFFECT = Effect(
     cells=cells,
     cause_per='joints',
     costly=True,
+    many=True,
 )

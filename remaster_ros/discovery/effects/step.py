@@ -171,5 +171,6 @@ EFFECT = Effect(
     cells=cells,
     needs=needs_time,
     cause_per='variant',
+    many=True,
     between=between,
 )

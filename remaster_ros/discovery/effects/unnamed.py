@@ -310,4 +310,5 @@ EFFECT = Effect(
     size=_size,
     cells=cells,
     cause_per='variant',
+    many=True,
 )

@@ -58,10 +58,13 @@ def summary(session, confirmation=None):
 def test_causes_look_alikes_and_gain_are_said():
     text = summary(found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {}))
     assert 'verdict: effects' in text
-    assert 'Joint compliance of joints 2 and 4: 0.500 mm, 100 % of the gain' in text
+    assert (
+        'Joint compliance of joints 2 and 4: 0.500 mm, without it 100 % of the gain is lost'
+        in text
+    )
     assert 'to do: Stiffen it.' in text
     nothing = summary(found((replace(EFFECT, share=-0.004),), Gain(None, None, 1e-4, {}), {}))
-    assert ', 0 % of the gain' in nothing
+    assert ', without it 0 % of the gain is lost' in nothing
     assert 'could be encoder scale of joint 2; to distinguish: a payload' in text
     assert 'could be joint 4 alone; to distinguish: another payload' in text
 

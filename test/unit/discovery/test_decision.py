@@ -5,23 +5,22 @@ from functools import cache
 import numpy as np
 import pytest
 from calibration_scenes import CHAIN
-from discovery_scenes import at_joint, session_with
+from discovery_scenes import at_joint, discovered, session_with
 from scipy.stats import norm
 
 from remaster_ros.discovery.decision import Decision, Named, decisions, sigma_of
-from remaster_ros.discovery.discover import find_causes
-from remaster_ros.discovery.findings import Findings
+from remaster_ros.discovery.discover import Discovery
 
 SAG, BASE = Named('joint_compliance', (2,)), Named('base_compliance', ())
 WAVE = Named('encoder_eccentricity', (2,))
 
 
 @cache
-def sagging() -> Findings:
+def sagging() -> Discovery:
     session = session_with(
         51, lambda s: at_joint(2, 4e-5 * CHAIN.gravity_torque(s.measurements.q)[:, 1])
     )
-    found = find_causes(session, rng=np.random.default_rng(0), progress=lambda stage, share: None)
+    found = discovered(session)
     assert [(effect.name, effect.joints) for effect in found.effects] == [SAG]
     return found
 

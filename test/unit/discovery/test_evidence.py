@@ -12,7 +12,6 @@ from remaster_ros.discovery import evidence, packed
 from remaster_ros.discovery.effects.base import Cell
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import log_prior_one_by_one, solve
-from remaster_ros.discovery.families import visible
 from remaster_ros.discovery.residuals import Residuals, units
 from remaster_ros.discovery.solution import Solution
 
@@ -23,7 +22,11 @@ def scene() -> tuple[Any, list[Cell]]:
     data = residuals_of(session)
     cells = []
     for name in ('joint_compliance', 'joint_error_curve', 'link_length'):
-        cells += visible(data, cells, list(EFFECTS[name].cells(data.context)))[:3]
+        added = 0
+        for cell in EFFECTS[name].cells(data.context):
+            if added < 3 and solve(data, (*cells, cell)) is not None:
+                cells.append(cell)
+                added += 1
     assert len(cells) == 9
     return session, cells
 

@@ -5,9 +5,8 @@ import pytest
 from discovery_scenes import residuals_of, session_with
 from scipy.stats import multivariate_normal
 
-from remaster_ros.discovery.cross_validation import LeftOut
 from remaster_ros.discovery.evidence import solve
-from remaster_ros.discovery.held_out_poses import compare_held_out, predicted_squares
+from remaster_ros.discovery.held_out_poses import LeftOut, compare_held_out, predicted_squares
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray, IntArray, Session

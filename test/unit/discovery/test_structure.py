@@ -4,22 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from discovery_scenes import at_joint, residuals_of, session_with
+from discovery_scenes import at_joint, discovered, residuals_of, session_with
 
-from remaster_ros.calibration.estimate import Problem, estimate
-from remaster_ros.calibration.fit import fit_session
-from remaster_ros.discovery.discover import discover_session, find_causes
+from remaster_ros.discovery.discover import discover_session
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.step import moments_of
 from remaster_ros.discovery.evidence import solve
-from remaster_ros.discovery.findings import Findings
-from remaster_ros.discovery.undetected import undetected
 from remaster_ros.reports.discovery_json import discovery_content
 from remaster_ros.types import FloatArray, Session
-
-
-def findings(session: Session) -> Findings:
-    return find_causes(session, rng=np.random.default_rng(0), progress=lambda stage, share: None)
 
 
 def in_time(session: Session) -> np.ndarray:
@@ -90,7 +82,7 @@ def test_a_slip_is_dated_between_the_two_configurations():
     plain = residuals_of(session_with(32, pose_sigma_m=0.05e-3)).context
     moments = moments_of(plain)
     truth = float(moments[len(moments) // 3])
-    found = findings(session_with(32, slipped(truth), pose_sigma_m=0.05e-3))
+    found = discovered(session_with(32, slipped(truth), pose_sigma_m=0.05e-3))
     (group,) = found.groups
     assert (group[0].name, group[0].joints) == ('step', (3,))
     (effect,) = found.effects
@@ -149,7 +141,7 @@ def test_a_marker_that_slips_on_the_tool_is_located():
         slip *= (plain.elapsed_s > moment)[:, None]
         return np.einsum('nji,nj->ni', plain.sensor_turn, slip)
 
-    found = findings(session_with(33, sensor=shifted, pose_sigma_m=0.05e-3))
+    found = discovered(session_with(33, sensor=shifted, pose_sigma_m=0.05e-3))
     places = [(group[0].name, group[0].place, group[0].subject) for group in found.groups]
     assert places == [('step', 'marker', plain.marker_names[0])]
 
@@ -192,7 +184,7 @@ def test_a_cause_of_the_sign_that_physics_excludes_is_not_named():
         m = session.measurements
         return at_joint(2, 2e-3 * np.nan_to_num(m.q - m.from_q)[:, 1])
 
-    found = findings(session_with(36, ahead))
+    found = discovered(session_with(36, ahead))
     assert [(e.name, e.joints, e.driver) for e in found.effects] == [
         ('unnamed', (2,), 'last_move')
     ]
@@ -225,54 +217,6 @@ def test_moments_lie_between_configurations():
         after = context.elapsed_s > moment
         configurations = context.measurements.configuration
         assert not set(configurations[after]) & set(configurations[~after])
-
-
-def test_causes_too_small_to_be_found_widen_the_offsets_and_nothing_else():
-    """They move zero-offsets, not the predictions; the more of them, the further."""
-    found = findings(session_with(39))
-    data, solution = found.residuals, found.selection.solution
-    spread = undetected(found.found, data, solution).moves
-    free = found.found.posterior.free
-    assert spread.shape[0] == found.found.model.size + len(solution.parameters)
-    held = np.setdiff1d(np.arange(found.found.model.size), free)
-    assert np.all(spread[held] == 0.0)
-    assert np.all(np.isfinite(spread))
-    plain = fit_session(session_with(39), rng=np.random.default_rng(1), precision=0.05)
-    wide = fit_session(
-        session_with(39), rng=np.random.default_rng(1), precision=0.05, unmodelled=spread
-    )
-    known = plain.identifiable
-    np.testing.assert_array_equal(known, wide.identifiable)
-    by_data, std = (fit.joint_offset_draws.std(axis=(0, 1)) for fit in (plain, wide))
-    assert 1.02 < np.max(std[known] / by_data[known]) < 3.0
-    np.testing.assert_allclose(wide.joint_offsets, plain.joint_offsets, rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(wide.residuals_after, plain.residuals_after, atol=1e-12)
-    expected = np.hypot(by_data, np.linalg.norm(spread[: len(known)], axis=1))
-    # A standard deviation of 400 independent draws is known to 3.5 %.
-    np.testing.assert_allclose(std[known], expected[known], rtol=0.15)
-
-
-def test_causes_too_small_to_be_found_open_the_regions_away_from_the_poses_that_were_fitted():
-    session = session_with(81, poses=60)
-    m = session.measurements
-    away = np.linalg.norm(m.q - m.q[0], axis=1)
-    near = away < np.quantile(away, 0.3)
-    near &= np.isin(m.pose, np.unique(m.pose[near])[:18])
-    session = replace(session, measurements=replace(m, is_validation=~near))
-    data, found = residuals_of(session), estimate(Problem.of(session))
-    solution = solve(data, ())
-    assert solution is not None
-    covariance = undetected(found, data, solution).covariance(data.context)
-    std = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-    noise = float(np.sqrt(3.0) * data.noise_model.sensor_noise(solution.noise).total[0])
-    print('m:', np.median(std[near]), np.median(std[~near]), 'noise', noise)
-    assert np.median(std[near]) < 0.5 * noise
-    assert np.median(std[~near]) > 2.0 * np.median(std[near])
-    # Of a block of rows the same as of all.
-    part = data.context.at(np.flatnonzero(~near)[:5])
-    np.testing.assert_allclose(
-        undetected(found, data, solution).covariance(part), covariance[~near][:5]
-    )
 
 
 @pytest.mark.parametrize('shift_m', [1e-3, 20e-3])

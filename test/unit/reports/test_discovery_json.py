@@ -61,7 +61,6 @@ def test_discovery_json_keeps_its_contract(saved):
     assert re.search(r'joint 2 errs by up to [45]\.\d+′ ± 0\.\d+′', effect['cause'])
     assert effect['sizes'][0] in effect['cause']
     assert effect['remedy'].endswith('.')
-    assert content['least_p_value'] == pytest.approx(1.0 / 301.0)
     assert content['gain']['held_out_rms_after_m'] < content['gain']['held_out_rms_before_m']
     assert content['joint_offsets_after'][1].keys() >= {'joint', 'mean_deg', 'std_deg'}
     assert content['confirmation']['confirmed'] is True
@@ -79,7 +78,7 @@ def test_the_report_needs_nothing_else_and_names_the_cause(saved):
     assert found.effects[0].cause in page
     assert 'decided: encoder eccentricity of joint 2, not joint compliance of joint 2; ' in page
     assert f'What to do: {found.effects[0].remedy}' in page
-    assert 'p &lt; 0.0033 over all causes' in page
+    assert 'p &lt; 0.0001 over all causes' in page
     assert 'sin2_2' in page
     for name in ('gain', 'drivers', 'causes'):
         ElementTree.parse(folder / 'figures' / f'{name}.svg')
@@ -127,11 +126,11 @@ def test_a_free_curve_is_drawn_where_it_was_measured_with_a_band_that_opens(save
         curve.columns(q[away]).T @ curve.columns(q[away]) + 1e-3 * curve.penalty
     )
     draws = np.random.default_rng(seed).multivariate_normal(0.0 * curve.places, covariance, 400)
-    solution = replace(found.selection.solution, cells=(cell,), parameters=draws[0])
+    solution = replace(found.solution, cells=(cell,), parameters=draws[0])
     drawn = replace(
         found,
         groups=((cell,),),
-        selection=replace(found.selection, solution=solution),
+        solution=solution,
         fit=replace(found.fit, theta_names=names, theta_draws=draws[None]),
     )
     (axes,) = discovery_figures.causes(drawn).axes
@@ -175,13 +174,13 @@ def test_noise_along_the_line_of_sight_is_drawn_by_sensor(saved):
     data = found.residuals
     noise_model = NoiseModel.of(data.rows, np.eye(4)[None], (0,))
     noise = Noise(np.array([0.3e-3, 0.0]), np.array([0.0, 0.6e-3]), np.zeros(2))
-    selection = replace(
-        found.selection,
-        empty=replace(found.selection.empty, noise=noise),
-        solution=replace(found.selection.solution, noise=noise),
+    drawn = replace(
+        found,
+        residuals=replace(data, noise_model=noise_model),
+        empty=replace(found.empty, noise=noise),
+        solution=replace(found.solution, noise=noise),
     )
-    residuals = replace(data, noise_model=noise_model)
-    figure = discovery_figures.gain(replace(found, residuals=residuals, selection=selection))
+    figure = discovery_figures.gain(drawn)
     widths = [bar.get_width() for bar in figure.axes[1].patches]
     np.testing.assert_allclose(widths, 2 * [0.6 * np.sqrt(2.0 / 3.0), 0.3 / np.sqrt(3.0)])
 
@@ -202,11 +201,7 @@ def test_predictions_csv_has_every_row_with_its_covariance(saved):
     assert regions['held_out']['rows'] == len(held_out) == m.is_validation.sum()
     assert regions['held_out']['inside'] == sum(int(row['inside95']) for row in held_out)
     assert regions['held_out']['share'] > 0.8
-    assert regions['widening'] == pytest.approx(found.stretches.widening)
-    stretches = content['stretches']
-    assert stretches['count'] == found.stretches.count == 10
-    assert stretches['ratio'] == pytest.approx(found.stretches.ratio)
-    assert stretches['widened'] is (stretches['p_value'] <= 0.01 and stretches['ratio'] > 1.0)
+    assert regions['widening'] >= 1.0
     first = rows[0]
     matrix = [[float(first[f'cov_{min(a, b)}{max(a, b)}_m2']) for a in 'xyz'] for b in 'xyz']
     assert np.linalg.eigvalsh(matrix).min() > 0.0
@@ -278,6 +273,6 @@ def test_where_no_joint_is_determined_and_no_cause_found_there_is_no_covariance(
         theta_draws=np.zeros((4, 100, 0)),
         theta_names=(),
     )
-    nothing = SimpleNamespace(solution=SimpleNamespace(cells=()))
-    found = discovery_json._covariance(SimpleNamespace(fit=fit, selection=nothing))
+    nothing = SimpleNamespace(cells=())
+    found = discovery_json._covariance(SimpleNamespace(fit=fit, solution=nothing))
     assert found == {'names': [], 'units': [], 'matrix': []}

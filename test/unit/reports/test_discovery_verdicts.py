@@ -26,7 +26,7 @@ def bent(session):
 
 
 def too_long(session):
-    return 2e-3 * session.measurements.position
+    return 4e-3 * session.measurements.position
 
 
 def discovered(seed, **options):
