@@ -8,7 +8,10 @@ arm; and its last digits depend on the machine.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Iterator
 from functools import wraps
 from typing import ParamSpec, TypeVar
 
@@ -27,7 +30,26 @@ def one_thread(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]
     @wraps(function)
     def limited(*args: _Given.args, **given: _Given.kwargs) -> _Result:
         # Looked up anew at each call: a library that was loaded since has threads of its own.
-        with threadpool_limits(limits=1, user_api='blas'):
+        with contextlib.ExitStack() as stack:
+            with _interrupts_later():
+                stack.enter_context(threadpool_limits(limits=1, user_api='blas'))
             return function(*args, **given)
 
     return limited
+
+
+@contextlib.contextmanager
+def _interrupts_later() -> Iterator[None]:
+    """Raise behind this block what Ctrl-C raises in it: in a callback of ctypes it is lost."""
+    handler = signal.getsignal(signal.SIGINT)
+    if not callable(handler) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, frame: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        if came:
+            signal.raise_signal(signal.SIGINT)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,6 +15,7 @@ import pytest
 from calibration_scenes import scene
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from remaster_ros import linear_algebra
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.linear_algebra import one_thread
@@ -69,3 +72,19 @@ def test_a_library_that_was_loaded_later_counts():
     before, counts = json.loads(done.stdout)
     assert len(counts) >= before
     assert set(counts) == {1}
+
+
+def test_an_interrupt_while_the_libraries_are_looked_up_is_not_lost(monkeypatch):
+    """What is raised in a callback of ctypes is printed and forgotten: Ctrl-C did nothing."""
+    callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))
+
+    def interrupted(**limits):
+        callback()
+        return threadpool_limits(**limits)
+
+    monkeypatch.setattr(linear_algebra, 'threadpool_limits', interrupted)
+    worked = []
+    with pytest.raises(KeyboardInterrupt):
+        linear_algebra.one_thread(worked.append)(1)
+    assert worked == []
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
