@@ -36,7 +36,6 @@ CHEAP = {
     'quick-start-real-hardware',
     'tutorial-demo',
     'tutorial-table',
-    'tutorial-ur5e',
 }
 
 

@@ -90,7 +90,14 @@ FIT = {
 }
 
 
-@pytest.mark.parametrize('case', FIT)
+@pytest.mark.parametrize(
+    'case',
+    [
+        # The chain of the paper's sampler has not converged either.
+        pytest.param(case, marks=pytest.mark.qualify if case == 'few draws' else ())
+        for case in FIT
+    ],
+)
 def test_fit(case: str, healthy: Path, tmp_path: Path) -> None:
     options, change, mood, words = FIT[case]
     session, out = changed(healthy, tmp_path, change), tmp_path / 'fit'
@@ -210,7 +217,7 @@ def test_causes_that_do_harm_on_held_out_poses_are_not_returned(tmp_path: Path) 
     assert left['next'] in page
 
 
-@pytest.mark.parametrize('case', ['none', 'effects'])
+@pytest.mark.parametrize('case', ['none', pytest.param('effects', marks=pytest.mark.qualify)])
 def test_discover_with_a_session_that_confirms(case: str, tmp_path: Path) -> None:
     options = DISCOVER[case][0]
     session = simulated(tmp_path / 'session', '--seed', 3, *options)
@@ -245,6 +252,7 @@ def test_causes_that_another_session_does_not_have_are_not_green(tmp_path: Path)
     assert remaster('discover', session, '--out', confirming, '--confirm', again).returncode == 0
     page, _, _ = page_of(confirming)
     assert 'class="verdict good"' in page
+    assert 'In the other session' in page
     assert 'does not confirm' not in page
 
 
