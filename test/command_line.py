@@ -15,8 +15,6 @@ from pathlib import Path
 from remaster_ros.cli.main import main
 
 ROOT = Path(__file__).parent.parent
-BECOME_NODES = {'demo', 'replay'}
-"""Verbs that may replace the process that they run in."""
 
 
 def remaster(
@@ -40,7 +38,9 @@ def remaster(
         Whether it is a process of its own in any case.
     """
     words = [str(arg) for arg in args]
-    if real or environment or through or BECOME_NODES & {*words[:1]}:
+    # They may become the process of a node.
+    is_node = words[:1] == ['demo'] or (words[:1] == ['replay'] and '--out' not in words)
+    if real or environment or through or is_node:
         done = _in_its_own_process(words, environment, through)
     else:
         done = _in_this_process(words)

@@ -102,7 +102,9 @@ def test_one_change_is_found_and_nothing_else_is(robot, change, found):
     assert not fit_arrangement(again, given.arrangement).gross
 
 
-@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize(
+    'seed', [0, 1, *(pytest.param(seed, marks=pytest.mark.qualify) for seed in (2, 3, 4))]
+)
 def test_a_right_table_is_not_gross_and_nonsense_has_no_remedy(seed):
     session = scene('irb120', 30, seed)
     given = Arrangement.given(6)

@@ -67,7 +67,7 @@ def test_a_few_rows_that_do_not_fit_are_named_and_the_session_is_written(table, 
     assert len(read_session(out).measurements) == 72
 
 
-@pytest.mark.parametrize('count', [8, 18])
+@pytest.mark.parametrize('count', [8, pytest.param(18, marks=pytest.mark.qualify)])
 def test_more_rows_off_than_a_fit_leaves_out_are_no_session(table, count):
     """Of 48, and of them so many in a row that the median does not show them."""
     imported = table()

@@ -31,6 +31,11 @@ from remaster_ros.sensors.optitrack.protocol.wire import ProtocolError
 VERSIONS = [
     (2, 6), (2, 7), (2, 9), (2, 10), (2, 11), (3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (4, 3),
 ]  # fmt: skip
+# Of what takes every byte in turn: the oldest, the first with a residual, the newest.
+SOME_VERSIONS = [
+    pytest.param(version, marks=() if version in ((2, 6), (3, 0), (4, 3)) else pytest.mark.qualify)
+    for version in VERSIONS
+]
 
 f32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
 i32 = st.integers(-(2**31), 2**31 - 1)
@@ -137,7 +142,7 @@ def test_markers_only_leaves_out_the_rest_and_nothing_else(version, data):
 
 
 @pytest.mark.parametrize('markers_only', [False, True])
-@pytest.mark.parametrize('version', VERSIONS)
+@pytest.mark.parametrize('version', SOME_VERSIONS)
 def test_every_truncation_is_refused(version, markers_only):
     payload = encode_frame(full_frame(version), version)
     for length in range(len(payload)):
@@ -177,7 +182,7 @@ def test_flipped_bits_give_a_protocol_error_or_a_frame(version, flips):
         assert marker.params & OCCLUDED or all(map(math.isfinite, marker.position))
 
 
-@pytest.mark.parametrize('version', VERSIONS)
+@pytest.mark.parametrize('version', SOME_VERSIONS)
 @pytest.mark.parametrize('count', [-1, 2**31 - 1, 70_000])
 def test_absurd_counts_are_refused_at_every_place(version, count):
     """Overwrite every aligned-or-not i32 with a count that the bytes cannot hold."""
