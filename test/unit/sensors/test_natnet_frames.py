@@ -122,7 +122,7 @@ def test_size_of_the_demo_scene(version, bytes_with_header):
 
 
 @pytest.mark.parametrize('version', VERSIONS)
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(data=st.data())
 def test_what_is_encoded_is_decoded(version, data):
     frame = data.draw(frames(version))
@@ -131,7 +131,7 @@ def test_what_is_encoded_is_decoded(version, data):
 
 
 @pytest.mark.parametrize('version', VERSIONS)
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(data=st.data())
 def test_markers_only_leaves_out_the_rest_and_nothing_else(version, data):
     frame = data.draw(frames(version))
