@@ -23,6 +23,7 @@ from remaster_ros.discovery.side_by_side import rms_sigmas
 from remaster_ros.discovery.words import part_words, percent, sentence_case, shown
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
+from remaster_ros.reports.discovery_apply import load_words, loadable
 from remaster_ros.reports.discovery_json import (
     held_out_coverage,
     predictions_of,
@@ -138,6 +139,11 @@ def summary(
             name = fewer or sentence_case(alike.title)
             lines.append(f'    could be {name}; to distinguish: {alike.separate_by}')
     lines += [f'unexplained: {left.next}' for left in found.unexplained]
+    for row in loadable(found):
+        what, to_do = load_words(row)
+        mean = row.held_out_mean_mm
+        error = '' if mean is None else f', mean error on held-out poses {mean:.3f} mm'
+        lines.append(f'to load: {what}{error}: {to_do}')
     if held_out is not None and held_out.share is not None:
         lines.append(
             f'{held_out.inside} of {held_out.rows} held-out rows ({percent(held_out.share)}) lie '

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 REMASTER_FILE = 'remaster.txt'
 LAYER_FILE = 'offset_layer.yaml'
 URDF_FILE = 'robot_calibrated.urdf'
-GEOMETRY_FILE = 'robot_geometry.urdf'
 MODEL_FILE = 'robot_model.urdf'
 
 _PROLOG = re.compile(r'(?:\s*(?:<\?.*?\?>|<!--.*?-->))*\s*', re.DOTALL)
@@ -44,7 +43,7 @@ _LIMITS = {
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """What a discovery corrects in a robot model of k joints beyond the zero-offsets.
+    """What is corrected in a robot model of k joints beyond the zero-offsets.
 
     Attributes
     ----------
@@ -52,13 +51,10 @@ class Geometry:
         Of each joint's origin, in the frame of the link that the joint before it moves, m, (k, 3).
     turns
         Of each joint's frame, as a rotation vector in that frame, rad, (k, 3).
-    remarks
-        For the user: what is corrected, and what is not, a line each.
     """
 
     shifts: FloatArray
     turns: FloatArray
-    remarks: tuple[str, ...]
 
     @property
     def is_any(self) -> bool:
@@ -66,24 +62,23 @@ class Geometry:
         return bool(np.any(self.shifts) or np.any(self.turns))
 
 
-def exports(result: FitResult, geometry: Geometry | None = None) -> dict[str, str]:
-    """Return the files of the folder ``apply`` next to fit.json or discovery.json: name -> text.
+def exports(result: FitResult, remarks: Sequence[str] = ()) -> dict[str, str]:
+    """Return the files with the zero-offsets of the folder ``apply``: name -> text.
 
-    With changes of the geometry there is a robot model more, which holds them and no offsets.
+    Parameters
+    ----------
+    result
+        Whose offsets they hold.
+    remarks
+        For the user: what is not corrected, a line each.
     """
     offsets = np.where(result.identifiable, result.joint_offsets, 0.0)
-    urdf, chain = result.session.urdf, result.chain
-    remarks = geometry.remarks if geometry is not None else ()
     notes = _notes(result, remarks)
-    files = {
+    return {
         REMASTER_FILE: remaster_text(result, remarks),
         LAYER_FILE: layer_text(result, remarks),
-        URDF_FILE: calibrated_urdf(urdf, chain, offsets, notes, geometry),
+        URDF_FILE: calibrated_urdf(result.session.urdf, result.chain, offsets, notes),
     }
-    if geometry is not None and geometry.is_any:
-        none = np.zeros(len(chain))
-        files[GEOMETRY_FILE] = calibrated_urdf(urdf, chain, none, notes, geometry)
-    return files
 
 
 def _notes(result: FitResult, remarks: Sequence[str] = ()) -> list[str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -33,6 +33,7 @@ from remaster_ros.discovery.gain import (
     pose_common_fraction,
     residuals_of,
 )
+from remaster_ros.discovery.geometry_model import GeometryModel, better_of_two, geometry_model
 from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, unfitted
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
 from remaster_ros.discovery.omnibus import structure_left
@@ -58,6 +59,7 @@ LEADING_SHARE = 0.1
 # A kind of error whose members displace the marker by less than this share of the noise, RMS,
 # moves no offset and no prediction by a noticeable part of its standard deviation.
 LEAST_SHOWN = 0.01
+NOT_LOADED = 'No robot model with it predicts held-out poses better than the zero-offsets do.'
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +102,12 @@ class Discovery:
         its sensor, m, (n, 3).
     unexplained
         Structure that no cause explains.
+    alone
+        The sampled fit whose zero-offsets are right where nothing else of the arm is corrected:
+        with errors of the measurement taken out, and no other.
+    geometry
+        All lengths and tilts beside the zero-offsets, errors of the measurement taken out; None
+        where they cannot be fitted.
     """
 
     verdict: Verdict
@@ -117,8 +125,22 @@ class Discovery:
     residuals: Residuals
     fit: FitResult
     residuals_before: FloatArray
+    alone: FitResult
+    geometry: GeometryModel | None
     thinning: Thinning | None = None
     unexplained: tuple[Unexplained, ...] = ()
+
+    @property
+    def loads_geometry(self) -> bool:
+        """Whether a robot model with all lengths and tilts is worth loading.
+
+        Held-out poses decide; without them, that a length or tilt is among the causes.
+        """
+        if self.geometry is None:
+            return False
+        if self.geometry.is_validation.any():
+            return self.geometry.is_better
+        return any(effect.in_robot_model for effect in self.effects)
 
 
 @one_thread
@@ -203,10 +225,26 @@ def discover_session(
         verdict = 'undetermined'
     empty = search.fit(())
     assert empty is not None
+    report('fitting what can be loaded', 0.0)
+    measured = [cell for group in groups if group[0].of_measurement for cell in group]
+    alone = fit
+    if not all(effect.of_measurement for effect in effects):
+        errors = search.fit(measured) if measured else None
+        alone = fit_session(
+            session,
+            rng=rng,
+            clock=clock,
+            priors=None if found is before else found.problem.priors,
+            precision=PRECISION,
+            extension=None if errors is None else extension_of(data, errors, found),
+        )
+    geometry = geometry_model(found, causes=measured)
+    if geometry is not None and any(effect.in_robot_model for effect in effects):
+        geometry = better_of_two(geometry, found, solution.cells, fit.theta, measured)
     thinning = None
     if len(pool) < len(found.problem.fitted):
         thinning = judge_by_others(data, found.kept, data.rows.source, empty, solution)
-    return Discovery(
+    result = Discovery(
         verdict=verdict,
         effects=effects,
         gain=gain,
@@ -222,9 +260,15 @@ def discover_session(
         residuals=data,
         fit=fit,
         residuals_before=residuals_of(before),
+        alone=alone,
+        geometry=geometry,
         thinning=thinning,
         unexplained=unexplained,
     )
+    if result.loads_geometry:
+        return result
+    effects = tuple(replace(e, remedy=NOT_LOADED) if e.in_robot_model else e for e in effects)
+    return replace(result, effects=effects)
 
 
 def _to_search(

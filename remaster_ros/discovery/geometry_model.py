@@ -21,9 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from remaster_ros.calibration.comparison import predicted_rows
-from remaster_ros.calibration.estimate import Estimate, Problem, estimate
+from remaster_ros.calibration.estimate import Estimate, estimate
 from remaster_ros.calibration.identifiability import OPEN_ANGLE
-from remaster_ros.calibration.model import Model
 from remaster_ros.calibration.priors import TIGHTEST_PRIOR, prior_rows
 from remaster_ros.discovery.effects import joint_axis_tilt, link_length
 from remaster_ros.discovery.effects.base import Cell
@@ -36,7 +35,7 @@ from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix
 from remaster_ros.linear_algebra import one_thread
-from remaster_ros.types import FloatArray
+from remaster_ros.types import BoolArray, FloatArray
 
 # Links of arms are machined and assembled to a tenth of a millimetre or so.
 TOLERANCE_M = 1e-4
@@ -63,9 +62,11 @@ class GeometryModel:
         vector, rad, (k, 3) each.
     joint_offsets
         Zero-offsets fitted together with it, those that the gauge holds at 0, rad, (k,).
-    held_out_m, drawing_held_out_m
-        Mean distance of measured and predicted position over the validation rows, m, with this
-        geometry and on the drawing; NaN without such rows.
+    errors, drawing_errors
+        Measured minus predicted position of every row of the session, m, (n, 3), with this
+        geometry and on the drawing.
+    is_validation
+        Which of them were held out, (n,).
     """
 
     tolerance_m: float
@@ -75,8 +76,19 @@ class GeometryModel:
     shifts: FloatArray
     turns: FloatArray
     joint_offsets: FloatArray
-    held_out_m: float
-    drawing_held_out_m: float
+    errors: FloatArray
+    drawing_errors: FloatArray
+    is_validation: BoolArray
+
+    @property
+    def held_out_m(self) -> float:
+        """Mean 3-D error over the validation rows with this geometry, m; NaN without any."""
+        return mean_length(self.errors[self.is_validation])
+
+    @property
+    def drawing_held_out_m(self) -> float:
+        """The same on the drawing."""
+        return mean_length(self.drawing_errors[self.is_validation])
 
     @property
     def is_better(self) -> bool:
@@ -107,7 +119,9 @@ class GeometryModel:
 
 
 @one_thread
-def geometry_model(found: Estimate, tolerance_m: float = TOLERANCE_M) -> GeometryModel | None:
+def geometry_model(
+    found: Estimate, tolerance_m: float = TOLERANCE_M, causes: Sequence[Cell] = ()
+) -> GeometryModel | None:
     """Fit all lengths and tilts beside the zero-offsets; None where they cannot be fitted.
 
     Parameters
@@ -116,8 +130,10 @@ def geometry_model(found: Estimate, tolerance_m: float = TOLERANCE_M) -> Geometr
         The session's fit on the drawing.
     tolerance_m
         Of the drawing.
+    causes
+        Errors of the measurement, fitted beside them: they are no errors of the arm.
     """
-    drawing_held_out_m = held_out_mean(found.problem, found.model, found.mode.z)
+    drawing = _fitted(found, causes)
     found = _without_open_offsets(found)
     data = Residuals.of(found)
     families = [
@@ -125,49 +141,115 @@ def geometry_model(found: Estimate, tolerance_m: float = TOLERANCE_M) -> Geometr
         for members in (_lengths(data.context), _tilts(data.context))
         if (family := Family.of(data, members[0].name, members, tolerance_m)) is not None
     ]
-    solution = solve(data, [family.cell for family in families]) if families else None
-    if solution is None:
+    cells = [*(family.cell for family in families), *causes]
+    solution = solve(data, cells) if families else None
+    if drawing is None or solution is None:
         return None
     factors = dict(zip(solution.cells, solution.smoothness, strict=True))
     std_m = np.concatenate(
         [np.full(len(one.members), factors[one.cell] ** -0.5) for one in families]
     )
+    members = tuple(member for one in families for member in one.members)
     solution = by_members(solution, families)
-    members = solution.cells
     try:
         mode = estimate(found.problem, extension_of(data, solution, found)).mode
     except InsufficientDataError:
         return None
     model = mode.linearisation.posterior.model
     x = model.natural(mode.z)
-    k = model.joints
-    shifts, turns = np.zeros((2, k, 3))
-    for member, value in zip(members, model.theta(x), strict=True):
-        change = member.model_change
-        assert change is not None
-        shifts[change.joint] += value * change.shifts[0]
-        turns[change.joint] += value * change.turns[0]
-    # Lengths and tilts were linearised: all else settles on the arm that they make.
-    fit = estimate(replace(found.problem, chain=_moved(model.chain, shifts, turns)))
+    # Errors of the measurement come behind all members.
+    loaded = _loaded(found, solution.cells, model.theta(x), causes)
+    if loaded is None:
+        return None
     return GeometryModel(
         tolerance_m,
         members,
         std_m,
         _offset_moves(found, data, families) * std_m,
-        shifts,
-        turns,
-        fit.model.offsets(fit.mode.z),
-        held_out_mean(fit.problem, fit.model, fit.mode.z),
-        drawing_held_out_m,
+        *loaded,
+        _errors(drawing),
+        found.problem.measurements.is_validation,
     )
 
 
-def held_out_mean(problem: Problem, model: Model, z: FloatArray) -> float:
-    """Return the mean 3-D error over the validation rows by pinned z, m; NaN without any."""
-    measurements = problem.measurements
-    errors = measurements.position - predicted_rows(problem, model, z)
-    held_out = np.linalg.norm(errors[measurements.is_validation], axis=1)
-    return float(held_out.mean()) if len(held_out) else float('nan')
+def better_of_two(
+    geometry: GeometryModel,
+    found: Estimate,
+    cells: Sequence[Cell],
+    theta: FloatArray,
+    causes: Sequence[Cell],
+) -> GeometryModel:
+    """Return the model with lengths and tilts as fitted beside all causes, where that is better.
+
+    By themselves they take over a part of curves and compliances, which helps where poses are like
+    those fitted; fitted beside these they are the arm's own. Held-out poses decide.
+
+    Parameters
+    ----------
+    geometry, found, causes
+        The model, and what it was made of.
+    cells, theta
+        Of the model with all causes, and their parameters (m,). Those of no robot model count
+        nothing.
+    """
+    loaded = _loaded(_without_open_offsets(found), cells, theta, causes)
+    if loaded is None:
+        return geometry
+    shifts, turns, joint_offsets, errors = loaded
+    other = replace(
+        geometry, shifts=shifts, turns=turns, joint_offsets=joint_offsets, errors=errors
+    )
+    return other if other.held_out_m < geometry.held_out_m else geometry
+
+
+def _loaded(
+    found: Estimate, cells: Sequence[Cell], theta: FloatArray, causes: Sequence[Cell]
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
+    """Return shifts, turns, zero-offsets and the errors of all rows on an arm with some lengths.
+
+    They were linearised: all else settles on the arm that they make.
+    """
+    chain = found.problem.chain
+    shifts, turns = np.zeros((2, len(chain), 3))
+    at = 0
+    for cell in cells:
+        values = theta[at : at + cell.size]
+        at += cell.size
+        if cell.model_change is not None:
+            shifts[cell.model_change.joint] += values @ cell.model_change.shifts
+            turns[cell.model_change.joint] += values @ cell.model_change.turns
+    try:
+        moved = estimate(replace(found.problem, chain=_moved(chain, shifts, turns)))
+    except InsufficientDataError:
+        return None
+    fit = _fitted(moved, causes)
+    if fit is None:
+        return None
+    return shifts, turns, fit.posterior.model.offsets(fit.mode.z), _errors(fit)
+
+
+def mean_length(errors: FloatArray) -> float:
+    """Return the mean length of errors, m, (n, 3); NaN of none."""
+    return float(np.linalg.norm(errors, axis=1).mean()) if len(errors) else float('nan')
+
+
+def _fitted(found: Estimate, causes: Sequence[Cell]) -> Estimate | None:
+    """Return the fit with some causes beside it; None where they cannot be fitted."""
+    if not causes:
+        return found
+    data = Residuals.of(found)
+    solution = solve(data, causes)
+    if solution is None:
+        return None
+    try:
+        return estimate(found.problem, extension_of(data, solution, found))
+    except InsufficientDataError:
+        return None
+
+
+def _errors(fit: Estimate) -> FloatArray:
+    predicted = predicted_rows(fit.problem, fit.posterior.model, fit.mode.z)
+    return fit.problem.measurements.position - predicted
 
 
 def _without_open_offsets(found: Estimate) -> Estimate:

@@ -11,7 +11,7 @@ import numpy as np
 from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.noise_check import MEAN_LENGTH
 from remaster_ros.calibration.outliers import LARGEST_SHARE
-from remaster_ros.compensation.export import GEOMETRY_FILE, LAYER_FILE, REMASTER_FILE, URDF_FILE
+from remaster_ros.compensation.export import LAYER_FILE, MODEL_FILE, REMASTER_FILE, URDF_FILE
 from remaster_ros.compensation.mastering import MasteringStep, mastering
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, transform
@@ -22,7 +22,7 @@ from remaster_ros.reports.remaining import Remaining, what_remains
 from remaster_ros.reports.schemas import JointOffset, Judgement
 from remaster_ros.types import BoolArray, FloatArray, Session
 
-ALL_FILES = (REMASTER_FILE, URDF_FILE, LAYER_FILE, GEOMETRY_FILE)
+ALL_FILES = (REMASTER_FILE, URDF_FILE, LAYER_FILE, MODEL_FILE)
 Mood = Literal['good', 'caution', 'bad']
 
 
@@ -83,9 +83,9 @@ class Answer:
     action
         'set' the offsets, 'wait' with them, or 'nothing' has to be set.
     uses_causes
-        The offsets, and what stands in the files, are those of the model with causes.
-    has_geometry
-        The robot model holds lengths or tilts as well.
+        The offsets are those of the model with the causes: all lie in the measurement.
+    loads_model
+        The deed is to load the robot model with all lengths, tilts and zero-offsets.
     stages
         From today on, each with more corrected.
     brings
@@ -112,7 +112,7 @@ class Answer:
     headline: str
     action: Literal['set', 'wait', 'nothing']
     uses_causes: bool
-    has_geometry: bool
+    loads_model: bool
     stages: tuple[Stage, ...]
     brings: int
     final_mm: FloatArray
@@ -145,7 +145,7 @@ class Answer:
         """The files that belong to the deed, in the folder ``apply``."""
         if self.action != 'set':
             return []
-        return [name for name in ALL_FILES if self.has_geometry or name != GEOMETRY_FILE]
+        return [name for name in ALL_FILES if self.loads_model or name != MODEL_FILE]
 
 
 def answer_of(inputs: Inputs) -> Answer:
@@ -154,34 +154,38 @@ def answer_of(inputs: Inputs) -> Answer:
     effects = found.effects if found is not None else []
     judged, held_out = judged_rows(inputs)
     not_counted = int(inputs.session.measurements.is_validation.sum()) - int(judged.sum())
-    rows, brings = _stages(inputs)
+    rows = _stages(inputs)
     stages = tuple(Stage(text, errors[judged]) for text, errors in rows)
-    uses_causes = brings > 1
+    uses_causes = inputs.causes_mm is not None and all_taken_out(found)
+    loads_model = (
+        inputs.model_mm is not None
+        and not uses_causes
+        and stages[1].mean > NOTICEABLE_GAIN * stages[2].mean
+    )
+    brings = 2 if uses_causes or loads_model else 1
     offsets = found.joint_offsets_after if uses_causes and found else fit.joint_offsets
     action, reason = _action(
         inputs.judgement, effects, stages[0].mean, stages[brings].mean, offsets
     )
     known = sum(row.identifiable for row in offsets)
-    geometry = uses_causes and any(effect.in_robot_model for effect in effects)
-    taken_out = uses_causes and brings == len(rows) - 1
     pad = inputs.session.controller
-    measured = [e.title for e in effects if taken_out and e.of_measurement]
+    measured = [e.title for e in effects if uses_causes]
     return Answer(
-        mood=_mood(inputs, uses_causes, held_out and action != 'wait'),
+        mood=_mood(inputs, loads_model, held_out and action != 'wait'),
         headline=reason
         or _headline(
-            known, stages, brings, held_out, measured, geometry, not_counted if held_out else 0
+            known, stages, brings, held_out, measured, loads_model, not_counted if held_out else 0
         ),
         action=action,
         uses_causes=uses_causes,
-        has_geometry=geometry,
+        loads_model=loads_model,
         stages=stages,
         brings=brings,
         final_mm=rows[brings][1],
         held_out=held_out,
         not_counted=not_counted if held_out else 0,
         noise=_noise(inputs),
-        remains=tuple(what_remains(inputs, uses_causes, held_out)),
+        remains=tuple(what_remains(inputs, loads_model, held_out)),
         offsets=tuple(offsets),
         on_the_pad=_on_the_pad(inputs.session, offsets),
         pad_names={} if pad is None else {name: joint.name for name, joint in pad.joints.items()},
@@ -212,31 +216,16 @@ def judged_rows(inputs: Inputs) -> tuple[BoolArray, bool]:
     return ~np.isin(m.observation, list(inputs.fit_left_out)), False
 
 
-def _stages(inputs: Inputs) -> tuple[list[tuple[str, FloatArray]], int]:
-    """Return title and errors of all rows, mm, at each stage, and the one that a deed reaches."""
+def _stages(inputs: Inputs) -> list[tuple[str, FloatArray]]:
+    """Return title and errors of all rows, mm, at each stage."""
     rows = [('today', inputs.before_mm), ('with the zero-offsets', inputs.after_mm)]
-    if inputs.causes_mm is None or inputs.found is None:
-        return rows, 1
-    if all_taken_out(inputs.found):
-        effects = inputs.found.effects
-        text = 'with zero-offsets' + (
-            ' and lengths' if any(effect.in_robot_model for effect in effects) else ''
-        )
-        text += (
-            ', measuring errors taken out'
-            if any(effect.of_measurement for effect in effects)
-            else ''
-        )
-        return [*rows, (text, inputs.causes_mm)], 2
-    brings = 1
+    if inputs.causes_mm is not None and all_taken_out(inputs.found):
+        return [*rows, ('with zero-offsets, measuring errors taken out', inputs.causes_mm)]
     if inputs.model_mm is not None:
-        rows.append(('with the corrected robot model', inputs.model_mm))
-        # Chosen by the fitted rows; those held out only show what it brings.
-        fitted = ~inputs.session.measurements.is_validation
-        means = [float(errors[fitted].mean()) for _, errors in rows]
-        brings = 2 if means[1] > NOTICEABLE_GAIN * means[2] else 1
-    rows.append(('with every cause corrected too', inputs.causes_mm))
-    return rows, brings
+        rows.append(('with all lengths and tilts in the robot model', inputs.model_mm))
+    if inputs.causes_mm is not None:
+        rows.append(('with every cause corrected', inputs.causes_mm))
+    return rows
 
 
 def _action(
@@ -283,7 +272,7 @@ def _noise(inputs: Inputs) -> tuple[SensorNoise, ...]:
     return tuple(rows)
 
 
-def _mood(inputs: Inputs, uses_causes: bool, may_be_good: bool) -> Mood:
+def _mood(inputs: Inputs, loads_model: bool, may_be_good: bool) -> Mood:
     """Return 'good' only where the fit, the discovery and the held-out poses all agree."""
     fit, found = inputs.judgement, inputs.found
     if fit.mood == 'bad':
@@ -293,7 +282,7 @@ def _mood(inputs: Inputs, uses_causes: bool, may_be_good: bool) -> Mood:
     moods: list[Mood] = []
     if found is None or not found.effects:
         moods.append(fit.mood)
-    elif not uses_causes or not all(effect.in_robot_model for effect in found.effects):
+    elif not loads_model or not all(effect.in_robot_model for effect in found.effects):
         # Something is left, in the arm or in how it was measured.
         moods.append('caution')
     if found is not None and isinstance(found.judgement, Judgement):
@@ -307,13 +296,14 @@ def _headline(
     brings: int,
     held_out: bool,
     measured: Sequence[str],
-    corrects_model: bool,
+    loads_model: bool,
     not_counted: int,
 ) -> str:
     """Return the deed and its gain; ``measured`` is what was found of the measurement."""
     before, after = stages[0], stages[brings]
     deed = f'Set the zero-offsets of {joints} joint{"s" if joints > 1 else ""}'
-    deed += ' and correct the robot model' if corrects_model else ''
+    if loads_model:
+        deed = 'Load the robot model with all lengths, tilts and zero-offsets'
     where = 'poses that were never fitted' if held_out else 'the fitted poses'
     if not_counted:
         where += f' ({not_counted} gross error{"s" if not_counted > 1 else ""} not counted)'

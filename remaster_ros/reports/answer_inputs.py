@@ -12,10 +12,10 @@ import numpy as np
 
 from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Problem, estimate
-from remaster_ros.compensation.export import URDF_FILE
+from remaster_ros.compensation.export import MODEL_FILE
 from remaster_ros.errors import InputError
 from remaster_ros.reports.discovery_json import read_discovery
-from remaster_ros.reports.discovery_schema import Discovered
+from remaster_ros.reports.discovery_schema import Discovered, Loadable
 from remaster_ros.reports.fit_json import (
     APPLY_FOLDER,
     DISCOVERY_FILE,
@@ -25,7 +25,7 @@ from remaster_ros.reports.fit_json import (
 )
 from remaster_ros.reports.predictions_csv import PREDICTED, PREDICTIONS_FILE
 from remaster_ros.reports.rows_csv import AFTER, BEFORE, RESIDUALS_FILE, read_columns
-from remaster_ros.reports.schemas import Fit, Judgement
+from remaster_ros.reports.schemas import Fit, FittedGeometry, Judgement
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.recorded_plan import RecordedPlan
 from remaster_ros.types import FloatArray, Session
@@ -46,8 +46,10 @@ class Inputs:
     causes_mm
         With the causes as well, (n,); None where there are none.
     model_mm
-        With the corrected robot model of the discovery and nothing else, (n,); None where it has
-        all causes or none.
+        With the robot model of all lengths, tilts and zero-offsets and nothing else, (n,); None
+        where there is none that predicts held-out poses better.
+    model
+        That file.
     plan
         Of its collection; None where the session's folder has none.
     """
@@ -59,6 +61,7 @@ class Inputs:
     after_mm: FloatArray
     causes_mm: FloatArray | None
     model_mm: FloatArray | None = None
+    model: Path | None = None
     plan: RecordedPlan | None = None
 
     @property
@@ -125,25 +128,47 @@ def read_inputs(
     residuals = read_columns(fit_path.parent / RESIDUALS_FILE, session, BEFORE + AFTER, 'fit')
     before_mm, after_mm = _lengths_mm(residuals[:, :3]), _lengths_mm(residuals[:, 3:])
     if found_path is None:
-        return Inputs(session, fit, None, before_mm, after_mm, None, plan=plan)
+        model, model_mm = _model(session, fit_path, _file_of(fit.geometry), 'fit')
+        return Inputs(session, fit, None, before_mm, after_mm, None, model_mm, model, plan)
     found = msgspec.convert(read_discovery(found_path), Discovered)
     _require_same(session, found, found_path, 'discover')
-    causes_mm = model_mm = None
+    causes_mm = None
     if found.effects:
         path = found_path.parent / PREDICTIONS_FILE
         predicted = read_columns(path, session, PREDICTED, 'discover')
         causes_mm = _lengths_mm(session.measurements.position - predicted)
-    if any(effect.in_robot_model for effect in found.effects) and not all_taken_out(found):
-        path = found_path.parent / APPLY_FOLDER / URDF_FILE
-        data = read_limited(path, FIT_LIMIT, 'discover again, which writes it')
-        model_mm = errors_with_model_mm(session, decode_text(data, path))
-    return Inputs(session, fit, found, before_mm, after_mm, causes_mm, model_mm, plan)
+    rows = found.loadable if isinstance(found.loadable, list) else []
+    model, model_mm = _model(
+        session,
+        found_path,
+        ''.join(_file_of(r) for r in rows if r.result == 'geometry'),
+        'discover',
+    )
+    return Inputs(session, fit, found, before_mm, after_mm, causes_mm, model_mm, model, plan)
 
 
-def all_taken_out(found: Discovered) -> bool:
-    """Whether all causes are in the corrected robot model, or in how the arm was measured."""
-    return found.verdict != 'undetermined' and all(
-        effect.in_robot_model or effect.of_measurement for effect in found.effects
+def _file_of(source: Loadable | FittedGeometry | msgspec.UnsetType) -> str:
+    return '' if isinstance(source, msgspec.UnsetType) else source.file
+
+
+def _model(
+    session: Session, result: Path, file: str, verb: str
+) -> tuple[Path | None, FloatArray | None]:
+    """Return a result's robot model and the errors with it, mm; None where it has none."""
+    if not file:
+        return None, None
+    path = result.parent / APPLY_FOLDER / MODEL_FILE
+    data = read_limited(path, FIT_LIMIT, f'{verb} again, which writes it')
+    return path, errors_with_model_mm(session, decode_text(data, path))
+
+
+def all_taken_out(found: Discovered | None) -> bool:
+    """Whether all causes lie in how the arm was measured, and there is at least one."""
+    return (
+        found is not None
+        and found.verdict != 'undetermined'
+        and bool(found.effects)
+        and all(effect.of_measurement for effect in found.effects)
     )
 
 

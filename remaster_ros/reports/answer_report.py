@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from markupsafe import Markup
 
-from remaster_ros.compensation.export import GEOMETRY_FILE
+from remaster_ros.compensation.export import MODEL_FILE
 from remaster_ros.discovery.words import clock_time
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -93,7 +93,7 @@ def write_answer(
     make_folder(folder)
     html = answer_html(subject, {name: inlined(name, svg) for name, svg in drawings.items()})
     source = found_folder if answer.uses_causes and found_folder else fit_folder
-    _copy_apply(source / APPLY_FOLDER, answer, folder)
+    _copy_apply(source / APPLY_FOLDER, inputs.model, answer, folder)
     copy_plan(inputs.plan, folder)
     write_atomically(folder / REPORT_FILE, html)
     if printer is not None:
@@ -127,7 +127,7 @@ def answer_html(subject: Subject, drawings: dict[str, Markup], printing: bool = 
     inputs, answer = subject.inputs, subject.answer
     fit = msgspec.to_builtins(inputs.fit)
     found = msgspec.to_builtins(inputs.found) if inputs.found is not None else None
-    if found is not None and GEOMETRY_FILE not in answer.files:
+    if found is not None and MODEL_FILE not in answer.files:
         for effect in found['effects']:
             if effect['in_robot_model']:
                 effect['remedy'] = NO_FILE
@@ -215,14 +215,15 @@ def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
     return rows
 
 
-def _copy_apply(source: Path, answer: Answer, folder: Path) -> None:
+def _copy_apply(source: Path, model: Path | None, answer: Answer, folder: Path) -> None:
     """Copy the files of the deed, so that the page can be handed on with them."""
     make_folder(folder / APPLY_FOLDER)
     for name in ALL_FILES:
         # One of an earlier page would contradict this one.
         (folder / APPLY_FOLDER / name).unlink(missing_ok=True)
     for name in answer.files:
-        data = read_limited(source / name, FILE_LIMIT, 'fit or discover again, which write it')
+        path = model if model is not None and name == MODEL_FILE else source / name
+        data = read_limited(path, FILE_LIMIT, 'fit or discover again, which write it')
         write_atomically(folder / APPLY_FOLDER / name, data)
 
 

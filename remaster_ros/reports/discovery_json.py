@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.calibration.predictions import Coverage, Predictions, predict
-from remaster_ros.compensation.export import GEOMETRY_FILE
+from remaster_ros.compensation.export import MODEL_FILE
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.decision import Decision
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.reports import schemas
-from remaster_ros.reports.discovery_apply import applied
+from remaster_ros.reports.discovery_apply import applied, loadable
 from remaster_ros.reports.discovery_judgement import judgement
 from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.fit_json import (
@@ -55,6 +55,7 @@ def discovery_content(
         'verdict': discovery.verdict,
         'effects': discovery.effects,
         'gain': discovery.gain,
+        'loadable': loadable(discovery),
         'metrics': discovery.gain.metrics,
         'noise': {
             'pose_common_fraction': discovery.pose_common_fraction,
@@ -166,8 +167,8 @@ def save_discovery(
     text = predictions_text(discovery.fit.session, predictions, gross)
     write_atomically(folder / PREDICTIONS_FILE, text)
     make_folder(folder / APPLY_FOLDER)
-    # That of an earlier run with other causes would contradict the rest.
-    (folder / APPLY_FOLDER / GEOMETRY_FILE).unlink(missing_ok=True)
+    # That of an earlier run would contradict the rest.
+    (folder / APPLY_FOLDER / MODEL_FILE).unlink(missing_ok=True)
     for name, text in applied(discovery).items():
         write_atomically(folder / APPLY_FOLDER / name, text)
     if not figures:

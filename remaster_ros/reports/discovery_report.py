@@ -10,6 +10,7 @@ from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.confirmation_words import in_words
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.reports.discovery_apply import load_words
 from remaster_ros.reports.discovery_figures import draw_discovery
 from remaster_ros.reports.discovery_schema import Discovered
 from remaster_ros.reports.pages import inlined, page, write_report
@@ -49,6 +50,7 @@ def write_discovery_report(
         sources={name: effect.source for name, effect in EFFECTS.items()},
         most_parameters=MOST_PARAMETERS,
         confirmed=in_words(discovery, confirmation) if confirmation else (),
+        to_load=[(row, *load_words(row)) for row in content.loadable or ()],
         drawings={name: inlined(name, text) for name, text in drawings.items()},
     )
     return write_report(folder, drawings, html)

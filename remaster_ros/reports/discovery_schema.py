@@ -105,6 +105,20 @@ class Gain(Struct):
     held_out_kept_after_m: float | UnsetType | None = UNSET
 
 
+class Loadable(Struct):
+    """What of the result a robot can load, and the mean 3-D error on held-out poses with it.
+
+    'offsets' by themselves, 'geometry': all link lengths, axis tilts and zero-offsets together, or
+    'everything' that the model holds. ``better`` than all before it, or there is no reason to load
+    it. ``file`` is '' where no file holds it.
+    """
+
+    result: Literal['offsets', 'geometry', 'everything']
+    held_out_mean_mm: float | None
+    better: bool
+    file: str
+
+
 class NoiseOfDiscovery(Struct):
     """What the search found of the noise."""
 
@@ -240,6 +254,7 @@ class Discovered(Struct):
     markers: dict[str, Marker] | UnsetType = UNSET
     covariance: JointCovariance | UnsetType = UNSET
     predicted_regions95: PredictedRegions | UnsetType = UNSET
+    loadable: list[Loadable] | UnsetType = UNSET
     rows_searched: SearchedRows | UnsetType = UNSET
     confirmation: Confirmed | UnsetType = UNSET
     decided: list[Decided] | UnsetType = UNSET

@@ -105,24 +105,24 @@ def geometry_of(result: FitResult) -> GeometryModel | None:
     return None if result.found is None else geometry_model(result.found)
 
 
-def model_text(result: FitResult) -> str:
-    """Return the robot model with lengths, tilts and offsets fitted together; '' if no better."""
-    geometry = geometry_of(result)
-    if geometry is None or not geometry.is_better:
-        return ''
+def model_text(result: FitResult, geometry: GeometryModel) -> str:
+    """Return the robot model with lengths, tilts and offsets fitted together."""
     remark = (
         f'Load this model in place of {URDF_FILE}, never beside another correction: lengths, '
-        'tilts and zero-offsets were fitted together. Mean error on held-out poses: '
-        f'{1e3 * geometry.held_out_m:.3f} mm, with the zero-offsets alone '
-        f'{1e3 * geometry.drawing_held_out_m:.3f} mm.'
+        'tilts and zero-offsets were fitted together.'
     )
+    if geometry.is_validation.any():
+        remark += (
+            f' Mean error on held-out poses: {1e3 * geometry.held_out_m:.3f} mm, with the '
+            f'zero-offsets alone {1e3 * geometry.drawing_held_out_m:.3f} mm.'
+        )
     offsets = np.where(result.identifiable, geometry.joint_offsets, 0.0)
     return calibrated_urdf(
         result.session.urdf,
         result.chain,
         offsets,
         [remark],
-        Geometry(geometry.shifts, geometry.turns, (remark,)),
+        Geometry(geometry.shifts, geometry.turns),
     )
 
 
@@ -418,8 +418,10 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
     make_folder(folder / APPLY_FOLDER)
     # A model of an earlier fit would contradict the rest.
     (folder / APPLY_FOLDER / MODEL_FILE).unlink(missing_ok=True)
-    model = model_text(result)
-    for name, text in (exports(result) | ({MODEL_FILE: model} if model else {})).items():
+    files = exports(result)
+    if (geometry := geometry_of(result)) is not None and geometry.is_better:
+        files[MODEL_FILE] = model_text(result, geometry)
+    for name, text in files.items():
         write_atomically(folder / APPLY_FOLDER / name, text)
     if not figures:
         remove_report(folder)

@@ -37,10 +37,10 @@ class Remaining(NamedTuple):
         return f'{self.what}{": " if size else ""}{size}. {self.remedy}'.rstrip()
 
 
-def what_remains(inputs: Inputs, uses_causes: bool, held_out: bool) -> list[Remaining]:
+def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Remaining]:
     """Return what the deed leaves, the causes first."""
     found, judgement = inputs.found, inputs.judgement
-    rows = [] if found is None else _of_discovery(found, uses_causes)
+    rows = [] if found is None else _of_discovery(found, loads_model)
     if found is None and (lines := judgement.findings or judgement.doubts):
         rows.append(
             Remaining(
@@ -82,10 +82,10 @@ def what_remains(inputs: Inputs, uses_causes: bool, held_out: bool) -> list[Rema
     return rows
 
 
-def _of_discovery(found: Discovered, uses_causes: bool) -> list[Remaining]:
+def _of_discovery(found: Discovered, loads_model: bool) -> list[Remaining]:
     """Return the causes that stay, and what has none."""
     rows: list[Remaining] = []
-    stay = [e for e in found.effects if not (uses_causes and e.in_robot_model)]
+    stay = [e for e in found.effects if not (loads_model and e.in_robot_model)]
     for effect in stay[:MOST_NAMED]:
         sizes = effect.sizes if isinstance(effect.sizes, list) else []
         size = '; '.join(sizes)

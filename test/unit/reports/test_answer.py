@@ -134,7 +134,7 @@ def inputs(fit_result, fit):
     [
         (None, 'set', False, 'good'),
         ([], 'set', False, 'good'),
-        ([LENGTH], 'set', True, 'good'),
+        ([LENGTH], 'set', False, 'caution'),
         ([SOFT], 'set', False, 'caution'),
         ([LENGTH, SOFT], 'set', False, 'caution'),
         ([BUMP], 'set', True, 'caution'),
@@ -151,7 +151,7 @@ def test_the_deed_takes_the_offsets_that_belong_to_its_files(
     assert answer.offsets[1].mean_deg == fit.joint_offsets[1].mean_deg + shift
     assert answer.brings == (2 if uses_causes else 1)
     assert len(answer.stages) == (3 if effects else 2)
-    assert ('robot_geometry.urdf' in answer.files) == (effects == [LENGTH])
+    assert 'robot_model.urdf' not in answer.files
     assert bool(answer.files) == (action == 'set')
 
 
@@ -162,7 +162,9 @@ def test_causes_that_stay_are_listed_with_their_remedy_and_the_others_are_not(in
         'Joint compliance of joint 2',
     ]
     assert [row.remedy for row in remains] == [NO_FILE, 'The remedy.']
-    (left,) = answer_of(inputs([LENGTH])).remains
+    answer = answer_of(inputs([LENGTH], model=0.3))
+    assert answer.mood == 'good'
+    (left,) = answer.remains
     assert left.what == 'Noise'
 
 
@@ -175,7 +177,7 @@ def test_causes_that_stay_are_listed_with_their_remedy_and_the_others_are_not(in
     ],
 )
 def test_no_page_names_a_file_that_is_not_beside_it(inputs, fit_result, model, errors, there):
-    file = 'apply/robot_geometry.urdf'
+    file = 'apply/robot_model.urdf'
     length = {**LENGTH, 'remedy': f'Put it into the robot model: {file} has it.'}
     made = inputs([length, SOFT], errors=errors, model=model)
     made.found.untestable, made.found.unexplained = {}, []
@@ -191,22 +193,33 @@ def test_no_page_names_a_file_that_is_not_beside_it(inputs, fit_result, model, e
     for key in ('registration', 'markers', 'sampler'):
         setattr(made.found, key, getattr(made.fit, key))
     answer = answer_of(made)
-    assert ('robot_geometry.urdf' in answer.files) == there
+    assert ('robot_model.urdf' in answer.files) == there
     html = answer_html(Subject(made, answer, fit_result.chain), {})
     assert (file in html) == there
 
 
-@pytest.mark.parametrize(('model', 'uses_causes'), [(0.4, True), (0.49, False)])
-def test_a_robot_model_that_holds_a_part_is_used_where_that_helps(inputs, model, uses_causes):
+@pytest.mark.parametrize(('model', 'loads'), [(0.4, True), (0.49, False)])
+def test_a_robot_model_that_holds_a_part_is_used_where_that_helps(inputs, fit, model, loads):
     answer = answer_of(inputs([LENGTH, SOFT], model=model))
-    assert answer.uses_causes == uses_causes
+    assert answer.loads_model == loads
+    assert not answer.uses_causes
     assert [stage.mean for stage in answer.stages] == pytest.approx([3.0, 0.5, model, 0.3])
-    assert answer.brings == (2 if uses_causes else 1)
-    assert answer.final_mm[0] == (model if uses_causes else 0.5)
+    assert answer.brings == (2 if loads else 1)
+    assert answer.final_mm[0] == (model if loads else 0.5)
     assert answer.mood == 'caution'
+    assert answer.headline.startswith('Load the robot model' if loads else 'Set the zero-offsets')
+    # What is set on the pad stays the zero-offsets by themselves.
+    assert answer.offsets == tuple(fit.joint_offsets)
     named = [row.what for row in answer.remains]
-    assert ('Link length of joint 2' in named) != uses_causes
+    assert ('Link length of joint 2' in named) != loads
     assert 'Joint compliance of joint 2' in named
+
+
+def test_a_fit_without_a_search_offers_its_robot_model_too(inputs):
+    answer = answer_of(inputs(model=0.3))
+    assert answer.loads_model
+    assert [stage.mean for stage in answer.stages] == pytest.approx([3.0, 0.5, 0.3])
+    assert 'robot_model.urdf' in answer.files
 
 
 def test_the_first_screen_names_the_largest_causes_alone(inputs):
@@ -239,7 +252,7 @@ def test_what_no_cause_explains_is_never_called_noise(inputs, fit):
     assert searched.what == 'More than noise'
     assert searched.size.startswith(fit.judgement.findings[0].rstrip('.'))
     # A cause that the robot model then holds has answered the finding of the fit without it.
-    assert [row.what for row in answer_of(inputs([LENGTH])).remains] == ['Noise']
+    assert [row.what for row in answer_of(inputs([LENGTH], model=0.3)).remains] == ['Noise']
 
 
 def test_a_doubt_is_no_finding(inputs, fit):
@@ -288,7 +301,7 @@ def test_an_error_of_the_measurement_is_no_gain_of_the_arm(inputs):
     headline = answer_of(inputs([BUMP])).headline
     assert 'The sensor tracker moved' in headline
     assert 'times smaller' not in headline
-    assert '10 times smaller' in answer_of(inputs([LENGTH])).headline
+    assert '10 times smaller' in answer_of(inputs([LENGTH], model=0.3)).headline
 
 
 @pytest.mark.parametrize('held', ['fit', 'discovery', 'disagreement', 'undetermined', 'unproven'])

@@ -13,7 +13,6 @@ import pytest
 from discovery_scenes import at_joint, session_with
 
 from remaster_ros.calibration.noise import Noise, NoiseModel
-from remaster_ros.compensation.export import exports
 from remaster_ros.discovery.confirmation import confirm
 from remaster_ros.discovery.decision import Named, decisions
 from remaster_ros.discovery.discover import discover_session
@@ -23,8 +22,8 @@ from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports import discovery_figures, discovery_json
-from remaster_ros.reports.discovery_apply import geometry_of
 from remaster_ros.reports.discovery_json import read_discovery, save_discovery
+from remaster_ros.reports.fit_json import model_text
 
 
 def bent(session):
@@ -225,11 +224,14 @@ def test_discovery_json_has_registration_markers_and_joint_covariance(saved):
 def test_discover_writes_what_to_apply_and_says_what_it_leaves(saved, tmp_path):
     found, folder = saved
     (tmp_path / 'apply').mkdir()
-    (tmp_path / 'apply' / 'robot_geometry.urdf').write_text('of an earlier run')
+    (tmp_path / 'apply' / 'robot_model.urdf').write_text('of an earlier run')
     save_discovery(found, tmp_path, figures=False)
     for place in (folder, tmp_path):
         names = {path.name for path in (place / 'apply').iterdir()}
-        assert names == {'remaster.txt', 'offset_layer.yaml', 'robot_calibrated.urdf'}
+        model = {'robot_model.urdf'} if found.loads_geometry else set()
+        assert names == {'remaster.txt', 'offset_layer.yaml', 'robot_calibrated.urdf'} | model
+        for path in (place / 'apply').iterdir():
+            assert 'of an earlier run' not in path.read_text()
     text = (folder / 'apply' / 'remaster.txt').read_text()
     assert 'Corrected in none of these files: encoder eccentricity of joint 2.' in text
 
@@ -247,22 +249,24 @@ def test_lengths_and_tilts_are_in_the_robot_model(saved):
     seed = 4
     print(f'seed {seed}')
     theta = 1e-5 * np.random.default_rng(seed).standard_normal(len(cells))
-    names = tuple(cell.parameters[0] for cell in cells)
-    fit = replace(found.fit, theta_names=names, theta=theta)
-    drawn = replace(found, fit=fit, groups=(tuple(cells),))
-    files = exports(fit, geometry_of(drawn))
-    geometry = SerialChain.from_urdf(files['robot_geometry.urdf'], chain.base_link, chain.tip_link)
+    shifts, turns = np.zeros((2, len(chain), 3))
+    for cell, value in zip(cells, theta, strict=True):
+        change = cell.model_change
+        shifts[change.joint] += value * change.shifts[0]
+        turns[change.joint] += value * change.turns[0]
+    drawn = replace(found.geometry, shifts=shifts, turns=turns, joint_offsets=np.zeros(len(chain)))
+    text = model_text(found.alone, drawn)
+    model = SerialChain.from_urdf(text, chain.base_link, chain.tip_link)
     markers = context.markers[context.marker]
-    moved = geometry.positions(context.q, markers) - chain.positions(context.q, markers)
+    moved = model.positions(context.q, markers) - chain.positions(context.q, markers)
     np.testing.assert_allclose(moved, found.residuals.displaced(cells, theta), atol=2e-9)
-    both = SerialChain.from_urdf(files['robot_calibrated.urdf'], chain.base_link, chain.tip_link)
-    offsets = np.where(fit.identifiable, fit.joint_offsets, 0.0)
+    offsets = 1e-3 * np.random.default_rng(seed + 1).standard_normal(len(chain))
+    text = model_text(found.alone, replace(drawn, joint_offsets=offsets))
+    both = SerialChain.from_urdf(text, chain.base_link, chain.tip_link)
+    known = np.where(found.alone.identifiable, offsets, 0.0)
     np.testing.assert_allclose(
-        both.positions(context.q, markers),
-        geometry.positions(context.q, markers, offsets),
-        atol=1e-12,
+        both.positions(context.q, markers), model.positions(context.q, markers, known), atol=1e-12
     )
-    assert 'The robot model holds of them' in files['remaster.txt']
 
 
 def test_where_no_joint_is_determined_and_no_cause_found_there_is_no_covariance():
