@@ -139,10 +139,12 @@ def summary(
             name = fewer or sentence_case(alike.title)
             lines.append(f'    could be {name}; to distinguish: {alike.separate_by}')
     lines += [f'unexplained: {left.next}' for left in found.unexplained]
+    measured = any(effect.of_measurement for effect in found.effects)
+    taken_out = ' (measuring errors taken out)' if measured else ''
     for row in loadable(found):
         what, to_do = load_words(row)
         mean = row.held_out_mean_mm
-        error = '' if mean is None else f', mean error on held-out poses {mean:.3f} mm'
+        error = '' if mean is None else f', mean error on held-out poses {mean:.3f} mm{taken_out}'
         lines.append(f'to load: {what}{error}: {to_do}')
     if held_out is not None and held_out.share is not None:
         lines.append(
