@@ -125,11 +125,15 @@ class Priors:
         Marker name -> position in the tool frame T, m, (3,), and standard deviation per axis, m.
     base
         Sensor name -> registration.
+    geometry_tolerance_m
+        Of the drawing: RMS displacement of the marker by each link length and each axis tilt off
+        it, at least, m. Links are machined and assembled to a tenth of a millimetre or so.
     """
 
     joint_offsets: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     markers: Mapping[str, tuple[FloatArray, float]] = field(default_factory=dict)
     base: Mapping[str, BasePrior] = field(default_factory=dict)
+    geometry_tolerance_m: float = 1e-4
 
 
 @dataclass(frozen=True)

@@ -37,9 +37,6 @@ from remaster_ros.kinematics.transforms import rotation_vector_to_matrix
 from remaster_ros.linear_algebra import one_thread
 from remaster_ros.types import BoolArray, FloatArray
 
-# Links of arms are machined and assembled to a tenth of a millimetre or so.
-TOLERANCE_M = 1e-4
-
 
 @dataclass(frozen=True, eq=False)
 class GeometryModel:
@@ -119,20 +116,17 @@ class GeometryModel:
 
 
 @one_thread
-def geometry_model(
-    found: Estimate, tolerance_m: float = TOLERANCE_M, causes: Sequence[Cell] = ()
-) -> GeometryModel | None:
+def geometry_model(found: Estimate, causes: Sequence[Cell] = ()) -> GeometryModel | None:
     """Fit all lengths and tilts beside the zero-offsets; None where they cannot be fitted.
 
     Parameters
     ----------
     found
-        The session's fit on the drawing.
-    tolerance_m
-        Of the drawing.
+        The session's fit on the drawing, with the drawing's tolerance among its priors.
     causes
         Errors of the measurement, fitted beside them: they are no errors of the arm.
     """
+    tolerance_m = found.problem.priors.geometry_tolerance_m
     drawing = _fitted(found, causes)
     found = _without_open_offsets(found)
     data = Residuals.of(found)

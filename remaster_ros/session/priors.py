@@ -1,4 +1,4 @@
-"""What is known before a fit, from a YAML file: offsets, markers, base frames.
+"""What is known before a fit, from a YAML file: offsets, markers, base frames, the drawing.
 
 All keys are optional::
 
@@ -6,6 +6,7 @@ All keys are optional::
     markers: {sir: {position_m: [0.1, 0.0, 0.02], std_m: 1.0e-4}}
     base: {mocap: {translation_m: [2.0, 0.0, 1.0], rotation_xyzw: [0, 0, 0, 1],
                    std_m: 1.0e-3, std_rad: 1.0e-3}}
+    geometry_tolerance_mm: 0.1
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ class _File(_Strict):
     joint_offsets: dict[str, _Offset] = {}
     markers: dict[str, _Marker] = {}
     base: dict[str, _Base] = {}
+    geometry_tolerance_mm: Annotated[float, Bounds(0.0, 100.0, 'mm', above=True)] = 0.1
 
 
 def read_priors(path: str | os.PathLike[str]) -> Priors:
@@ -81,4 +83,5 @@ def read_priors(path: str | os.PathLike[str]) -> Priors:
             for marker, prior in content.markers.items()
         },
         base={sensor: base.prior() for sensor, base in content.base.items()},
+        geometry_tolerance_m=1e-3 * content.geometry_tolerance_mm,
     )

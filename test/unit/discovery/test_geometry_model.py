@@ -20,7 +20,7 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.answer_inputs import errors_with_model_mm
 from remaster_ros.reports.discovery_json import save_discovery
 from remaster_ros.reports.fit_json import fit_content, model_text
-from remaster_ros.types import FloatArray, Session
+from remaster_ros.types import FloatArray, Priors, Session
 
 SHARED = Path(__file__).parents[3].parent / 'shared' / 'data'
 SEEDS = range(4)
@@ -61,6 +61,20 @@ def test_an_elbow_off_its_drawing_by_the_tolerance_is_held_by_the_wider_std() ->
     print(f'seeds {list(SEEDS)}: largest z {max(given_drawing):.1f}, {max(with_geometry):.1f}')
     assert max(given_drawing) > 5.0
     assert np.sum(np.array(with_geometry) > 1.96) <= 4
+
+
+def test_the_tolerance_of_the_drawing_is_a_prior() -> None:
+    """Where lengths and tilts show nothing, it alone decides what they could do to offsets."""
+    made = remaster_ros.simulate(poses=12, validation_poses=8, seed=3)
+    wider = []
+    for tolerance_m in (0.5e-4, 2e-4):
+        fit = remaster_ros.fit(made.session, priors=Priors(geometry_tolerance_m=tolerance_m))
+        assert fit.found is not None
+        geometry = geometry_model(fit.found)
+        assert geometry is not None
+        assert geometry.tolerance_m == tolerance_m
+        wider.append(np.linalg.norm(geometry.offset_moves, axis=1)[fit.identifiable])
+    assert np.all(wider[1] > 2.0 * wider[0])
 
 
 def held_out_mean(session: Session, urdf: str) -> float:

@@ -15,6 +15,7 @@ joint_offsets: {joint_2: {mean_deg: 0.1, std_deg: 0.05}}
 markers: {sir: {position_m: [0.1, 0.0, 0.02], std_m: 1e-4}}
 base:
   mocap: {translation_m: [2.0, 0.0, 1.0], rotation_xyzw: [0, 0, 0, 1], std_m: 1e-3, std_rad: 2e-3}
+geometry_tolerance_mm: 0.05
 """
 
 
@@ -34,6 +35,7 @@ def test_every_key_is_read(tmp_path) -> None:
     assert base.translation_m.tolist() == [2.0, 0.0, 1.0]
     assert base.rotation_xyzw.tolist() == [0.0, 0.0, 0.0, 1.0]
     assert (base.std_m, base.std_rad) == (1e-3, 2e-3)
+    assert priors.geometry_tolerance_m == pytest.approx(5e-5)
 
 
 @pytest.mark.parametrize(
@@ -55,6 +57,7 @@ def test_every_key_is_read(tmp_path) -> None:
         ('std_rad: 2e-3', 'std_rad: 7', r'base.mocap.std_rad is 7'),
         ('[2.0, 0.0, 1.0]', '[.inf, 0.0, 1.0]', r'base.mocap.translation_m'),
         ('markers:', '- markers:', 'line'),
+        ('tolerance_mm: 0.05', 'tolerance_mm: 0', r'geometry_tolerance_mm is 0'),
     ],
 )
 def test_what_cannot_be_is_refused(tmp_path, before: str, after: str, words: str) -> None:
