@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -23,14 +24,14 @@ from remaster_ros.discovery.side_by_side import rms_sigmas
 from remaster_ros.discovery.words import part_words, percent, sentence_case, shown
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports.discovery_apply import load_words, loadable
+from remaster_ros.reports.discovery_apply import load_words
 from remaster_ros.reports.discovery_json import (
     held_out_coverage,
     predictions_of,
     read_discovery,
     save_discovery,
 )
-from remaster_ros.reports.discovery_schema import Discovered
+from remaster_ros.reports.discovery_schema import Discovered, Loadable
 from remaster_ros.reports.fit_json import DISCOVERY_FILE, prepare_folder
 from remaster_ros.reports.found_causes import earlier_pairs
 from remaster_ros.reports.schemas import Judgement
@@ -108,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
         assert isinstance(content.judgement, Judgement)
         judged = content.judgement
         coverage = held_out_coverage(found, predictions)
-        show(args.quiet, summary(found, judged, confirmation, coverage))
+        show(args.quiet, summary(found, judged, confirmation, coverage, content.loadable or ()))
         for one in decided:
             show(args.quiet, one.describe())
         show(args.quiet, f'written: {report}')
@@ -122,8 +123,9 @@ def summary(
     judged: Judgement,
     confirmation: Confirmation | None = None,
     held_out: Coverage | None = None,
+    to_load: Sequence[Loadable] = (),
 ) -> str:
-    """Return verdict, causes, gain and coverage of the held-out rows in a few lines."""
+    """Return verdict, causes, what can be loaded, and the coverage of held-out rows in lines."""
     lines = [f'verdict: {found.verdict}', judged.headline]
     for effect in found.effects:
         share = (
@@ -141,7 +143,7 @@ def summary(
     lines += [f'unexplained: {left.next}' for left in found.unexplained]
     measured = any(effect.of_measurement for effect in found.effects)
     taken_out = ' (measuring errors taken out)' if measured else ''
-    for row in loadable(found):
+    for row in to_load:
         what, to_do = load_words(row)
         mean = row.held_out_mean_mm
         error = '' if mean is None else f', mean error on held-out poses {mean:.3f} mm{taken_out}'

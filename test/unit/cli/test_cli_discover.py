@@ -13,6 +13,7 @@ from remaster_ros.discovery.explain import FoundEffect, LookAlike
 from remaster_ros.discovery.gain import Gain
 from remaster_ros.discovery.side_by_side import Compared
 from remaster_ros.discovery.thinning import Thinning
+from remaster_ros.reports.discovery_schema import Loadable
 from remaster_ros.reports.schemas import Judgement
 
 EFFECT = FoundEffect(
@@ -49,14 +50,24 @@ def found(effects, gain, untestable, thinning=None):
     )
 
 
-def summary(session, confirmation=None):
+TO_LOAD = (
+    Loadable('offsets', 1.4, True, 'apply/robot_calibrated.urdf'),
+    Loadable('geometry', 1.5, False, ''),
+    Loadable('everything', 0.3, True, ''),
+)
+
+
+def summary(session, confirmation=None, to_load=()):
     points = in_words(session, confirmation) if confirmation else []
     judged = Judgement('good', 'The headline.', points)
-    return summary_of(session, judged, confirmation)
+    return summary_of(session, judged, confirmation, to_load=to_load)
 
 
 def test_causes_look_alikes_and_gain_are_said():
-    text = summary(found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {}))
+    text = summary(found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {}), to_load=TO_LOAD)
+    assert 'alone, mean error on held-out poses 1.400 mm: apply/robot_calibrated.urdf, ' in text
+    assert 'together, mean error on held-out poses 1.500 mm: leave it: no better than' in text
+    assert 'in the model, mean error on held-out poses 0.300 mm: no file holds it' in text
     assert 'verdict: effects' in text
     assert (
         'Joint compliance of joints 2 and 4: 0.500 mm, without it 100 % of the gain is lost'
