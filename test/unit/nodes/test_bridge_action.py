@@ -309,7 +309,13 @@ def test_a_publisher_on_the_topic_of_the_controller_halts(rig):
     r = rig()
     r.settle(TARGET)
     r.peer.create_publisher(JointTrajectory, controller_link.COMMANDS, 10)
-    r.wait(lambda: r.bridge.count_publishers(controller_link.COMMANDS), 'the publisher')
+
+    def listed():
+        # A node's name is known later than its publisher.
+        found = r.bridge.get_publishers_info_by_topic(f'/{controller_link.COMMANDS}')
+        return [info.node_name for info in found] == ['peer']
+
+    r.wait(listed, 'the publisher and its node')
     r.bridge._watch()
     assert r.halted().startswith(
         f'1 publisher on /{controller_link.COMMANDS}, where none may be: /peer; '
