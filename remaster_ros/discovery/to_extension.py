@@ -70,9 +70,7 @@ def moved_by_open_offsets(found: Estimate, data: Residuals, solution: Solution) 
     ndarray
         (size + m, c) for all natural parameters of the fit and the m of the solution's cells.
     """
-    columns, precision, where = fitted_columns(found, data, solution)
-    white = data.noise_model.whitened(columns, solution.noise).reshape(3 * len(data), -1)
-    root = root_of_inverse(white.T @ white + precision)
+    _, root, where = _solved(found, data, solution)
     names = found.problem.chain.joint_names
     joints = np.array(
         [
@@ -95,6 +93,15 @@ def moved_by_open_offsets(found: Estimate, data: Residuals, solution: Solution) 
     return moves
 
 
+def _solved(
+    found: Estimate, data: Residuals, solution: Solution
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return the whitened columns of all that is fitted, a root of its covariance, and where."""
+    columns, precision, where = fitted_columns(found, data, solution)
+    white = data.noise_model.whitened(columns, solution.noise).reshape(3 * len(data), -1)
+    return white, root_of_inverse(white.T @ white + precision), where
+
+
 def moved_by(
     found: Estimate, data: Residuals, solution: Solution, displacements: FloatArray
 ) -> FloatArray:
@@ -112,10 +119,8 @@ def moved_by(
     ndarray
         (size + m, c), as in `moved_by_open_offsets`.
     """
-    columns, precision, where = fitted_columns(found, data, solution)
-    white = data.noise_model.whitened(columns, solution.noise).reshape(3 * len(data), -1)
+    white, root, where = _solved(found, data, solution)
     others = data.noise_model.whitened(displacements, solution.noise).reshape(3 * len(data), -1)
-    root = root_of_inverse(white.T @ white + precision)
     moves = np.zeros((found.model.size + len(solution.parameters), others.shape[1]))
     moves[where] = root @ (root.T @ (white.T @ others))
     return moves

@@ -45,9 +45,10 @@ def loadable(discovery: Discovery) -> list[Loadable]:
         results.append(('geometry', discovery.geometry.errors, file))
     results.append(('everything', discovery.fit.residuals_after, ''))
     rows: list[Loadable] = []
+    # To what is shown: a difference in the fourth figure is no reason to load anything else.
     least = np.inf
     for name, errors, file in results:
-        mean_mm = 1e3 * mean_length(errors[held_out])
+        mean_mm = round(1e3 * mean_length(errors[held_out]), 3)
         rows.append(Loadable(name, mean_mm if held_out.any() else None, mean_mm < least, file))
         least = min(least, mean_mm)
     return rows

@@ -22,6 +22,7 @@ from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports import discovery_figures, discovery_json
+from remaster_ros.reports.discovery_apply import load_words, loadable
 from remaster_ros.reports.discovery_json import read_discovery, save_discovery
 from remaster_ros.reports.fit_json import model_text
 
@@ -280,3 +281,22 @@ def test_where_no_joint_is_determined_and_no_cause_found_there_is_no_covariance(
     nothing = SimpleNamespace(cells=())
     found = discovery_json._covariance(SimpleNamespace(fit=fit, solution=nothing))
     assert found == {'names': [], 'units': [], 'matrix': []}
+
+
+def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded():
+    """Everything that was found is in the robot model: no compensation is asked for."""
+    rows = SimpleNamespace(
+        is_validation=np.array([False, True, True]), observation=np.array([1, 2, 3])
+    )
+    errors = np.full((3, 3), 1e-3)
+    found = SimpleNamespace(
+        residuals=SimpleNamespace(context=SimpleNamespace(measurements=rows)),
+        outliers=(),
+        alone=SimpleNamespace(residuals_after=2.0 * errors),
+        geometry=SimpleNamespace(errors=errors),
+        fit=SimpleNamespace(residuals_after=0.9999 * errors),
+        loads_geometry=True,
+    )
+    results = loadable(found)
+    assert [row.better for row in results] == [True, True, False]
+    assert load_words(results[-1])[1].startswith('leave it')
