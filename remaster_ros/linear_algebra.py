@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import threading
 from collections.abc import Callable, Iterator
 from functools import wraps
 from typing import ParamSpec, TypeVar
@@ -42,11 +41,15 @@ def one_thread(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]
 def _interrupts_later() -> Iterator[None]:
     """Raise behind this block what Ctrl-C raises in it: in a callback of ctypes it is lost."""
     handler = signal.getsignal(signal.SIGINT)
-    if not callable(handler) or threading.current_thread() is not threading.main_thread():
+    came: list[int] = []
+    try:
+        if callable(handler):
+            signal.signal(signal.SIGINT, lambda number, frame: came.append(number))
+    except ValueError:  # Not the main thread: Ctrl-C is not raised in it.
+        handler = None
+    if not callable(handler):
         yield
         return
-    came: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, frame: came.append(number))
     try:
         yield
     finally:
