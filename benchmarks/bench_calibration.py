@@ -42,7 +42,7 @@ from pathlib import Path
 
 import common  # noqa: F401  its folder of helpers
 import numpy as np
-from calibration_study import NOISES, RANKS, SENSORS, Outcome, one_session
+from calibration_study import NOISES, RANKS, Outcome, one_session
 from common import machine, progress, table
 from parallel import in_parallel
 from scipy.stats import binom, chi2, kstest
@@ -87,22 +87,6 @@ def _coverage(outcomes: Sequence[Outcome]) -> str:
                 f'{100 * low / fewest:.1f} to {100 * high / fewest:.1f}',
             )
         )
-    cells = []
-    for noise in NOISES:
-        for sensors in SENSORS:
-            mine = [o for o in outcomes if (o.noise, o.sensors) == (noise, '+'.join(sensors))]
-            held = [h for o in mine for n, h in o.inside.items() if kind_of(n) == 'offset']
-            if held:
-                error = 100 * np.sqrt(0.95 * 0.05 / len(held))
-                cells.append(
-                    (
-                        noise,
-                        ' + '.join(sensors),
-                        len(mine),
-                        f'{100 * np.mean(held):.1f}',
-                        f'{error:.1f}',
-                    )
-                )
     header = (
         'parameters',
         'how many',
@@ -111,11 +95,7 @@ def _coverage(outcomes: Sequence[Outcome]) -> str:
         'from worst to best, %',
         'of one at 95 %: 99 % of chance lies in',
     )
-    of_offsets = ('noise', 'sensors', 'sessions', 'offsets held, %', 'std of that by chance')
-    return (
-        f'Coverage of central 95 % intervals\n\n{table(header, rows)}\n\n'
-        f'Offsets, by kind of session\n\n{table(of_offsets, cells)}'
-    )
+    return f'Coverage of central 95 % intervals\n\n{table(header, rows)}'
 
 
 def _ranks(outcomes: Sequence[Outcome]) -> str:

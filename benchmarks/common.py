@@ -7,7 +7,6 @@ import multiprocessing
 import os
 import platform
 import signal
-import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -75,29 +74,3 @@ def progress(text: str) -> None:
     """Write a line that the next one replaces, on a terminal only."""
     if sys.stderr.isatty():
         print(f'\r\x1b[K{text}', end='', file=sys.stderr, flush=True)
-
-
-def each_in_its_process(
-    path: Path, todo: Mapping[str, Sequence[str]], limit_s: int
-) -> dict[str, dict[str, Any]]:
-    """Run a benchmark again for each name that is not in the results file; return all lines.
-
-    With these arguments it prints a line, within so many seconds of CPU.
-    """
-    lines = known(path)
-    for name, arguments in todo.items():
-        if name in lines:
-            continue
-        command = [sys.executable, *arguments, '--limit', str(limit_s)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode == 0:
-            line = json.loads(done.stdout)
-        elif done.returncode < 0:
-            line = {'name': name, 'error': f'not ended after {limit_s} s of CPU'}
-        else:
-            line = {'name': name, 'error': done.stderr.strip().splitlines()[-1]}
-        lines[name] = line
-        with path.open('a', encoding='utf-8') as file:
-            file.write(json.dumps(line) + '\n')
-        print(f'{name}: {line.get("error") or line["verdict"]}', flush=True)
-    return lines

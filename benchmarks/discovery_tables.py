@@ -43,7 +43,6 @@ def report(lines: Iterable[dict[str, Any]]) -> None:
             report_null(groups[group])
     if groups['single']:
         report_single(groups['single'])
-        report_confusion(groups['single'])
         report_held_out(groups['single'])
     for group in ('pair', 'unnamed', 'triple'):
         if groups[group]:
@@ -129,32 +128,6 @@ def multiple_for(lines: list[dict[str, Any]], share: float = 0.9) -> float | Non
     return float(2.0**at) if at <= np.log2(BINS[-1]) else None
 
 
-def report_confusion(lines: list[dict[str, Any]]) -> None:
-    clear = [line for line in lines if line['multiple'] >= 2.0]
-    print(
-        f'\nConfusion: what was named first, where the best test had twice what it needs '
-        f'({len(clear)} sessions)'
-    )
-    for kind in NAMED:
-        mine = [line for line in clear if line['kinds'] == [kind]]
-        if not mine:
-            continue
-        counts: Counter[str] = Counter()
-        for line in mine:
-            if not line['named']:
-                counts['(nothing)'] += 1
-            elif line['named_right'] and line['forgiven']:
-                counts['look-alike, listed'] += 1
-            elif line['first_right']:
-                counts['right' if line['named_right'] else 'right, and more'] += 1
-            else:
-                name = line['named'][0].split()[0]
-                counts[f'{name}, other joint' if name == kind else name] += 1
-        print(f'  {kind:22}' + ', '.join(f'{what} {n}' for what, n in counts.most_common()))
-    right = sum(line['named_right'] for line in clear)
-    print(f'  all: {right} of {len(clear)} right ({_percent(right, len(clear))})')
-
-
 def report_held_out(lines: list[dict[str, Any]]) -> None:
     ratios = np.array([line['after_mm'] / line['floor_mm'] for line in lines])
     within = int(np.sum(ratios <= EXCESS))
@@ -163,12 +136,6 @@ def report_held_out(lines: list[dict[str, Any]]) -> None:
         f'{len(ratios)} ({_percent(within, len(ratios))}; at least {WITHIN_EXCESS:.0%} wanted); '
         f'median {np.median(ratios):.3f}, largest {ratios.max():.3f}'
     )
-    worst = sorted(lines, key=lambda line: line['floor_mm'] / line['after_mm'])[:8]
-    for line in worst:
-        ratio = line['after_mm'] / line['floor_mm']
-        if ratio > EXCESS:
-            named = '; '.join(line['named']) or 'nothing'
-            print(f'  {ratio:.2f} {line["name"]} x{line["multiple"]:.1f}: {named}')
 
 
 def report_named(group: str, lines: list[dict[str, Any]]) -> None:

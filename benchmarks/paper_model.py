@@ -25,8 +25,6 @@ from remaster_ros.types import FloatArray, Session
 
 NAMES = ('x', 'y', 'z', 'alpha', 'beta', 'gamma', *CHAIN.joint_names[1:], 'sigma')
 DIMENSION = len(NAMES)
-# Pseudo-measurement of the marker in the product's fit, m: as good as known.
-KNOWN_MARKER_M = 0.0
 _UNIT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -166,7 +164,7 @@ class PaperModel:
 
 def product_mode(session: Session) -> Mode:
     """Return the product's posterior of the same model: no common part, the marker as known."""
-    found = estimate(Problem.of(replace(session, marker_std_m=KNOWN_MARKER_M)))
+    found = estimate(Problem.of(replace(session, marker_std_m=0.0)))
     return find_mode(found.posterior.with_independent_rows())
 
 

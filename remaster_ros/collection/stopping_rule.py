@@ -35,7 +35,7 @@ FREEDOM_PER_PARAMETER = 2
 ERROR_RATE = 0.005
 """Of all looks at the residuals together: structure claimed where there is none. The p-values are
 not exact with two dozen readings and an estimated noise: with 1 % spent it was claimed in 14 of
-1,000 sessions (benchmarks/bench_stopping.py)."""
+1,000 sessions."""
 MOST_TESTS = 20
 """Looks that test: more of them spend power, and find nothing sooner that matters."""
 

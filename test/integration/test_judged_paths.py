@@ -1,7 +1,7 @@
 """Moves as the planner plans them, judged by what shares nothing with its checks.
 
 The kinematics are pinocchio's, the distances FCL's on triangles; sampled at 1 mm, bodies grown by
-half of that. In the small; benchmarks/bench_paths.py does twelve cells.
+half of that. Two cells, in make qualify all twelve.
 """
 
 import numpy as np
@@ -14,16 +14,16 @@ from path_cells import SPECS, make_cell
 from path_judges import collides
 from planned_moves import tours
 
+SOON = ('LWR 4+, low, 3 held values', 'LWR 4+, low, 250 mm tool, boxes')
 CELLS = [
-    'LWR 4+, low, 3 held values',
-    'LWR 4+, low, 250 mm tool, boxes',
+    pytest.param(spec, id=spec.name, marks=() if spec.name in SOON else pytest.mark.qualify)
+    for spec in SPECS
 ]
 
 
 @pytest.fixture(scope='module', params=CELLS)
 def judged(request, tmp_path_factory):
-    spec = next(spec for spec in SPECS if spec.name == request.param)
-    return make_cell(spec, tmp_path_factory.mktemp('cell'))
+    return make_cell(request.param, tmp_path_factory.mktemp('cell'))
 
 
 def test_no_move_hits_anything(judged):

@@ -1,7 +1,4 @@
-"""Sag or a base that yields: decided by what separates them, in a world of its own.
-
-benchmarks/bench_separating.py does the same with six pairs and all sizes. Seeds are fixed.
-"""
+"""Sag or a base that yields: decided by what separates them, in a world of its own."""
 
 import numpy as np
 import pytest

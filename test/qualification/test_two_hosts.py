@@ -1,4 +1,4 @@
-"""Sensors on one host, the rest on another, the cable cut: bench_two_hosts.py, small."""
+"""Sensors on one host, the rest on another, the cable cut: two_hosts.py, small."""
 
 import subprocess
 import sys
@@ -13,10 +13,10 @@ NOT_HERE = 3
 
 
 def test_nothing_is_lost_when_the_cable_is_cut(ros_environment, tmp_path):
-    """Longer than the heartbeat; the benchmark's 30 s let DDS give its peers up as well."""
+    """Longer than the heartbeat; the script's own 30 s let DDS give its peers up as well."""
     done = subprocess.run(
         [
-            sys.executable, ROOT / 'benchmarks' / 'bench_two_hosts.py', '--candidates', '2',
+            sys.executable, ROOT / 'test' / 'qualification' / 'two_hosts.py', '--candidates', '2',
             '--rate', '2.5', '--cut', '8', '--out', tmp_path,
         ],
         env=ros_environment,

@@ -1,7 +1,8 @@
-"""A short run of what benchmarks/bench_fuzz.py does ten million times."""
+"""A short run of the fuzzer; FUZZ=1000000 takes as many inputs of each kind."""
 
 from __future__ import annotations
 
+import os
 import random
 import time
 
@@ -10,6 +11,7 @@ import fuzzing
 import pytest
 
 SEED = random.SystemRandom().randrange(10**6)
+INPUTS = int(os.environ.get('FUZZ', '5000'))
 
 
 @pytest.fixture
@@ -25,7 +27,7 @@ def test_no_datagram_harms_the_optitrack_client(rng, version):
         fuzzing.run(
             fuzz_messages.natnet_mutator(rng, version),
             [fuzzing.decode_as_any_version(rng), client],
-            5000,
+            INPUTS,
         )
     assert client.samples > 50, 'hardly anything came through: the fuzzer tests next to nothing'
     assert client.strangers > 5
@@ -34,7 +36,7 @@ def test_no_datagram_harms_the_optitrack_client(rng, version):
 def test_no_packet_harms_the_laser_tracker_client(rng):
     client = fuzzing.TrackerClientTarget(rng)
     fuzzing.run(
-        fuzz_messages.emscon_mutator(rng), [fuzzing.read_from_both_sides(rng), client], 5000
+        fuzz_messages.emscon_mutator(rng), [fuzzing.read_from_both_sides(rng), client], INPUTS
     )
     assert client.readings > 20
     assert client.errors > 20

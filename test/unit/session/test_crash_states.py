@@ -1,4 +1,4 @@
-"""Simulated power cuts in the life of a session (more: bench_crash_states.py).
+"""Simulated power cuts in the life of a session; CRASH_STATES=12000 tries more.
 
 What a crash may leave is in test/crash_states.py, what must hold then in test/session_crashes.py.
 """
@@ -6,6 +6,7 @@ What a crash may leave is in test/crash_states.py, what must hold then in test/s
 from __future__ import annotations
 
 import logging
+import os
 import random
 import shutil
 import tempfile
@@ -28,7 +29,11 @@ def quick_folder(tmp_path):
         yield Path(folder)
 
 
-@pytest.mark.parametrize('states', [100, pytest.param(1000, marks=pytest.mark.qualify)])
+MANY = int(os.environ.get('CRASH_STATES', '1000'))
+
+
+@pytest.mark.timeout(600 + MANY // 4)
+@pytest.mark.parametrize('states', [100, pytest.param(MANY, marks=pytest.mark.qualify)])
 def test_no_crash_loses_what_was_acknowledged(states, quick_folder, caplog):
     caplog.set_level(logging.CRITICAL, 'remaster_ros')
     found: Counter[str] = Counter()

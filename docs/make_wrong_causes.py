@@ -1,6 +1,6 @@
 """Where obvious methods name the wrong cause: three kinds of session of the hidden world.
 
-    python benchmarks/wrong_causes.py [--seeds 10] [--figure docs/figures/wrong_causes.svg]
+    python docs/make_wrong_causes.py [--seeds 10] [--figure docs/figures/wrong_causes.svg]
 
 *Greedy*: of all causes the one whose effect correlates best with the residuals, all rows alike.
 *Full DH*: every link offset and axis tilt by least squares; the most significant is to blame.
@@ -52,6 +52,7 @@ def searched(kind: str, seed: int) -> Discovery:
 
 
 def ours(found: Discovery) -> str:
+    """Return the causes that the product names."""
     return ' + '.join(_named(e.name, e.joints) for e in found.effects) or 'nothing'
 
 
@@ -167,6 +168,7 @@ def draw(kind: str, found: Discovery, path: Path) -> None:
 
 
 def main() -> None:
+    """Print the answers; draw on request."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').partition('\n')[0])
     parser.add_argument('--seeds', type=int, default=10)
     parser.add_argument('--figure', type=Path, help='write two figures, of the first seed each')

@@ -8,7 +8,7 @@ arm must have stood still from its arrival until the cable was back.
 
 Needs the right to make network namespaces: root, or unprivileged user namespaces (`unshare -rnm`).
 
-Run: python benchmarks/bench_two_hosts.py [--candidates 5] [--rate 3] [--cut 30] [--seed 0]
+Run: python test/qualification/two_hosts.py [--candidates 5] [--rate 3] [--cut 30] [--seed 0]
 """
 
 from __future__ import annotations
